@@ -129,5 +129,5 @@ def test_invalid_input_is_rejected() -> None:
     with pytest.raises(ValueError, match="NaN or Inf"):
         chirplet_clean(data * torch.nan, PRF)
     for options in ({"atoms": 0}, {"sweep": 0.0}, {"floor_db": -1.0}):
-        with pytest.raises(ValueError, match="one atom at least"):
+        with pytest.raises(ValueError, match="atoms 1 or more"):
             chirplet_clean(data, PRF, **options)

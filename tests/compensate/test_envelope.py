@@ -95,7 +95,7 @@ def test_shift_is_unitary_reversible_and_exact_for_whole_cells() -> None:
     torch.testing.assert_close(shift_range(moved, -shift), x, atol=1e-12, rtol=0)
     torch.testing.assert_close(shift_range(x, 3.0), x.roll(3, -1), atol=1e-12, rtol=0)
     assert shift_range(x.to(torch.complex64), shift).dtype == torch.complex64
-    with pytest.raises(ValueError, match=r"one shift per pulse is needed, \(..., 5\), got \(2, 4\)"):
+    with pytest.raises(ValueError, match=r"hold one shift per pulse, \(..., 5\), got shape \(2, 4\)"):
         shift_range(x, shift[:, :4])
 
 

@@ -170,7 +170,7 @@ def test_phase_has_the_sign_of_the_range() -> None:
 def test_invalid_input_is_rejected() -> None:
     sweeps, pulse, truth = seen(n=4)
     v = truth.values["velocity_m_s"]
-    with pytest.raises(ValueError, match="one velocity per period"):
+    with pytest.raises(ValueError, match="velocity_m_s must hold one velocity per period"):
         compensate_motion(sweeps, v[:3], RADAR, pulse)
     with pytest.raises(ValueError, match="1 velocities are NaN or Inf"):
         compensate_motion(sweeps, torch.where(v == v[1], torch.nan, v), RADAR, pulse)

@@ -137,9 +137,9 @@ def test_invalid_input_is_rejected(name) -> None:
     estimator = ESTIMATORS[name]
     with pytest.raises(TypeError, match="complex sweeps"):
         estimator(sweeps.real, RADAR, pulse)
-    with pytest.raises(ValueError, match="up before down, got shape"):
+    with pytest.raises(ValueError, match="the up sweep before the down sweep, got shape"):
         estimator(sweeps[..., :-1], RADAR, pulse)
-    with pytest.raises(ValueError, match="up before down, got shape"):
+    with pytest.raises(ValueError, match="the up sweep before the down sweep, got shape"):
         estimator(sweeps[0], RADAR, pulse)
     for window, said in (
         ((2.0, 1.0), "low < high"),

@@ -306,25 +306,25 @@ def test_invalid_input_is_rejected() -> None:
         figure(data.real)
     with pytest.raises(ValueError, match="NaN or Inf"):
         figure(data * torch.nan)
-    with pytest.raises(ValueError, match="range_m needs the 8 coordinates"):
+    with pytest.raises(ValueError, match="range_m must hold the 8 coordinates"):
         figure(data[:, :8])
-    with pytest.raises(ValueError, match="nothing to search for"):
+    with pytest.raises(ValueError, match="order must be 2 or more without the range term, got 1"):
         figure(data, order=1, range_term=False)
-    with pytest.raises(ValueError, match="range term alone"):
+    with pytest.raises(ValueError, match="the range centre deviation affects the range term alone"):
         figure(data, range_term=False, yc_m=None)
     with pytest.raises(ValueError, match="'raw' or 'shape'"):
         figure(data, variables="polar")
-    with pytest.raises(ValueError, match="low needs the 3 values omega_rad_s, k1_per_s, k2_per_s2, got 2"):
+    with pytest.raises(ValueError, match="low must hold the 3 values omega_rad_s, k1_per_s, k2_per_s2, got 2"):
         genetic_rotation(figure(data), [0.01, 9.0], [0.03, 11.0], draws=Draws(1))
-    with pytest.raises(ValueError, match="needs the values of the 3 unknowns"):
+    with pytest.raises(ValueError, match="list of values for each of the 3 unknowns"):
         search_rotation(figure(data), [[0.02], [10.0]])
     with pytest.raises(ValueError, match="27000 evaluations per trial, above the limit of 1000"):
         search_rotation(figure(data), [torch.linspace(1, 2, 30, dtype=F64)] * 3, limit=1000)
-    with pytest.raises(ValueError, match="RotationDescent needs a start"):
+    with pytest.raises(ValueError, match="RotationDescent needs a rotation to start from"):
         RotationDescent(RADAR)(signal_of(data))
-    with pytest.raises(ValueError, match="a start needs the 3 values omega, k1, k2"):
+    with pytest.raises(ValueError, match="start must hold the 3 values omega, k1, k2"):
         RotationNewton(RADAR, [10.0, 1000.0])
-    with pytest.raises(ValueError, match="as many values in low, high and counts"):
+    with pytest.raises(ValueError, match="low, high and counts must hold one entry per unknown"):
         RotationSearch(RADAR, [0.0], [1.0, 2.0], [3])
 
 

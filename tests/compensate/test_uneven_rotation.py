@@ -324,13 +324,13 @@ def test_invalid_input_is_rejected() -> None:
         uneven_rotation(
             data.index_put((torch.tensor(3), torch.tensor(5)), torch.tensor(math.nan + 0j, dtype=data.dtype)), **OPTIONS
         )
-    with pytest.raises(ValueError, match="range_m needs the 24 coordinates"):
+    with pytest.raises(ValueError, match="range_m must be a tensor of the 24 coordinates"):
         uneven_rotation(data, **{**OPTIONS, "range_m": RANGE_M[:5]})
     with pytest.raises(ValueError, match="wavelength_m must be a positive number, got -1"):
         uneven_rotation(data, **{**OPTIONS, "wavelength_m": -1.0})
     with pytest.raises(ValueError, match="order must be a whole number of 1 or more"):
         uneven_rotation(data, **OPTIONS, order=0)
-    with pytest.raises(ValueError, match="an order of 1"):
+    with pytest.raises(ValueError, match=r"order of the rotation must be 1 \(uniform rotation\) or more"):
         UnevenRotation(RADAR, 0)
 
 

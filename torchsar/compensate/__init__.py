@@ -1,4 +1,4 @@
-"""Estimators of motion and pointing, and the correctors that use them."""
+"""Estimators of motion, pointing and phase errors, and the stages that correct data with them."""
 
 from torchsar.compensate.ambiguity import DopplerCentroid, ambiguity_evidence, line_doppler
 from torchsar.compensate.aperture import complete_aperture_centroid

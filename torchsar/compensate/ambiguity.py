@@ -1,12 +1,15 @@
 """Absolute Doppler centroid: the PRF ambiguity is resolved from range migration.
 
-The multiple of the PRF is found without prior knowledge. Three kinds of evidence give a
-log-likelihood for each candidate number of PRFs, from statistics over independent blocks of data:
+The absolute centroid f_dc is the baseband centroid plus k PRFs. The whole number k is found without
+prior knowledge. Three kinds of evidence give a log-likelihood for each candidate k, from statistics
+over independent blocks of data:
 
-- looks: the range displacement between azimuth looks of the image, dr = lambda k PRF df / (2 Ka).
-- lines: the range displacement between adjacent lines; the phase increment grows with range
-frequency as f_dc (f0 + f) / f0.
-- entropy: the entropy of a small group of range cells that is focused with every candidate.
+- looks: if k is wrong by dk, azimuth looks of the image whose centres differ by df in Doppler are
+displaced in range by lambda dk PRF df / (2 Ka), where Ka is the azimuth FM rate.
+- lines: the phase increment between adjacent lines grows with the range frequency f as
+f_dc (f0 + f) / f0, where f0 is the carrier frequency.
+- entropy: a small group of range cells is focused with every candidate; the entropy of its image
+is least for the right one.
 
 The looks are the strongest evidence wherever there is contrast. The lines are the only evidence on
 featureless speckle. The log-likelihoods are added.
@@ -43,20 +46,20 @@ _BLOCKS = 8  # independent parts of the data; more give more degrees of freedom,
 
 
 def candidate_turns(reach: int, device: torch.device | None = None) -> Tensor:
-    """List the candidate numbers of PRFs, -reach..reach.
+    """List the candidates for the Doppler ambiguity: the whole numbers from -reach to reach.
 
     Args:
-        reach: Largest number of PRFs; 0 where no other squint is possible.
+        reach: Largest candidate in PRFs; 0 leaves only the candidate 0.
         device: Device of the result.
 
     Returns:
-        The candidates, shape (2 reach + 1,), float64.
+        The candidates in PRFs in rising order, shape (2 reach + 1,), float64.
 
     Raises:
         ValueError: If `reach` is negative.
     """
     if reach < 0:
-        raise ValueError(f"the ambiguity search needs a reach of 0 or more PRFs, got {reach}")
+        raise ValueError(f"reach must be 0 or more (largest Doppler ambiguity to search, in PRFs), got {reach}")
     return torch.arange(-reach, reach + 1, dtype=torch.float64, device=device)
 
 
@@ -84,9 +87,10 @@ def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turn
     """Correlate neighbouring azimuth looks at the range displacement of every candidate ambiguity.
 
     The group is focused with the baseband Doppler as if it were absolute. If the true centroid lies
-    k PRFs away, look l + 1 is displaced against look l by dr of the module's docstring. Blocks are
-    ranges of image lines. Intensities are limited to 20 times their mean, so that one ship cannot
-    dominate.
+    k PRFs away, each look is displaced in range against the look before it by lambda k PRF df /
+    (2 Ka), where df is the Doppler spacing of the looks and Ka the azimuth FM rate. Looks one, two
+    and three spacings apart are correlated at this displacement. Intensities are limited to 20
+    times their mean, so that one ship cannot dominate.
 
     Args:
         group: Group of range cells.
@@ -96,7 +100,8 @@ def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turn
         looks: Number of azimuth looks.
 
     Returns:
-        The correlations, shape (..., block, candidate), float64; larger is better.
+        The correlations, shape (..., block, candidate), float64; the right candidate has the
+        largest. A block is one eighth of the lines of the look images.
     """
     rows = beam_spectrum(group, doppler_hz).rows(doppler_hz, velocity_m_s)
     height = rows.shape[-2] // looks
@@ -123,8 +128,10 @@ def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turn
 def line_doppler(lines: Tensor, radar: StripmapRadar) -> tuple[Tensor, Tensor]:
     """Estimate the absolute Doppler from the growth of the phase increment with range frequency.
 
-    The estimate is unambiguous but coarse: its standard deviation is about f0 / bandwidth *
-    sqrt(12) times that of the baseband centroid. Amplitudes are limited to three times their mean.
+    The phase increment between adjacent lines is 2 pi f_dc (f0 + f) / (f0 PRF) at range frequency
+    f, with carrier frequency f0 and Doppler f_dc; its slope over f is not ambiguous. The estimate
+    is coarse: its standard deviation is about f0 / bandwidth * sqrt(12) times that of the baseband
+    centroid. Amplitudes are limited to three times their mean.
 
     Args:
         lines: Range-compressed lines, shape (..., pulse, range), complex.
@@ -162,7 +169,9 @@ def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
 def entropy_scores(
     group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, dwell_s: float
 ) -> tuple[Tensor, Tensor]:
-    """Compute the negative entropies of a group focused with every candidate ambiguity.
+    """Compute the negative image entropies of a group of range cells for each candidate ambiguity.
+
+    The group is focused once with each candidate for the absolute Doppler centroid.
 
     Args:
         group: Group of range cells.
@@ -188,7 +197,9 @@ def ambiguity_evidence(
 ) -> dict[str, Tensor]:
     """Compute the log-likelihood of every candidate ambiguity from each kind of evidence.
 
-    At most four apertures of lines and 4096 range cells about the middle of the swath are used.
+    Only lines about the middle of the record are used: as many as four synthetic apertures, or 1024
+    if that is more. Of these, the looks use the 4096 neighbouring range cells with the most signal,
+    the entropy uses 512, and the lines use all.
 
     Args:
         raw: Lines, shape (..., pulse, range), complex.
@@ -199,8 +210,11 @@ def ambiguity_evidence(
         reach: The candidates are -reach..reach PRFs.
 
     Returns:
-        "looks", "lines" and "entropy", shape (..., candidate) each, and "line_doppler_hz" with
-        "line_doppler_std_hz", shape (...,), see `line_doppler`.
+        A dictionary. "looks", "lines" and "entropy" hold the log-likelihoods of the candidates,
+        shape (..., candidate), up to a constant: from the range displacement between azimuth looks,
+        from the phase increment between adjacent lines, and from the image entropy.
+        "line_doppler_hz" and "line_doppler_std_hz", shape (...,), are the results of
+        `line_doppler`.
 
     Raises:
         ValueError: If `reach` is negative.
@@ -223,14 +237,16 @@ def ambiguity_evidence(
 
 
 def possible_reach(radar: StripmapRadar, reach: int) -> int:
-    """Limit the search for the ambiguity to squints of about 70 degrees, 0.94 * 2 v / lambda.
+    """Limit the search for the Doppler ambiguity to squints of up to about 70 degrees.
+
+    The absolute Doppler is then at most 0.94 * 2 v / lambda, with the nominal velocity v.
 
     Args:
         radar: Radar parameters.
-        reach: Largest number of PRFs that is wanted.
+        reach: Largest ambiguity that the caller wants to search, in PRFs.
 
     Returns:
-        The largest number of PRFs to search, at most `reach`.
+        The largest ambiguity to search, in PRFs: `reach` or less.
     """
     return max(0, min(reach, math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)))
 
@@ -241,8 +257,8 @@ class DopplerCentroid(Stage):
     The baseband centroid comes from the phase increment, and the ambiguity from range migration,
     without prior knowledge. If the dwell of the beam is known (`radar.integration_s`) and shorter
     than the record, the centroid is refined with targets whose whole dwell lies in the record (see
-    `complete_aperture_centroid`), because targets cut by the ends of the record would pull it. The
-    signal is left unchanged.
+    `complete_aperture_centroid`), because targets that the ends of the record cut would bias it.
+    The signal is left unchanged.
 
     Provides `doppler_hz` (absolute, positive when closing), `doppler_baseband_hz`, `ambiguity`
     (whole number of PRFs, as float64) and `squint_deg` (positive ahead, for the nominal velocity).
@@ -273,7 +289,7 @@ class DopplerCentroid(Stage):
                 "None for range-compressed data"
             )
         if reach < 1:
-            raise ValueError(f"the ambiguity search needs a reach of at least one PRF, got {reach}")
+            raise ValueError(f"reach must be 1 or more (largest Doppler ambiguity to search, in PRFs), got {reach}")
         self.radar, self.reference, self.reach, self.blocks = radar, reference, possible_reach(radar, reach), blocks
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
@@ -294,15 +310,20 @@ class DopplerCentroid(Stage):
 
     @torch.no_grad()
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the centroid of a signal of axes (pulse, range).
+        """Estimate the absolute Doppler centroid of a signal of axes (pulse, range).
+
+        Args:
+            signal: Lines, shape (..., pulse, range), complex.
 
         Returns:
-            The four values, shape (...,) each, with the standard deviations of both frequencies in
-            Hz. quality is the probability of the ambiguity. `ok` is False where that probability is
-            0.9 or less, or where the baseband centroid is unreliable. info: block_hz, block_power,
-            the log-likelihoods looks, lines and entropy, line_doppler_hz and line_doppler_std_hz,
-            candidates, margin (log-likelihood over that of the second-best candidate) and
-            coherence.
+            `doppler_hz` (absolute) and `doppler_baseband_hz`, with their standard deviations in Hz,
+            `ambiguity` (whole number of PRFs) and `squint_deg`, shape (...,) each. quality is the
+            probability that the ambiguity is right. `ok` is False where that probability is 0.9 or
+            less, or where the baseband centroid is unreliable. info: block_hz and block_power (see
+            `baseband_estimate`); the log-likelihoods looks, lines and entropy of the candidates,
+            line_doppler_hz and line_doppler_std_hz (see `ambiguity_evidence`); candidates (in
+            PRFs); margin (log-likelihood of the best candidate minus that of the second-best); and
+            coherence (of adjacent lines, 0..1).
         """
         raw, radar = signal.data, self.radar
         first = phase_increment(raw, radar.prf_hz, self.blocks)

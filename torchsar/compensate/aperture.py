@@ -1,9 +1,10 @@
 """Doppler centroid from targets that are illuminated for their whole dwell within the record.
 
 The ends of a record cut the apertures of the targets near them. In a strip with a few bright points
-this pulls the centroid by a considerable part of the beam's band. In an image each target lies at
-the time when the beam centre crosses it, so lines of complete apertures can be separated from the
-others. The azimuth spectrum of these lines alone is that of the beam for any scene.
+this biases the centroid by a considerable part of the beam's Doppler band. In an image each target
+lies at the time when the beam centre crosses it, so image lines whose targets have complete
+apertures can be separated from the others. The azimuth spectrum of these lines alone has the shape
+of the beam, whatever the scene.
 """
 
 from __future__ import annotations
@@ -31,10 +32,11 @@ _GUARD = 0.02  # share of the dwell by which it is widened at each end, found by
 def complete_aperture_centroid(
     raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, std_hz: Tensor, reference: str | None, rounds: int = 2
 ) -> tuple[Tensor, Tensor]:
-    """Refine an absolute Doppler centroid by using complete apertures only.
+    """Refine an absolute Doppler centroid with targets whose whole dwell lies within the record.
 
-    The input is returned unchanged if the dwell of the beam is not known (`radar.integration_s` is
-    None), or if the record is shorter than 1.1 dwells.
+    Targets whose apertures are cut by the ends of the record would bias the centroid; they are
+    excluded in the image. `doppler_hz` and `std_hz` are returned unchanged if the dwell of the beam
+    is not known (`radar.integration_s` is None), or if the record is shorter than 1.1 dwells.
 
     Args:
         raw: Lines, shape (..., pulse, range), complex.
@@ -46,8 +48,8 @@ def complete_aperture_centroid(
         rounds: Number of rounds, each of which forms the image anew with the current centroid.
 
     Returns:
-        The refined centroid and its standard deviation in Hz, shape (...,) each. A trial keeps its
-        input where the new standard deviation exceeds twice the old one.
+        The refined centroid and its standard deviation in Hz, shape (...,) each. A trial keeps
+        `doppler_hz` and `std_hz` if its new standard deviation is twice `std_hz` or more.
     """
     if radar.integration_s is None:
         return doppler_hz, std_hz

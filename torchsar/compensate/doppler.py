@@ -53,25 +53,26 @@ def unit_peak(x: Tensor) -> Tensor:
 def _bounds(n: int, parts: int, what: str) -> list[tuple[int, int]]:
     """First and last index of each of `parts` nearly equal parts of 0..n."""
     if not 1 <= parts <= n:
-        raise ValueError(f"{parts} blocks do not fit {n} {what}; choose 1..{n}")
+        raise ValueError(f"blocks must be 1..{n} where there are {n} {what}, got {parts}")
     edges = [round(i * n / parts) for i in range(parts + 1)]
     return list(pairwise(edges))
 
 
 def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, Tensor]:
-    """Sum the products of adjacent lines, and their mean powers, over blocks.
+    """Sum the products of adjacent lines, and the powers of these lines, over blocks of the data.
 
     The products are conj(line n) * line n+1. Every pair of adjacent lines belongs to exactly one
-    block. The lines are divided by their peak per trial, so the results do not depend on the scale
-    of the input. Differentiable.
+    block. Each trial is first divided by its peak modulus, so the results do not depend on the
+    scale of the input. Differentiable.
 
     Args:
         x: Lines, shape (..., pulse, range), complex.
         blocks: Number of blocks a along pulses and b along range.
 
     Returns:
-        The products, shape (..., a, b), complex128, and the mean power of the same pairs, shape
-        (..., a, b), float64, with |product| <= power.
+        The sum of the products of each block, shape (..., a, b), complex128; and the sum of the
+        mean power of the two lines of each pair, shape (..., a, b), float64. The modulus of a
+        product never exceeds its power; their ratio is the coherence.
 
     Raises:
         ValueError: If there are fewer pairs of lines or range cells than blocks.
@@ -100,7 +101,8 @@ def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
     """Compute azimuth power spectra of blocks of lines, summed over the range cells of each block.
 
     Each block shares one line with the next and is padded with zeros, so that the first Fourier
-    coefficient of its spectrum equals its `lag_products`.
+    coefficient of its spectrum equals the sum of the products of its adjacent lines, as
+    `lag_products` computes it.
 
     Args:
         x: Lines, shape (..., pulse, range), complex.
@@ -127,8 +129,8 @@ def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
 def circular_centre(spectrum: Tensor) -> Tensor:
     """Compute the first Fourier coefficient of a power spectrum.
 
-    Its argument divided by 2 pi is the energy centre of the spectrum, as a fraction of the sampling
-    rate.
+    The phase of this coefficient divided by 2 pi is the circular energy centre of the spectrum, as
+    a fraction of the sampling rate.
 
     Args:
         spectrum: Power spectrum in FFT order, shape (..., n).
@@ -145,7 +147,8 @@ def circular_centre(spectrum: Tensor) -> Tensor:
 def plain_energy_centre(spectrum: Tensor, prf_hz: float) -> Tensor:
     """Compute the ordinary, non-circular centre of mass of a power spectrum.
 
-    A baseline for comparison: it is wrong wherever the spectrum wraps. Use `energy_centre` instead.
+    It serves for comparison only, because it is wrong wherever the spectrum wraps at half the PRF.
+    Use `energy_centre` instead.
 
     Args:
         spectrum: Power spectrum in FFT order, shape (..., n).
@@ -165,9 +168,10 @@ def combine_blocks(products: Tensor, over: str = "mean") -> Tensor:
 
     Args:
         products: Block products, shape (..., a, b), complex.
-        over: "mean" takes the argument of their sum, which weights blocks by their energy. "median"
-            takes the median of their angles about that mean, so that the angles do not wrap; each
-            block with energy has equal weight, so that one bright block cannot dominate.
+        over: "mean" takes the phase of the sum of all products, which weights blocks by their
+            energy. "median" takes the median of the phases of the products, measured from the phase
+            of that sum so that they do not wrap. Each block with energy then has equal weight, so
+            that one bright block cannot dominate.
 
     Returns:
         The phase increment from line to line in rad, shape (...,).
@@ -176,7 +180,7 @@ def combine_blocks(products: Tensor, over: str = "mean") -> Tensor:
         ValueError: If `over` is neither "mean" nor "median".
     """
     if over not in OVER:
-        raise ValueError(f"blocks are combined by one of {OVER}, got {over!r}")
+        raise ValueError(f"over must be one of {OVER} (how blocks are combined), got {over!r}")
     flat = products.flatten(-2)
     mean = torch.angle(flat.sum(-1))
     if over == "mean":
@@ -208,20 +212,23 @@ def increment_std_rad(products: Tensor, phase_rad: Tensor) -> Tensor:
 
 
 def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz: float, **info: Tensor) -> Estimate:
-    """Make the estimate of the baseband Doppler centroid from block products.
+    """Convert a phase increment between adjacent lines to a baseband Doppler centroid.
+
+    The standard deviation and the quality follow from the products of adjacent lines, summed over
+    blocks.
 
     Args:
-        products: Block products, shape (..., a, b), complex.
+        products: Block products, shape (..., a, b), complex, as from `lag_products`.
         power: Mean power of the same pairs of lines, shape (..., a, b).
-        phase_rad: Combined phase increment in rad, shape (...,).
+        phase_rad: Phase increment that all blocks were combined to, in rad, shape (...,).
         prf_hz: Pulse repetition frequency in Hz.
         info: Further entries of the estimate's info.
 
     Returns:
-        `doppler_baseband_hz` of shape (...,), positive when closing, with its standard deviation.
-        quality is the coherence of adjacent lines. `ok` is False where there is no energy, or where
-        the standard deviation of the increment exceeds a tenth of a turn. info: block_hz,
-        block_power, both of shape (..., a, b).
+        `doppler_baseband_hz` of shape (...,), positive when closing, with its standard deviation in
+        Hz. quality is the coherence of adjacent lines. `ok` is False where there is no energy, or
+        where the standard deviation of the increment is a tenth of a turn or more. info: block_hz
+        (centroid of each block) and block_power, both of shape (..., a, b), and the entries given.
     """
     scale = prf_hz / (2 * math.pi)
     std = increment_std_rad(products, phase_rad)
@@ -239,8 +246,8 @@ def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz
 def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), over: str = "mean") -> Estimate:
     """Estimate the baseband Doppler centroid from the mean phase increment between adjacent lines.
 
-    The centroid is f = PRF * dphi / (2 pi). It is ambiguous by multiples of the PRF;
-    `DopplerCentroid` resolves the ambiguity.
+    The centroid is PRF * dphi / (2 pi), where dphi is the phase increment in rad. It is ambiguous
+    by multiples of the PRF; `DopplerCentroid` resolves the ambiguity.
 
     Args:
         x: Lines, shape (..., pulse, range), complex.
@@ -249,8 +256,10 @@ def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), 
         over: "mean" or "median" over the blocks, see `combine_blocks`.
 
     Returns:
-        An estimate as `baseband_estimate` describes it. info["block_hz"] shows how the centroid
-        varies along the strip and over range.
+        `doppler_baseband_hz` in Hz, shape (...,), positive when closing, with its standard
+        deviation; quality is the coherence of adjacent lines; further details are those of
+        `baseband_estimate`. info["block_hz"] shows how the centroid varies along the strip and over
+        range.
 
     Raises:
         ValueError: If there are fewer pairs of lines or range cells than blocks, or `over` is
@@ -274,9 +283,10 @@ def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) ->
         blocks: Number of blocks along pulses and along range.
 
     Returns:
-        An estimate as `baseband_estimate` describes it. info also holds spectrum, shape (..., n) in
-        FFT order, and plain_baseband_hz, the non-circular centre, which is wrong where the spectrum
-        wraps.
+        `doppler_baseband_hz` in Hz, shape (...,), positive when closing, with its standard
+        deviation; quality, `ok` and info are those of `baseband_estimate`. info also holds
+        spectrum, shape (..., n) in FFT order, and plain_baseband_hz, the non-circular centre of
+        mass, which is wrong where the spectrum wraps.
 
     Raises:
         ValueError: If there are fewer pairs of lines or range cells than blocks.
@@ -300,10 +310,10 @@ def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) ->
 def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12) -> tuple[Tensor, Tensor]:
     """Fit a robust polynomial to the phase increment over range blocks.
 
-    The polynomial is a sum of Legendre polynomials of the block centre u in -1..1. Blocks are
-    weighted with the square of their coherence. Blocks that lie off the curve by more than the
-    common scatter are weighted down (Cauchy weights), so that a few very bright targets do not bend
-    the curve.
+    The polynomial is a sum of Legendre polynomials of the position of the block, which runs from -1
+    to 1 across the swath. Blocks are weighted with the square of their coherence. Blocks that lie
+    off the curve by more than the common scatter are weighted down (Cauchy weights), so that a few
+    very bright targets do not bend the curve.
 
     Args:
         products: Block products, shape (..., b), complex.
@@ -312,14 +322,15 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
         rounds: Number of reweighted least-squares rounds.
 
     Returns:
-        The coefficients in rad, shape (..., order + 1), and the residuals in rad, shape (..., b).
+        The coefficients of the Legendre polynomials in rad, shape (..., order + 1), and the
+        residuals of the blocks in rad, shape (..., b).
 
     Raises:
         ValueError: If the order is negative or not below the number of range blocks.
     """
     count = products.shape[-1]
     if not 0 <= order < count:
-        raise ValueError(f"a polynomial of order {order} needs more than {order} range blocks, got {count}")
+        raise ValueError(f"order of the polynomial must be 0 or more and below the {count} range blocks, got {order}")
     mean = torch.angle(products.sum(-1))
     angle = torch.angle(products * torch.polar(torch.ones_like(mean), -mean)[..., None])
     basis = legendre(block_centres(count, products.device), order)
@@ -365,7 +376,8 @@ class PhaseIncrement(Stage):
     Args:
         radar: Radar parameters, of which the PRF is used.
         blocks: Number of blocks along pulses and along range.
-        over: "mean" or "median" over the blocks.
+        over: How the phase increments of the blocks are combined: "mean" (weighted by energy) or
+            "median" (robust against bright blocks).
 
     Raises:
         ValueError: If `over` is neither "mean" nor "median".
@@ -376,11 +388,15 @@ class PhaseIncrement(Stage):
     def __init__(self, radar: StripmapRadar, blocks: tuple[int, int] = (8, 8), over: str = "mean") -> None:
         super().__init__()
         if over not in OVER:
-            raise ValueError(f"blocks are combined by one of {OVER}, got {over!r}")
+            raise ValueError(f"over must be one of {OVER} (how blocks are combined), got {over!r}")
         self.prf_hz, self.blocks, self.over = radar.prf_hz, blocks, over
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the baseband centroid of a signal of axes (pulse, range)."""
+        """Estimate the baseband Doppler centroid of a signal of axes (pulse, range).
+
+        Returns:
+            The estimate of `phase_increment`: `doppler_baseband_hz` in Hz, shape (...,).
+        """
         return phase_increment(signal.data, self.prf_hz, self.blocks, self.over)
 
 
@@ -401,7 +417,11 @@ class EnergyCentre(Stage):
         self.prf_hz, self.blocks = radar.prf_hz, blocks
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the baseband centroid of a signal of axes (pulse, range)."""
+        """Estimate the baseband Doppler centroid of a signal of axes (pulse, range).
+
+        Returns:
+            The estimate of `energy_centre`: `doppler_baseband_hz` in Hz, shape (...,).
+        """
         return energy_centre(signal.data, self.prf_hz, self.blocks)
 
 
@@ -410,8 +430,8 @@ class RangeDependentCentroid(Stage):
 
     Provides `doppler_range_hz` of shape (..., range), and `doppler_baseband_hz` of shape (...,) in
     the middle of the swath; leaves the signal unchanged. If an absolute `doppler_hz` is connected,
-    the curve is absolute too, by the multiple of the PRF that brings it nearest to that value in
-    the middle of the swath; otherwise it is baseband.
+    `doppler_range_hz` is absolute too: it is raised by the multiple of the PRF that brings it
+    nearest to `doppler_hz` in the middle of the swath. Otherwise it is baseband.
 
     Args:
         radar: Radar parameters, of which the PRF is used.
@@ -430,13 +450,15 @@ class RangeDependentCentroid(Stage):
 
         Args:
             signal: Lines, shape (..., pulse, range), complex.
-            doppler_hz: Absolute centroid in Hz, shape (...,), positive when closing.
+            doppler_hz: Absolute centroid in Hz, shape (...,), positive when closing. Without it,
+                the result is baseband.
 
         Returns:
-            `doppler_range_hz` and `doppler_baseband_hz` in Hz, the latter with its standard
-            deviation. `ok` is False where there is no energy, or where that standard deviation
-            exceeds a tenth of the PRF. info: block_hz, shape (..., b), and coefficients_hz, shape
-            (..., order + 1), of the Legendre polynomials.
+            `doppler_range_hz` of every range cell, shape (..., range), and `doppler_baseband_hz` in
+            the middle of the swath, shape (...,), in Hz, the latter with its standard deviation.
+            `ok` is False where there is no energy, or where that standard deviation is a tenth of
+            the PRF or more. info: block_hz (centroid of each of the b range blocks), shape (...,
+            b), and coefficients_hz of the Legendre polynomials, shape (..., order + 1).
 
         Raises:
             ValueError: If there are too few lines or range cells for the blocks, or too few blocks
@@ -473,9 +495,10 @@ def point_doppler(
     """Estimate the Doppler of one point at the middle line of its aperture by maximum likelihood.
 
     The known quadratic phase is removed first. The peak of the zero-padded spectrum is then refined
-    by Newton steps. The result reaches the Cramer-Rao bound of a tone, 0.39 / (T sqrt(q)), below
-    the reference curve 1 / (T sqrt(q)) of Tsvetkov (2017). It is the Doppler of that point at that
-    time, not the centroid of the beam.
+    by Newton steps. The result reaches the Cramer-Rao bound of a tone, a standard deviation of 0.39
+    / (T sqrt(q)) in Hz, where T is the length of the history in seconds and q the SNR after
+    compression as a power ratio. This lies below the reference curve 1 / (T sqrt(q)) of Tsvetkov
+    (2017). It is the Doppler of that point at that time, not the centroid of the beam.
 
     Args:
         x: Azimuth history of the point, shape (..., pulse), complex.

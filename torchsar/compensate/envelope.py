@@ -7,10 +7,10 @@ shifts by any fraction of a cell are exact. Each is divided by its own mean: nei
 the gain of a pulse affects its shift.
 
 A range cell with many scatterers is speckle: its power in a pulse has an exponential distribution
-about the mean T of all pulses, noise included. The log-likelihood of a shift is then the
-correlation of |s|^2 with -1 / T, not with T nor of |s|. On a simulated aircraft (as in Ruan et al.
-2013, Fig. 2) this halves the jitter of single pulses and allows a polynomial to be fitted at -10
-dB.
+whose mean T is estimated from all pulses, noise included. The log-likelihood of a shift is then the
+correlation of |s|^2 with -1 / T. Compared with the usual correlation of |s| with its mean, this
+halves the jitter of single pulses on a simulated aircraft (as in Ruan et al. 2013, Fig. 2) and
+allows a polynomial to be fitted at -10 dB.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
     shift = torch.as_tensor(shift_cells, dtype=torch.float64, device=data.device)
     if shift.ndim and shift.shape[-1] != data.shape[-2]:
         raise ValueError(
-            f"shift_range: one shift per pulse is needed, (..., {data.shape[-2]}), got {tuple(shift.shape)}"
+            f"shift_range: shift_cells must be a number or hold one shift per pulse, (..., {data.shape[-2]}), "
+            f"got shape {tuple(shift.shape)}"
         )
     refuse_non_finite(shift, "shift_range: shift_cells")
     phasor = torch.fft.ifftshift(linear_phasor(-shift / n, -(n // 2), n, data.dtype), dim=-1)
@@ -73,45 +74,50 @@ def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
 
 
 def align_running(data: Tensor, *, memory_pulses: float = 10.0) -> Estimate:
-    """Estimate the shift of each pulse against a running mean of the aligned pulses before it.
+    """Estimate the range shift of each pulse against a running mean of the pulses before it.
 
-    Correlates |s|; the peak is found by a parabola through samples a quarter of a cell apart.
-    Follows any motion of less than half a window from pulse to pulse, but the mean drifts: use it
-    as a start for other methods.
+    The amplitude of the pulse is correlated with the running mean of the amplitudes; the peak is
+    found by a parabola through samples a quarter of a cell apart. The method follows any motion of
+    less than half a range window from pulse to pulse, but the mean drifts: use the result as a
+    start for other methods.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
         memory_pulses: Length of the exponential memory of the mean, in pulses.
 
     Returns:
-        `shift_cells` of shape (..., pulse); std, quality and `ok` as for `align_envelopes`.
+        `shift_cells` in range cells, shape (..., pulse), positive towards greater range, of mean
+        zero. Standard deviation, quality and `ok` are defined as for `align_envelopes`.
 
     Raises:
         TypeError: If the data are not complex.
         ValueError: If the data are empty or not finite, or `memory_pulses` is below 1.
     """
     if not memory_pulses >= 1:
-        raise ValueError(f"align_running: memory_pulses is {memory_pulses}; choose 1 or more")
+        raise ValueError(f"align_running: memory_pulses must be 1 or more, got {memory_pulses}")
     return _estimated(data, "align_running", lambda pulses: (running_shifts(pulses, 1 / memory_pulses), None))
 
 
 def align_mean(
     data: Tensor, *, first: Literal["running", "none"] = "running", match: Match = "likelihood", iterations: int = 4
 ) -> Estimate:
-    """Estimate the shift of each pulse separately against the mean envelope, iteratively.
+    """Estimate the range shift of each pulse separately against the mean envelope of all pulses.
 
-    For motion that is not a smooth function of slow time; otherwise use `align_envelopes`. On
-    noise-free data of a simulated aircraft the shifts have an rms speckle jitter of 0.03 cell
-    ("likelihood") or 0.07 cell ("amplitude").
+    The mean envelope is formed anew from the aligned pulses in every iteration. Use this for motion
+    that is not a smooth function of slow time, and `align_envelopes` otherwise. On noise-free data
+    of a simulated aircraft the shifts have an rms speckle jitter of 0.03 cell with match
+    "likelihood" and 0.07 cell with "amplitude".
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
-        first: Where to begin: "running" with the running mean, "none" with the data as they are.
-        match: "likelihood" correlates |s|^2 with -1 / T, "amplitude" correlates |s| with its mean.
+        first: Shifts to start from: "running" takes those of `align_running`, "none" takes zero.
+        match: "likelihood" correlates the power |s|^2 of a pulse with -1 / T, where T is the mean
+            power envelope; "amplitude" correlates |s| with the mean amplitude envelope.
         iterations: Number of times that the mean envelope is formed anew.
 
     Returns:
-        `shift_cells` of shape (..., pulse); std, quality and `ok` as for `align_envelopes`.
+        `shift_cells` in range cells, shape (..., pulse), positive towards greater range, of mean
+        zero. Standard deviation, quality and `ok` are defined as for `align_envelopes`.
 
     Raises:
         TypeError: If the data are not complex.
@@ -119,8 +125,8 @@ def align_mean(
     """
     if first not in ("running", "none") or match not in ("likelihood", "amplitude") or iterations < 1:
         raise ValueError(
-            f"align_mean: first is {first!r} ('running' or 'none'), match {match!r} ('likelihood' "
-            f"or 'amplitude'), iterations {iterations} (1 or more)"
+            "align_mean: first must be 'running' or 'none', match 'likelihood' or 'amplitude', and "
+            f"iterations 1 or more; got first {first!r}, match {match!r} and iterations {iterations}"
         )
 
     def find(pulses: Envelopes) -> Course:
@@ -135,7 +141,7 @@ def align_mean(
 def align_envelopes(
     data: Tensor, *, degree: int | None = 2, tones: int = 0, passes: int = 6, blocks: int = 16
 ) -> Estimate:
-    """Estimate a smooth history of range shifts; the recommended alignment.
+    """Estimate the range shifts of pulses as a smooth function of slow time; the recommended way.
 
     First the straight line is found along which the coarse envelopes add up best. In each of
     `passes` rounds, the likelihood of the shift of each block of pulses is evaluated against the
@@ -144,8 +150,8 @@ def align_envelopes(
     depart from a straight line by half a window. Not differentiable.
 
     On a simulated aircraft of 400 pulses the shift history is found to 0.02 cell down to -8 dB and
-    to 0.05 cell at -12.5 dB; on noise-free data the alignment costs less than 0.002 nats of
-    entropy.
+    to 0.05 cell at -12.5 dB; on noise-free data the remaining shifts raise the image entropy by
+    less than 0.002 nats.
 
     Args:
         data: Range-compressed pulses of any phase, shape (..., pulse, range), complex.
@@ -158,13 +164,13 @@ def align_envelopes(
         blocks: Number of blocks of pulses.
 
     Returns:
-        `shift_cells` of shape (..., pulse), of mean zero; `shift_range(data, -shift_cells)` removes
-        it. A pulse of zeros has the shift of the fitted history. Its standard deviation is half of
-        the rms difference between independent estimates from the lower and the upper half of the
-        band, or the standard deviation of the history by the scatter of its blocks if that is
-        larger. quality is 1 / (1 + (2 std)^2). `ok` is False where the standard deviation reaches
-        half a cell, or fewer than two pulses hold samples. info["present"] marks the pulses that
-        hold samples.
+        `shift_cells` in range cells, shape (..., pulse), positive towards greater range, of mean
+        zero; `shift_range(data, -shift_cells)` removes these shifts. A pulse of zeros has the shift
+        of the fitted history. The standard deviation is the larger of two: half of the rms
+        difference between independent estimates from the lower and the upper half of the band; and
+        that of the fitted history, from the scatter of the blocks about it. quality is 1 / (1 + (2
+        std)^2). `ok` is False where the standard deviation reaches half a cell, or fewer than two
+        pulses hold samples. info["present"] marks the pulses that hold samples.
 
     Raises:
         TypeError: If the data are not complex.
@@ -175,8 +181,8 @@ def align_envelopes(
         degree is None and tones
     ):
         raise ValueError(
-            "align_envelopes needs whole numbers: degree and tones must be 0 or more, passes and blocks 1 "
-            "or more; degree may be None only if tones is 0; "
+            "align_envelopes: degree and tones must be whole numbers of 0 or more (degree may be None if tones "
+            "is 0), and passes and blocks whole numbers of 1 or more, "
             f"got degree {degree!r}, tones {tones!r}, passes {passes!r} and blocks {blocks!r}"
         )
 
@@ -194,20 +200,22 @@ def refine_alignment(
 ) -> Estimate:
     """Refine an alignment by the polynomial of shifts that gives the image of least entropy.
 
-    In each round `autofocus` finds the phases for the present shifts; then the coefficients of
-    degrees 1 to `degree` are varied with these phases held. A round that does not lower the entropy
-    is discarded. Assumes shifts that are right within about a cell, so that the phases can be
-    found. After `align_envelopes` it changes the entropy by less than 0.005 nats.
+    In each round `autofocus` finds the phases for the present shifts; then a polynomial of degrees
+    1 to `degree` is added to the shifts, with these phases held, so that the entropy is least. A
+    round that does not lower the entropy is discarded. Assumes shifts that are right within about a
+    cell, so that the phases can be found. After `align_envelopes` the refinement changes the
+    entropy by less than 0.005 nats.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
         shift_cells: Shifts to refine, in cells, shape (..., pulse).
-        degree: Degree of the polynomial.
+        degree: Degree of the polynomial that is added to the shifts.
         rounds: Number of rounds.
         steps: Largest number of descent steps in a round; each trial descends separately.
 
     Returns:
-        `shift_cells` of shape (..., pulse). quality and `ok` are those of the last `autofocus`.
+        `shift_cells` in range cells, shape (..., pulse). quality and `ok` are those of the last
+        `autofocus`.
         info["entropy_nats"], shape (...,), is the entropy of the image.
 
     Raises:
@@ -216,7 +224,7 @@ def refine_alignment(
     """
     flat, _ = checked(data, "refine_alignment")
     if degree < 1 or rounds < 1:
-        raise ValueError(f"refine_alignment: degree is {degree} and rounds {rounds}; choose 1 or more of both")
+        raise ValueError(f"refine_alignment: degree and rounds must be 1 or more, got {degree} and {rounds}")
     flat, shift = flat.detach(), shift_cells.detach().to(torch.float64).expand(data.shape[:-1]).reshape(flat.shape[:-1])
     basis = legendre(unit_time(flat.shape[-2], flat.device), degree)[:, 1:]
     phase = autofocus(shift_range(flat, -shift))
@@ -320,13 +328,14 @@ class AlignEnvelopes(Stage):
 
     Provides `shift_m` of shape (..., pulse), positive towards greater range, to be removed by
     `ShiftRange`, and the range rate `velocity_m_s` of shape (...,), receding positive. The signal
-    is left unchanged. Drift is known modulo a window per pulse. Where dechirped pulses couple range
-    to Doppler, an acceleration a adds a f0 / gamma to the range rate (f0 / gamma is 0.13 s for the
-    parameters of Ruan et al. 2013).
+    is left unchanged. The range rate is ambiguous by one range window per pulse. Where dechirped
+    pulses couple range to Doppler, an acceleration a of the target adds a f0 / gamma to the range
+    rate, with carrier frequency f0 and chirp rate gamma (f0 / gamma is 0.13 s for the parameters of
+    Ruan et al. 2013).
 
     Args:
-        degree: Degree of the polynomial, see `align_envelopes`.
-        tones: Number of sinusoids, see `align_envelopes`.
+        degree: Degree of the polynomial of slow time, see `align_envelopes`.
+        tones: Number of sinusoids (vibration) to estimate, see `align_envelopes`.
         passes: Number of rounds.
         blocks: Number of blocks of pulses.
     """
@@ -345,10 +354,10 @@ class AlignEnvelopes(Stage):
             velocity_m_s: Range rate in m/s for which the pulses were compressed, shape (...,).
 
         Returns:
-            `shift_m` in metres with its standard deviation, and `velocity_m_s`, the range rate of
-            the residual drift plus that of the compression: the value to give to
-            `torchsar.focus.CompressDechirped`. quality, `ok` and info are those of
-            `align_envelopes`.
+            `shift_m` in metres, shape (..., pulse), with its standard deviation. `velocity_m_s`,
+            shape (...,), is the mean rate of the shifts plus the `velocity_m_s` given, if any: the
+            value to give to `torchsar.focus.CompressDechirped`. quality, `ok` and info are those
+            of `align_envelopes`.
         """
         found = align_envelopes(
             signal.data, degree=self.degree, tones=self.tones, passes=self.passes, blocks=self.blocks
@@ -363,9 +372,9 @@ class AlignEnvelopes(Stage):
 
 
 class ShiftRange(Stage):
-    """Shift of every pulse back in range by a connected value `shift_m`; see `shift_range`.
+    """Alignment of pulses: each is moved in range by -`shift_m`, a connected value in metres.
 
-    Differentiable in the signal and the shifts.
+    The move is circular, see `shift_range`. Differentiable in the signal and the shifts.
     """
 
     def forward(self, signal: Signal, shift_m: Tensor) -> Signal:

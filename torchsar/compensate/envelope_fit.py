@@ -1,6 +1,7 @@
-"""Shift histories of envelopes, found by the likelihood of speckle.
+"""Range shifts of pulse envelopes over slow time, found by the likelihood of speckle.
 
-Shifts of single pulses, straight lines, robust polynomials of slow time, and sinusoids.
+The shifts are found pulse by pulse, or as a straight line, a robust polynomial or a sum of
+sinusoids of slow time.
 """
 
 from __future__ import annotations
@@ -73,22 +74,26 @@ class Envelopes:
         return Envelopes(torch.fft.rfft(power / torch.where(mean > 0, mean, 1)), present, n)
 
     def moved(self, shift: Tensor) -> Tensor:
-        """Remove shifts from the envelopes.
+        """Remove range shifts from the envelopes.
 
         Args:
-            shift: Shifts in cells, shape (trial, pulse), towards greater range.
+            shift: Shifts to remove in cells, shape (trial, pulse), positive towards greater range.
 
         Returns:
-            Spectra, shape (trial, pulse, frequency).
+            Half spectra of the envelopes moved by -shift, shape (trial, pulse, frequency).
         """
         return self.spectra * linear_phasor(shift / self.n, 0, self.spectra.shape[-1], self.spectra.dtype)
 
     def amplitudes(self) -> Envelopes:
-        """Compute the envelopes of |s| instead of |s|^2."""
+        """Compute the amplitude envelopes |s| from these power envelopes |s|^2.
+
+        Returns:
+            The envelopes |s|, with the same pulses and range cells.
+        """
         return Envelopes(torch.fft.rfft(self.on_grid(self.spectra).clamp_min(0).sqrt()), self.present, self.n)
 
     def on_grid(self, spectra: Tensor, per_cell: int = _HALF) -> Tensor:
-        """Compute samples of envelopes from their half spectra.
+        """Compute samples of envelopes over range from their half spectra.
 
         Args:
             spectra: Half spectra, shape (..., frequency).
@@ -102,7 +107,8 @@ class Envelopes:
     def likelihood(self, mean: Tensor) -> Tensor:
         """Compute the spectrum of -1 / T within the band of the envelopes, for a mean envelope T.
 
-        Its correlation with the power of a pulse is the log-likelihood of the shift of that pulse.
+        The correlation of -1 / T with the power envelope of a pulse is the log-likelihood of the
+        shift of that pulse.
 
         Args:
             mean: Half spectrum of T, shape (..., frequency).
@@ -155,7 +161,7 @@ def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
 
     Args:
         pulses: Envelopes.
-        gain: Weight with which a pulse enters the mean.
+        gain: Weight of a new pulse in the mean, 0..1; the mean before it keeps 1 - gain.
 
     Returns:
         The shifts in cells, shape (trial, pulse), float64, of mean zero.
@@ -178,14 +184,15 @@ def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
 
 
 def single_shifts(pulses: Envelopes, start: Tensor, match: Match, iterations: int) -> Tensor:
-    """Find the shift of each pulse separately against the mean envelope.
+    """Find the shift of each pulse separately against the mean envelope of all aligned pulses.
 
-    The shifts lie within half a window of the start.
+    The shifts lie within half a window of those in `start`.
 
     Args:
         pulses: Envelopes.
         start: Shifts to start from, in cells, shape (trial, pulse).
-        match: "likelihood" correlates |s|^2 with -1 / T, "amplitude" correlates |s| with its mean.
+        match: "likelihood" correlates the power |s|^2 of a pulse with -1 / T, where T is the mean
+            power envelope; "amplitude" correlates |s| with the mean amplitude envelope.
         iterations: Number of times that the mean envelope is formed anew.
 
     Returns:
@@ -237,8 +244,9 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
 def mean_drift(pulses: Envelopes) -> Tensor:
     """Find the mean drift of the envelopes: the straight line along which they add up best.
 
-    Maximises sum_f |sum_k P_k(f) exp(2j pi f v k / n)|^2 over the drift v, with the lowest
-    frequencies f only, for all v at once from one zero-padded transform along pulses.
+    Maximises sum_f |sum_k P_k(f) exp(2j pi f v k / n)|^2 over the drift v, where P_k is the
+    spectrum of the power envelope of pulse k over the n range cells. Only the 16 lowest frequencies
+    f are used. One zero-padded transform along pulses gives the sum for all v.
 
     Args:
         pulses: Envelopes.
@@ -331,9 +339,10 @@ class _Tone:
 
 
 def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Tensor:
-    """Add sinusoids to a shift history, one by one.
+    """Add sinusoids (vibration) to a history of range shifts, one by one.
 
-    A sinusoid is added only in trials where it clearly exceeds the jitter of single pulses.
+    The sinusoids are estimated from the shifts of single pulses. One is added only in trials where
+    it clearly exceeds the jitter of these shifts.
 
     Args:
         pulses: Envelopes.
@@ -373,9 +382,10 @@ def _residual_shifts(pulses: Envelopes, course: Tensor) -> Tensor:
 
 
 def log_likelihood(pulses: Envelopes, course: Tensor) -> Tensor:
-    """Compute the log-likelihood of a shift history, with the mean envelope T that is best for it.
+    """Compute the log-likelihood of a history of range shifts.
 
-    It is -(number of pulses) * sum over cells of ln T, up to a constant.
+    It is -(number of pulses) * sum over cells of ln T, up to a constant, where T is the mean power
+    envelope of the pulses with these shifts removed.
 
     Args:
         pulses: Envelopes.
@@ -396,8 +406,8 @@ def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
         present: False for pulses without samples, shape (trial, pulse), bool.
 
     Returns:
-        The frequency in cycles per pulse, shape (trial,), and whether noise would hardly contain a
-        sinusoid as strong, shape (trial,), bool.
+        The frequency in cycles per pulse, shape (trial,); and True where the sinusoid is stronger
+        than noise alone would give, except in about one of 400 trials, shape (trial,), bool.
     """
     k = rest.shape[-1]
     limit = 3 * rest.abs().median(-1, keepdim=True).values
@@ -408,7 +418,7 @@ def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def about_circular_mean(shift: Tensor, present: Tensor, n: int) -> Tensor:
-    """Subtract from shifts their mean on the circle of n cells.
+    """Subtract from circular shifts their circular mean, in a window of n cells.
 
     Args:
         shift: Shifts in cells, shape (trial, pulse).
@@ -450,7 +460,7 @@ def wrapped(cells: Tensor, n: int) -> Tensor:
 
 
 def unit_time(n: int, device: torch.device) -> Tensor:
-    """Compute the times of n pulses on the interval -1..1.
+    """Compute evenly spaced times of n pulses, scaled to the interval -1..1.
 
     Args:
         n: Number of pulses.

@@ -1,9 +1,10 @@
 """A small group of range cells, cut out of a recording and focused alone.
 
-Estimators focus such a group many times at low cost. The group may lie elsewhere in every trial, so
-its reference range is a tensor per trial. It is focused by the omega-K algorithm in its form of
-bulk compression and refocusing (`torchsar.focus.omega_k`), referred to the middle of the group, in
-the frame of the Doppler centroid.
+Estimators focus such a group many times at low cost. The group may lie at another range in every
+trial, so its reference range is a tensor with one value per trial. The group is focused by the
+omega-K algorithm: bulk compression at the range of its middle, then refocusing of the other ranges
+(`torchsar.focus.omega_k`). The image places each target at the time when its Doppler equals the
+frame Doppler, for which estimators take the Doppler centroid.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ def central_lines(raw: Tensor, most: int) -> Tensor:
 
 
 def full_columns(n_range: int, pulse_samples: int) -> int:
-    """Count the columns of a compressed line that hold the whole pulse.
+    """Count the columns (range cells) whose echo lies completely in the recorded line.
+
+    Later columns are compressed from a part of the pulse only.
 
     Args:
         n_range: Number of range samples of the line.
@@ -65,7 +68,7 @@ def full_columns(n_range: int, pulse_samples: int) -> int:
 
 
 def compress(raw: Tensor, radar: StripmapRadar, spectrum: Tensor | None) -> Tensor:
-    """Compress lines in range and keep only the fully compressed columns.
+    """Compress lines in range and keep the columns (range cells) whose whole echo was recorded.
 
     Args:
         raw: Lines, shape (..., pulse, range), complex.
@@ -106,7 +109,7 @@ class RangeGroup:
 
 @dataclass(frozen=True)
 class BeamSpectrum:
-    """Two-dimensional spectrum of a group, or a part of its Doppler rows.
+    """Two-dimensional spectrum of a group of range cells, or some Doppler rows of this spectrum.
 
     Args:
         group: The group.
@@ -119,7 +122,9 @@ class BeamSpectrum:
     doppler_hz: Tensor
 
     def moved(self, by_hz: Tensor | float) -> BeamSpectrum:
-        """Interpret the same samples as lying higher in absolute Doppler.
+        """Reinterpret the spectrum at another absolute Doppler; the samples stay as they are.
+
+        This serves to try another Doppler ambiguity.
 
         Args:
             by_hz: Increase of the Doppler in Hz, shape (...,) or a number.
@@ -130,14 +135,15 @@ class BeamSpectrum:
         return replace(self, doppler_hz=self.doppler_hz + by_hz)
 
     def rows(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
-        """Focus the group in the range-Doppler domain.
+        """Focus the group of range cells without the last transform, that from Doppler to azimuth.
 
         Args:
-            frame_hz: Doppler of the frame of the image in Hz, shape (...,).
+            frame_hz: Frame Doppler in Hz, shape (...,): the image will hold each target at the time
+                when its Doppler has this value.
             velocity_m_s: Effective velocity in m/s, shape (...,) or a number.
 
         Returns:
-            Range-Doppler rows of the focused group, shape (..., d, width), complex.
+            Range-Doppler spectrum of the focused group, shape (..., d, width), complex.
         """
         radar, n = self.group.radar, self.data.shape[-1]
         at = FrameGeometry(
@@ -151,12 +157,14 @@ class BeamSpectrum:
         return refocus(torch.fft.ifft(rows), refocus_turns_per_sample(at), n // 2)
 
     def image(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
-        """Focus the group, sampled in azimuth as coarsely as the band of the rows allows.
+        """Focus the group of range cells.
 
-        Differentiable in the velocity.
+        The image has as many azimuth samples as the spectrum has Doppler rows. Differentiable in
+        the velocity.
 
         Args:
-            frame_hz: Doppler of the frame of the image in Hz, shape (...,).
+            frame_hz: Frame Doppler in Hz, shape (...,): the image holds each target at the time
+                when its Doppler has this value.
             velocity_m_s: Effective velocity in m/s, shape (...,) or a number.
 
         Returns:
@@ -166,13 +174,14 @@ class BeamSpectrum:
 
 
 def full_spectrum(group: RangeGroup, doppler_hz: Tensor) -> BeamSpectrum:
-    """Compute the whole spectrum of a group, unwrapped about the Doppler centroid.
+    """Compute the whole spectrum of a group of range cells.
 
-    The rows are in FFT order; images of this spectrum keep the phase from line to line.
+    The Doppler of each row is taken within half a PRF of the centroid. The rows are in FFT order;
+    images of this spectrum keep the phase from line to line.
 
     Args:
-        group: The group.
-        doppler_hz: Centroid in Hz, shape (...,).
+        group: The group of range cells.
+        doppler_hz: Doppler centroid in Hz, shape (...,).
 
     Returns:
         The spectrum with all its Doppler rows.
@@ -183,15 +192,16 @@ def full_spectrum(group: RangeGroup, doppler_hz: Tensor) -> BeamSpectrum:
 
 
 def beam_spectrum(group: RangeGroup, doppler_hz: Tensor, margin: float = 1.2) -> BeamSpectrum:
-    """Compute the spectrum of a group within the Doppler band of the beam.
+    """Compute the spectrum of a group of range cells within the Doppler band of the beam.
 
-    Outside that band there is only noise. Its phase under the azimuth filter changes fastest with
-    the velocity and would make objective functions rough.
+    Outside that band there is only noise. The azimuth filter turns the phase of this noise fastest
+    when the velocity changes, which would make objective functions of the velocity rough.
 
     Args:
-        group: The group.
-        doppler_hz: Centroid in Hz, shape (...,).
-        margin: Width of the band that is kept, as a multiple of the band of the beam's dwell.
+        group: The group of range cells.
+        doppler_hz: Doppler centroid in Hz, shape (...,).
+        margin: Width of the band that is kept, as a multiple of the Doppler band that a target
+            sweeps while the beam illuminates it.
 
     Returns:
         The spectrum with its rows in rising Doppler; all rows if no dwell is known.
@@ -207,11 +217,11 @@ def beam_spectrum(group: RangeGroup, doppler_hz: Tensor, margin: float = 1.2) ->
 
 
 def column_signal(lines: Tensor) -> Tensor:
-    """Measure the energy of each column above the background.
+    """Measure the energy of each column (range cell) above the background.
 
-    The background is the energy of the column at the lowest tenth. Four standard deviations of
-    noise are subtracted. The result is limited to 10, so that one ship does not outweigh a hundred
-    good columns, and is never quite 0.
+    The background is the energy that a tenth of the columns do not exceed. Four standard deviations
+    of noise are subtracted. The result is limited to 1e-3..10: the upper limit prevents one ship
+    from outweighing a hundred good columns.
 
     Args:
         lines: Lines or an image, shape (..., pulse, range), complex.
@@ -226,17 +236,17 @@ def column_signal(lines: Tensor) -> Tensor:
 
 
 def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
-    """Choose the group of columns with the most signal above the background.
+    """Choose the group of neighbouring range cells with the most signal above the background.
 
-    Among similar groups the one nearer to the middle of the swath is chosen.
+    Among groups with similar signal, the one nearest to the middle of the swath is chosen.
 
     Args:
         lines: Range-compressed lines, shape (..., pulse, range), complex.
         radar: Radar parameters.
-        width: Number of columns.
+        width: Number of range cells in the group.
 
     Returns:
-        The group, which may lie elsewhere in every trial.
+        The group, which may lie at another range in every trial.
     """
     count = lines.shape[-1]
     width = min(width, count)
@@ -250,9 +260,9 @@ def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
 
 
 def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """Mark the columns of a group whose targets stay in the group while they migrate.
+    """Mark the columns of a group of range cells whose targets stay in the group as they migrate.
 
-    The middle half is always marked.
+    The middle half of the columns is always marked.
 
     Args:
         width: Number of columns of the group.
@@ -271,10 +281,11 @@ def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: 
 
 
 def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """Compute the weights of the range blocks of a group in an objective function.
+    """Compute the weights with which the blocks of range cells of a group enter an objective.
 
-    A block is weighted with its signal (`column_signal`). Columns whose targets migrate out of the
-    group within the aperture do not contribute; those of the middle half always do.
+    A block is weighted with its signal above the background (`column_signal`). Range cells whose
+    targets migrate out of the group within the aperture do not contribute, except those of the
+    middle half of the group.
 
     Args:
         columns: Lines or an image of the group, shape (..., n, width), complex.
@@ -320,8 +331,8 @@ def block_entropy(image: Tensor) -> Tensor:
 def student_log_likelihood(t: Tensor, degrees: Tensor | int) -> Tensor:
     """Compute the logarithm of Student's density, without its constant.
 
-    It measures how well an error of t predicted standard deviations is explained, outliers
-    included.
+    It measures how plausible an error of t predicted standard deviations is. Large errors are less
+    implausible than under a normal distribution, so outliers do not dominate.
 
     Args:
         t: Error divided by its predicted standard deviation.

@@ -2,9 +2,10 @@
 
 If the time is known at which the beam centre crosses a point, such as a corner reflector, the
 azimuth position of the point in the image gives the Doppler at that time: the image holds the point
-at the time when its Doppler equals that of the frame of the image. The position of the peak is
-known to 0.39 / (T sqrt(q)) in Doppler, the Cramer-Rao bound of a tone. No estimator that uses the
-envelope of the beam's spectrum reaches this accuracy from one point.
+at the time when its Doppler equals the frame Doppler, a constant that was set when the image was
+focused. The position of the peak gives the Doppler with a standard deviation of 0.39 / (T sqrt(q)),
+the Cramer-Rao bound of a tone of duration T with the SNR q after compression (a power ratio). No
+estimator that uses the envelope of the beam's spectrum reaches this accuracy from one point.
 
 Reference: Tsvetkov 2017, text after Fig. 5.
 """
@@ -40,7 +41,8 @@ def doppler_at(
         radar: Radar parameters.
         azimuth_m: Azimuth position in the image in metres.
         slant_m: Slant range position in the image in metres.
-        frame_hz: Doppler of the frame of the image in Hz.
+        frame_hz: Frame Doppler in Hz: the image holds each point at the time when its Doppler has
+            this value.
         velocity_m_s: Effective velocity in m/s.
         crossing_s: Slow time in seconds at which the Doppler is wanted.
 
@@ -63,19 +65,20 @@ def peak_time_s(
     doppler_hz: Tensor,
     start_s: Tensor,
 ) -> Tensor:
-    """Refine the slow time of a peak at one range position by maximum likelihood.
+    """Refine the azimuth position of a point in an image, as a slow time, by maximum likelihood.
 
-    The column of the image is defocused to the azimuth history of the point about its Doppler. Only
-    the part in which the point was observed is kept, because an image contains the noise of all
-    lines and of the whole PRF.
+    The image column at the range of the point is defocused to the azimuth history of the point.
+    Only the part of the history in which the point was observed is kept, because an image contains
+    the noise of all lines and of the whole PRF. The Doppler of the history, estimated by
+    `point_doppler`, then gives the correction of the time.
 
     Args:
         image: Image, shape (..., azimuth, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
         sample: Range position of the peak in samples, fractional, shape (...,).
         rate_hz_s: Magnitude of the Doppler rate in Hz/s, shape (...,) or a number.
-        seen_s: First and last time at which the record observed the point, in seconds from the
-            crossing of the beam centre.
+        seen_s: First and last time at which the record observed the point, in seconds from the time
+            when the beam centre crosses it.
         doppler_hz: Doppler of the point in Hz, shape (...,).
         start_s: Slow time of the peak in seconds from the first line, shape (...,).
 
@@ -107,9 +110,10 @@ class PointDoppler(Stage):
     """Doppler centroid of the beam from the brightest point of an image.
 
     Provides `doppler_hz` and `doppler_baseband_hz`. Assumes that the beam centre crosses the point
-    at `crossing_s`. The band of the beam must lie within half a PRF of the frame of the image,
-    because focusing folds what lies outside, and its Doppler within half the length of the image,
-    rate * n / (2 PRF).
+    at `crossing_s`. The Doppler band of the beam must lie within half a PRF of the frame Doppler,
+    with which the image was focused, because focusing folds frequencies outside. The centroid must
+    differ from the frame Doppler by less than rate * n / (2 PRF), with the Doppler rate in Hz/s and
+    n image lines; otherwise the point leaves the image at its end and appears at the other.
 
     Args:
         radar: Radar parameters.
@@ -129,30 +133,33 @@ class PointDoppler(Stage):
 
     @torch.no_grad()
     def forward(self, signal: Signal, frame_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Estimate:
-        """Estimate the centroid from an image of axes (azimuth, range).
+        """Estimate the Doppler centroid from an image of axes (azimuth, range).
 
         Args:
             signal: Focused image, shape (..., azimuth, range), complex.
-            frame_hz: Doppler of the frame of the image in Hz; by default the pointing of the radar.
-            velocity_m_s: Effective velocity of the image in m/s; by default the nominal one.
+            frame_hz: Frame Doppler in Hz with which the image was focused; by default
+                radar.pointing_doppler_hz.
+            velocity_m_s: Effective velocity in m/s with which the image was focused; by default the
+                nominal one.
 
         Returns:
-            `doppler_hz` and `doppler_baseband_hz` in Hz, shape (...,), positive when closing, with
-            the bound of a tone as their standard deviation. The bound is that for the measured q
-            (info["q"]) and the part of the dwell that the record observed; it holds if
-            radar.integration_s is the true dwell. quality is 1 - 1 / (1 + q). `ok` is False where
-            the crossing lies outside the record, or where noise alone would have as high a peak
-            more often than once in 10,000 images.
+            `doppler_hz` and `doppler_baseband_hz` in Hz, shape (...,), positive when closing. Their
+            standard deviation is the Cramer-Rao bound of a tone, for the measured SNR q after
+            compression (info["q"], a power ratio) and the part of the dwell that the record
+            observed; it holds if radar.integration_s is the true dwell. quality is 1 - 1 / (1 + q).
+            `ok` is False where the time at which the beam centre crosses the point lies outside the
+            record, or where noise alone would have as high a peak more often than once in 10,000
+            images.
 
         Raises:
-            ValueError: If neither the radar nor a connected value gives the frame of the image.
+            ValueError: If neither the radar nor a connected value gives the frame Doppler.
         """
         radar, image, (azimuth, slant) = self.radar, signal.data, signal.axes
         frame = radar.pointing_doppler_hz if frame_hz is None else frame_hz
         if frame is None:
             raise ValueError(
-                "PointDoppler needs the frame of the image: set radar.pointing_doppler_hz, or "
-                "connect frame_hz with the Doppler that the image was focused with"
+                "PointDoppler: frame_hz, the Doppler (Hz) that the image was focused with, is not known; "
+                "connect it, or set radar.pointing_doppler_hz"
             )
         power = image.real.square() + image.imag.square()
         line, sample = torch.unravel_index(power.flatten(-2).argmax(-1), power.shape[-2:])

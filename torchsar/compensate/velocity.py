@@ -33,7 +33,7 @@ Refine = Callable[..., tuple[Tensor, Tensor]]
 
 
 class Focuser(Protocol):
-    """What the estimator uses of a focusing stage, such as `torchsar.focus.OmegaK`.
+    """The part of a focusing stage, such as `torchsar.focus.OmegaK`, that `EffectiveVelocity` uses.
 
     Args:
         radar: Radar parameters of the stage.
@@ -55,11 +55,12 @@ class Focuser(Protocol):
 
 
 def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> Callable[[Tensor], Tensor]:
-    """Make the function that maps a velocity to the weighted entropies of the range blocks.
+    """Make the function whose minimum is the effective velocity: the entropy of a group's image.
 
-    The function is differentiable. Columns whose targets migrate out of the group do not
-    contribute. The others are weighted with their signal above the background in the image of the
-    nominal velocity, in which range migration is already corrected.
+    The function maps a velocity to the weighted entropies of blocks of range cells and is
+    differentiable. Range cells whose targets migrate out of the group do not contribute. The others
+    are weighted with their signal above the background, in the image focused with the nominal
+    velocity.
 
     Args:
         group: Group of range cells.
@@ -82,10 +83,11 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
 
 
 def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float:
-    """Compute the step of the grid search for the velocity.
+    """Compute the step of the grid search for the effective velocity.
 
-    It is the velocity error that changes the phase by one cycle between the middle and the end of
-    the aperture, 2 lambda R / (v T^2).
+    It is 2 lambda R / (v T^2), with range R, nominal velocity v and length T of the aperture: the
+    velocity error that changes the phase by one cycle between the middle and the end of the
+    aperture.
 
     Args:
         radar: Radar parameters.
@@ -103,8 +105,9 @@ def minimum_entropy_velocity(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Find the velocity of least entropy: a grid search, then a refinement.
 
-    The standard deviation follows from how far the minima of eight separate parts of the group
-    scatter about the common minimum (by their slopes there and the common curvature).
+    The group is divided into eight parts. The standard deviation follows from the scatter of their
+    separate minima about the common minimum, predicted from the slope of the entropy of each part
+    at the common minimum and from the common curvature.
 
     Args:
         group: Group of range cells.
@@ -144,8 +147,9 @@ def _scatter_std(blocks: Callable[[Tensor], Tensor], velocity: Tensor, curvature
 class EffectiveVelocity(Stage):
     """Effective velocity of least image entropy.
 
-    Provides `velocity_m_s` and leaves the signal unchanged. The absolute Doppler centroid is a
-    value to connect. At most four apertures of pulses about the middle of the record are used.
+    Provides `velocity_m_s` and leaves the signal unchanged. The absolute Doppler centroid is to be
+    connected as `doppler_hz`. Only lines about the middle of the record are used: as many as four
+    synthetic apertures, or 1024 if that is more.
 
     Args:
         focuser: Focusing stage of the chain, of which the radar and the range reference are used.
@@ -155,7 +159,7 @@ class EffectiveVelocity(Stage):
         tolerance_m_s: Tolerance of the refinement in m/s.
 
     Raises:
-        ValueError: If the reach or the tolerance is not positive, or there are fewer than 16 lines.
+        ValueError: If `reach_m_s` or `tolerance_m_s` is not positive, or `lines` is below 16.
 
     Reference:
         Tsvetkov 2017, focusing algorithm, remark on step 4.
@@ -174,8 +178,8 @@ class EffectiveVelocity(Stage):
         super().__init__()
         if not (reach_m_s > 0 and tolerance_m_s > 0 and lines >= 16):
             raise ValueError(
-                "a velocity search needs a positive reach and tolerance and at least 16 lines, got "
-                f"reach_m_s {reach_m_s}, tolerance_m_s {tolerance_m_s} and lines {lines}"
+                "EffectiveVelocity: reach_m_s and tolerance_m_s must be positive and lines (range cells) 16 or "
+                f"more, got reach_m_s {reach_m_s}, tolerance_m_s {tolerance_m_s} and lines {lines}"
             )
         # in a list, so that torch does not register the focuser of the chain as a submodule twice
         self._focuser = [focuser]
@@ -209,10 +213,11 @@ class EffectiveVelocity(Stage):
                 default the pointing of the radar, or 0.
 
         Returns:
-            `velocity_m_s` of shape (...,) with its standard deviation. `ok` is False where the
-            minimum lies at the edge of the search or the standard deviation is 5 m/s or more. info:
-            grid_velocity_m_s, shape (grid,), grid_entropy, shape (..., grid), and group_start,
-            shape (...,).
+            `velocity_m_s` of shape (...,) with its standard deviation in m/s. `ok` is False where
+            the entropy is least at an end of the searched interval, or the standard deviation is 5
+            m/s or more. info: grid_velocity_m_s, the velocities of the grid search, shape (grid,);
+            grid_entropy, their entropies in nats, shape (..., grid); and group_start, the first
+            range sample of the group of range cells used, shape (...,).
         """
         raw = signal.data.detach()
         radar, doppler = self._focuser[0].radar, self._doppler(raw, doppler_hz)
@@ -236,15 +241,16 @@ class EffectiveVelocity(Stage):
 
     @torch.no_grad()
     def entropy(self, signal: Signal, velocity_m_s: Tensor, doppler_hz: Tensor | None = None) -> Tensor:
-        """Evaluate what the search minimises, for curves.
+        """Compute the image entropy that the search minimises, at given velocities.
 
         Args:
             signal: Lines, shape (..., pulse, range), complex.
             velocity_m_s: Effective velocities in m/s, shape (n,).
-            doppler_hz: As in `forward`.
+            doppler_hz: Absolute Doppler centroid in Hz, shape (...,), positive when closing; by
+                default the pointing of the radar, or 0.
 
         Returns:
-            The objective in nats, shape (..., n).
+            The entropy in nats, a weighted mean over blocks of range cells, shape (..., n).
         """
         raw = signal.data.detach()
         doppler = self._doppler(raw, doppler_hz)

@@ -1,4 +1,4 @@
-"""Input of the autofocus functions: data are checked, scaled and laid out."""
+"""Input of the autofocus functions: pulses are checked, scaled and brought to one layout."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _PHASE_ERROR_RAD = 1e-3
 
 @dataclass(frozen=True)
 class Pulses:
-    """Range-compressed pulses, laid out for the estimators.
+    """Range-compressed pulses in the layout that the autofocus estimators use.
 
     Args:
         rows: Samples, shape (trial, range, pulse), complex. Each trial is divided by its own peak,
             so that squares neither underflow nor overflow.
         present: False where a pulse holds only zeros, shape (trial, pulse), bool.
-        trials: The leading dimensions that were folded into one.
+        trials: The leading dimensions of the data that were folded into the dimension trial.
     """
 
     rows: Tensor
@@ -68,7 +68,7 @@ def checked(data: Tensor, name: str) -> tuple[Tensor, Tensor]:
 
 
 def prepare(data: Tensor, name: str) -> Pulses:
-    """Check range-compressed data and lay them out for the estimators.
+    """Check range-compressed data and bring them to the layout of the autofocus estimators.
 
     Warns if the data hold fewer than three pulses or only one range cell, from which no phase error
     can be estimated.
@@ -78,7 +78,7 @@ def prepare(data: Tensor, name: str) -> Pulses:
         name: Name of the calling function for error messages and warnings.
 
     Returns:
-        The pulses.
+        The pulses, scaled to a peak of about one and transposed to shape (trial, range, pulse).
 
     Raises:
         TypeError: If the data are not a tensor of complex64 or complex128.
@@ -106,13 +106,13 @@ def prepare(data: Tensor, name: str) -> Pulses:
 
 
 def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | None:
-    """Convert a start given by the caller to the working precision.
+    """Convert phases to start from to the precision of the data, one row per trial.
 
-    If phases are too large for that precision, whole turns are removed first.
+    If phases are too large for that precision, whole turns are subtracted first.
 
     Args:
         start: Phases in rad, shape (..., pulse) or (pulse,), or None.
-        pulses: The pulses that the start belongs to.
+        pulses: The pulses to which the phases belong.
         name: Name of the calling function for error messages.
 
     Returns:
@@ -137,7 +137,9 @@ def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | 
     try:
         wide = start.expand(want)
     except RuntimeError:
-        raise ValueError(f"{name}: start has the shape {tuple(start.shape)}; one phase per pulse is {want}") from None
+        raise ValueError(
+            f"{name}: start must hold one phase per pulse, shape {want} or (pulse,), got {tuple(start.shape)}"
+        ) from None
     phase, working = wide.reshape(-1, pulses.n), pulses.rows.real.dtype
     large = phase.detach().abs().amax(-1, keepdim=True) > _PHASE_ERROR_RAD / torch.finfo(working).eps
     return torch.where(large, on_the_circle(phase.to(torch.float64)), phase).to(
@@ -162,20 +164,20 @@ def refuse_odd_counts(name: str, least: int, **counts: int) -> None:
 
 
 def rotate(rows: Tensor, phase_rad: Tensor) -> Tensor:
-    """Multiply pulses by exp(-j phase).
+    """Remove a phase from every pulse: the samples are multiplied by exp(-j phase).
 
     Args:
         rows: Samples, shape (trial, range, pulse), complex.
         phase_rad: Phases in rad, shape (trial, pulse).
 
     Returns:
-        The product, shape (trial, range, pulse), complex.
+        The corrected samples, shape (trial, range, pulse), complex.
     """
     return rows * cis(-phase_rad)[..., None, :]
 
 
 def safe_angle(z: Tensor) -> Tensor:
-    """Compute arg z; it is zero, with zero gradient, where z is zero.
+    """Compute the phase angle of complex values; where z is zero, angle and gradient are zero.
 
     Args:
         z: Complex values, any shape.
@@ -188,9 +190,9 @@ def safe_angle(z: Tensor) -> Tensor:
 
 
 def without_line(phase_rad: Tensor, present: Tensor) -> Tensor:
-    """Subtract from phases their constant and their slope, by least squares.
+    """Subtract from the phases of pulses the straight line that fits them best (least squares).
 
-    Only pulses that are present enter the fit.
+    Only pulses with samples enter the fit; the line is subtracted from all.
 
     Args:
         phase_rad: Phases in rad, shape (..., pulse).

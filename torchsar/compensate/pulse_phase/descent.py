@@ -1,4 +1,7 @@
-"""The phase of every pulse as the minimum of a cost of the image, such as its entropy."""
+"""Autofocus by gradient descent: the phases of the pulses that minimise a cost of the image.
+
+Such a cost is, for example, the entropy of the image.
+"""
 
 from __future__ import annotations
 
@@ -68,17 +71,18 @@ def sharpest_phase(
             returns costs (trial,). It is called with some of the trials at a time.
         mask: Weights of the pixels, shape (azimuth, range) or with the trials in front.
         start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
-        basis: Real functions, shape (coefficient, pulse) or (..., coefficient, pulse). The phase is
-            then a sum of these functions, such as `torchsar.core.legendre(u, 5).mT[2:]`, starting
-            from the least-squares fit to the start.
+        basis: Real functions of slow time, shape (coefficient, pulse) or (..., coefficient, pulse),
+            such as `torchsar.core.legendre(u, 5).mT[2:]`. The phase is then a weighted sum of these
+            functions, and the descent starts from their least-squares fit to the start.
         method: "lbfgs", or "adam" for rough costs.
         steps: Largest number of steps, by default 100 for "lbfgs" and 500 for "adam".
         tolerance: Norm of the gradient, relative to that at the start, at which a trial ends. With
             "lbfgs" it also ends when a step lowers the cost by less than 1e-7 of its value.
-        imaging: Any object with a differentiable `image` of profiles of shape (..., pulse, range),
-            see `entropy_fixed_point`; by default `torchsar.focus.azimuth_transform`. Where
-            migration determines the position of the image, start from the phase that `autofocus`
-            finds with the same `imaging`.
+        imaging: Image formation: any object with a differentiable `image` of profiles of shape
+            (..., pulse, range), see `entropy_fixed_point`; by default
+            `torchsar.focus.azimuth_transform`. If range migration makes the sharpness depend on
+            where the target lies in the image, start from the phase that `autofocus` finds with
+            the same `imaging`.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed, detached, with its standard deviation.
@@ -117,27 +121,27 @@ def sharpest_phase(
 
 
 def minimum_entropy(data: Tensor, **options: Any) -> Estimate:
-    """Find the phase of each pulse of least power entropy, see `sharpest_phase`.
+    """Find the phases of the pulses with which the entropy of the image power is least.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
         options: Options of `sharpest_phase`.
 
     Returns:
-        The estimate of `sharpest_phase`.
+        The estimate of `sharpest_phase`: `phase_rad` of shape (..., pulse), to be removed.
     """
     return sharpest_phase(data, objective="power_entropy", **options)
 
 
 def maximum_contrast(data: Tensor, **options: Any) -> Estimate:
-    """Find the phase of each pulse of most contrast of intensities, see `sharpest_phase`.
+    """Find the phases of the pulses with which the contrast of the image intensity is greatest.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
         options: Options of `sharpest_phase`.
 
     Returns:
-        The estimate of `sharpest_phase`.
+        The estimate of `sharpest_phase`: `phase_rad` of shape (..., pulse), to be removed.
     """
     return sharpest_phase(data, objective="contrast", **options)
 
@@ -206,14 +210,14 @@ def _space_of(basis: Tensor | None, pulses: Pulses) -> _Space:
         or not 1 <= basis.shape[-2] <= pulses.n
     ):
         raise ValueError(
-            f"sharpest_phase: basis needs real functions (coefficient, pulse) over {pulses.n} "
-            f"pulses, got {basis.dtype} of shape {tuple(basis.shape)}"
+            f"sharpest_phase: basis must hold 1..{pulses.n} real functions over {pulses.n} pulses, shape "
+            f"(coefficient, pulse), got {basis.dtype} of shape {tuple(basis.shape)}"
         )
     wide = _by_trial(basis.to(device=pulses.rows.device, dtype=torch.float64), pulses, "basis")
     if not torch.isfinite(wide).all() or bool((torch.linalg.matrix_rank(wide) < wide.shape[-2]).any()):
         raise ValueError(
-            f"sharpest_phase: the {wide.shape[-2]} functions of the basis must be finite and linearly "
-            "independent; orthogonal functions such as torchsar.core.legendre are"
+            f"sharpest_phase: the {wide.shape[-2]} functions of basis must be finite and linearly "
+            "independent; use orthogonal functions such as those of torchsar.core.legendre"
         )
     return _Spanned((torch.linalg.qr(wide.mT).Q.mT * math.sqrt(pulses.n)).to(pulses.rows.real.dtype).contiguous())
 
@@ -234,7 +238,8 @@ def _by_trial(x: Tensor, pulses: Pulses, what: str) -> Tensor:
     except RuntimeError:
         raise ValueError(
             f"sharpest_phase: {what} of shape {tuple(x.shape)} does not fit "
-            f"{tuple(pulses.trials)} trials; give two dims for all of them, or the trials in front"
+            f"the trials of shape {tuple(pulses.trials)}; give two dimensions, for all trials alike, or put "
+            "the dimensions of the trials in front"
         ) from None
 
 
@@ -268,8 +273,7 @@ def _cost_of(
         )
     if mask is not None and not isinstance(objective, str):
         raise ValueError(
-            "sharpest_phase: a mask applies only to objectives given by name; apply the mask inside "
-            "your own function of images"
+            "sharpest_phase: mask must be None if objective is a function; apply the mask inside that function"
         )
     if objective == "power_entropy" and mask is None and imaging is None:
         return lambda rows, _: _PowerEntropy(rows, rows.conj().resolve_conj())
@@ -336,8 +340,8 @@ def _check_cost(cost: Any, phase: Tensor) -> None:
             else type(cost).__name__
         )
         raise ValueError(
-            f"sharpest_phase: the objective returned {got} for {len(phase)} images; return one "
-            "real cost per image, differentiable in its samples"
+            f"sharpest_phase: the objective returned {got} for {len(phase)} images; it must return one real "
+            "cost per image that is differentiable in the samples of the image"
         )
 
 

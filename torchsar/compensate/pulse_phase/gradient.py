@@ -1,10 +1,10 @@
 """Phase gradient autofocus (PGA).
 
 The strongest scatterer of every range cell is isolated by a window that narrows from iteration to
-iteration. The window acts on an image of twice as many cells, that is on pulses padded with as many
-zeros. On the plain image a narrow window joins the last pulses to the first, and the iterations
-then drift away from their optimum: from 0.07 rad at the best iterate to 0.4 rad after 20 iterations
-on images of 1024 x 1024 cells, where padded pulses stay at 0.03 rad.
+iteration. The window acts on an image of twice as many Doppler cells, made from pulses padded with
+as many zeros. Without padding, a narrow window mixes the last pulses with the first, and the
+iterations drift away from their optimum: on images of 1024 x 1024 cells the phase error rises from
+0.07 rad at the best iteration to 0.4 rad after 20 iterations. With padding it stays at 0.03 rad.
 """
 
 from __future__ import annotations
@@ -36,16 +36,19 @@ _PADDING = 2  # zero-padding of the pulses; the docstring of this module gives t
 
 
 class Windows(Protocol):
-    """A schedule of window widths."""
+    """A schedule of window widths for phase gradient autofocus (PGA).
+
+    In every iteration of PGA the window isolates the strongest scatterer of each range cell.
+    """
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Compute the width of the window at an iteration.
+        """Compute the width of the window that isolates the scatterers in an iteration of PGA.
 
         Args:
             iteration: Number of the iteration, from 0.
             n: Number of Doppler cells of the image.
-            profile: Function that returns the power of the rows about their peaks, shape (trial,
-                n), peak first.
+            profile: Function that returns the power along Doppler, summed over the range cells with
+                their peaks shifted to index 0, shape (trial, n).
 
         Returns:
             The width in Doppler cells, shape (trial,) or (1,).
@@ -55,12 +58,13 @@ class Windows(Protocol):
 
 @dataclass(frozen=True)
 class Shrinking:
-    """A window that starts at a share of the pulses and narrows by a factor per iteration.
+    """A PGA window that narrows by a constant factor per iteration.
 
     Args:
-        first: First width as a share of the number of pulses (1/2 in Ruan et al. 2013, section
+        first: First width as a fraction of the number of Doppler cells (1/2 in Ruan et al. 2013,
+            section 3.1).
+        factor: Factor by which the width changes per iteration (0.8 in Ruan et al. 2013, section
             3.1).
-        factor: Factor per iteration (0.8 in Ruan et al. 2013, section 3.1).
         floor: Smallest width in Doppler cells.
 
     Raises:
@@ -74,11 +78,12 @@ class Shrinking:
     def __post_init__(self) -> None:
         if not (0 < self.first <= 1 and 0 < self.factor <= 1 and self.floor >= 1):
             raise ValueError(
-                f"a shrinking window needs first in 0..1, factor in 0..1 and a floor of 1 cell or more, got {self}"
+                "Shrinking: first and factor must be above 0 and at most 1, and floor must be 1 Doppler cell or "
+                f"more, got {self}"
             )
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Compute the width of the window at an iteration, see `Windows.width`.
+        """Compute the width of the PGA window, which narrows by a constant factor per iteration.
 
         Args:
             iteration: Number of the iteration, from 0.
@@ -93,13 +98,14 @@ class Shrinking:
 
 @dataclass(frozen=True)
 class Measured:
-    """A window that follows the width of the blur.
+    """A PGA window that follows the width of the blur.
 
-    Its width is `margin` times the width over which the mean centred power stays within `level_db`
-    of its peak.
+    The power is summed over the range cells, with their peaks shifted to zero Doppler. The window
+    is `margin` times as wide as the interval centred on the peak that holds all cells in which this
+    sum is at most `level_db` below the peak.
 
     Args:
-        level_db: Level below the peak in dB.
+        level_db: Level below the peak in dB, positive.
         margin: Factor applied to the measured width.
         floor: Smallest width in Doppler cells.
 
@@ -112,13 +118,13 @@ class Measured:
     floor: float = 5.0
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Compute the width of the window at an iteration, see `Windows.width`.
+        """Compute the width of the PGA window from the width of the blur.
 
         Args:
             iteration: Not used.
             n: Number of Doppler cells of the image.
-            profile: Function that returns the power of the rows about their peaks, shape (trial,
-                n), peak first.
+            profile: Function that returns the power along Doppler, summed over the range cells with
+                their peaks shifted to index 0, shape (trial, n).
 
         Returns:
             The width in Doppler cells, shape (trial,).
@@ -132,7 +138,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Listed:
-    """A list of window widths, one per iteration; the last one serves all further iterations.
+    """A list of PGA window widths, one per iteration; the last serves all further iterations.
 
     Args:
         cells: Widths in Doppler cells.
@@ -145,10 +151,10 @@ class Listed:
 
     def __post_init__(self) -> None:
         if not self.cells or not all(math.isfinite(w) and w >= 1 for w in self.cells):
-            raise ValueError(f"a list of windows needs widths of 1 cell or more, got {self.cells}")
+            raise ValueError(f"Listed: cells must hold window widths of 1 Doppler cell or more, got {self.cells}")
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Compute the width of the window at an iteration, see `Windows.width`.
+        """Look up the width of the PGA window of an iteration in the list.
 
         Args:
             iteration: Number of the iteration, from 0.
@@ -173,25 +179,28 @@ def pga(
     """Estimate the phase of each pulse by phase gradient autofocus.
 
     Every iteration works on the original data with the present phase removed. It shifts the
-    strongest cell of each row to zero Doppler, applies a window, transforms back to pulses, and
-    estimates the phase with the kernel, without its constant and linear part. A trial ends after
-    `patience` iterations without a lower image entropy under a window that no longer narrows, and
-    returns its sharpest iterate, because narrow windows drift away. Differentiable except for the
-    choice of peaks and iterates.
+    strongest cell of each range cell to zero Doppler, applies a window, transforms back to pulses,
+    and estimates the remaining phase with the kernel; a constant and a linear part are dropped.
+    Once the window no longer narrows, a trial ends after `patience` iterations that do not lower
+    the image entropy. The phase of the iteration with the least entropy is returned, because
+    iterations with narrow windows drift away. Differentiable except for the choice of peaks and of
+    that iteration.
 
-    From a zero start PGA is not equivariant and fails on large or white phase errors; use `pga_sca`
-    or `autofocus` for these.
+    From a zero start PGA fails on phase errors that are large or independent from pulse to pulse;
+    use `pga_sca` or `autofocus` for these.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
-        kernel: "lumv" (linear unbiased minimum variance; underestimates steps above one radian),
-            "ml" (maximum likelihood of adjacent pulses), or a kernel that is coherent over the
-            aperture, with peaks found to a fraction of a cell: "synchronised" (unit phasors) or
-            "eigenvector" (of the windowed covariance).
+        kernel: Method that estimates the phase from the windowed data. "lumv" (linear unbiased
+            minimum variance) and "ml" (maximum likelihood) add up the phases between adjacent
+            pulses; "lumv" underestimates steps above one radian. "eigenvector" and "synchronised"
+            use all pairs of pulses, with peaks found to a fraction of a cell: "eigenvector" takes
+            the phases of the first eigenvector of the covariance matrix between pulses,
+            "synchronised" finds the unit phasors that best agree with this matrix.
         start: Phase to start from in rad, shape (..., pulse); by default zero.
         windows: Schedule of window widths, by default `Shrinking()`.
         iterations: Largest number of iterations.
-        patience: Number of iterations without a lower entropy after which a trial ends.
+        patience: Number of iterations without a lower image entropy after which a trial ends.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
@@ -220,19 +229,22 @@ def pga(
 def pga_sca(
     data: Tensor, *, kernel: Kernel = "ml", windows: Windows | None = None, iterations: int = 20, patience: int = 6
 ) -> Estimate:
-    """Estimate the phase of each pulse by PGA with the kernel of SCA, started from SCA.
+    """Estimate the phase of each pulse by phase gradient autofocus (PGA) that starts from `sca`.
 
-    Equivariant, as `sca` is.
+    Phase errors of any size are removed alike, because `sca` does so: a phase added to a pulse of
+    the data is added to the estimate.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
-        kernel: Kernel, see `pga`.
+        kernel: Method that estimates the phase from the windowed data, see `pga`. "ml" forms the
+            same products of adjacent pulses as `sca`.
         windows: Schedule of window widths, by default `Shrinking()`.
         iterations: Largest number of iterations.
         patience: Number of iterations without a lower entropy after which a trial ends.
 
     Returns:
-        An estimate as that of `pga`.
+        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation; quality, `ok`
+        and info are those of `pga`.
 
     Raises:
         TypeError: If the data are not complex or `windows` is not a schedule.
@@ -379,7 +391,7 @@ def _solver(kernel: Kernel) -> Solver:
     """The function of a kernel."""
     solvers: dict[str, Solver] = {"lumv": _lumv, "ml": _ml, "synchronised": _synchronised, "eigenvector": _eigenvector}
     if kernel not in solvers:
-        raise ValueError(f"kernel {kernel!r} is not known; choose one of {', '.join(solvers)}")
+        raise ValueError(f"PGA kernel {kernel!r} is not known; choose one of {', '.join(solvers)}")
     return solvers[kernel]
 
 

@@ -1,4 +1,4 @@
-"""Linear image formation for autofocus: the forward operator and its adjoint."""
+"""Linear image formation for autofocus: operators from pulses to an image, and their adjoints."""
 
 from __future__ import annotations
 
@@ -9,40 +9,41 @@ from torch import Tensor
 
 
 class Imaging(Protocol):
-    """A linear operator from pulses to an image, with its adjoint; its scale has no effect.
+    """A linear image formation for autofocus: an operator from pulses to an image, and its adjoint.
 
-    Autofocus functions accept any object with these two methods on profiles of shape (..., pulse,
-    range), such as `torchsar.focus.PolarOperator`.
+    Autofocus functions accept any object with the methods `image` and `adjoint` for profiles of
+    shape (..., pulse, range), such as `torchsar.focus.PolarOperator`. A constant factor in the
+    operator has no effect.
     """
 
     def image(self, rows: Tensor, /) -> Tensor:
-        """Form the image of pulses.
+        """Form the image of range-compressed pulses.
 
         Args:
-            rows: Pulses.
+            rows: Pulses, complex, in the layout of the operator, such as (..., pulse, range).
 
         Returns:
-            The image.
+            The image, complex, in the layout of the operator.
         """
         ...
 
     def adjoint(self, image: Tensor, /) -> Tensor:
-        """Apply the adjoint operator to an image.
+        """Apply the adjoint of the image formation, which maps an image to pulses.
 
         Args:
-            image: The image.
+            image: Image, complex, in the layout in which `image` returns it.
 
         Returns:
-            Pulses.
+            Pulses, complex, in the layout in which `image` takes them.
         """
         ...
 
 
 class AlongPulses:
-    """Fourier transform along pulses, each range cell separately.
+    """Image formation by a Fourier transform along pulses, of each range cell separately.
 
-    The image of a target whose scatterers do not migrate through range cells. With oversampling 1
-    the operator is unitary.
+    It suits a target whose scatterers do not migrate through range cells. With oversampling 1 the
+    operator is unitary.
 
     Args:
         oversampling: Factor by which the pulses are padded with zeros.
@@ -52,21 +53,21 @@ class AlongPulses:
         self.oversampling = oversampling
 
     def image(self, rows: Tensor) -> Tensor:
-        """Form the image.
+        """Form the image by a Fourier transform along pulses.
 
         Args:
             rows: Pulses, shape (trial, range, pulse), complex.
 
         Returns:
-            The image, shape (trial, range, Doppler), in FFT order.
+            The image, shape (trial, range, Doppler), complex, with Doppler in FFT order.
         """
         return torch.fft.fft(rows, self.oversampling * rows.shape[-1], norm="ortho")
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Apply the adjoint operator.
+        """Apply the adjoint of the Fourier transform along pulses, which maps an image to pulses.
 
         Args:
-            image: Image, shape (trial, range, Doppler), in FFT order.
+            image: Image, shape (trial, range, Doppler), complex, with Doppler in FFT order.
 
         Returns:
             Pulses, shape (trial, range, pulse), complex.
@@ -76,11 +77,11 @@ class AlongPulses:
 
 
 class Through:
-    """Any linear image formation, adapted to pulses of shape (trial, range, pulse).
+    """Adapter that lets an image formation for pulses (..., pulse, range) take (..., range, pulse).
 
     Args:
-        operator: Object with `image` and `adjoint` of profiles of shape (..., pulse, range), such
-            as `torchsar.focus.PolarOperator`.
+        operator: Object with the methods `image` and `adjoint` for profiles of shape (..., pulse,
+            range), such as `torchsar.focus.PolarOperator`.
 
     Raises:
         TypeError: If the operator lacks one of the two methods.
@@ -89,27 +90,27 @@ class Through:
     def __init__(self, operator: Imaging) -> None:
         if not (hasattr(operator, "image") and hasattr(operator, "adjoint")):
             raise TypeError(
-                "imaging must have `image` and `adjoint`, as torchsar.focus.PolarOperator, got "
-                f"{type(operator).__name__}"
+                "imaging must have the methods `image` and `adjoint`, as torchsar.focus.PolarOperator has, "
+                f"got {type(operator).__name__}"
             )
         self.operator = operator
 
     def image(self, rows: Tensor) -> Tensor:
-        """Form the image.
+        """Form the image of pulses with the wrapped operator.
 
         Args:
             rows: Pulses, shape (trial, range, pulse), complex.
 
         Returns:
-            The image of the operator.
+            The image, as the operator returns it.
         """
         return self.operator.image(rows.mT)
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Apply the adjoint operator.
+        """Apply the adjoint of the wrapped operator, which maps an image to pulses.
 
         Args:
-            image: Image of the operator.
+            image: Image, as the operator returns it.
 
         Returns:
             Pulses, shape (trial, range, pulse), complex.

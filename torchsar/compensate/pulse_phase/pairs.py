@@ -1,4 +1,7 @@
-"""Spatial correlation algorithm (SCA): the phase between adjacent pulses, summed over range."""
+"""Spatial correlation algorithm (SCA), an autofocus by the phases between adjacent pulses.
+
+The phase between two pulses is that of their product, summed over range.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,11 @@ from torchsar.core import Estimate
 def sca(data: Tensor) -> Estimate:
     """Estimate the phase of each pulse from the products of adjacent pulses.
 
-    The compensated data are data * exp(-j phase_rad)[..., None]. The estimate is exactly
-    equivariant: for data * exp(j a) it is larger by a, up to a constant, whatever a is. The size of
-    the phase error therefore has no effect. The scene (about 1.2 rad for a target of many
-    scatterers per range cell) and noise limit the accuracy. Differentiable.
+    The phase between two pulses is that of their product summed over range; these are added up from
+    pulse to pulse. The compensated data are data * exp(-j phase_rad)[..., None]. If a phase a[k] is
+    added to pulse k of the data, the estimate grows by exactly a[k], up to a constant, so the size
+    of the phase error has no effect. Noise and the scene limit the accuracy; a scene of many
+    scatterers per range cell leaves an error of about 1.2 rad. Differentiable.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
@@ -47,7 +51,7 @@ def sca(data: Tensor) -> Estimate:
 
 
 def pair_phase(rows: Tensor, present: Tensor) -> Tensor:
-    """Sum the phases between successive pulses.
+    """Estimate the phase of each pulse by adding up the phases between successive pulses.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
@@ -62,14 +66,14 @@ def pair_phase(rows: Tensor, present: Tensor) -> Tensor:
 def pair_products(rows: Tensor, present: Tensor) -> Tensor:
     """Sum over range the product of each pulse and the conjugate of the pulse before it.
 
-    Pulses that are not present are skipped.
+    Pulses without samples are skipped: the pulse after them is paired with the one before them.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
         present: False for pulses without samples, shape (trial, pulse), bool.
 
     Returns:
-        The products, shape (trial, pulse - 1), complex; zero for a pulse that is not present.
+        The products, shape (trial, pulse - 1), complex; zero for a pulse without samples.
     """
     if bool(present.all()):
         return (rows[..., 1:] * rows[..., :-1].conj()).sum(-2)
@@ -82,23 +86,24 @@ def pair_products(rows: Tensor, present: Tensor) -> Tensor:
 
 
 def previous_present(present: Tensor) -> Tensor:
-    """Find the last pulse with samples before each pulse but the first.
+    """Find, for each pulse but the first, the last pulse before it that holds samples.
 
     Args:
         present: False for pulses without samples, shape (trial, pulse), bool.
 
     Returns:
-        Its index, shape (trial, pulse - 1); 0 where there is none.
+        The index of that pulse, shape (trial, pulse - 1); 0 where there is none.
     """
     index = torch.arange(present.shape[-1], device=present.device)
     return torch.where(present, index, 0).cummax(-1).values[:, :-1]
 
 
 def running_sum(products: Tensor) -> Tensor:
-    """Sum the phases of products of successive pulses in float64.
+    """Add up the phases of products of successive pulses, in float64.
 
     Args:
-        products: Products with the pulse before, shape (trial, pulse - 1), complex.
+        products: Product of each pulse but the first with the conjugate of the pulse before it,
+            shape (trial, pulse - 1), complex.
 
     Returns:
         The phase of every pulse in rad, shape (trial, pulse); that of the first pulse is 0.

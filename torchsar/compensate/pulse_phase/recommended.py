@@ -40,30 +40,31 @@ def autofocus(
 ) -> Estimate:
     """Estimate the phase of each pulse; the recommended autofocus.
 
-    Starts from `sca`. The entropy fixed point follows, with a low floor (with a higher one for the
-    first six iterations where noise is weak), until a trial no longer moves. The last iterations
-    take the phase of each pulse against a Wiener estimate of the scene, on an image of twice as
-    many cells. They reduce the error that remains after the entropy fixed point by half or more.
-    Differentiable without `imaging`.
+    The method starts from `sca`. The iterations of `entropy_fixed_point` follow, with a low power
+    floor (a higher one for the first six iterations where noise is weak), until the phases no
+    longer change. In the last iterations the phase of each pulse is measured against a Wiener
+    estimate of the scene, on an image of twice as many Doppler cells. These reduce the remaining
+    error by half or more. Differentiable without `imaging`.
 
     Do not use it for homogeneous clutter that fills a large part of the Doppler band. Wrong phases
     lower the entropy of such an image, and `ok` may be True although the phase is wrong.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
-        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`, with which
-            the result is equivariant: any phase per pulse is removed, whatever its size.
+        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`. With this
+            default, phase errors of any size are removed alike.
         search: Largest number of iterations of the entropy fixed point, approximately; only hard
             cases of low SNR need them all.
         polish: Largest number of iterations against the Wiener estimate.
-        search_tolerance_rad: Step in rad, rms over the pulses, below which the entropy fixed point
-            ends.
-        tolerance_rad: The same for the iterations against the Wiener estimate.
-        imaging: Image formation in which scatterers do not migrate, for data in which they migrate
+        search_tolerance_rad: Step in rad, rms over the pulses, below which the iterations of the
+            entropy fixed point end.
+        tolerance_rad: Step in rad, rms over the pulses, below which the iterations against the
+            Wiener estimate end.
+        imaging: Image formation that corrects range migration, for data in which scatterers migrate
             through range cells; see `entropy_fixed_point`. Its image must cover the whole
-            unambiguous cross range. It also determines the slope of the phase over pulses, since a
-            displaced image has the wrong migration: after the steps above, 48 slopes over one turn
-            per pulse are tried, the best is refined, and both kinds of iterations are run with
+            unambiguous cross range. The migration of a displaced image is wrong, so the slope of
+            the phase over pulses is then determined too: after the steps above, 48 slopes over one
+            turn per pulse are tried, the best is refined, and both kinds of iterations are run with
             `imaging`.
 
     Returns:

@@ -1,7 +1,8 @@
-"""Fixed-point iterations that sharpen the image.
+"""Fixed-point iterations that sharpen the image by correcting the phase of every pulse.
 
-The entropy fixed point, and the phase of each pulse against a Wiener estimate of the scene from the
-other pulses.
+Each iteration weights the cells of the image, transforms it back to pulses, and takes the phase of
+each pulse relative to the result. The weights either follow from the image entropy, or make the
+weighted image a Wiener estimate of the scene.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ Weights = Callable[[Tensor, Tensor], Tensor]
 class Run:
     """Settings of fixed-point iterations with one kind of weights.
 
-    A trial ends after `iterations`, or once its step is below `tolerance_rad`.
+    The iterations of a trial end after `iterations`, or once a step is below `tolerance_rad`.
 
     Args:
         weights: Function of the power of the cells and its mean that returns their real weights.
@@ -43,12 +44,16 @@ class Run:
 
 
 def fixed_point(rows: Tensor, phase: Tensor, run: Run) -> tuple[Tensor, Tensor]:
-    """Iterate psi <- psi + relaxation * arg sum_n x conj(A^H (w A x)), with x = rows exp(-j psi).
+    """Sharpen the image by fixed-point iterations of the phase psi of every pulse.
+
+    Each iteration is psi <- psi + relaxation * arg sum_n x conj(A^H (w A x)). Here x = rows exp(-j
+    psi) are the corrected pulses, A is the image formation and A^H its adjoint, w are the real
+    weights of the image cells, and the sum is over range cells n.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
         phase: Phase to start from in rad, shape (trial, pulse).
-        run: Settings.
+        run: Settings of the iterations.
 
     Returns:
         The phase in rad, shape (trial, pulse), and the number of iterations, shape (trial,).
@@ -78,14 +83,15 @@ def _phase_step(rows: Tensor, mirrored: Tensor, phase: Tensor, run: Run) -> Tens
 
 
 def weighted(image: Tensor, weights: Weights) -> Tensor:
-    """Multiply an image by w(p / mean p), with p = |image|^2.
+    """Multiply each cell of an image by a weight that depends on its power.
 
     Real and imaginary parts are multiplied separately, which on a CPU is three times as fast as a
     product of complex and real numbers.
 
     Args:
         image: Image, shape (..., range, Doppler), complex.
-        weights: Function of the power and its mean that returns the weights.
+        weights: Function of the power of the cells and its mean over the image that returns the
+            real weights of the cells.
 
     Returns:
         The weighted image, same shape.
@@ -101,7 +107,9 @@ def weighted(image: Tensor, weights: Weights) -> Tensor:
 
 @dataclass(frozen=True)
 class LogAbove:
-    """Weights ln(max(p, floor) / floor): the gradient of the entropy above a floor, zero below it.
+    """Weights ln(max(p, floor) / floor) of image cells, where p is the power over its mean.
+
+    Above the floor they are the gradient of the image entropy, below it they are zero.
 
     Args:
         floor: Floor as a multiple of the mean power, a number or shape (trial, 1, 1).
@@ -115,12 +123,13 @@ class LogAbove:
 
 @dataclass(frozen=True)
 class Wiener:
-    """Weights (p / (p + level * mean p))^2 of locally averaged powers, minus their mean in the row.
+    """Weights (p / (p + level * m))^2 of image cells, minus their mean over each range cell.
 
-    Powers are averaged over three range cells. A weight is small where a cell holds no more than
+    Here p is the power, summed over three neighbouring range cells with weights 1, 2, 1 and divided
+    by 4, and m is the mean power of the image. A weight is small where a cell holds no more than
     noise and constant where it holds much more: a Wiener filter whose prior is the local power.
-    Subtracting the mean removes, to first order, the contribution of a pulse to the scene with
-    which it is compared; steps then need no relaxation.
+    Subtracting the mean removes, to first order, the contribution of a pulse to the estimated scene
+    with which this pulse is compared; the phase steps then need no relaxation.
 
     Args:
         level: Noise level as a multiple of the mean power.
@@ -148,21 +157,24 @@ def entropy_fixed_point(
     """Estimate the phase of each pulse by a fixed-point iteration that lowers the image entropy.
 
     Each iteration forms the image, weights its cells with ln(max(p, floor) / floor), where p is the
-    power over its mean, transforms back to pulses, and takes the phase of each pulse against the
-    result. It needs two transforms, no peaks and no windows. Differentiable.
+    power of a cell over the mean power, transforms the weighted image back to pulses, and takes the
+    phase of each pulse relative to the result. An iteration takes two transforms and, unlike PGA,
+    needs no peaks and no windows. Differentiable.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
-        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`, with which
-            the result is equivariant.
-        floors: Pairs (floor, iterations) that are used one after another. A trial proceeds to the
-            next once its steps are below `tolerance_rad`.
+        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`. With this
+            default, phase errors of any size are removed alike.
+        floors: Pairs (floor, largest number of iterations) that are used one after another; a
+            floor is a multiple of the mean power. A trial proceeds to the next pair once its steps
+            are below `tolerance_rad`.
         relaxation: Factor applied to the phase step. Above 1 it helps to pass local minima; at 2 or
             more the iteration need not converge.
-        tolerance_rad: Step in rad, rms over the pulses, below which a trial ends a floor.
-        imaging: Image formation to sharpen, by default a transform along pulses; any object with
-            `image` and `adjoint` of profiles of shape (..., pulse, range), such as
-            `torchsar.focus.PolarOperator`.
+        tolerance_rad: Step in rad, rms over the pulses, below which a trial ends its iterations
+            with a floor.
+        imaging: Image formation whose image is sharpened, by default a Fourier transform along
+            pulses; any object with the methods `image` and `adjoint` for profiles of shape (...,
+            pulse, range), such as `torchsar.focus.PolarOperator`.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
@@ -177,8 +189,8 @@ def entropy_fixed_point(
     pulses = prepare(data, "entropy_fixed_point")
     if not floors or not all(floor > 0 and count >= 1 for floor, count in floors) or not 0 < relaxation < 2:
         raise ValueError(
-            "entropy_fixed_point needs floors above 0 with one iteration or more each and a "
-            f"relaxation in 0..2, got {list(floors)} and {relaxation}"
+            "entropy_fixed_point: floors must be pairs of a floor above 0 and 1 iteration or more, and relaxation "
+            f"must lie between 0 and 2, got floors {list(floors)} and relaxation {relaxation}"
         )
     operator = AlongPulses() if imaging is None else Through(imaging)
     runs = [Run(LogAbove(floor), operator, count, relaxation, tolerance_rad) for floor, count in floors]
@@ -209,10 +221,10 @@ def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, T
 
 
 def settled(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
-    """Continue a phase by four steps of the entropy fixed point.
+    """Continue the estimation of a phase by four iterations of the entropy fixed point.
 
-    Other estimators use this to predict their accuracy, see
-    `torchsar.compensate.pulse_phase.verdict`.
+    Autofocus methods use it to predict their accuracy: how far their result moves when it is
+    continued on all or on half of the range cells.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.

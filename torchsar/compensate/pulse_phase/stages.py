@@ -1,6 +1,6 @@
-"""Autofocus as stages: estimators of `phase_rad`, and the stage that removes it.
+"""Autofocus as stages of a chain: estimators of the phase error of every pulse, and its removal.
 
-The estimators leave the signal unchanged.
+The estimators provide the phase as `phase_rad` and leave the signal unchanged.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from torchsar.radar import FarField, InverseRadar, Spotlight
 
 
 def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
-    """Multiply pulses by exp(-j phase).
+    """Remove a phase from every pulse: the samples are multiplied by exp(-j phase).
 
-    Whole turns of the phase are removed in float64. Differentiable in both arguments.
+    Whole turns are first subtracted from the phase in float64, so that large phases lose no
+    accuracy. Differentiable in both arguments.
 
     Args:
         data: Pulses, shape (..., pulse, range), complex.
@@ -43,14 +44,18 @@ def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
     if not isinstance(phase_rad, Tensor) or phase_rad.shape[-1:] != data.shape[-2:-1]:
         got = tuple(phase_rad.shape) if isinstance(phase_rad, Tensor) else type(phase_rad).__name__
         raise ValueError(
-            f"correct_pulse_phase needs a tensor of one phase per pulse, (..., {data.shape[-2]}), got {got}"
+            f"correct_pulse_phase: phase_rad must be a tensor of one phase per pulse, (..., {data.shape[-2]}), "
+            f"got {got}"
         )
     refuse_non_finite(phase_rad, "correct_pulse_phase")
     return rotate(data.mT, on_the_circle(phase_rad.to(torch.float64)).to(real_dtype(data.dtype))).mT
 
 
 class CorrectPulsePhase(Stage):
-    """Removal of a phase per pulse by a connected value `phase_rad`; see `correct_pulse_phase`."""
+    """Removal of the phase `phase_rad` (rad, a connected value) of every pulse.
+
+    Every pulse is multiplied by exp(-j phase_rad), see `correct_pulse_phase`.
+    """
 
     def forward(self, signal: Signal, phase_rad: Tensor) -> Signal:
         """Remove the phase from a signal of axes (pulse, range).
@@ -71,15 +76,21 @@ class Sca(Stage):
     provides = ("phase_rad",)
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range)."""
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
+
+        Returns:
+            The estimate of `sca`: `phase_rad` of shape (..., pulse), to be removed.
+        """
         return sca(signal.data)
 
 
 def windows_of(windows: Literal["shrinking", "measured"] | list[float]) -> Windows:
-    """Make a schedule of window widths from its name or a list.
+    """Make the schedule of window widths for phase gradient autofocus from its name or a list.
 
     Args:
-        windows: "shrinking", "measured", or widths in Doppler cells.
+        windows: "shrinking" narrows by a constant factor per iteration (`Shrinking`), "measured"
+            follows the width of the blur (`Measured`), and a list gives the width for each
+            iteration in Doppler cells (`Listed`).
 
     Returns:
         The schedule.
@@ -93,8 +104,10 @@ class Pga(Stage):
     """Phase per pulse by phase gradient autofocus; see `pga`.
 
     Args:
-        kernel: Kernel, see `pga`.
-        windows: "shrinking", "measured", or a list of widths in Doppler cells.
+        kernel: Method that estimates the phase from the windowed data: "lumv", "ml", "synchronised"
+            or "eigenvector", see `pga`.
+        windows: Window widths: "shrinking", "measured", or a list of widths in Doppler cells, see
+            `windows_of`.
         iterations: Largest number of iterations.
         patience: Number of iterations without a lower entropy after which a trial ends.
     """
@@ -113,14 +126,14 @@ class Pga(Stage):
         self.windows, self.iterations, self.patience = windows_of(windows), iterations, patience
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             start: Phase to start from in rad, shape (..., pulse); by default zero.
 
         Returns:
-            The estimate of `pga`.
+            The estimate of `pga`: `phase_rad` of shape (..., pulse), to be removed.
         """
         return pga(
             signal.data,
@@ -136,8 +149,10 @@ class PgaSca(Pga):
     """Phase per pulse by phase gradient autofocus started from SCA; see `pga_sca`.
 
     Args:
-        kernel: Kernel, see `pga`.
-        windows: "shrinking", "measured", or a list of widths in Doppler cells.
+        kernel: Method that estimates the phase from the windowed data: "lumv", "ml", "synchronised"
+            or "eigenvector", see `pga`.
+        windows: Window widths: "shrinking", "measured", or a list of widths in Doppler cells, see
+            `windows_of`.
         iterations: Largest number of iterations.
         patience: Number of iterations without a lower entropy after which a trial ends.
     """
@@ -152,7 +167,11 @@ class PgaSca(Pga):
         super().__init__(kernel, windows, iterations, patience)
 
     def forward(self, signal: Signal) -> Estimate:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Estimate `phase_rad` of a signal of axes (pulse, range)."""
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
+
+        Returns:
+            The estimate of `pga_sca`: `phase_rad` of shape (..., pulse), to be removed.
+        """
         return pga_sca(
             signal.data, kernel=self.kernel, windows=self.windows, iterations=self.iterations, patience=self.patience
         )
@@ -162,13 +181,15 @@ class EntropyFixedPoint(Stage):
     """Phase per pulse by the entropy fixed point; see `entropy_fixed_point`.
 
     Args:
-        floors: Floors that are used one after another.
+        floors: Power floors as multiples of the mean power of the image, used one after another;
+            cells below the floor get no weight.
         iterations: Largest number of iterations for each floor.
         relaxation: Factor applied to the phase step.
-        imaging: Image formation to sharpen.
+        imaging: Image formation whose image is sharpened; by default a Fourier transform along
+            pulses.
 
     Raises:
-        ValueError: If there is not one number of iterations for each floor.
+        ValueError: If `floors` and `iterations` differ in length.
     """
 
     provides = ("phase_rad",)
@@ -183,20 +204,20 @@ class EntropyFixedPoint(Stage):
         super().__init__()
         if len(floors) != len(iterations):
             raise ValueError(
-                f"entropy_fixed_point needs a number of iterations for each floor, got {list(floors)} "
-                f"and {list(iterations)}"
+                "EntropyFixedPoint: iterations must hold a number of iterations for each floor, got floors "
+                f"{list(floors)} and iterations {list(iterations)}"
             )
         self.schedule, self.relaxation, self.imaging = tuple(zip(floors, iterations)), relaxation, imaging
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `entropy_fixed_point`.
+            The estimate of `entropy_fixed_point`: `phase_rad` of shape (..., pulse), to be removed.
         """
         return entropy_fixed_point(
             signal.data, start=start, floors=self.schedule, relaxation=self.relaxation, imaging=self.imaging
@@ -208,8 +229,10 @@ class Autofocus(Stage):
 
     Args:
         search: Largest number of iterations of the entropy fixed point, approximately.
-        polish: Largest number of iterations against the Wiener estimate.
-        imaging: Image formation to sharpen.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
+        imaging: Image formation whose image is sharpened; by default a Fourier transform along
+            pulses.
     """
 
     provides = ("phase_rad",)
@@ -219,14 +242,14 @@ class Autofocus(Stage):
         self.search, self.polish, self.imaging = search, polish, imaging
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `autofocus`.
+            The estimate of `autofocus`: `phase_rad` of shape (..., pulse), to be removed.
         """
         return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=self.imaging)
 
@@ -234,14 +257,15 @@ class Autofocus(Stage):
 class TargetAutofocus(Autofocus):
     """Phase per pulse that sharpens the image of a target; see `autofocus`.
 
-    The image is the polar-format image of `TargetImage` if the recording has a geometry, and the
-    Fourier transform along pulses otherwise.
+    The image is the polar-format image of `TargetImage` if `geometry` is given, and the Fourier
+    transform along pulses otherwise.
 
     Args:
         radar: Radar of the recording.
         geometry: Geometry of the recording; None if it is not known.
         search: Largest number of iterations of the entropy fixed point, approximately.
-        polish: Largest number of iterations against the Wiener estimate.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
     """
 
     def __init__(
@@ -251,25 +275,25 @@ class TargetAutofocus(Autofocus):
         self.target = None if geometry is None else TargetImage(radar, geometry)
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `autofocus`.
+            The estimate of `autofocus`: `phase_rad` of shape (..., pulse), to be removed.
         """
         imaging = None if self.target is None else self.target.operator(signal.data)
         return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=imaging)
 
 
 class SharpestPhase(Stage):
-    """Phase per pulse of least entropy or most contrast, by descent; see `sharpest_phase`.
+    """Phase per pulse of least image entropy or most contrast, by descent; see `sharpest_phase`.
 
     Args:
-        objective: "power_entropy", "amplitude_entropy" or "contrast".
-        method: "lbfgs" or "adam".
+        objective: "power_entropy" or "amplitude_entropy" (minimised), or "contrast" (maximised).
+        method: Gradient descent: "lbfgs", or "adam" for rough objectives.
         steps: Largest number of steps.
     """
 
@@ -287,13 +311,13 @@ class SharpestPhase(Stage):
         self.steps = steps
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `sharpest_phase`.
+            The estimate of `sharpest_phase`: `phase_rad` of shape (..., pulse), to be removed.
         """
         return sharpest_phase(signal.data, objective=self.objective, method=self.method, steps=self.steps, start=start)

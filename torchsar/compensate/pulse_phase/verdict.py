@@ -1,4 +1,8 @@
-"""Reliability of an estimated phase: image sharpness against noise, and agreement of two halves."""
+"""Reliability of the phases that autofocus estimates.
+
+It follows from the sharpness of the image, compared with that of noise, and from the agreement of
+estimates from two halves of the range cells.
+"""
 
 from __future__ import annotations
 
@@ -32,16 +36,17 @@ Find = Callable[[Tensor, Tensor, Tensor | None], Found]
 def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Compute by how much the entropy of an image lies below that of speckle.
 
-    The speckle has the same row energies. An image whose rows are circular noise has 0 before any
-    phase is fitted to it.
+    The speckle has the same energy in each row (range cell) as the image. The result is 0 for an
+    image of circular noise to which no phase was fitted.
 
     Args:
         image: Image, shape (..., range, Doppler), complex.
 
     Returns:
-        The missing entropy in nats, the effective number of rows over which the energy is spread,
-        and the effective number of rows over which the missing entropy is spread (1 if one bright
-        row makes all of it); shape (...,) each, float64.
+        The difference of entropies in nats, positive for an image sharper than speckle; the
+        effective number of rows over which the energy is spread; and the effective number of rows
+        over which the difference of entropies is spread (1 if one bright row makes all of it);
+        shape (...,) each, float64.
     """
     real, imag = image.real.contiguous(), image.imag.contiguous()
     power = real * real + imag * imag
@@ -57,17 +62,18 @@ def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def sharpness_of_noise(rows: Tensor) -> Tensor:
-    """Compute the missing entropy of the sharpest image that can be made from pure noise.
+    """Predict the sharpness of the sharpest image that autofocus can make from pure noise.
 
-    A fit, within 15 %, to measurements with the entropy fixed point on circular noise of 4 to 1024
-    rows and 64 to 1600 pulses: 0.94, 0.29, 0.10, 0.045, 0.019 nats at 4, 16, 64, 256, 1024 rows.
-    The number of pulses has hardly any effect.
+    The sharpness is the amount in nats by which the image entropy lies below that of speckle. The
+    prediction is a fit, within 15 %, to measurements with the entropy fixed point on circular noise
+    of 4 to 1024 rows and 64 to 1600 pulses: 0.94, 0.29, 0.10, 0.045, 0.019 nats at 4, 16, 64, 256,
+    1024 rows. The number of pulses has hardly any effect.
 
     Args:
-        rows: Effective number of rows, shape (...,).
+        rows: Effective number of rows (range cells), shape (...,).
 
     Returns:
-        The missing entropy in nats, shape (...,).
+        The sharpness in nats, shape (...,).
     """
     return 0.62 / torch.sqrt(rows) + 2.1 / rows
 
@@ -75,7 +81,8 @@ def sharpness_of_noise(rows: Tensor) -> Tensor:
 def occupied_band(rows: Tensor) -> Tensor:
     """Compute the share of the range band that the data occupy.
 
-    In noise that is sampled four times too finely, for example, 1 / 4 of the rows are independent.
+    It is the share of the rows (range cells) that are independent: 1 / 4 in noise that is sampled
+    four times too finely, for example.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
@@ -89,20 +96,21 @@ def occupied_band(rows: Tensor) -> Tensor:
 
 
 def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = False) -> Estimate:
-    """Find a phase and predict its accuracy, in blocks of trials that fit into the cache.
+    """Run an autofocus method on all trials and predict the accuracy of its phases.
 
-    All trials are processed at once if gradients are wanted. The standard deviation combines two
-    measurements. One is half of the difference between estimates from two halves of the rows, dealt
-    out by their energy, whose noise is independent; `occupied_band` corrects for rows that are
-    sampled finer than their band requires. The other is how far the method moves its result on all
-    rows when it is continued.
+    Trials are processed in blocks that fit into the cache, or all at once if gradients are
+    required. The standard deviation combines two measurements. One is half of the rms difference
+    between the phases from two halves of the rows (range cells): the rows are sorted by energy and
+    taken alternately, and the noise of the halves is independent. `occupied_band` corrects for rows
+    that are sampled finer than their band requires. The other is how far the phases move when the
+    method is continued on all rows.
 
     Args:
         pulses: The pulses.
-        start: Start of the estimate per trial, or None.
-        find: Function of (rows, present, start) that returns the phase (trial, pulse), the number
-            of iterations (trial,), and a function of (rows, present, phase) that continues the
-            method on some of the rows from that phase.
+        start: Phase to start from in rad, one row per trial, or None.
+        find: The autofocus method: a function of (rows, present, start) that returns the phase
+            (trial, pulse), the number of iterations (trial,), and a function of (rows, present,
+            phase) that continues the method on some of the rows from that phase.
         at_rest: True if continuing the method does not move its result; the second measurement is
             then left out.
 
@@ -111,9 +119,10 @@ def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = 
         Strehl ratio times the share of the sharpness that noise does not explain. `ok` is False
         unless the image is 1.5 times sharper than noise can be made, more than one row contributes
         to the sharpness, and the standard deviation predicts a Strehl ratio above 0.8. info:
-        present, shape (..., pulse), False for pulses without samples, which have no phase of their
-        own; iterations, sharpness_nats, noise_sharpness_nats, effective_rows and telling_rows (rows
-        over which the sharpness is spread), shape (...,).
+        present, shape (..., pulse), False for pulses that hold only zeros; and, of shape (...,),
+        iterations, sharpness_nats (entropy below that of speckle), noise_sharpness_nats (the
+        largest that noise can reach), effective_rows (rows over which the energy is spread) and
+        telling_rows (rows over which the sharpness is spread).
     """
     rows, present = pulses.rows, pulses.present
     if not len(rows) or pulses.n < 3:

@@ -1,7 +1,7 @@
 """Radial motion of a triangular-FMCW ladar, estimated from up and down sweeps and compensated.
 
-Velocities refer to the turning points, where the up sweep ends and the down sweep begins, and are
-positive for receding targets (dR/dt).
+A period is an up sweep followed by a down sweep. Velocities refer to the turning points, the times
+at which the up sweeps end and the down sweeps begin, and are positive for receding targets (dR/dt).
 """
 
 from torchsar.compensate.radial.compensate import compensate_motion

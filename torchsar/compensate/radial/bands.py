@@ -1,4 +1,7 @@
-"""Up sweeps and mirrored down sweeps of a range window, without the bulk of the Doppler shift."""
+"""Filtering of the up and down sweeps of a triangular-FMCW ladar to a range window.
+
+The down sweeps are mirrored in time, and whole bins of the Doppler shift are removed.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +34,11 @@ class Bands:
 
     A bin is 1 / T, where T is the length of a sweep. `up` is up(u) exp(-2j pi s u / T) and `down`
     is the mirrored sweep down(-u) exp(+2j pi s u / T), with u the time from the middle of the sweep
-    and s the shift. They follow the sign convention of Remote Sens. 2024, 16, 793 ("lo_conj_echo").
-    Both then have the beat frequency of the range plus and minus the remaining Doppler shift, which
-    is about a bin or less. The residual video phase is removed unless it was to be kept. Samples
-    are multiplied by a power of two per trial that brings them to about one.
+    and s the removed Doppler shift in bins. They follow the sign convention of Remote Sens. 2024,
+    16, 793 (dechirp sign "lo_conj_echo"). The beat frequency of a scatterer is then that of its
+    range plus the remaining Doppler shift in `up`, and minus it in `down`; the remaining shift is
+    about a bin or less. The residual video phase is removed unless `bands_of` was asked to keep it.
+    The samples of each trial are multiplied by a power of two that brings them to about one.
 
     Args:
         up: Up sweeps, shape (..., pulse, m), complex, symmetric about the middle of the sweep.
@@ -44,8 +48,8 @@ class Bands:
         lit: False where no echo was found and the shift is that of the neighbouring periods, shape
             (..., pulse), bool.
         lines: Number of bins that the window keeps.
-        first: Beat frequency of the first of them, in bins.
-        noise_lines: Number of unfiltered bins that pass as much noise.
+        first: Beat frequency of the first bin of the window, in bins.
+        noise_lines: Noise bandwidth of the filter in bins.
         radar: Ladar parameters.
     """
 
@@ -61,13 +65,17 @@ class Bands:
 
     @property
     def shift_m_s(self) -> Tensor:
-        """Radial velocity of the removed shift in m/s, receding positive, (..., pulse), float64."""
+        """Radial velocity that corresponds to the Doppler shift removed from the sweeps.
+
+        In m/s, receding positive, shape (..., pulse), float64.
+        """
         return self.shift.to(torch.float64) * self.radar.ambiguous_velocity_m_s
 
     def product(self) -> Tensor:
         """Multiply the up sweeps by the conjugate of the mirrored down sweeps.
 
-        Samples of equal optical frequency are multiplied, see `mirror_product`.
+        Samples of equal optical frequency are multiplied, so that the scene cancels from the phase
+        and the radial velocity remains, see `mirror_product`.
 
         Returns:
             The product, shape (..., pulse, m), complex.
@@ -76,7 +84,7 @@ class Bands:
 
     @property
     def inner(self) -> slice:
-        """Samples without the outer 1/32 at each end, where filters ring."""
+        """Slice of the samples of a sweep without 1/32 of them at each end, where filters ring."""
         drop = round(self.time_s.shape[-1] / 32)
         return slice(drop, self.time_s.shape[-1] - drop)
 
@@ -114,17 +122,18 @@ def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str, pulse
     if not (isinstance(sweeps, Tensor) and sweeps.is_complex()):
         raise TypeError(
             f"{what} works on complex sweeps (..., 2, pulse, {n}), got "
-            f"{getattr(sweeps, 'dtype', type(sweeps).__name__)}; separate the record "
-            "of a real detector into sweeps first"
+            f"{getattr(sweeps, 'dtype', type(sweeps).__name__)}; pass the record of "
+            "a real-valued detector through SplitSweeps first"
         )
     if sweeps.ndim < 3 or sweeps.shape[-3] != 2 or sweeps.shape[-1] != n or sweeps.shape[-2] < 1:
         raise ValueError(
-            f"{what} works on sweeps (..., 2, pulse, {n}), up before down, got shape {tuple(sweeps.shape)}"
+            f"{what} works on sweeps of shape (..., 2, pulse, {n}), with the up sweep before the down sweep, "
+            f"got shape {tuple(sweeps.shape)}"
         )
     if pulse is not None and pulse.n != sweeps.shape[-2]:
         raise ValueError(
-            f"{what}: the axis has {pulse.n} periods, the sweeps have {sweeps.shape[-2]}; take "
-            "the pulse axis of the signal"
+            f"{what}: pulse must be the axis of the {sweeps.shape[-2]} periods of the sweeps, got an axis of "
+            f"{pulse.n} periods"
         )
     refuse_non_finite(sweeps, what)
 
@@ -169,20 +178,20 @@ def window_lines(radar: TriangularLadar, window_m: tuple[float, float] | None) -
 def inside(
     radar: TriangularLadar, window_m: tuple[float, float] | None, bins: int, per_line: float, device: torch.device
 ) -> Tensor:
-    """Mark the bins of a transform that lie in a window of relative ranges.
+    """Mark the bins of the Fourier transform of a sweep that lie in a window of relative ranges.
 
     Args:
         radar: Ladar parameters.
         window_m: Lowest and highest relative range in metres; None for the whole band.
         bins: Length of the transform, zero frequency first.
-        per_line: Bins of the transform per range cell.
+        per_line: Bins of the transform per range cell (zero-padding).
         device: Device of the result.
 
     Returns:
         The mask, shape (bins,), bool.
 
     Raises:
-        ValueError: As for `window_lines`.
+        ValueError: If the window is invalid, see `window_lines`.
     """
     first, lines = window_lines(radar, window_m)
     at = torch.arange(bins, device=device)
@@ -193,9 +202,10 @@ def inside(
 def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     """Find the Doppler shift of every period in whole bins, from the envelopes of both sweeps.
 
-    The lag that aligns the up and down envelopes is 2 fd (Remote Sens. 2024, 16, 793, Eq. (13)).
-    Lags beyond half the band, which a circular correlation would wrap, are resolved by
-    zero-padding. Periods whose envelopes are not similar take the shift of their neighbours.
+    The lag that aligns the range spectra of the up and the down sweep is twice the Doppler shift
+    (Remote Sens. 2024, 16, 793, Eq. (13)). Lags beyond half the band, which a circular correlation
+    would wrap, are resolved by zero-padding. Periods whose two spectra are not similar take the
+    shift of the neighbouring periods.
 
     Args:
         blocks: Power spectra, zero frequency first, the down sweep as recorded, each the mean over
@@ -203,8 +213,8 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
         pulses: Number of periods.
 
     Returns:
-        The shift in bins, shape (..., pulse), int64, and whether the envelopes are similar, shape
-        (..., pulse), bool.
+        The Doppler shift in bins, shape (..., pulse), int64, and True where the spectra are
+        similar, shape (..., pulse), bool.
     """
     n = blocks.shape[-1]
     blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
@@ -226,8 +236,8 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
 def filled(values: Tensor, known: Tensor) -> Tensor:
     """Replace unknown values by interpolation between their known neighbours.
 
-    Values beyond the first and the last known one are set to these. If no value is known, all are
-    returned unchanged.
+    Values before the first known value are set to that value, and values after the last known value
+    to the last. If no value is known, all are returned unchanged.
 
     Args:
         values: Values, shape (..., n).
@@ -279,18 +289,20 @@ def bands_of(
 ) -> Bands:
     """Filter both sweeps of every period to a window of relative ranges.
 
-    Differentiable except for the shift.
+    The down sweeps are mirrored in time, and the bulk of the Doppler shift (whole bins, estimated
+    from the data) is removed. Differentiable, except that the removed shift is held constant.
 
     Args:
         sweeps: Sweeps as recorded, shape (..., 2, pulse, N), complex.
         radar: Ladar parameters.
         window_m: Lowest and highest relative range in metres; None for the whole band.
-        taper: Share of the window that its raised-cosine edges take. 0 cuts sharply, which leaves
-            ringing at the ends of the sweep (the error floor of a mirror product at high SNR); at 1
-            the edges meet in the middle.
-        oversampling: Samples per bin, rounded up to a power of two. Products of sweeps need 2.
-        video: Keep the residual video phase. It does not affect single scatterers, and the filter
-            that removes it rings at the ends of the sweep.
+        taper: Share of the window that its raised-cosine edges take, 0..1. At 0 the window is cut
+            sharply, which leaves ringing at the ends of the sweep and limits the accuracy of
+            `mirror_product` at high SNR; at 1 the edges meet in the middle.
+        oversampling: Samples per bin; the number of samples is rounded up to a power of two.
+            Products of sweeps need 2.
+        video: True keeps the residual video phase. It does not affect single scatterers, and the
+            filter that removes it rings at the ends of the sweep.
 
     Returns:
         The filtered sweeps.

@@ -1,4 +1,4 @@
-"""Estimators over many trials, in blocks that fit into the cache."""
+"""Evaluation of an estimator on many trials, in blocks of trials that fit into the cache."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ Estimator = Callable[[Tensor, Tensor | float], Estimate]
 def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
     """Apply an estimator to blocks of trials, in as many threads as torch uses.
 
-    It takes less time and memory and gives the same values. All trials are processed at once if
-    gradients are required.
+    This takes less time and memory than one call with all trials and gives the same values. All
+    trials are processed at once if gradients are required.
 
     Args:
         estimator: Function of (sweeps, azimuth_m) that returns an estimate.

@@ -1,4 +1,4 @@
-"""Exact compensation of a known radial motion in dechirped sweeps."""
+"""Exact compensation of a known radial motion in dechirped sweeps of a triangular-FMCW ladar."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ def compensate_motion(
 ) -> Tensor:
     """Remove a radial motion from dechirped sweeps.
 
-    Every sample is multiplied by exp(-+ j 4 pi f(u) DR / c), where f(u) = fc +- K u and DR is the
-    integral of the velocity at that sample. This removes the phase of the carrier, the motion of
-    the envelope, and acceleration inside the sweeps. Differentiable.
+    Every sample is multiplied by exp(-j 4 pi f(u) DR(u) / c) for the dechirp sign "lo_conj_echo" of
+    the radar, and by the conjugate for "echo_conj_lo". Here u is the time from the middle of the
+    sweep, DR(u) the range error (the integral of the velocity), and f(u) the optical frequency: fc
+    + K u in up sweeps and fc - K u in down sweeps, with carrier frequency fc and chirp rate K. This
+    removes the phase of the carrier, the motion of the envelope, and acceleration inside the
+    sweeps. Differentiable.
 
     Args:
         sweeps: Sweeps, up before down, in the dechirp sign of the radar, shape (..., 2, pulse, N),
@@ -31,8 +34,8 @@ def compensate_motion(
             pulse).
         radar: Ladar parameters.
         pulse: Axis of the periods.
-        carrier_only: Use fc in place of f(u), as the paper prints it. The envelopes then remain
-            displaced by the motion.
+        carrier_only: True takes fc in place of f(u), as the paper prints it. The envelopes then
+            remain displaced by the motion.
 
     Returns:
         The compensated sweeps, shape (..., 2, pulse, N), complex.
@@ -42,7 +45,7 @@ def compensate_motion(
         ValueError: If the sweeps or the velocity have another shape or are not finite.
 
     Reference:
-        Remote Sens. 2024, 16, 793, Eqs. (21) and (23), completed by the terms above.
+        Remote Sens. 2024, 16, 793, Eqs. (21) and (23), completed by the term K u.
     """
     refuse_other_sweeps(sweeps, radar, "compensate_motion", pulse)
     refuse_other_velocity(velocity_m_s, sweeps, "compensate_motion")
@@ -68,12 +71,13 @@ def refuse_other_velocity(velocity_m_s: Tensor, sweeps: Tensor, what: str) -> No
     """
     if not isinstance(velocity_m_s, Tensor) or velocity_m_s.is_complex():
         raise TypeError(
-            f"{what} needs a tensor of real velocities (m/s), got "
+            f"{what}: velocity_m_s must be a tensor of real velocities (m/s), got "
             f"{getattr(velocity_m_s, 'dtype', type(velocity_m_s).__name__)}"
         )
     if velocity_m_s.ndim < 1 or velocity_m_s.shape[-1] != sweeps.shape[-2]:
         raise ValueError(
-            f"{what} needs one velocity per period (..., {sweeps.shape[-2]}), got shape {tuple(velocity_m_s.shape)}"
+            f"{what}: velocity_m_s must hold one velocity per period, shape (..., {sweeps.shape[-2]}), got shape "
+            f"{tuple(velocity_m_s.shape)}"
         )
     try:
         finite = bool(torch.isfinite(velocity_m_s.detach()).all())
@@ -82,21 +86,24 @@ def refuse_other_velocity(velocity_m_s: Tensor, sweeps: Tensor, what: str) -> No
     if not finite:
         raise ValueError(
             f"{what}: {int((~torch.isfinite(velocity_m_s.detach())).sum())} velocities are NaN or "
-            "Inf; use an estimate whose `ok` is True, or replace them first"
+            "Inf; use an estimate whose `ok` is True, or replace these velocities first"
         )
 
 
 def carrier_turns(motion: Tensor, radar: TriangularLadar, carrier_only: bool = False) -> Tensor:
-    """Compute the phase 2 f(u) DR(u) / c in turns, as polynomials in u.
+    """Compute the phase that a range error DR(u) causes in both sweeps, as polynomials in u.
+
+    The phase is 2 f(u) DR(u) / c in turns, with u the time from the middle of the sweep and f(u) =
+    fc + K u in up sweeps and fc - K u in down sweeps (carrier frequency fc, chirp rate K).
 
     Args:
-        motion: Coefficients of the range error in metres, shape (..., 2, pulse, 5), see
+        motion: Coefficients of DR(u) by power of u, in m/s^k, shape (..., 2, pulse, 5), see
             `sweep_motion`.
         radar: Ladar parameters.
-        carrier_only: Use fc in place of f(u).
+        carrier_only: True takes fc in place of f(u).
 
     Returns:
-        Coefficients in turns, shape (..., 2, pulse, 6).
+        Coefficients by power of u, in turns/s^k, shape (..., 2, pulse, 6).
     """
     per_m = 2 * radar.carrier_hz / radar.wave_speed_m_s
     turns = torch.nn.functional.pad(motion * per_m, (0, 1))
@@ -111,11 +118,11 @@ def carrier_turns(motion: Tensor, radar: TriangularLadar, carrier_only: bool = F
 def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) -> Tensor:
     """Compute exp(2j pi sum_k turns[..., k] u^k) at u_i = (i - (n - 1) / 2) step_s.
 
-    Constant and slope are formed from short tables in float64. The higher terms are small and are
-    formed in the working precision; negligible ones are skipped.
+    The constant and the linear term are formed from short tables in float64. The higher terms are
+    small and are formed in the precision of `dtype`; negligible terms are skipped.
 
     Args:
-        turns: Coefficients in turns, shape (..., k), float64.
+        turns: Coefficients by power of u, in turns/s^k, shape (..., k), float64.
         step_s: Sample spacing in seconds.
         n: Number of samples.
         dtype: Complex type of the result.

@@ -1,4 +1,7 @@
-"""Radial velocity by cross-correlation of up and down spectra, the paper's reference method."""
+"""Radial velocity by cross-correlation of the range spectra of up and down sweeps.
+
+It is the reference method of Remote Sens. 2024, 16, 793.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,12 @@ def spectrum_correlation(
 ) -> Estimate:
     """Estimate the radial velocity from the lag between the range envelopes of both sweeps.
 
-    The lag that aligns |S+(f)| with the mirrored |S-(-f)| is 2 fd. It is found on a grid of 1 /
-    (upsampling T). However strong the signal, an error of lambda / (4 upsampling T sqrt(12))
-    remains, 0.70 mm/s for the system of the paper and an upsampling of 20, and slow motion stays on
-    one step of the grid. Not differentiable.
+    The envelopes are the magnitude spectra |S+(f)| of the up sweep and |S-(-f)| of the mirrored
+    down sweep. The lag that aligns them is twice the Doppler shift. It is found on a grid with the
+    step 1 / (upsampling T), where T is the length of a sweep. However strong the signal, an rms
+    error of lambda / (4 upsampling T sqrt(12)) remains, 0.70 mm/s for the system of the paper and
+    an upsampling of 20. If the motion is slow, the estimate stays on one step of the grid. Not
+    differentiable.
 
     Args:
         sweeps: Sweeps, shape (..., 2, pulse, N), complex.
@@ -71,16 +76,18 @@ def spectrum_correlation(
 
 @torch.no_grad()
 def envelope_lag(bands: Bands, upsampling: int) -> Tensor:
-    """Find the lag of the up envelope behind the mirrored down envelope.
+    """Find the lag between the range envelopes of the up sweep and of the mirrored down sweep.
 
-    Only lags within 4 bins are searched, because the removed shift is right to a bin or two.
+    Only lags within 4 bins are searched, because the Doppler shift that the filtered sweeps have
+    lost is right to a bin or two.
 
     Args:
         bands: Filtered sweeps.
         upsampling: Upsampling of the spectra.
 
     Returns:
-        The lag 2 fd T of the remaining Doppler shift in bins of 1 / T, shape (..., pulse), float64.
+        The lag of the up envelope, twice the remaining Doppler shift, in bins of 1 / T (T is the
+        length of a sweep), shape (..., pulse), float64.
     """
     m = bands.time_s.shape[-1]
     n = upsampling * m

@@ -1,4 +1,4 @@
-"""Amplitude of every pulse relative to steady scatterers, and its correction."""
+"""Estimation of the amplitude of every pulse from steady scatterers, and its equalisation."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ def pulse_gain(data: Tensor) -> Estimate:
             corrected), shape (..., pulse, range), complex.
 
     Returns:
-        `gain` of shape (..., pulse), of mean one, to be divided by; never below 0.05, so that a
-        lost pulse is not amplified. quality is the share of the energy that the tones explain. `ok`
-        is False where that share is half or less; the gain is then one.
+        `gain` of shape (..., pulse), by which each pulse is to be divided. Its mean is about one,
+        and it is never below 0.05, so that a lost pulse is not amplified. quality is the share of
+        the energy that the tones explain. `ok` is False where that share is half or less; all gains
+        of the trial are then one.
 
     Raises:
         TypeError: If the data are not complex.
@@ -78,6 +79,7 @@ def equalise_pulses(data: Tensor, gain: Tensor) -> Tensor:
     """
     if not bool((gain.detach() > 0).all()):
         raise ValueError(
-            f"gains of pulses must be positive, got {float(gain.detach().min()):g}; set lost pulses to zero instead"
+            f"gain must be positive for every pulse, got {float(gain.detach().min()):g}; for a lost pulse, give a gain "
+            "of 1 and set its samples to zero"
         )
     return data / gain[..., None].to(data.real.dtype)

@@ -33,9 +33,11 @@ def mirror_product(
 ) -> Estimate:
     """Estimate the radial velocity from the product of the up sweep and the mirrored down sweep.
 
-    z(u) = up(u) conj(down(-u)) multiplies samples of equal optical frequency. Therefore z =
-    |scene(u)|^2 exp(-j 4 pi / c (fc + K u) (T - 2u) v), whatever scatterers lie in the window.
-    Acceleration cancels about the turning point; jerk remains. Differentiable: the peak search is
+    z(u) = up(u) conj(down(-u)), with u the time from the middle of a sweep, multiplies samples of
+    equal optical frequency fc + K u (carrier frequency fc, chirp rate K). Therefore z(u) =
+    |scene(u)|^2 exp(-j 4 pi / c (fc + K u) (T - 2u) v), with the radial velocity v and the length T
+    of a sweep, whatever scatterers lie in the window. The two samples lie symmetrically about the
+    turning point, so acceleration cancels; jerk remains. Differentiable: the peak search is
     detached, and Newton steps refine its result.
 
     Args:
@@ -44,20 +46,22 @@ def mirror_product(
         pulse: Axis of the periods.
         window_m: Lowest and highest relative range in metres; None for the whole band. The window
             follows the Doppler shift.
-        intercept: "known" uses that z is real at the turning point, which requires accurate trigger
-            timing and lowers the variance by a factor of four. "free" uses the slope alone.
-            "record" estimates one constant phase for the whole record, for an unknown but constant
-            timing.
+        intercept: What is assumed of the phase of z at the turning point, u = T / 2. "known" takes
+            it as zero, which requires accurate trigger timing and lowers the variance by a factor
+            of four. "free" assumes nothing and uses the slope of the phase alone. "record"
+            estimates one constant phase for the whole record, for a timing error that is unknown
+            but constant.
         taper: Share of the window that its edges take, see `bands_of`.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,). Its geometric
-            velocity is subtracted.
+            velocity, which the straight flight causes, is subtracted.
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points, receding positive. Its standard
         deviation is predicted from the measured SNR and includes the squaring loss. `ok` is False
         where the SNR after compression, less the squaring loss, is below 15 dB, or no scatterer is
-        illuminated in any period. info: snr_db (after compression), shift and, with "record",
-        intercept_rad, shape (...,).
+        illuminated in any period. info: snr_db (after compression), shape (...,); shift (Doppler
+        shift in whole bins) and lit (periods with an echo), shape (..., pulse); and, with "record",
+        intercept_rad, the estimated phase, shape (...,).
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -73,25 +77,25 @@ def mirror_product(
 
 
 def refuse_other_intercept(intercept: str) -> None:
-    """Check the name of a kind of intercept.
+    """Check the option `intercept` of `mirror_product`.
 
     Args:
-        intercept: The name.
+        intercept: The value given.
 
     Raises:
-        ValueError: If the name is not "known", "record" or "free".
+        ValueError: If the value is not "known", "record" or "free".
     """
     if intercept not in get_args(Intercept):
         raise ValueError(f"intercept must be 'known', 'record' or 'free', got {intercept!r}")
 
 
 def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: Tensor | float) -> Estimate:
-    """Make the estimate of `mirror_product` from filtered sweeps.
+    """Estimate the radial velocity as `mirror_product` does, from sweeps that are already filtered.
 
     Args:
-        bands: Sweeps with two samples per bin.
+        bands: Filtered sweeps with two samples per bin.
         pulse: Axis of the periods.
-        intercept: Kind of intercept.
+        intercept: "known", "record" or "free", see `mirror_product`.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
 
     Returns:
@@ -112,12 +116,15 @@ def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: 
 def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[str, Tensor]]:
     """Compute the velocity of `mirror_product`, with the geometric velocity still included.
 
+    The geometric velocity is that of a static scatterer seen from the straight flight path.
+
     Args:
-        bands: Sweeps with two samples per bin.
-        intercept: Kind of intercept.
+        bands: Filtered sweeps with two samples per bin.
+        intercept: "known", "record" or "free", see `mirror_product`.
 
     Returns:
-        The velocity in m/s, receding positive, shape (..., pulse), float64, and entries for info.
+        The velocity in m/s, receding positive, shape (..., pulse), float64, and the entries that
+        the estimate adds to its info.
     """
     inner = bands.inner
     u = bands.time_s[inner]

@@ -1,4 +1,7 @@
-"""Newton steps that refine a peak after a coarse, detached search."""
+"""Newton steps that refine the position of a peak after a coarse search.
+
+Gradients pass through the steps, but not through the search.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,14 @@ from torchsar.core import cis
 
 
 def climbed(x: Tensor, weights: Tensor, value: Tensor, steps: int) -> Tensor:
-    """Refine the value v of greatest |sum_i x_i exp(-j w_i v)| by Newton steps.
+    """Refine, by Newton steps, the value v for which |sum_i x_i exp(-j w_i v)| is greatest.
 
     Differentiable.
 
     Args:
-        x: Samples, shape (..., m), complex.
-        weights: w in rad per unit of the value, shape (m,).
-        value: Values to start from, shape (...,).
+        x: Samples x_i, shape (..., m), complex.
+        weights: w_i in rad per unit of v, shape (m,).
+        value: Values of v to start from, shape (...,).
         steps: Number of Newton steps.
 
     Returns:
@@ -33,14 +36,14 @@ def climbed(x: Tensor, weights: Tensor, value: Tensor, steps: int) -> Tensor:
 
 
 def step_uphill(gradient: Tensor, bend: Tensor) -> Tensor:
-    """Compute a Newton step where the objective is concave, and zero elsewhere.
+    """Compute the Newton step towards a maximum; zero where the objective is not concave.
 
     Args:
-        gradient: First derivative.
-        bend: Second derivative.
+        gradient: First derivative of the objective, any shape.
+        bend: Second derivative of the objective, same shape.
 
     Returns:
-        The step, float64.
+        The step, same shape, float64.
     """
     concave = bend < 0
     return torch.where(concave, -gradient / torch.where(concave, bend, -1), 0).to(torch.float64)

@@ -31,9 +31,11 @@ def ml_peak(
 ) -> Estimate:
     """Estimate the radial velocity from the periodogram peaks of both sweeps.
 
-    fd = (f'up - f'mirrored down) / 2, with each peak refined by Newton steps. For one scatterer
-    this is the maximum-likelihood estimate with unknown offsets. The peak is searched within two
-    range cells of that of the whole record. Differentiable around the detached peaks.
+    The Doppler shift is half the difference between the beat frequencies of the up sweep and of the
+    mirrored down sweep; each is the peak of a periodogram, refined by Newton steps. For one
+    scatterer this is the maximum-likelihood estimate if the phase of each sweep is unknown. Each
+    peak is searched within two range cells of the peak of the mean over the whole record.
+    Differentiable: the search is detached, the Newton steps are not.
 
     Assumes one dominant scatterer; use `radial_motion` for extended scenes.
 
@@ -69,9 +71,10 @@ def ml_peak(
 
 
 def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:
-    """Compute the velocity from the beat frequencies of up and mirrored down sweeps.
+    """Compute the radial velocity from the beat frequencies of up and mirrored down sweeps.
 
-    The range changes between the middles of both sweeps, which gives the factor 1 + B / (2 fc).
+    The range changes between the middles of the two sweeps, which leads to a factor 1 + B / (2 fc),
+    with bandwidth B and carrier frequency fc.
 
     Args:
         up_hz: Beat frequency of the up sweep in Hz, shape (..., pulse).
@@ -89,14 +92,15 @@ def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:
 def shining(up: Tensor, down: Tensor) -> Tensor:
     """Mark the periods in which a scatterer is illuminated in both sweeps.
 
-    Its powers there are a fifth of their mean or more.
+    In these periods its power is at least a fifth of its mean power over the record, in the up
+    sweep and in the down sweep.
 
     Args:
         up: Power in the up sweeps, shape (..., pulse).
         down: Power in the down sweeps, same shape.
 
     Returns:
-        True where it is illuminated, shape (..., pulse), bool.
+        True where the scatterer is illuminated, shape (..., pulse), bool.
     """
     return torch.stack([power >= _DARK * power.mean(-1, keepdim=True) for power in (up, down)]).all(0) & (up + down > 0)
 
@@ -106,12 +110,12 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
 
     Args:
         bands: Filtered sweeps.
-        window_m: Lowest and highest relative range in metres in which it is searched; None for the
-            whole band.
+        window_m: Lowest and highest relative range in metres in which the scatterer is searched;
+            None for the whole band.
 
     Returns:
-        The frequencies in the up and the mirrored down sweeps in Hz, shape (..., pulse) each,
-        float64, and whether it is illuminated, shape (..., pulse), bool.
+        The beat frequencies in the up and in the mirrored down sweeps in Hz, shape (..., pulse)
+        each, float64, and True where the scatterer is illuminated, shape (..., pulse), bool.
     """
     both = torch.stack([bands.up, bands.down], -3)
     m = both.shape[-1]

@@ -1,6 +1,7 @@
-"""Residual phase of each pulse after a compensation by velocities.
+"""Residual phase of each pulse after the motion was compensated by integrated velocities.
 
-Its error does not accumulate over the record, unlike that of integrated velocities.
+The error of integrated velocities grows over the record; that of the phases estimated here does
+not.
 """
 
 from __future__ import annotations
@@ -26,26 +27,29 @@ _SHARE, _LEVEL = 0.02, 4.0
 def phase_polish(
     data: Tensor, *, start: Tensor | None = None, iterations: int = 80, tolerance_rad: float = 0.005
 ) -> Estimate:
-    """Estimate the residual phase of each pulse against the scene that all pulses have in common.
+    """Estimate the residual phase of each pulse relative to the scene that all pulses share.
 
-    Integrated velocities leave a random walk of the order of a radian with small phase steps, so no
-    start by adjacent pulses is needed. Beyond a radian, the iterations may end in an image with two
-    peaks; a start such as that of `pga` prevents this. Differentiable.
+    It is meant for pulses whose motion was compensated by integrated velocities. These leave a
+    random walk of the order of a radian with small phase steps, so the iterations can start from
+    zero. Beyond a radian, they may end in an image with two peaks; a start such as that of `pga`
+    prevents this. Differentiable.
 
     Every iteration forms the image, weights its cells, transforms back to pulses, and takes the
-    phase of each pulse against the result. The first step, with weights equal to the power over the
-    maximum of the range cell, already suffices for trials of single points. Over-relaxed steps with
-    Wiener weights follow; a cell counts as scene where it holds a fiftieth of a typical bright
-    cell, however wide the window. The last five steps, with weights p / (p + p_max / 10) on twice
-    as many cells, admit scatterers that are illuminated for a part of the record only.
+    phase of each pulse relative to the result. The weights of the first step are the power over the
+    maximum of the range cell; this step already suffices for trials of single points. Over-relaxed
+    steps with Wiener weights follow, in which a cell counts as scene if its power is a fiftieth of
+    that of a typical bright cell. The last five steps have weights p / (p + p_max / 10), where p is
+    the power of a cell and p_max the maximum of its range cell, on twice as many Doppler cells;
+    these include scatterers that are illuminated for a part of the record only.
 
-    Single points reach the bound of the phase of one sweep where the SNR after compression exceeds
-    about 14 dB. Constant and slope, which only shift the image, stay near zero.
+    For single points the error reaches the bound of the phase of one sweep where the SNR after
+    compression exceeds about 14 dB. A constant and a slope of the phase, which only shift the
+    image, stay near zero.
 
     Args:
         data: Pulses, compensated, range-compressed and deramped in azimuth so that scatterers are
-            tones, shape (..., pulse, range), complex. A window of range cells about the scatterers
-            costs less and has a higher SNR.
+            tones, shape (..., pulse, range), complex. If only the range cells about the scatterers
+            are given, the estimate takes less time and less noise enters.
         start: Phase to start from in rad, shape (..., pulse); by default zero.
         iterations: Largest number of iterations with Wiener weights.
         tolerance_rad: Step in rad, rms over the pulses, below which a trial ends.

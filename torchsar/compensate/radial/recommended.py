@@ -1,6 +1,7 @@
-"""The recommended estimate of the radial motion.
+"""The recommended estimator of the radial motion of a triangular-FMCW ladar.
 
-Velocities by the mirror product, then the phase of every pulse against the scene.
+It estimates velocities by `mirror_product`, and then the residual phase of every pulse by
+`phase_polish`.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def radial_motion(
     iterations: int = 80,
     tolerance_rad: float = 0.005,
 ) -> Estimate:
-    """Estimate the radial motion; the recommended estimator.
+    """Estimate the radial motion from up and down sweeps; the recommended estimator.
 
     `mirror_product` estimates the velocities. Their integral compensates the motion in the range
     cells of the window, which are deramped in azimuth. `phase_polish` then estimates the residual
@@ -56,7 +57,8 @@ def radial_motion(
         radar: Ladar parameters.
         pulse: Axis of the periods.
         window_m: Lowest and highest relative range in metres; None for the whole band.
-        intercept: Kind of intercept, see `mirror_product`.
+        intercept: "known", "record" or "free": what is assumed of the phase of the mirror product
+            at the turning point, see `mirror_product`.
         taper: Share of the window that its edges take, see `bands_of`.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
         iterations: Largest number of iterations, see `phase_polish`.
@@ -65,9 +67,9 @@ def radial_motion(
     Returns:
         `velocity_m_s` at the turning points, receding positive, and `phase_rad` at the middles of
         the up sweeps, shape (..., pulse) each, with standard deviations. The phase is to be removed
-        after `compensate_motion` by the velocities; `range_error` combines both. quality is that of
-        the velocities. `ok` is False where that of `mirror_product` is, or the phase has a standard
-        deviation of 0.5 rad or more.
+        after `compensate_motion` with the velocities; `range_error` combines both to a range error.
+        quality is that of the velocities. `ok` is False where `ok` of `mirror_product` is False, or
+        the phase has a standard deviation of 0.5 rad or more.
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -84,7 +86,10 @@ def radial_motion(
 
 
 def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, tolerance_rad: float) -> Estimate:
-    """Add to estimated velocities the residual phases of the up sweeps.
+    """Complete an estimate of radial velocities by the residual phase of each up sweep.
+
+    The motion is compensated with the velocities first; `phase_polish` then estimates the phases
+    that remain.
 
     Args:
         bands: Filtered sweeps from which the velocities were estimated.
@@ -131,9 +136,10 @@ def _start(cells: Tensor, coarse: Estimate, radar: TriangularLadar, pulse: Axis)
 
 
 def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
-    """Compute range cells of the up sweeps with the motion and the azimuth phase removed.
+    """Compute the range cells of the up sweeps, with the motion and the azimuth phase removed.
 
-    The azimuth phase is that of a scatterer at azimuth zero.
+    The azimuth phase removed is that of a scatterer at azimuth zero (deramping), so that scatterers
+    become tones over the pulses.
 
     Args:
         bands: Filtered sweeps.
@@ -160,11 +166,13 @@ def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
 def range_error(estimate: Estimate, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:
     """Compute the range error at any slow time from an estimate of the radial motion.
 
-    It is the integral of the velocities, zero at the first turning point, plus lambda / (4 pi)
-    times the phases of the pulses if the estimate has them. Both are interpolated by cubic splines.
+    The range error is the integral of the velocities, zero at the first turning point, plus lambda
+    / (4 pi) times the phases of the pulses if the estimate has phases. Both parts are interpolated
+    by cubic splines.
 
     Args:
-        estimate: Estimate of `radial_motion` or another estimator of this package.
+        estimate: Estimate that holds `velocity_m_s`, `phase_rad` or both, such as that of
+            `radial_motion`.
         radar: Ladar parameters.
         pulse: Axis of the periods.
         at_s: Slow times in seconds, any shape.

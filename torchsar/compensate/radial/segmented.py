@@ -37,38 +37,43 @@ def segmented_interference(
 ) -> Estimate:
     """Estimate the radial velocity from the phase between the halves of both sweeps.
 
-    phi = arg{U1 conj(D1) conj(U2 conj(D2))} is -2 pi T fd. U and D are spectra of the halves of the
-    up sweep and of the down sweep, which is conjugated before its transform; each spectrum is
-    referenced to the centre of its half. Up and down sweeps are each evaluated at their own peaks.
-    The paper prints the equations without these corrections. Differentiable around the detached
-    peaks and integers.
+    The phase phi = arg{U1 conj(D1) conj(U2 conj(D2))} is -2 pi T fd, with sweep length T and
+    Doppler shift fd. U1 and U2 are the spectra of the first and the second half of the up sweep, D1
+    and D2 those of the conjugated down sweep; the phase of each refers to the centre of its half.
+    Up and down sweeps are each evaluated at their own peaks. The paper prints the equations without
+    these corrections. Differentiable; peaks and whole turns are held constant.
 
-    For scenes with scatterers closer than c / B in range, use `bins="sum"` or `mirror_product`.
+    For scenes with scatterers closer in range than c / B, where B is the bandwidth, use
+    `bins="sum"` or `mirror_product`.
 
     Args:
         sweeps: Sweeps, shape (..., 2, pulse, N), complex.
         radar: Ladar parameters.
         pulse: Axis of the periods.
-        bins: "peak" reads the phase at the peaks of the strongest scatterers, which must be c / B
-            or more apart, and combines their azimuth gradients with weights from contrast (Eqs.
-            (18) and (19)). "sum" adds the complex products of all bins, for dense scenes.
-        unwrap: "gradient" takes the integer of the first period from the envelopes and adds wrapped
-            differences from there on, as in the paper. It slips where the velocity changes by
-            lambda / (4 T) per period, or the SNR after compression is below 14 dB. "per_pulse"
-            takes every integer from the envelopes.
-        scatterers: Number of scatterers with "peak". Each counts in periods where it is
+        bins: Frequency bins in which the phase is read. "peak" takes those of the strongest
+            scatterers, which must be c / B or more apart, and averages their phase changes from
+            period to period with weights from the contrast (Eqs. (18) and (19)). "sum" adds the
+            complex products of all bins, for dense scenes.
+        unwrap: How the whole turns of the phase are found. "per_pulse" takes them for every period
+            from the lag between the range envelopes of the two sweeps. "gradient", the method of
+            the paper, does so for the first period only and then adds the wrapped phase changes
+            from period to period; it slips by a turn where the velocity changes by lambda / (4 T)
+            per period, or where the SNR after compression is below 14 dB.
+        scatterers: Number of scatterers with "peak". Each is used in the periods in which it is
             illuminated.
-        padding: Zero-padding of the halves, 1..16.
-        hann: Apply a Hann window to each half, for windows with other scatterers.
+        padding: Factor of the zero-padding of the halves, 1..16.
+        hann: True applies a Hann window to each half, for range windows with other scatterers.
         window_m: Lowest and highest relative range in metres; None for the whole band.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points, receding positive, with its
         standard deviation. `ok` is False where the SNR after compression is below 14 dB, or no
-        scatterer is illuminated in any period. info: phase_rad and integer, shape (..., pulse);
-        slips, the number of periods where gradient and envelopes disagree by a turn, and dispersion
-        of the amplitude, shape (...,); weights, shape (..., scatterers), means over the periods.
+        scatterer is illuminated in any period. info: phase_rad and integer (whole turns), shape
+        (..., pulse); slips, the number of period changes at which "gradient" and "per_pulse"
+        disagree by a turn, and dispersion, the standard deviation of the amplitude over the periods
+        relative to its mean, shape (...,); weights of the scatterers, averaged over the periods,
+        shape (..., scatterers).
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -80,11 +85,13 @@ def segmented_interference(
     refuse_other_sweeps(sweeps, radar, "segmented_interference", pulse)
     if bins not in ("peak", "sum") or unwrap not in ("gradient", "per_pulse"):
         raise ValueError(
-            f"bins must be 'peak' or 'sum' and unwrap 'gradient' or 'per_pulse', got {bins!r} and {unwrap!r}"
+            f"bins must be 'peak' or 'sum' and unwrap 'gradient' or 'per_pulse', got bins {bins!r} and unwrap "
+            f"{unwrap!r}"
         )
     if not (isinstance(scatterers, int) and scatterers >= 1 and isinstance(padding, int) and 1 <= padding <= 16):
         raise ValueError(
-            f"scatterers must be 1 or more and padding 1..16, both whole numbers, got {scatterers} and {padding}"
+            "scatterers must be 1 or more and padding 1..16, both whole numbers, got scatterers "
+            f"{scatterers} and padding {padding}"
         )
     window_lines(radar, window_m)
 

@@ -1,4 +1,4 @@
-"""Estimators and compensation of radial motion as stages.
+"""Estimation and compensation of the radial motion of a triangular-FMCW ladar, as chain stages.
 
 The estimators leave the sweeps unchanged.
 """
@@ -52,7 +52,8 @@ class MirrorProduct(_OfSweeps):
     Args:
         radar: Ladar parameters.
         window_m: Lowest and highest relative range in metres; None for the whole band.
-        intercept: Kind of intercept: "known", "record" or "free".
+        intercept: "known", "record" or "free": what is assumed of the phase of the product at the
+            turning point, see `mirror_product`.
         taper: Share of the window that its edges take, see `bands_of`.
         azimuth_m: Azimuth of the scene centre in metres.
 
@@ -73,7 +74,11 @@ class MirrorProduct(_OfSweeps):
         self.taper = taper
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate `velocity_m_s` from sweeps of axes (ramp, pulse, fast_time)."""
+        """Estimate the radial velocity from sweeps of axes (ramp, pulse, fast_time).
+
+        Returns:
+            `velocity_m_s` at the turning points, shape (..., pulse), receding positive.
+        """
         return mirror_product(
             signal.data,
             self.radar,
@@ -88,12 +93,14 @@ class MirrorProduct(_OfSweeps):
 class RadialMotion(MirrorProduct):
     """Radial motion by the recommended estimator; see `radial_motion`.
 
-    Provides `velocity_m_s` for `CompensateMotion`, then `phase_rad` for `CorrectPulsePhase`.
+    Provides `velocity_m_s`, to be removed by `CompensateMotion`, and the residual `phase_rad`, to
+    be removed after it by `CorrectPulsePhase`.
 
     Args:
         radar: Ladar parameters.
         window_m: Lowest and highest relative range in metres; None for the whole band.
-        intercept: Kind of intercept: "known", "record" or "free".
+        intercept: "known", "record" or "free": what is assumed of the phase of the product at the
+            turning point, see `mirror_product`.
         taper: Share of the window that its edges take, see `bands_of`.
         azimuth_m: Azimuth of the scene centre in metres.
         iterations: Largest number of iterations, see `phase_polish`.
@@ -119,7 +126,12 @@ class RadialMotion(MirrorProduct):
         self.iterations, self.tolerance_rad = iterations, tolerance_rad
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate velocities and phases from sweeps of axes (ramp, pulse, fast_time)."""
+        """Estimate the radial motion from sweeps of axes (ramp, pulse, fast_time).
+
+        Returns:
+            The estimate of `radial_motion`: `velocity_m_s` at the turning points, receding
+            positive, and the residual `phase_rad` of the up sweeps, shape (..., pulse) each.
+        """
         return radial_motion(
             signal.data,
             self.radar,
@@ -149,7 +161,11 @@ class MlPeak(_OfSweeps):
         super().__init__(radar, window_m, azimuth_m)
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate `velocity_m_s` from sweeps of axes (ramp, pulse, fast_time)."""
+        """Estimate the radial velocity from sweeps of axes (ramp, pulse, fast_time).
+
+        Returns:
+            `velocity_m_s` at the turning points, shape (..., pulse), receding positive.
+        """
         return ml_peak(signal.data, self.radar, signal.axis("pulse"), window_m=self.window_m, azimuth_m=self.azimuth_m)
 
 
@@ -173,7 +189,11 @@ class SpectrumCorrelation(_OfSweeps):
         self.upsampling = upsampling
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate `velocity_m_s` from sweeps of axes (ramp, pulse, fast_time)."""
+        """Estimate the radial velocity from sweeps of axes (ramp, pulse, fast_time).
+
+        Returns:
+            `velocity_m_s` at the turning points, shape (..., pulse), receding positive.
+        """
         return spectrum_correlation(
             signal.data,
             self.radar,
@@ -189,11 +209,13 @@ class SegmentedInterference(_OfSweeps):
 
     Args:
         radar: Ladar parameters.
-        bins: "peak" or "sum".
-        unwrap: "gradient" or "per_pulse".
+        bins: Frequency bins in which the phase is read: "peak" (those of the strongest scatterers)
+            or "sum" (all).
+        unwrap: How the whole turns of the phase are found: "gradient" (from period to period) or
+            "per_pulse" (from the envelopes of every period).
         scatterers: Number of scatterers with "peak".
-        padding: Zero-padding of the halves, 1..16.
-        hann: Apply a Hann window to each half.
+        padding: Factor of the zero-padding of the halves, 1..16.
+        hann: True applies a Hann window to each half.
         window_m: Lowest and highest relative range in metres; None for the whole band.
         azimuth_m: Azimuth of the scene centre in metres.
 
@@ -218,7 +240,11 @@ class SegmentedInterference(_OfSweeps):
         self.scatterers, self.padding, self.hann = scatterers, padding, hann
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate `velocity_m_s` from sweeps of axes (ramp, pulse, fast_time)."""
+        """Estimate the radial velocity from sweeps of axes (ramp, pulse, fast_time).
+
+        Returns:
+            `velocity_m_s` at the turning points, shape (..., pulse), receding positive.
+        """
         return segmented_interference(
             signal.data,
             self.radar,
@@ -234,11 +260,14 @@ class SegmentedInterference(_OfSweeps):
 
 
 class CompensateMotion(Stage):
-    """Compensation of radial motion by a connected value `velocity_m_s`; see `compensate_motion`.
+    """Compensation of the radial motion given by `velocity_m_s`, a value to be connected.
+
+    See `compensate_motion`.
 
     Args:
         radar: Ladar parameters.
-        carrier_only: Compensate the phase of the carrier only.
+        carrier_only: True compensates the phase of the carrier only; the envelopes then remain
+            displaced by the motion.
     """
 
     works_on = SWEEPS
@@ -248,7 +277,7 @@ class CompensateMotion(Stage):
         self.radar, self.carrier_only = radar, carrier_only
 
     def forward(self, signal: Signal, velocity_m_s: Tensor) -> Signal:
-        """Compensate sweeps of axes (ramp, pulse, fast_time).
+        """Remove the radial motion from sweeps of axes (ramp, pulse, fast_time).
 
         Args:
             signal: Sweeps, shape (..., 2, pulse, N), complex.
@@ -264,7 +293,7 @@ class CompensateMotion(Stage):
 
 
 class PhasePolish(Stage):
-    """Residual phase of each pulse after a compensation by velocities; see `phase_polish`.
+    """Residual phase of each pulse after the motion was compensated; see `phase_polish`.
 
     Provides `phase_rad` of shape (..., pulse).
 
@@ -280,14 +309,18 @@ class PhasePolish(Stage):
         self.iterations, self.tolerance_rad = iterations, tolerance_rad
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range)."""
+        """Estimate the residual phase of every pulse of a signal of axes (pulse, range).
+
+        Returns:
+            The estimate of `phase_polish`: `phase_rad` of shape (..., pulse), to be removed.
+        """
         return phase_polish(signal.data, iterations=self.iterations, tolerance_rad=self.tolerance_rad)
 
 
 class PulseGain(Stage):
-    """Amplitude of every pulse; see `pulse_gain`.
+    """Amplitude of every pulse relative to steady scatterers; see `pulse_gain`.
 
-    Provides `gain` of shape (..., pulse).
+    Provides `gain` of shape (..., pulse), by which `EqualisePulses` divides the pulses.
     """
 
     provides = ("gain",)
@@ -298,10 +331,10 @@ class PulseGain(Stage):
 
 
 class EqualisePulses(Stage):
-    """Division of every pulse by a connected value `gain`; see `equalise_pulses`."""
+    """Division of every pulse by its `gain`, a value to be connected; see `equalise_pulses`."""
 
     def forward(self, signal: Signal, gain: Tensor) -> Signal:
-        """Equalise the pulses of a signal of axes (pulse, range).
+        """Divide the pulses of a signal of axes (pulse, range) by their gains.
 
         Args:
             signal: Pulses, shape (..., pulse, range), complex.

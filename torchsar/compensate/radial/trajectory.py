@@ -1,4 +1,4 @@
-"""Range error from radial velocities at the turning points, and the geometric velocity."""
+"""Range error by integration of radial velocities, and the velocity that straight flight causes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from torchsar.radar import TriangularLadar, sweep_middles
 
 
 def turning_points(radar: TriangularLadar, pulse: Axis) -> Axis:
-    """Compute the slow times of the turning points, half a period after the starts of the periods.
+    """Compute the slow times at which the up sweeps end and the down sweeps begin.
+
+    These turning points lie half a period after the starts of the periods.
 
     Args:
         radar: Ladar parameters.
@@ -32,16 +34,18 @@ def geometric_velocity_m_s(
     relative_range_m: float = 0.0,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Compute the radial velocity V (V t - x) / R of a static scatterer at the turning points.
+    """Compute the radial velocity of a static scatterer that the straight flight causes.
 
-    An estimate from the echo contains it. If it were compensated as motion, the azimuth phase
+    It is V (V t - x) / R at slow time t, with platform speed V and the azimuth x and range R of the
+    scatterer, and is computed at the turning points between up and down sweeps. A velocity
+    estimated from the echo contains it. If it were compensated as motion error, the azimuth phase
     history would be removed.
 
     Args:
         radar: Ladar parameters.
         pulse: Axis of the periods.
         azimuth_m: Azimuth x of the scatterer in metres, a number or shape (...,).
-        relative_range_m: Range beyond the reference range in metres.
+        relative_range_m: Range R of the scatterer minus the reference range of the radar in metres.
         device: Device of the result.
 
     Returns:
@@ -55,8 +59,8 @@ def geometric_velocity_m_s(
 def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:
     """Integrate radial velocities to the range error at any slow time.
 
-    It is the antiderivative of the cubic spline through the velocities, zero at the first turning
-    point. A sum of rectangles has errors of micrometres. Differentiable.
+    The range error is the antiderivative of the cubic spline through the velocities, zero at the
+    first turning point. A sum of rectangles would have errors of micrometres. Differentiable.
 
     Args:
         velocity_m_s: Radial velocity at the turning points in m/s, shape (..., pulse).
@@ -77,8 +81,10 @@ def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, 
 def sweep_motion(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> Tensor:
     """Compute the range error over both sweeps of every period as polynomials.
 
-    DR(u) = sum_k c_k u^k, with u the time from the middle of the sweep. Exact for the spline: its
-    knots are the turning points, so each sweep lies in one piece.
+    The range error is DR(u) = sum_k c_k u^k, with u the time from the middle of the sweep: the
+    integral of the cubic spline through the velocities, zero at the first turning point. The
+    polynomials are exact, because the knots of the spline are the turning points, so each sweep
+    lies in one piece of the spline.
 
     Args:
         velocity_m_s: Radial velocity at the turning points in m/s, shape (..., pulse).

@@ -1,4 +1,4 @@
-"""Estimates of the radial velocity with their accuracy and reliability."""
+"""Accuracy and reliability of an estimated radial velocity, from the measured SNR."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ LEAST_SQUARED_DB = 15.0  # the same for a product of sweeps, after the squaring 
 def signal_and_noise(bands: Bands, residual_m_s: Tensor) -> tuple[Tensor, Tensor]:
     """Measure the mean power per sample of the scene and of the noise.
 
-    What both sweeps have in common after the motion is removed is scene; the rest is noise.
+    The power that the up sweep and the mirrored down sweep have in common, after the motion is
+    removed, is taken as scene; the rest is taken as noise.
 
     Args:
         bands: Filtered sweeps.
-        residual_m_s: Velocity beyond the shift that the bands have removed, in m/s, shape (...,
-            pulse).
+        residual_m_s: Radial velocity minus that of the Doppler shift already removed from `bands`,
+            in m/s, shape (..., pulse).
 
     Returns:
         The powers of scene and noise, shape (...,) each, float64.
@@ -58,31 +59,32 @@ def velocity_estimate(
     window_m: tuple[float, float] | None = None,
     info: dict[str, Tensor] | None = None,
 ) -> Estimate:
-    """Make the estimate of an estimator of the radial velocity.
+    """Complete a measured radial velocity to an estimate with its accuracy and reliability.
 
-    Its variance bound is factor * (lambda / 2)^2 / ((2 pi T)^2 g), where g is the energy of a sweep
-    over the noise variance.
+    The variance is factor * (lambda / 2)^2 / ((2 pi T)^2 g), plus the square of `floor_m_s`, where
+    T is the length of a sweep and g the energy of a sweep over the noise variance of a sample.
 
     Args:
-        velocity_m_s: Velocity at the turning points in m/s, with the geometric velocity still
-            included, shape (..., pulse).
+        velocity_m_s: Velocity at the turning points in m/s, with the geometric velocity (that of a
+            static scatterer, see `geometric_velocity_m_s`) still included, shape (..., pulse).
         bands: Filtered sweeps.
         pulse: Axis of the periods.
-        factor: Factor of the bound.
+        factor: Factor of the variance, which depends on the method of measurement.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
-        squared: True for an estimator that multiplies the sweeps, which at low SNR loses more.
-        floor_m_s: Standard deviation in m/s that remains for the strongest signal.
-        window_m: Ranges of the scene in metres, if the bands are wider.
+        squared: True for a method that multiplies sweeps with each other; the squaring loss at low
+            SNR is then included.
+        floor_m_s: Standard deviation in m/s that remains however strong the signal.
+        window_m: Lowest and highest relative range of the scene in metres, if `bands` holds more.
         info: Further entries of the estimate's info.
 
     Returns:
         `velocity_m_s` of shape (..., pulse), receding positive, without the geometric velocity,
         with its standard deviation. quality is the share of the power in the window that both
-        sweeps have in common. `ok` is False where the SNR after compression (info["snr_db"]) is
-        below 14 dB, or 15 dB after the squaring loss for a squared estimator, where nothing is
-        illuminated, or where a velocity is not finite. info: shift, and lit, shape (..., pulse),
-        False where no scatterer is illuminated; the velocity is there interpolated between
-        neighbours.
+        sweeps have in common. `ok` is False where the SNR after compression (info["snr_db"], shape
+        (...,)) is below 14 dB (with `squared`: the SNR less the squaring loss below 15 dB), where
+        nothing is illuminated, or where a velocity is not finite. info, shape (..., pulse): shift,
+        the Doppler shift removed from `bands` in whole bins, and lit, False where no scatterer is
+        illuminated. There the velocity is interpolated between the neighbouring periods.
     """
     radar, tiny = bands.radar, torch.finfo(torch.float64).tiny
     velocity, finite = settle(filled(velocity_m_s, bands.lit), 0.0)

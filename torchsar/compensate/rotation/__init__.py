@@ -1,6 +1,7 @@
-"""Rotation of a target with non-uniform rotation.
+"""Estimation of the rotation of a target that rotates at a changing rate.
 
-Searches for the least image entropy, and maximum likelihood without a start.
+Some estimators search for the rotation with the least image entropy; the recommended one fits the
+rotation and the scatterers by maximum likelihood and needs no values to start from.
 """
 
 from torchsar.compensate.rotation.chirplet import ChirpletClean, Chirplets, chirplet_clean

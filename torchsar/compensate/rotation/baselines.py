@@ -1,4 +1,7 @@
-"""Searches for a rotation that start near the truth: what they cost and lose at best."""
+"""Searches for a rotation that start near the truth, to compare other estimators with.
+
+They show the best accuracy and the least time that these searches can reach.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +32,14 @@ def _entropy(
 
 
 def descent_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **known: object) -> Estimate:
-    """Descend from 0.95 of the true rotation.
+    """Estimate a rotation by a descent of the image entropy that starts at 0.95 of the true values.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range).
         omega_rad_s: True rate at the first pulse in rad/s, shape (...,).
-        warp_k: True coefficients of the warp, shape (..., coefficient).
-        known: wavelength_m, prf_hz, range_m, yc_m and order, as `uneven_rotation` takes them.
+        warp_k: True relative derivatives k1, k2, ... of the rotation rate in 1/s, 1/s^2, ..., shape
+            (..., coefficient).
+        known: The arguments wavelength_m, prf_hz, range_m, yc_m and order of `uneven_rotation`.
 
     Returns:
         The estimate of `descend_rotation`.
@@ -45,13 +49,16 @@ def descent_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **know
 
 
 def genetic_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **known: object) -> Estimate:
-    """Search within 10 % of the true rotation by 10 individuals in 4 generations.
+    """Estimate a rotation by a genetic algorithm that searches within 10 % of the true values.
+
+    The image entropy is minimised with 10 individuals in 4 generations.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range).
         omega_rad_s: True rate at the first pulse in rad/s, shape (...,).
-        warp_k: True coefficients of the warp, shape (..., coefficient).
-        known: wavelength_m, prf_hz, range_m, yc_m and order, as `uneven_rotation` takes them.
+        warp_k: True relative derivatives k1, k2, ... of the rotation rate in 1/s, 1/s^2, ..., shape
+            (..., coefficient).
+        known: The arguments wavelength_m, prf_hz, range_m, yc_m and order of `uneven_rotation`.
 
     Returns:
         The estimate of `genetic_rotation`.

@@ -1,6 +1,7 @@
-"""Adaptive chirplet imaging in the manner of CLEAN, a baseline.
+"""Adaptive chirplet imaging in the manner of CLEAN, for comparison with other estimators.
 
-Every range cell is modelled as a sum of chirps, the strongest of which is removed first.
+Every range cell is modelled as a sum of chirps, which are found and removed one by one, the
+strongest first.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _PAD = 2  # zero-padding of the transforms: a peak between two bins loses little
 
 @dataclass(frozen=True)
 class Chirplets:
-    """Chirps found in every range cell, in the order in which they were found.
+    """Chirps found in every range cell, in the order in which they were found, and their image.
 
     Args:
         image: Image of the chirps above the floor, shape (..., lines, range), complex.
@@ -30,7 +31,8 @@ class Chirplets:
             as in exp(-2j pi f t), shape (..., atom, range).
         rate_hz_s: Rate in Hz/s, with the same sign convention, shape (..., atom, range).
         amplitude: Amplitude, shape (..., atom, range), complex.
-        residual_share: Remaining energy over that of the data, shape (...,).
+        residual_share: Energy that the chirps do not explain, over the energy of the data, shape
+            (...,).
     """
 
     image: Tensor
@@ -52,23 +54,23 @@ def chirplet_clean(
 ) -> Chirplets:
     """Form the image of the chirps that make up range-compressed pulses.
 
-    In each range cell the chirp a exp(-2j pi (f t + r t^2 / 2)) of most energy is found, with t
-    from the middle of the aperture, and removed; this is repeated `atoms` times. The image is that
-    of unchirped tones a exp(-2j pi f t), with lines as those of `torchsar.focus.matched_fourier`.
-    Not differentiable.
+    In each range cell the chirp a exp(-2j pi (f t + r t^2 / 2)) of most energy is found and
+    removed, where a is its complex amplitude, f its frequency, r its rate, and t the time from the
+    middle of the aperture. This is repeated `atoms` times. The image is that of the tones a exp(-2j
+    pi f t), which have no rate, with lines as those of `torchsar.focus.matched_fourier`. Not
+    differentiable.
 
-    A baseline. Chirps have no cubic phase, and scatterers of one range cell are not separated by a
-    common rotation. A target whose rotation has jerk leaves residuals of its strong scatterers, on
-    which atoms are spent before weak scatterers are reached: the image is sparse. The method needs
-    no model of the rotation and gives none. It costs two transforms of each range cell per atom and
-    rate.
+    The method is a baseline for comparison. It needs no model of the rotation and gives none. A
+    chirp has no cubic phase: if the rotation has jerk, strong scatterers leave residuals, further
+    chirps are spent on these, and weak scatterers are missing from the image. The method takes two
+    transforms of each range cell per chirp and rate.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
         atoms: Number of chirps per range cell.
-        sweep: Largest |r| that is searched, as the share of the pulse rate that a chirp sweeps
-            during the aperture.
+        sweep: Largest |r| that is searched, given by the band that a chirp sweeps during the
+            aperture, as a fraction of the pulse rate, 0..1.
         floor_db: Chirps this far below the strongest one of their trial are left out of the image.
         oversampling: Image lines per Doppler cell.
         lines: Number of image lines about zero Doppler; by default all that the pulse rate holds.
@@ -127,7 +129,16 @@ class _Search:
 
     @staticmethod
     def of(n: int, sweep: float, like: Tensor) -> _Search:
-        """Search for rows of n pulses; see `chirplet_clean` for sweep."""
+        """Build the search for the strongest chirp of each range cell.
+
+        Args:
+            n: Number of pulses.
+            sweep: Largest chirp rate, as in `chirplet_clean`.
+            like: Tensor on the device of the data.
+
+        Returns:
+            The search, with its coarse rates.
+        """
         segments = max(4, 2 ** round(math.log2(n) / 2))
         step = segments / n**2
         count = math.ceil(sweep / n / step)
@@ -228,12 +239,13 @@ def _check(data: Tensor, prf_hz: float, atoms: int, sweep: float, floor_db: floa
     refuse_non_finite(data, "chirplet_clean")
     if data.ndim < 2 or data.shape[-2] < 16 or not data.shape[-1]:
         raise ValueError(
-            f"chirplet_clean needs data (..., pulse, range) of at least 16 pulses, got shape {tuple(data.shape)}"
+            "chirplet_clean: data must have at least 16 pulses and one range cell, shape (..., pulse, range), got "
+            f"shape {tuple(data.shape)}"
         )
     if not (prf_hz > 0 and atoms >= 1 and 0 < sweep <= 1 and floor_db > 0):
         raise ValueError(
-            "chirplet_clean needs a positive prf_hz and floor_db, one atom at least and a sweep "
-            f"in 0..1, got prf_hz {prf_hz}, floor_db {floor_db}, atoms {atoms} and sweep {sweep}"
+            "chirplet_clean: prf_hz and floor_db must be positive, atoms 1 or more, and sweep above 0 and at most 1, "
+            f"got prf_hz {prf_hz}, floor_db {floor_db}, atoms {atoms} and sweep {sweep}"
         )
 
 
@@ -246,8 +258,9 @@ class ChirpletClean(Stage):
     Args:
         radar: Radar parameters.
         atoms: Number of chirps per range cell.
-        sweep: Largest rate that is searched, see `chirplet_clean`.
-        floor_db: Chirps this far below the strongest one are left out of the image.
+        sweep: Largest chirp rate that is searched, given by the band that a chirp sweeps during the
+            aperture, as a fraction of the pulse rate, 0..1.
+        floor_db: Chirps this far below the strongest one of their trial are left out of the image.
         oversampling: Image lines per Doppler cell.
         lines: Number of image lines about zero Doppler; by default all that the pulse rate holds.
     """
@@ -272,7 +285,11 @@ class ChirpletClean(Stage):
         }
 
     def forward(self, signal: Signal) -> Signal:
-        """Form the image of a signal of axes (pulse, range)."""
+        """Form the image of a signal of axes (pulse, range).
+
+        Returns:
+            The image of axes (azimuth, range), with the Doppler in Hz along azimuth.
+        """
         image = chirplet_clean(signal.data, self.radar.prf_hz, **self.options).image
         pulse, range_ = signal.axes
         step = 1 / (self.options["oversampling"] * pulse.n * pulse.step)

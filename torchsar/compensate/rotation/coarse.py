@@ -1,10 +1,10 @@
-"""Non-uniform rotation from short sections of the aperture, without a start.
+"""Estimate of a non-uniform rotation from the spectra of short sections of the aperture.
 
-Within a section the target rotates uniformly, at the rate of its middle. The Doppler axis of its
-spectrum is that of any other section, stretched by the ratio of their rates; on a logarithmic
-Doppler axis this is a shift. Magnitude spectra of all pairs of sections are correlated on that axis
-and summed over range cells. A global search finds the rate as a function of time with which all
-pairs agree.
+No values to start from are needed. Within a short section the target rotates almost uniformly. The
+Doppler spectra of two sections differ by a stretch, the ratio of the two rotation rates; on a
+logarithmic Doppler axis this is a shift. The magnitude spectra of every pair of sections are
+correlated on that axis and summed over range cells. A global search finds the rotation rate as a
+function of time with which the shifts of all pairs agree best.
 """
 
 from __future__ import annotations
@@ -44,7 +44,15 @@ class _Agreement:
     second: Tensor
 
     def at(self, log_rate: Tensor) -> Tensor:
-        """Sum over pairs (trial, candidate) for log_rate (trial, candidate, section)."""
+        """Compute how well the spectra of all pairs of sections agree with candidate rates.
+
+        Args:
+            log_rate: Logarithm of the rotation rate in each section, shape (trial, candidate,
+                section).
+
+        Returns:
+            The sum of the correlations over the pairs, shape (trial, candidate); larger is better.
+        """
         reach = (self.table.shape[-1] - 1) // 2
         shift = (log_rate[..., self.second] - log_rate[..., self.first]) * _STEPS_PER_UNIT + reach
         shift = shift.clamp(0, 2 * reach - 1e-3)
@@ -57,17 +65,19 @@ class _Agreement:
 
 
 def coarse_warp(data: Tensor, prf_hz: float, sections: int | None = None) -> Tensor:
-    """Estimate k1 and k2 from the spectra of short sections.
+    """Estimate how the rotation rate changes, from the Doppler spectra of short sections.
 
-    The result is accurate to about a percent of the rate. Rates between a quarter and four times
-    that of the first pulse are searched. Needs scatterers off the rotation axis in at least one
-    range cell.
+    The rate at time t after the first pulse is modelled as that at the first pulse times 1 + k1 t +
+    k2 t^2 / 2. This relative rate is found to about a percent. Rates between a quarter and four
+    times that of the first pulse are searched. At least one range cell must hold scatterers off the
+    rotation axis.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
         sections: Number of half-overlapping sections; by default half the square root of the number
-            of pulses, within 8..28. The Doppler of a section then changes by about its resolution.
+            of pulses, within 8..28. The Doppler of a scatterer then changes within a section by
+            about the Doppler resolution.
 
     Returns:
         k1 in 1/s and k2 in 1/s^2, shape (trial, 2), float64.
@@ -108,15 +118,26 @@ class _ThirdOrderRate:
     duration_s: float
 
     def warp_k(self, logs: Tensor) -> Tensor:
-        """k1 and k2 of these logarithms (..., 2)."""
+        """Compute k1 (1/s) and k2 (1/s^2), shape (..., 2), from logarithms of rates.
+
+        The logarithms are those of the rates in the middle and at the end of the aperture, relative
+        to the rate at the first pulse, shape (..., 2).
+        """
         middle, end = torch.exp(logs).unbind(-1)
         k2 = 4 * (end - 2 * middle + 1) / self.duration_s**2
         return torch.stack([(end - 1) / self.duration_s - k2 * self.duration_s / 2, k2], -1)
 
     def log_rate(self, logs: Tensor) -> tuple[Tensor, Tensor]:
-        """Logarithm of the rate in every section, (..., section), and its validity (...,).
+        """Compute the logarithm of the rotation rate in the middle of every section.
 
-        It is valid where the rate stays positive over the whole aperture.
+        Args:
+            logs: Logarithms of the rates in the middle and at the end of the aperture, relative to
+                the rate at the first pulse, shape (..., 2).
+
+        Returns:
+            The logarithms relative to the rate at the first pulse, shape (..., section); and True
+            where the rate stays above a tenth of that at the first pulse over the whole aperture,
+            shape (...,), bool.
         """
         k = self.warp_k(logs)
         ends = torch.linspace(0, self.duration_s, 33, dtype=torch.float64, device=logs.device)

@@ -32,8 +32,9 @@ class Pairs:
         first: First scatterer of each pair, shape (pair,).
         second: Second scatterer of each pair, shape (pair,).
         shape: Shape (trial, scatterer) of the scatterers.
-        products: For bases n and m, conj(s_p) s_q times the sum over pulses of b_n b_m conj(e_p)
-            e_q of unit echoes e, shape (pair,), from tables over their distance.
+        products: For basis functions b_n and b_m of slow time, conj(s_p) s_q times the sum over
+            pulses of b_n b_m conj(e_p) e_q, shape (pair,). Here s are the amplitudes and e the
+            echoes of unit amplitude of the two scatterers p and q of a pair.
     """
 
     trial: Tensor
@@ -44,11 +45,12 @@ class Pairs:
 
     @staticmethod
     def find(sampling: Sampling, k: Tensor, amplitude: Tensor, cell: Tensor, bases: Tensor) -> Pairs:
-        """Find the pairs among scatterers.
+        """Find the pairs of scatterers that are close enough in Doppler to couple.
 
         Args:
             sampling: Sampling of the data.
-            k: Warp, shape (trial, order - 1).
+            k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+                1/s^2, ..., shape (trial, order - 1).
             amplitude: Amplitudes, shape (trial, scatterer), complex; 0 for none.
             cell: Doppler cells, shape (trial, scatterer).
             bases: Basis functions, shape (trial, base, pulse); zero in pulses that are not present.
@@ -72,11 +74,11 @@ class Pairs:
         return Pairs(trial, first, second, cell.shape, products)
 
     def of(self, values: Tensor, side: int) -> Tensor:
-        """Select a value of the first or the second scatterer of each pair.
+        """Select the value of the first or of the second scatterer of each pair.
 
         Args:
-            values: Values, shape (trial, scatterer).
-            side: 0 for the first, 1 for the second.
+            values: One value per scatterer, shape (trial, scatterer).
+            side: 0 for the first scatterer, 1 for the second.
 
         Returns:
             The values, shape (pair,).
@@ -84,13 +86,15 @@ class Pairs:
         return values[self.trial, self.second if side else self.first]
 
     def matrix(self, blocks: list[list[Tensor]]) -> Tensor:
-        """Assemble a dense matrix from blocks of values of pairs.
+        """Assemble a dense matrix over the scatterers from values per pair of scatterers.
 
         Args:
-            blocks: Blocks by row and column, each of shape (pair,).
+            blocks: Square list of blocks, by row and column; each holds one value per pair, shape
+                (pair,).
 
         Returns:
-            The matrix, shape (trial, blocks * scatterer, blocks * scatterer).
+            The matrix, shape (trial, blocks * scatterer, blocks * scatterer); zero where two
+            scatterers do not form a pair.
         """
         count, n = self.shape[1], len(blocks)
         result = blocks[0][0].new_zeros(self.shape[0], n * count, n * count)
@@ -100,22 +104,22 @@ class Pairs:
         return result
 
     def per_scatterer(self, values: Tensor) -> Tensor:
-        """Sum over the second scatterer of pairs.
+        """Sum values of pairs over all pairs with the same first scatterer.
 
         Args:
-            values: Values, shape (pair, n).
+            values: Values per pair, shape (pair, n).
 
         Returns:
-            The sums, shape (trial, scatterer, n).
+            The sums for each first scatterer, shape (trial, scatterer, n).
         """
         flat = values.new_zeros(self.shape[0] * self.shape[1], values.shape[-1])
         return flat.index_add(0, self.trial * self.shape[1] + self.first, values).unflatten(0, self.shape)
 
     def per_trial(self, values: Tensor) -> Tensor:
-        """Sum over pairs.
+        """Sum values of pairs over all pairs of a trial.
 
         Args:
-            values: Values, shape (pair, n, m).
+            values: Values per pair, shape (pair, n, m).
 
         Returns:
             The sums, shape (trial, n, m).
@@ -142,8 +146,8 @@ def _product_tables(sampling: Sampling, k: Tensor, bases: Tensor, index: list[tu
 def band_response(x: Tensor, cells: int) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the range response to a scatterer and its first two derivatives.
 
-    The response is that of a flat band of `cells` frequencies, as FFTs of so many samples have
-    them: the sinc of the signal model, but periodic in the window as compressed pulses are.
+    The response is that of a flat band of `cells` FFT frequencies: a sinc, made periodic over the
+    range window as range-compressed pulses are.
 
     Args:
         x: Distance from the scatterer in range cells, any shape, float64.

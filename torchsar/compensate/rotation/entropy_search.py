@@ -1,6 +1,7 @@
-"""Searches for the rotation of least image entropy.
+"""Searches for the rotation of a target with which the image entropy is least.
 
-Grid search, genetic algorithm, differential evolution, Newton's method and L-BFGS.
+The methods are grid search, a genetic algorithm, differential evolution, Newton's method and
+L-BFGS.
 """
 
 from __future__ import annotations
@@ -39,20 +40,22 @@ _FOR_DESCENT = EntropyObjective(variables="shape")
 def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int = 100_000) -> Estimate:
     """Find the rotation of least image entropy on a full grid.
 
-    The grid of the paper has 5 x 21 x 201 points.
+    The grid of Remote Sens. 2025, 17, 3447 has 5 x 21 x 201 points.
 
     Args:
-        figure: Entropy as a function of its unknowns.
-        axes: Values of each unknown, shape (m,) or (..., m) per trial.
-        limit: Largest number of evaluations per trial.
+        figure: Image entropy as a function of the unknowns of the rotation.
+        axes: Values of each unknown, shape (m,), or (..., m) per trial.
+        limit: Largest number of grid points per trial.
 
     Returns:
-        An estimate as that of `genetic_rotation`. `ok` is False also where the best point lies at
-        the end of an axis of several values. info["entropy_grid_nats"], shape (..., m_1, m_2, ...),
-        is the entropy on the grid.
+        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
+        range-dependent phase, `omega_rad_s` and `yc_m`, as in `genetic_rotation`. `ok` is False
+        where the image is not sharper than without compensation, or the best point lies at the end
+        of an axis of several values. info["entropy_grid_nats"], shape (..., m_1, m_2, ...), is the
+        entropy on the grid.
 
     Raises:
-        ValueError: If there is not one list per unknown, or the grid exceeds the limit.
+        ValueError: If there is not one list of values per unknown, or the grid exceeds the limit.
     """
     _check_axes(figure, axes, "search_rotation")
     values = [torch.as_tensor(axis, dtype=torch.float64, device=figure.range_m.device) for axis in axes]
@@ -65,24 +68,27 @@ def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int 
 def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: Draws, **options: Any) -> Estimate:
     """Find the rotation of least image entropy in a box by a genetic algorithm.
 
-    This is the published estimator.
+    This is the published estimator, see Reference.
 
     Args:
-        figure: Entropy as a function of its unknowns.
+        figure: Image entropy as a function of the unknowns of the rotation.
         low: Lower bounds, one per unknown (`figure.unknowns.names`), shape (n,) or (..., n).
         high: Upper bounds, same shape.
         draws: Source of random numbers, see `torchsar.optim.genetic`.
         options: Options of `torchsar.optim.genetic`.
 
     Returns:
-        `warp_k`, shape (..., order - 1), and its entries `k1_per_s`, `k2_per_s2`, ...; with the
-        range term also `omega_rad_s`, shape (...,), made positive since its sign is not observable
-        (the image may be mirrored in cross range), and `yc_m`, shape (...,). There are no standard
-        deviations, because an entropy is not a likelihood. quality is the share by which the number
-        of cells that the image fills, exp(entropy), falls. `ok` is False where it does not fall, or
-        the minimum lies on the edge of the box; it does not exclude a bias by few image lines, see
-        `EntropyObjective`. info: evaluations, entropy_nats, uncompensated_entropy_nats, on_edge,
-        shape (..., n), and best_entropy_nats, shape (..., generation).
+        `warp_k`, the relative derivatives of the rotation rate, shape (..., order - 1), and its
+        entries `k1_per_s`, `k2_per_s2`, ... If `figure` compensates the range-dependent phase, also
+        the rotation rate `omega_rad_s` at the first pulse, shape (...,), made positive since its
+        sign is not observable (the image may be mirrored in cross range), and the range centre
+        deviation `yc_m`, shape (...,). There are no standard deviations, because an entropy is not
+        a likelihood. quality is the relative decrease of exp(entropy), the number of cells that the
+        image fills, due to the compensation. `ok` is False where this number does not decrease, or
+        the minimum lies on the edge of the box; with few image lines the result may be biased even
+        where `ok` is True, see `EntropyObjective`. info: evaluations, entropy_nats,
+        uncompensated_entropy_nats, on_edge, shape (..., n), and best_entropy_nats, shape (...,
+        generation).
 
     Raises:
         ValueError: If there is not one bound per unknown, or an option is invalid.
@@ -99,14 +105,16 @@ def evolve_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: D
     """Find the rotation of least image entropy in a box by differential evolution.
 
     Args:
-        figure: Entropy as a function of its unknowns.
+        figure: Image entropy as a function of the unknowns of the rotation.
         low: Lower bounds, one per unknown, shape (n,) or (..., n).
         high: Upper bounds, same shape.
         draws: Source of random numbers, see `torchsar.optim.differential_evolution`.
         options: Options of `torchsar.optim.differential_evolution`.
 
     Returns:
-        An estimate as that of `genetic_rotation`.
+        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
+        range-dependent phase, `omega_rad_s` and `yc_m`; quality, `ok` and info are defined as for
+        `genetic_rotation`.
 
     Raises:
         ValueError: If there is not one bound per unknown, or an option is invalid.
@@ -119,19 +127,22 @@ def evolve_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: D
 def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True, steps: int = 20) -> Estimate:
     """Find a rotation of least image entropy near a start by Newton's method.
 
-    The paper calls it Gauss-Newton; its Table 2 shows that the result depends on the start.
+    The paper (see Reference) calls the method Gauss-Newton; its Table 2 shows that the result
+    depends on the start.
 
     Args:
-        figure: Entropy as a function of its unknowns.
+        figure: Image entropy as a function of the unknowns of the rotation.
         start: Unknowns to start from, shape (..., n), see `figure.start`.
-        damped: Whether steps are damped. Undamped steps diverge on most targets, even from the true
+        damped: True damps the steps. Undamped steps diverge on most targets, even from the true
             rotation, because the entropy is nearly flat in one direction.
         steps: Largest number of steps.
 
     Returns:
-        An estimate as that of `genetic_rotation`. `ok` is False also where a trial diverges (it
-        keeps its last finite point) or uses up its steps. info["iterations"] is the number of
-        steps.
+        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
+        range-dependent phase, `omega_rad_s` and `yc_m`, as in `genetic_rotation`. `ok` is False
+        where the image is not sharper than without compensation, where a trial diverges (it keeps
+        its last finite point), or where it has not converged after `steps` steps.
+        info["iterations"] is the number of steps.
 
     Raises:
         ValueError: If the start does not have one value per unknown.
@@ -148,18 +159,22 @@ def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True,
 def descend_rotation(figure: ImageEntropy, start: Tensor, *, steps: int = 60, tolerance: float = 1e-4) -> Estimate:
     """Find a rotation of least image entropy near a start by L-BFGS with exact gradients.
 
-    Best in the variables "shape". With order 2 and without range term this is the second-order
-    method (SM) of the paper, whose k1 is not that of the target but about k1 + k2 T / 2.
+    The descent converges best in the variables "shape", see `Unknowns`. With order 2 and without
+    compensation of the range-dependent phase this is the second-order method (SM) of Remote Sens.
+    2025, 17, 3447. For a target of order 3, that method finds about k1 + k2 T / 2 in place of k1,
+    where T is the length of the aperture.
 
     Args:
-        figure: Entropy as a function of its unknowns.
+        figure: Image entropy as a function of the unknowns of the rotation.
         start: Unknowns to start from, shape (..., n), see `figure.start`.
         steps: Largest number of steps.
         tolerance: Norm of the gradient, relative to that at the start, at which a trial ends.
 
     Returns:
-        An estimate as that of `genetic_rotation`. `ok` is False also where a trial uses up its
-        steps.
+        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
+        range-dependent phase, `omega_rad_s` and `yc_m`, as in `genetic_rotation`. `ok` is False
+        where the image is not sharper than without compensation, or where a trial has not converged
+        after `steps` steps.
 
     Raises:
         ValueError: If the start does not have one value per unknown.
@@ -258,7 +273,8 @@ def _check_axes(figure: ImageEntropy, axes: Sequence[Any], who: str) -> None:
     names = figure.unknowns.names
     if len(axes) != len(names):
         raise ValueError(
-            f"{who} needs the values of the {len(names)} unknowns {', '.join(names)}, got {len(axes)} lists"
+            f"{who}: axes must hold a list of values for each of the {len(names)} unknowns {', '.join(names)}, got "
+            f"{len(axes)} lists"
         )
 
 
@@ -275,7 +291,16 @@ class _Search(Stage):
         )
 
     def figure(self, signal: Signal, yc_m: Tensor | None) -> ImageEntropy:
-        """Entropy of a signal; a connected yc_m replaces a known one of the settings."""
+        """Build the image entropy of a signal as a function of the unknowns of the rotation.
+
+        Args:
+            signal: Range-compressed pulses of axes (pulse, range).
+            yc_m: Known range centre deviation in metres, shape (...,); None takes that of the
+                settings. It is ignored if the settings make yc an unknown.
+
+        Returns:
+            The entropy function.
+        """
         known = self.objective.yc_m if yc_m is None or self.objective.yc_m is None else yc_m
         return ImageEntropy.of(signal, self.radar, replace(self.objective, yc_m=known))
 
@@ -283,17 +308,18 @@ class _Search(Stage):
 class RotationSearch(_Search):
     """Rotation of least image entropy on a grid; see `search_rotation`.
 
-    The grid has counts[i] values from low[i] to high[i], one entry per unknown: omega (rad/s), k1,
-    k2, ..., and yc if it is an unknown (see `Unknowns`).
+    Along unknown i the grid has counts[i] values from low[i] to high[i]. The unknowns are the
+    rotation rate omega at the first pulse (rad/s), its relative derivatives k1, k2, ... (1/s,
+    1/s^2, ...), and the range centre deviation yc (m) if it is not known (see `Unknowns`).
 
     Args:
         radar: Radar parameters.
-        low: Lower ends of the grid.
-        high: Upper ends of the grid.
-        counts: Numbers of values.
-        objective: Settings of the entropy. A connected `yc_m` replaces that of the settings unless
-            it is an unknown.
-        limit: Largest number of evaluations per trial.
+        low: Lowest value of each unknown.
+        high: Highest value of each unknown.
+        counts: Number of values of each unknown.
+        objective: Settings of the entropy. A connected `yc_m` replaces the value in the settings,
+            unless they make yc an unknown.
+        limit: Largest number of grid points per trial.
 
     Raises:
         ValueError: If low, high and counts differ in length, or a count is below 1.
@@ -311,8 +337,8 @@ class RotationSearch(_Search):
         super().__init__(radar, objective)
         if not len(low) == len(high) == len(counts) or any(count < 1 for count in counts):
             raise ValueError(
-                "a grid needs as many values in low, high and counts, and counts of at least 1, got "
-                f"{list(low)}, {list(high)} and {list(counts)}"
+                "low, high and counts must hold one entry per unknown, with counts of 1 or more, got "
+                f"low {list(low)}, high {list(high)} and counts {list(counts)}"
             )
         self.axes = [torch.linspace(a, b, n, dtype=torch.float64) for a, b, n in zip(low, high, counts, strict=True)]
         self.limit = limit
@@ -322,7 +348,8 @@ class RotationSearch(_Search):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            yc_m: Range centre deviation in metres known a priori, shape (...,).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), known a priori, shape (...,).
 
         Returns:
             The estimate of `search_rotation`.
@@ -337,10 +364,10 @@ class RotationGenetic(_Search):
 
     Args:
         radar: Radar parameters.
-        low: Lower bounds, one per unknown as in `RotationSearch`.
-        high: Upper bounds.
-        objective: Settings of the entropy. A connected `yc_m` replaces that of the settings unless
-            it is an unknown.
+        low: Lower bound of each unknown: omega (rad/s), k1, k2, ..., and yc (m) if it is not known.
+        high: Upper bound of each unknown.
+        objective: Settings of the entropy. A connected `yc_m` replaces the value in the settings,
+            unless they make yc an unknown.
         population: Number of candidates in a generation.
         generations: Number of generations.
         elites: Number of best candidates that pass unchanged to the next generation.
@@ -369,7 +396,8 @@ class RotationGenetic(_Search):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            yc_m: Range centre deviation in metres known a priori, shape (...,).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), known a priori, shape (...,).
 
         Returns:
             The estimate of `genetic_rotation`.
@@ -384,10 +412,10 @@ class RotationEvolution(_Search):
 
     Args:
         radar: Radar parameters.
-        low: Lower bounds, one per unknown as in `RotationSearch`.
-        high: Upper bounds.
-        objective: Settings of the entropy. A connected `yc_m` replaces that of the settings unless
-            it is an unknown.
+        low: Lower bound of each unknown: omega (rad/s), k1, k2, ..., and yc (m) if it is not known.
+        high: Upper bound of each unknown.
+        objective: Settings of the entropy. A connected `yc_m` replaces the value in the settings,
+            unless they make yc an unknown.
         population: Number of candidates in a generation.
         generations: Number of generations.
         strategy: Mutation strategy, "rand1bin" or "best1bin".
@@ -414,7 +442,8 @@ class RotationEvolution(_Search):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            yc_m: Range centre deviation in metres known a priori, shape (...,).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), known a priori, shape (...,).
 
         Returns:
             The estimate of `evolve_rotation`.
@@ -433,7 +462,7 @@ class _Descending(_Search):
         wanted = objective.order - 1 + objective.range_term
         if start is not None and len(start) != wanted:
             raise ValueError(
-                f"a start needs the {wanted} values {'omega, ' if objective.range_term else ''}k1, k2, "
+                f"start must hold the {wanted} values {'omega, ' if objective.range_term else ''}k1, k2, "
                 f"..., got {list(start)}"
             )
         self.begin = None if start is None else torch.tensor(start, dtype=torch.float64)
@@ -441,16 +470,28 @@ class _Descending(_Search):
     def started(
         self, figure: ImageEntropy, omega_rad_s: Tensor | None, warp_k: Tensor | None, yc_m: Tensor | None
     ) -> Tensor:
-        """The vector to start from, of connected values or else those of the start.
+        """Build the vector of unknowns to start from.
 
-        Raises ValueError if neither gives a value.
+        Connected values take precedence over the entries of the stage's `start`.
+
+        Args:
+            figure: Image entropy as a function of the unknowns.
+            omega_rad_s: Connected rotation rate in rad/s, or None.
+            warp_k: Connected relative derivatives of the rotation rate, or None.
+            yc_m: Connected range centre deviation in metres, or None.
+
+        Returns:
+            The vector of every trial, shape (..., n).
+
+        Raises:
+            ValueError: If a value is neither connected nor in `start`.
         """
         omega = self._given()[0] if omega_rad_s is None else omega_rad_s
         k = self._given()[1] if warp_k is None else warp_k
         if omega is None or k is None:
             raise ValueError(
-                f"{type(self).__name__} needs a start: give start=[omega, k1, k2, ...], or connect "
-                "omega_rad_s and warp_k from an estimator before it"
+                f"{type(self).__name__} needs a rotation to start from: give start=[omega, k1, k2, ...], or "
+                "connect omega_rad_s and warp_k from an earlier estimator"
             )
         return figure.start(omega, k, yc_m)
 
@@ -470,16 +511,16 @@ class _Descending(_Search):
 class RotationNewton(_Descending):
     """Rotation of least image entropy near a start by Newton's method; see `newton_rotation`.
 
-    Connected values (omega_rad_s, warp_k, yc_m) take precedence over the entries of the start. If
-    the start and the connected values give no rate, rotation_rad_s of the radar is used.
+    Connected values (omega_rad_s, warp_k, yc_m) take precedence over the entries of `start`. If
+    neither gives the rotation rate omega, rotation_rad_s of the radar is used.
 
     Args:
         radar: Radar parameters.
-        start: Start [omega (rad/s), k1, k2, ...], without omega if there is no range term; None if
-            the values are connected.
-        objective: Settings of the entropy, by default with six taps. If yc is an unknown, it starts
-            from the connected value or 0.
-        damped: Whether steps are damped.
+        start: Values to start from, [omega (rad/s), k1, k2, ...], without omega if the
+            range-dependent phase is not compensated; None if the values are connected.
+        objective: Settings of the entropy, by default with six taps. If yc is an unknown, the
+            search starts from the connected `yc_m` or 0.
+        damped: True damps the steps.
         steps: Largest number of steps.
 
     Raises:
@@ -509,8 +550,10 @@ class RotationNewton(_Descending):
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             omega_rad_s: Rotation rate in rad/s to start from, shape (...,).
-            warp_k: Warp to start from, shape (..., order - 1).
-            yc_m: Range centre deviation in metres, shape (...,).
+            warp_k: Relative derivatives k1, k2, ... of the rotation rate to start from, in 1/s,
+                1/s^2, ..., shape (..., order - 1).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), shape (...,).
 
         Returns:
             The estimate of `newton_rotation`.
@@ -527,13 +570,15 @@ class RotationNewton(_Descending):
 class RotationDescent(_Descending):
     """Rotation of least image entropy near a start by L-BFGS; see `descend_rotation`.
 
-    With order 2 and without range term it is the second-order method (SM) of the paper.
+    With order 2 and without compensation of the range-dependent phase it is the second-order method
+    (SM) of Remote Sens. 2025, 17, 3447.
 
     Args:
         radar: Radar parameters.
-        start: Start as in `RotationNewton`.
+        start: Values to start from, [omega (rad/s), k1, k2, ...], without omega if the
+            range-dependent phase is not compensated; None if the values are connected.
         objective: Settings of the entropy, by default with the variables "shape". If yc is an
-            unknown, it starts from the connected value or 0.
+            unknown, the search starts from the connected `yc_m` or 0.
         steps: Largest number of steps.
 
     Raises:
@@ -562,8 +607,10 @@ class RotationDescent(_Descending):
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             omega_rad_s: Rotation rate in rad/s to start from, shape (...,).
-            warp_k: Warp to start from, shape (..., order - 1).
-            yc_m: Range centre deviation in metres, shape (...,).
+            warp_k: Relative derivatives k1, k2, ... of the rotation rate to start from, in 1/s,
+                1/s^2, ..., shape (..., order - 1).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), shape (...,).
 
         Returns:
             The estimate of `descend_rotation`.

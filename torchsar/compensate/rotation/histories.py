@@ -1,10 +1,17 @@
-"""Phase least squares on the phase histories of bright isolated scatterers.
+"""Refinement of an estimated rotation from the phase histories of bright isolated scatterers.
 
-A window about a focused scatterer, transformed back, is its history over the aperture. An error of
-the motion leaves in it, beyond a constant and a line, the phase -2 pi c du/dk dk at Doppler cell c
-and (c4/2) (y dw + dv) phi^2 at range y, where c4 = 4 pi / lambda. The fit uses products of a
-history with itself a sixth of the aperture later, which need no unwrapping. It can start from any
-rate: even the range term of an unknown rotation, w = 0, changes the phase by little in that time.
+A window is set about each scatterer in the image and transformed back to slow time, which gives the
+history of the scatterer over the aperture. Errors of the estimated rotation leave a curved phase in
+it, apart from a constant and a line:
+
+- an error dk of a relative derivative k of the rotation rate leaves -2 pi c (du/dk) dk, where c is
+the Doppler cell of the scatterer and u the warped time over its value at the end of the aperture;
+- errors dw of the squared rotation rate w, and dv of v = w times the range centre deviation, leave
+(2 pi / lambda) (y dw + dv) phi^2, where y is the range of the scatterer and phi the warped time.
+
+The errors are found by least squares. The fit uses products of a history with itself a sixth of the
+aperture later, which need no unwrapping. It can start from any rotation rate, even from w = 0,
+because the phase that depends on range changes little in that time.
 """
 
 from __future__ import annotations
@@ -39,18 +46,21 @@ def refined_by_histories(
     count: int = 128,
     half_cells: int = 24,
 ) -> tuple[Motion, Tensor]:
-    """Perform one step of phase least squares.
+    """Refine a rotation by one least-squares fit to the phase histories of bright scatterers.
+
+    A history is the signal of one scatterer over the aperture, cut out of the image by a window.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
-        motion: Motion to start from.
-        free_centre: Whether the range centre deviation is estimated.
+        motion: Rotation to start from.
+        free_centre: True estimates the range centre deviation; False holds it.
         count: Largest number of scatterers.
-        half_cells: Half width of a window in Doppler cells, wide enough for the error of the start.
+        half_cells: Half width of a window in Doppler cells, wide enough for the blur that the error
+            of the start causes.
 
     Returns:
-        The motion, and the number of scatterers that were used, shape (trial,).
+        The refined rotation, and the number of scatterers that were used, shape (trial,).
     """
     image = image_of(data, sampling, motion, oversampling=_OVERSAMPLING)
     power = image.abs().square()
@@ -128,7 +138,7 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> Tensor:
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:
-    """Solve small normal equations.
+    """Solve small normal equations, one set per trial.
 
     Args:
         normal: Normal matrices, shape (trial, n, n).
@@ -148,8 +158,8 @@ def inverted(normal: Tensor) -> tuple[Tensor, Tensor]:
         normal: Normal matrices, shape (trial, n, n).
 
     Returns:
-        The inverse, shape (trial, n, n), and which unknowns contribute to the excluded directions,
-        shape (trial, n), bool.
+        The inverse, shape (trial, n, n); and True for unknowns that contribute to the excluded
+        directions and are therefore not determined, shape (trial, n), bool.
     """
     scale = normal.diagonal(dim1=-2, dim2=-1)
     root = torch.where(scale > 0, scale, 1).rsqrt()

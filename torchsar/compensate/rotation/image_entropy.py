@@ -1,7 +1,7 @@
 """Entropy of the image as a function of the rotation, for many candidates at once.
 
-The range phase is removed, the image is formed by the matched Fourier transform, and its entropy is
-computed.
+For each candidate rotation, the phase that depends on the range of a scatterer is removed, the
+image is formed by the matched Fourier transform, and the entropy of the image is computed.
 """
 
 from __future__ import annotations
@@ -22,21 +22,25 @@ from torchsar.radar import InverseRadar
 
 @dataclass(frozen=True)
 class EntropyObjective:
-    """Settings of an image entropy as a function of the rotation.
+    """Settings of the image entropy that searches for the rotation of a target minimise.
 
     Args:
-        order: Order of the warp; 1 is uniform rotation.
-        range_term: Whether the range-dependent phase is compensated, see `Unknowns`.
-        yc_m: Range centre deviation in metres if known a priori, a number or shape (...,), such
-            that y_n + yc is the range from the rotation centre. None makes it an unknown.
-        variables: "raw" or "shape", see `Unknowns`.
-        oversampling: Image lines per Doppler cell. At 1, peaks between lines displace the minimum:
-            by 2 % of k and 24 % of omega on a target of 120 points at 20 dB. At 2 it is 0.2 % and 1
-            %, at 4 0.07 % and 0.2 %; more on smaller targets.
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
+        range_term: True compensates the phase that depends on the range of a scatterer (and on
+            omega and yc), see `Unknowns`.
+        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+            rotation centre), if known a priori, a number or shape (...,). None makes it an unknown.
+        variables: Variables of the search, "raw" (rate and its relative derivatives) or "shape"
+            (less correlated ones), see `Unknowns`.
+        oversampling: Image lines per Doppler cell. With few lines, peaks between lines bias the
+            minimum. On a target of 120 points at 20 dB the bias is 2 % of k and 24 % of omega with
+            1 line, 0.2 % and 1 % with 2, and 0.07 % and 0.2 % with 4; it is larger on smaller
+            targets.
         lines: Number of image lines about zero Doppler; None computes all that the pulse rate
             holds.
-        taps: Taps of the kernel of the transform. The error of the entropy is 2e-6 nats with 4 taps
-            and 1e-7 with 6.
+        taps: Number of taps of the interpolation kernel of the matched Fourier transform. The error
+            of the entropy is 2e-6 nats with 4 taps and 1e-7 with 6.
     """
 
     order: int = 3
@@ -54,10 +58,11 @@ _DEFAULT = EntropyObjective()
 class ImageEntropy:
     """Entropy in nats of the image of range-compressed pulses, as a function of the rotation.
 
-    The objective of every search for the rotation. figure(x) returns the entropies (..., candidate)
-    of candidates x (..., candidate, n), the unknowns of `figure.unknowns`. They are +inf, never
-    NaN, where the warp is not monotonic. Twice differentiable in x. Candidates are processed in
-    blocks; derivatives keep the intermediate results of all candidates in memory.
+    Every search for the rotation minimises it. For an instance `figure`, figure(x) returns the
+    entropies, shape (..., candidate), of candidates x, shape (..., candidate, n), each a vector of
+    the unknowns in `figure.unknowns`. The entropy is +inf, never NaN, where the rotation would
+    stop or reverse. Twice differentiable in x. Candidates are processed in blocks; if derivatives
+    are required, the intermediate results of all candidates stay in memory.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
@@ -103,15 +108,15 @@ class ImageEntropy:
 
     @staticmethod
     def of(signal: Signal, radar: InverseRadar, objective: EntropyObjective = _DEFAULT) -> ImageEntropy:
-        """Make the entropy of a signal.
+        """Build the image entropy of a signal as a function of the rotation.
 
         Args:
             signal: Range-compressed pulses of axes (pulse, range).
             radar: Radar parameters.
-            objective: Settings.
+            objective: Settings of the entropy.
 
         Returns:
-            The entropy.
+            The entropy function.
         """
         return ImageEntropy(
             signal.data,
@@ -128,7 +133,7 @@ class ImageEntropy:
         return torch.cat(costs).reshape(x.shape[:-1])
 
     def single(self, x: Tensor) -> Tensor:
-        """Compute the entropy of one vector per trial.
+        """Compute the image entropy for one vector of unknowns per trial.
 
         Args:
             x: Unknowns, shape (..., n).
@@ -139,9 +144,10 @@ class ImageEntropy:
         return self(x[..., None, :])[..., 0]
 
     def with_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the entropy of one vector per trial and its gradient, in blocks.
+        """Compute the image entropy and its gradient for one vector of unknowns per trial.
 
-        The form that `torchsar.optim.lbfgs` requires.
+        The result has the form that `torchsar.optim.lbfgs` requires. Trials are processed in
+        blocks.
 
         Args:
             x: Unknowns, shape (..., n).
@@ -158,7 +164,7 @@ class ImageEntropy:
         return cost.reshape(x.shape[:-1]), gradient.reshape(x.shape)
 
     def turn(self, x: Tensor) -> RotationParameters:
-        """Convert unknowns to the rotation that they describe.
+        """Convert vectors of unknowns to the rotations that they describe.
 
         Args:
             x: Unknowns, shape (..., n), one vector per trial.
@@ -173,8 +179,10 @@ class ImageEntropy:
 
         Args:
             omega_rad_s: Rotation rate in rad/s, a number or shape (...,).
-            warp_k: Warp, shape (..., order - 1).
-            yc_m: Range centre deviation in metres; by default the one known a priori, or 0.
+            warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+                1/s^2, ..., shape (..., order - 1).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre); by default the one known a priori, or 0.
 
         Returns:
             The unknowns, shape (..., n).
@@ -186,14 +194,14 @@ class ImageEntropy:
         omega, k = torch.as_tensor(omega_rad_s, **like), torch.as_tensor(warp_k, **like)
         if k.shape[-1:] != (self.unknowns.order - 1,):
             raise ValueError(
-                f"a rotation of order {self.unknowns.order} starts from warp_k with "
-                f"{self.unknowns.order - 1} entries in its last dim, got shape {tuple(k.shape)}"
+                f"warp_k must have {self.unknowns.order - 1} entries in its last dimension for a rotation of order "
+                f"{self.unknowns.order}, got shape {tuple(k.shape)}"
             )
         yc = self._yc.reshape(self.trials) if yc_m is None else torch.as_tensor(yc_m, **like)
         return self.spread(self.unknowns.at(omega, k, yc))
 
     def spread(self, x: Tensor) -> Tensor:
-        """Expand a vector to all trials, on the device of the data.
+        """Expand a vector of unknowns to all trials, on the device of the data.
 
         Args:
             x: Unknowns, shape (n,) or (..., n).
@@ -204,19 +212,23 @@ class ImageEntropy:
         return x.to(self._data.device).expand(*self.trials, x.shape[-1]).contiguous()
 
     def units(self, x: Tensor) -> Tensor:
-        """Compute steps that change the phase at the edge of the target by about a radian.
+        """Compute a scale for each unknown: the change that alters phases by about a radian.
+
+        The phases are those of scatterers at the edge of the target.
 
         Args:
             x: Unknowns, shape (..., n).
 
         Returns:
-            The steps, shape (..., n), see `Unknowns.units`.
+            The changes, positive, shape (..., n), see `Unknowns.units`.
         """
         step = float(self.range_m[1] - self.range_m[0]) if len(self.range_m) > 1 else 1.0
         return self.unknowns.units(x, self.wavelength_m, abs(step) * len(self.range_m), self._data.shape[-2])
 
     def uncompensated(self) -> Tensor:
-        """Compute the entropy of the image for uniform rotation without range phase.
+        """Compute the entropy of the image formed as for a uniform rotation.
+
+        The phase that depends on the range of a scatterer is not compensated.
 
         Returns:
             The entropies in nats, shape (...,).
@@ -296,7 +308,7 @@ def _check(data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) ->
     real_dtype(data.dtype)
     if data.ndim < 2 or data.shape[-2] < 8 or not data.shape[-1]:
         raise ValueError(
-            "the entropy of an image needs data (..., pulse, range) of at least 8 pulses, got "
+            "ImageEntropy: data must have at least 8 pulses and one range cell, shape (..., pulse, range), got "
             f"shape {tuple(data.shape)}"
         )
     refuse_non_finite(data, "ImageEntropy")
@@ -305,6 +317,6 @@ def _check(data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) ->
             raise ValueError(f"ImageEntropy: {name} must be positive, got {value}")
     if range_m.shape != data.shape[-1:]:
         raise ValueError(
-            f"ImageEntropy: range_m needs the {data.shape[-1]} coordinates of the range axis, got "
+            f"ImageEntropy: range_m must hold the {data.shape[-1]} coordinates of the range cells (m), got "
             f"shape {tuple(range_m.shape)}"
         )

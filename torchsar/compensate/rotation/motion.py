@@ -1,4 +1,8 @@
-"""Common parts of the estimators of non-uniform rotation: sampling, motion, and its removal."""
+"""Common parts of the estimators of non-uniform rotation.
+
+They describe the sampling of a recording and the rotation of the target, and remove the effect of
+the rotation from the data.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ LEAST_PULSES = 8  # least number of pulses, a convention
 
 @dataclass(frozen=True)
 class Sampling:
-    """Sampling of a recording.
+    """Sampling of a recording in slow time and range.
 
     Args:
         wavelength_m: Wavelength in metres.
@@ -46,7 +50,11 @@ class Sampling:
 
     @property
     def turns_per_square(self) -> float:
-        """Phase in turns per metre of range and rad^2: half of 2 / wavelength."""
+        """Factor of the phase that depends on the range of a scatterer: 1 / wavelength (1/m).
+
+        At range y (m) from the rotation centre, a rotation by the angle a (rad) changes this phase
+        by a^2 y / wavelength turns.
+        """
         return 1 / self.wavelength_m
 
     def times(self, device: torch.device) -> Tensor:
@@ -64,27 +72,31 @@ class Sampling:
         """Convert range cells to range in metres.
 
         Args:
-            cell: Range cells, any shape.
+            cell: Indices of range cells, may be fractional, any shape.
 
         Returns:
-            The range, same shape.
+            The range in metres from the assumed rotation centre, same shape.
         """
         return self.first_m + self.step_m * cell
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Rotation in the form in which phases are linear in it.
+    """Rotation of a target, described by w and v, in which the phases of echoes are linear.
 
-    The range term of a scatterer at y_n is (c4/2) (w (y_n + centre_m) + v) phi^2, with c4 = 4 pi /
-    lambda. Only w and v show in the data. Both may start at zero, and may become negative where the
+    The phase that depends on the range y_n of a scatterer (the range term) is (2 pi / lambda) (w
+    (y_n + centre_m) + v) phi^2, where phi is the warped time t + k1 t^2 / 2 + ... and w the square
+    of the rotation rate. Estimates of w and v may start at zero, and may become negative where the
     data are noise.
 
     Args:
-        k: Warp, shape (trial, order - 1), float64.
+        k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s, 1/s^2,
+            ..., shape (trial, order - 1), float64.
         w: Square of the rotation rate in rad^2/s^2, shape (trial,), float64.
-        v: w times the range centre deviation found beyond `centre_m`, shape (trial,), float64.
-        centre_m: Range centre deviation known a priori in metres, shape (trial,), float64.
+        v: w times (yc - centre_m), where yc is the estimated range centre deviation, in m
+            rad^2/s^2, shape (trial,), float64.
+        centre_m: Range centre deviation yc known a priori, in metres (a cell at range y lies at y +
+            yc from the rotation centre), shape (trial,), float64.
     """
 
     k: Tensor
@@ -94,44 +106,56 @@ class Motion:
 
     @staticmethod
     def still(k: Tensor, centre_m: Tensor | None = None) -> Motion:
-        """Make a motion with a warp and rate zero.
+        """Make a description of the rotation with given k and unknown rate: w and v are zero.
 
         Args:
-            k: Warp, shape (trial, order - 1).
-            centre_m: Range centre deviation known a priori in metres, shape (trial,); by default 0.
+            k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+                1/s^2, ..., shape (trial, order - 1).
+            centre_m: Range centre deviation yc known a priori, in metres (a cell at range y lies at
+                y + yc from the rotation centre), shape (trial,); by default 0.
 
         Returns:
-            The motion.
+            The rotation.
         """
         zero = k.new_zeros(k.shape[0])
         return Motion(k, zero, zero, zero if centre_m is None else centre_m)
 
     @property
     def omega_rad_s(self) -> Tensor:
-        """Rotation rate at the first pulse in rad/s, shape (trial,); nearly 0 where w < 0."""
+        """Rotation rate at the first pulse in rad/s, shape (trial,).
+
+        It is nearly 0 where the estimate of its square is negative.
+        """
         return self.w.clamp_min(torch.finfo(torch.float64).tiny).sqrt()
 
     @property
     def offset(self) -> Tensor:
-        """The product w yc, which the centre adds to w y_n, shape (trial,)."""
+        """Product of the squared rotation rate w and the range centre deviation yc, shape (trial,).
+
+        In m rad^2/s^2.
+        """
         return self.w * self.centre_m + self.v
 
     @property
     def yc_m(self) -> Tensor:
-        """Range centre deviation in metres, shape (trial,); `centre_m` where w <= 0."""
+        """Range centre deviation yc in metres, shape (trial,).
+
+        A cell at range y lies at y + yc from the rotation centre. Where the estimate of the squared
+        rotation rate is not positive, yc is the value known a priori.
+        """
         return self.centre_m + torch.where(self.w > 0, self.v / torch.where(self.w > 0, self.w, 1), 0)
 
     def possible(self, sampling: Sampling) -> Tensor:
-        """Check whether a motion can occur in the data.
+        """Check whether the data can hold an echo with this rotation.
 
-        Its numbers must be finite, and the range term must change by less than half a turn from
-        pulse to pulse in every cell.
+        Its parameters must be finite, and the phase that depends on range must change by less than
+        half a turn from pulse to pulse in every range cell.
 
         Args:
             sampling: Sampling of the data.
 
         Returns:
-            True where the motion is possible, shape (trial,), bool.
+            True where the rotation is possible, shape (trial,), bool.
         """
         ends = sampling.range_m(torch.tensor([0.0, sampling.cells - 1.0], dtype=torch.float64, device=self.w.device))
         whole = warp(torch.tensor([sampling.duration_s], dtype=torch.float64, device=self.w.device), self.k)
@@ -139,14 +163,14 @@ class Motion:
         return torch.isfinite(self.k).all(-1) & (turns < sampling.pulses / 4).all(-1)
 
     def where(self, keep: Tensor, other: Motion) -> Motion:
-        """Combine two motions by trial.
+        """Choose, for each trial, between this rotation and another.
 
         Args:
-            keep: True where this motion is kept, shape (trial,), bool.
-            other: The motion of the other trials.
+            keep: True where this rotation is kept, shape (trial,), bool.
+            other: The rotation taken for the other trials.
 
         Returns:
-            The motion.
+            The chosen rotations, with this `centre_m`.
         """
         w, v = (torch.where(keep, getattr(self, name), getattr(other, name)) for name in ("w", "v"))
         return Motion(torch.where(keep[:, None], self.k, other.k), w, v, self.centre_m)
@@ -154,11 +178,11 @@ class Motion:
 
 @dataclass(frozen=True)
 class Warped:
-    """The warp of slow time at some times.
+    """Warped time of a target with non-uniform rotation, at m times.
 
     Args:
-        phi: Warp in seconds, shape (trial, m).
-        u: Normalised warp phi / phi(T), shape (trial, m).
+        phi: Warped time t + k1 t^2 / 2 + k2 t^3 / 6 + ... in seconds, shape (trial, m).
+        u: phi over its value at the end of the aperture, shape (trial, m).
         slopes: Derivatives du/dk_i, shape (trial, order - 1, m).
     """
 
@@ -168,15 +192,16 @@ class Warped:
 
     @staticmethod
     def of(k: Tensor, times_s: Tensor, duration_s: float) -> Warped:
-        """Evaluate a warp.
+        """Evaluate the warped time t + k1 t^2 / 2 + k2 t^3 / 6 + ... at given times t.
 
         Args:
-            k: Warp, shape (trial, order - 1).
+            k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+                1/s^2, ..., shape (trial, order - 1).
             times_s: Times in seconds, shape (m,) or (trial, m).
             duration_s: Duration T of the aperture in seconds.
 
         Returns:
-            The warp at these times.
+            The warped time, its normalised value, and the derivatives with respect to k.
         """
         end = torch.tensor([duration_s], dtype=torch.float64, device=k.device)
         whole, phi = warp(end, k), warp(times_s, k)
@@ -190,16 +215,20 @@ class Warped:
 
 
 def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Tensor) -> Tensor:
-    """Multiply data by exp(-j (c4/2) (w y_n + offset) phi^2).
+    """Remove the phase that depends on the range of a scatterer from pulses of a rotating target.
+
+    The data are multiplied by exp(-j (2 pi / lambda) w (y_n + yc) phi^2), with the squared rotation
+    rate w, the range y_n of cell n and the range centre deviation yc.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
-        motion: Motion.
-        phi: Warp in seconds, shape (trial, pulse).
+        motion: Rotation of the target.
+        phi: Warped time t + k1 t^2 / 2 + k2 t^3 / 6 + ... of the pulses in seconds, shape (trial,
+            pulse).
 
     Returns:
-        The data without the range term, shape (trial, pulse, range), complex.
+        The data without this phase, shape (trial, pulse, range), complex.
     """
     square = -sampling.turns_per_square * phi.square()
     fine, coarse = phasor_tables(
@@ -211,12 +240,12 @@ def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Te
 
 
 def image_of(data: Tensor, sampling: Sampling, motion: Motion, oversampling: float = 2.0) -> Tensor:
-    """Form the image of data with a motion compensated.
+    """Form the image of a target with its rotation compensated.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
-        motion: Motion.
+        motion: Rotation of the target.
         oversampling: Image lines per Doppler cell.
 
     Returns:

@@ -1,4 +1,7 @@
-"""Bright scatterers of an image: local maxima above the noise and the side lobes about them."""
+"""Detection of bright scatterers in an image.
+
+They are local maxima above the noise and above the side lobes of their neighbours.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ class Peaks:
             count: Number of peaks to keep, shape (trial,).
 
         Returns:
-            The peaks.
+            The kept peaks, brightest first; power 0 where a trial has fewer.
         """
         power = torch.where(torch.arange(self.power.shape[-1], device=count.device) < count[:, None], self.power, 0)
         width = max(1, int((power > 0).sum(-1).max()))
@@ -42,7 +45,7 @@ class Peaks:
 
 
 def noise_power(power: Tensor) -> Tensor:
-    """Estimate the mean power of circular Gaussian noise from the median over an image.
+    """Estimate the mean power of circular Gaussian noise in an image from the median of its power.
 
     Assumes that scatterers leave most of the image empty.
 
@@ -57,28 +60,30 @@ def noise_power(power: Tensor) -> Tensor:
 
 
 def threshold(power: Tensor) -> float:
-    """Compute the power over that of the noise which noise exceeds once in about ten images.
+    """Compute the detection threshold that noise alone exceeds in about one of ten images.
 
     Args:
-        power: Power of the image, shape (trial, line, range).
+        power: Power of the image, shape (trial, line, range); only its size is used.
 
     Returns:
-        The ratio.
+        The threshold, as a ratio of power to mean noise power.
     """
     return math.log(power[0].numel()) + 2.5
 
 
 def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: int, cells: int) -> Peaks:
-    """Find local maxima above the noise.
+    """Find local maxima of an image above the noise.
 
-    Strong scatterers hide weaker ones and their own side lobes. The weaker ones are found after the
-    strong ones are removed.
+    A maximum that is weak compared with the brightest pixel near it is left out, because it may be
+    a side lobe. Weak scatterers near strong ones are thus found only after the strong ones are
+    subtracted from the data.
 
     Args:
         power: Power of the image, shape (trial, line, range).
         floor: Least power of a peak, shape (trial,).
         count: Largest number of peaks.
-        share: Least amplitude of a peak over that of the largest amplitude in its neighbourhood.
+        share: Least amplitude of a peak, as a fraction of the largest amplitude in its
+            neighbourhood.
         lines: Half width of the neighbourhood in lines.
         cells: Half width of the neighbourhood in range cells.
 

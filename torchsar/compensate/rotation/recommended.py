@@ -1,4 +1,4 @@
-"""The recommended estimator of non-uniform rotation, and its first steps alone."""
+"""The recommended estimator of non-uniform rotation, and estimators of its first steps alone."""
 
 from __future__ import annotations
 
@@ -48,34 +48,39 @@ def uneven_rotation(
 ) -> Estimate:
     """Estimate the rotation of a target with non-uniform rotation; the recommended estimator.
 
-    Needs no start and no search box. Three steps: correlation of the spectra of short sections
-    (`coarse_warp`), phase least squares of bright scatterers (`refined_by_histories`), and maximum
-    likelihood of the motion and every scatterer (`fit_scatterers`).
+    No values to start from and no search bounds are needed. The estimator has three steps:
+    correlation of the Doppler spectra of short sections (`coarse_warp`), least squares on the phase
+    histories of bright scatterers (`refined_by_histories`), and a joint maximum-likelihood fit of
+    the rotation and every scatterer (`fit_scatterers`).
 
-    Needs scatterers at several ranges: the rate shows only in the curvature that grows with range,
-    and not at all if all scatterers lie in one range cell and yc is unknown.
+    The rotation rate is found only from the phase curvature, which grows with range. Scatterers at
+    several ranges are therefore needed; the rate cannot be found if all lie in one range cell and
+    yc is unknown.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
         wavelength_m: Wavelength in metres.
         prf_hz: Pulse repetition frequency in Hz.
         range_m: Range coordinates y_n of the cells in metres, evenly spaced, shape (range,).
-        order: Order of the warp: 1 for uniform rotation, 2, 3 or more.
-        yc_m: Range centre deviation in metres if known a priori, a number or shape (...,); None
-            estimates it.
+        order: Degree of the polynomial of time that describes the rotation angle: 1 for uniform
+            rotation, 2, 3 or more.
+        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+            rotation centre), if known a priori, a number or shape (...,); None estimates it.
         scatterers: Largest number of scatterers; more are more accurate and take longer.
         rounds: Largest number of maximum-likelihood steps.
 
     Returns:
-        `omega_rad_s` at the first pulse, shape (...,), whose sign is not observable (the image may
-        be mirrored in cross range); `warp_k`, shape (..., order - 1), and its entries `k1_per_s`,
-        `k2_per_s2`, ...; and `yc_m`, shape (...,). Standard deviations follow from the Fisher
+        `omega_rad_s`, the rotation rate at the first pulse, shape (...,), whose sign is not
+        observable (the image may be mirrored in cross range); `warp_k`, its relative derivatives
+        k1, k2, ..., shape (..., order - 1), and their entries `k1_per_s`, `k2_per_s2`, ...; and
+        `yc_m`, the range centre deviation, shape (...,). Standard deviations follow from the Fisher
         information of the scatterers found. quality is the share of the energy above the noise that
         these scatterers explain. info["focused"] is False where fewer than 3 scatterers are found,
         they explain less than 40 % of the energy, the entropy is higher than without compensation,
         or the fit has not converged. `ok` is False there, and where the standard deviation of the
-        rate is 5 % or more; k and yc may then still serve to form an image, whose scale is unknown.
-        Further info: scatterers, noise_power, steps, entropy_nats, uncompensated_entropy_nats.
+        rate is 5 % or more; in the second case k and yc may still serve to form an image, whose
+        cross-range scale is unknown. Further info: scatterers (their number), noise_power, steps,
+        entropy_nats, uncompensated_entropy_nats.
 
     Raises:
         TypeError: If the data are not complex.
@@ -105,18 +110,23 @@ def coarse_rotation(
 ) -> Estimate:
     """Estimate k1 and k2 from the spectra of short sections, the first step of `uneven_rotation`.
 
-    They are accurate to about a percent of the rate. The rate is not estimated and is 0.
+    The rotation rate at time t after the first pulse is modelled as that at the first pulse times 1
+    + k1 t + k2 t^2 / 2. This relative rate is found to about a percent. The absolute rate is not
+    estimated; `omega_rad_s` is 0.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
         wavelength_m: Wavelength in metres.
         prf_hz: Pulse repetition frequency in Hz.
         range_m: Range coordinates y_n of the cells in metres, evenly spaced, shape (range,).
-        order: Order of the warp.
-        yc_m: Range centre deviation in metres if known a priori, a number or shape (...,).
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
+        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+            rotation centre), if known a priori, a number or shape (...,).
 
     Returns:
-        The values of `uneven_rotation`. `ok` is False where the entropy is higher than without
+        `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
+        standard deviations. `ok` is False where the image entropy is higher than without
         compensation.
 
     Raises:
@@ -145,21 +155,25 @@ def phase_fit_rotation(
 ) -> Estimate:
     """Estimate the rotation by the first two steps of `uneven_rotation`.
 
-    Takes half of the time of `uneven_rotation`, with two to twenty times its error.
+    These steps are the correlation of the spectra of short sections, and least squares on the phase
+    histories of bright scatterers. They take half the time of `uneven_rotation`; the errors are two
+    to twenty times as large.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
         wavelength_m: Wavelength in metres.
         prf_hz: Pulse repetition frequency in Hz.
         range_m: Range coordinates y_n of the cells in metres, evenly spaced, shape (range,).
-        order: Order of the warp.
-        yc_m: Range centre deviation in metres if known a priori, a number or shape (...,); None
-            estimates it.
-        steps: Number of steps of phase least squares.
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
+        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+            rotation centre), if known a priori, a number or shape (...,); None estimates it.
+        steps: Number of times that the least-squares fit to the phase histories is repeated.
         half_cells: Half width of the windows about scatterers in Doppler cells, at least 4.
 
     Returns:
-        The values of `uneven_rotation`. `ok` is False where the entropy is higher than without
+        `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
+        standard deviations. `ok` is False where the image entropy is higher than without
         compensation.
 
     Raises:
@@ -261,7 +275,7 @@ def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_
     if not isinstance(range_m, Tensor) or range_m.shape != data.shape[-1:]:
         got = f"the shape {tuple(range_m.shape)}" if isinstance(range_m, Tensor) else type(range_m).__name__
         raise ValueError(
-            f"{name}: range_m needs the {data.shape[-1]} coordinates of the range axis as a tensor, got {got}"
+            f"{name}: range_m must be a tensor of the {data.shape[-1]} coordinates of the range cells (m), got {got}"
         )
     refuse_non_finite(data, name)
     refuse_non_finite(range_m, f"{name}: range_m")
@@ -270,7 +284,7 @@ def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_
     if step == 0 or bool(((steps - step).abs() > 1e-6 * abs(step)).any()):
         raise ValueError(
             f"{name}: range_m must be evenly spaced, got steps of {float(steps.min()):g} to "
-            f"{float(steps.max()):g} m; resample range first"
+            f"{float(steps.max()):g} m; resample the data in range first"
         )
     return Sampling(wavelength_m, prf_hz, data.shape[-2], data.shape[-1], float(range_m[0]), step)
 

@@ -1,11 +1,12 @@
-"""Maximum likelihood of the rotation and of every scatterer together.
+"""Joint maximum-likelihood estimation of the rotation of a target and of all its scatterers.
 
 The unknowns are the amplitude, Doppler cell and range of each scatterer, and the common rotation.
-Each round subtracts the model of all known scatterers from the data, finds further scatterers in
-the image of the residual, and takes a Gauss-Newton step of all unknowns at once, with the couplings
-of neighbouring scatterers. Steps follow from the exact residual, so neighbours and side lobes leave
-no error at the end. The change of the curvature by range terms, a few percent, is neglected.
-Assumes range-compressed echoes of a flat band that fills the cells (`band_response`).
+Each round subtracts the model of all known scatterers from the data and takes a Gauss-Newton step
+of all unknowns at once, with the couplings of neighbouring scatterers. Some rounds first find
+further scatterers in the image of the residual. The steps follow from the exact residual, so
+neighbours and side lobes leave no error at the end. The influence of the range-dependent phase on
+the couplings, a few percent, is neglected. The echoes are assumed to be range-compressed with a
+flat spectrum that fills the whole band (`band_response`).
 """
 
 from __future__ import annotations
@@ -53,12 +54,12 @@ _SETTLED = 0.2  # steps of the motion below this share of its standard deviation
 
 @dataclass(frozen=True)
 class Scatterers:
-    """Scatterers of every trial.
+    """Amplitudes and positions of the scatterers of every trial.
 
     Args:
-        amplitude: Amplitude, shape (trial, scatterer), complex128; 0 for none.
-        cell: Doppler cell, shape (trial, scatterer), float64.
-        row: Range cell, shape (trial, scatterer), float64.
+        amplitude: Amplitude, shape (trial, scatterer), complex128; 0 where there is no scatterer.
+        cell: Doppler cell, fractional, 0 at zero Doppler, shape (trial, scatterer), float64.
+        row: Range cell, fractional, shape (trial, scatterer), float64.
     """
 
     amplitude: Tensor
@@ -70,23 +71,23 @@ class Scatterers:
         """Make an empty set of scatterers.
 
         Args:
-            like: Data, shape (trial, ...), which give trials and device.
+            like: Data, shape (trial, ...), which give the number of trials and the device.
 
         Returns:
-            The scatterers, shape (trial, 0).
+            No scatterers: tensors of shape (trial, 0).
         """
         empty = torch.zeros(like.shape[0], 0, dtype=torch.float64, device=like.device)
         return Scatterers(empty.to(torch.complex128), empty, empty)
 
     def joined(self, new: Scatterers, closed: Tensor) -> Scatterers:
-        """Append further scatterers.
+        """Append new scatterers to these.
 
         Args:
             new: The new scatterers.
-            closed: True for trials that take no new ones, shape (trial,), bool.
+            closed: True for trials that take no new scatterers, shape (trial,), bool.
 
         Returns:
-            All scatterers.
+            These scatterers, followed by the new ones.
         """
         added = torch.where(closed[:, None], 0, new.amplitude)
         return Scatterers(
@@ -98,10 +99,11 @@ class Scatterers:
     def apart(self) -> Scatterers:
         """Remove scatterers that lie within the resolution of a brighter one.
 
-        The amplitudes of such pairs grow against each other without limit and bias the motion.
+        The amplitudes of two unresolved scatterers would grow without limit, with opposite phases,
+        and bias the rotation.
 
         Returns:
-            The remaining scatterers.
+            The scatterers, with zero amplitude for those removed.
         """
         level = self.amplitude.abs()
         near = ((self.cell[:, :, None] - self.cell[:, None]).abs() < _APART) & (
@@ -113,17 +115,18 @@ class Scatterers:
 
 @dataclass(frozen=True)
 class Fit:
-    """State of a fit.
+    """State of the joint fit of a rotation and its scatterers.
 
     Args:
-        motion: Motion.
+        motion: Rotation of the target.
         scatterers: Scatterers.
-        covariance: Covariance of the free ones of (k1, k2, ..., w, v) per unit noise power, shape
-            (trial, unknown, unknown).
+        covariance: Covariance per unit noise power of the parameters of the rotation that are
+            estimated, out of k1, k2, ..., w and v (see `Motion`), shape (trial, unknown, unknown).
         noise: Noise power per sample, shape (trial,).
         steps: Number of steps taken, shape (trial,).
         settled: True for trials that have ended, shape (trial,), bool.
-        last_step: Largest step of the common unknowns in their standard deviations, shape (trial,).
+        last_step: Largest change of a parameter of the rotation in the last step, in units of its
+            standard deviation, shape (trial,).
     """
 
     motion: Motion
@@ -144,21 +147,22 @@ def fit_scatterers(
     count: int | None = None,
     rounds: int = ROUNDS,
 ) -> Fit:
-    """Fit the motion and all scatterers by maximum likelihood.
+    """Fit the rotation of a target and all its scatterers by maximum likelihood.
 
-    A trial ends when its motion moves by less than a fifth of its standard deviation.
+    A trial ends when a step changes each parameter of the rotation by less than a fifth of its
+    standard deviation.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
-        start: Motion to start from.
-        free_centre: Whether the range centre deviation is estimated.
+        start: Rotation to start from.
+        free_centre: True estimates the range centre deviation; False holds it.
         count: Largest number of scatterers, reached over the first rounds; by default one for every
             1450 samples, within 128..800.
         rounds: Largest number of steps.
 
     Returns:
-        The fit.
+        The fit: rotation, scatterers, covariance and noise power.
     """
     count = min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH)) if count is None else count
     unknowns = _Unknowns(start.k.shape[-1], free_centre)
@@ -289,9 +293,21 @@ class _Step:
     def of(
         data: Tensor, sampling: Sampling, fit: Fit, present: Tensor, unknowns: _Unknowns, count: int
     ) -> tuple[Tensor, _Step]:
-        """The residual of the data and the step from it, in one pass over blocks of pulses.
+        """Subtract the model of all scatterers from the data and prepare the Gauss-Newton step.
 
-        The echoes of a block of up to `count` scatterers stay in the cache.
+        The data are processed in blocks of pulses, so that the echoes of up to `count` scatterers
+        stay in the cache.
+
+        Args:
+            data: Range-compressed pulses, shape (trial, pulse, range), complex.
+            sampling: Sampling of the data.
+            fit: Current rotation and scatterers.
+            present: False for pulses without samples, shape (trial, pulse), bool.
+            unknowns: Parameters of the rotation that are estimated.
+            count: Largest number of scatterers.
+
+        Returns:
+            The residual, shape (trial, pulse, range), and the gradient and curvature for the step.
         """
         motion, found = fit.motion, fit.scatterers
         warped = Warped.of(motion.k, sampling.times(data.device), sampling.duration_s)
@@ -331,11 +347,17 @@ class _Step:
         )
 
     def taken(self, noise: Tensor | None = None) -> tuple[Motion, Scatterers, Tensor, Tensor]:
-        """Motion and scatterers after the step, step of the common unknowns, their covariance.
+        """Take the Gauss-Newton step.
 
-        The covariance is per unit noise power. noise: per sample (trial,). If it is given,
-        scatterers whose own curvature disagrees with the step (several in one resolution cell) lose
-        weight in rate and centre.
+        Args:
+            noise: Noise power per sample, shape (trial,). If it is given, a scatterer whose own
+                phase curvature disagrees with the common rotation, as that of several scatterers in
+                one resolution cell does, gets less weight in the rotation rate and the centre.
+
+        Returns:
+            The rotation and the scatterers after the step; the change of the parameters of the
+            rotation, shape (trial, unknown); and their covariance per unit noise power, shape
+            (trial, unknown, unknown).
         """
         slopes, factor = self._slopes(), _Factor.of(self._local())
         found = self._solved(slopes, factor)

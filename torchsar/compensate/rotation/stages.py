@@ -1,4 +1,4 @@
-"""Estimators of non-uniform rotation as stages, and the autofocus of such a target."""
+"""Stages that estimate the non-uniform rotation of a target, and autofocus of such a target."""
 
 from __future__ import annotations
 
@@ -38,12 +38,20 @@ class _Rotation(Stage):
     def __init__(self, radar: InverseRadar, order: int, yc_m: float | None) -> None:
         super().__init__()
         if order < 1:
-            raise ValueError(f"a rotation needs an order of 1 (uniform) or more, got {order}")
+            raise ValueError(f"order of the rotation must be 1 (uniform rotation) or more, got {order}")
         self.radar, self.order, self.yc_m = radar, order, yc_m
         self.provides = ("omega_rad_s", "warp_k", "yc_m", *(k_name(i) for i in range(1, order)))
 
     def settings(self, signal: Signal, yc_m: Tensor | None) -> dict[str, Any]:
-        """Arguments of the estimating function from the signal, the radar and the stage."""
+        """Collect the arguments of the estimating function from signal, radar and stage.
+
+        Args:
+            signal: Range-compressed pulses of axes (pulse, range).
+            yc_m: Connected range centre deviation in metres, or None for that of the stage.
+
+        Returns:
+            The arguments by name.
+        """
         range_m = signal.axis("range").values(signal.data.device)
         centre = self.yc_m if yc_m is None else yc_m
         return {
@@ -58,13 +66,16 @@ class _Rotation(Stage):
 class UnevenRotation(_Rotation):
     """Non-uniform rotation by the recommended estimator; see `uneven_rotation`.
 
-    Provides omega_rad_s, warp_k, its entries, and yc_m.
+    Provides `omega_rad_s` (rotation rate at the first pulse), `warp_k` (its relative derivatives)
+    with its entries `k1_per_s`, `k2_per_s2`, ..., and `yc_m` (range centre deviation).
 
     Args:
         radar: Radar parameters.
-        order: Order of the warp.
-        yc_m: Range centre deviation in metres if known a priori; None estimates it.
-        scatterers: Largest number of scatterers.
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
+        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+            rotation centre), if known a priori; None estimates it.
+        scatterers: Largest number of scatterers that are fitted.
         rounds: Largest number of maximum-likelihood steps.
 
     Raises:
@@ -87,7 +98,8 @@ class UnevenRotation(_Rotation):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            yc_m: Range centre deviation in metres known a priori, shape (...,).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), known a priori, shape (...,).
 
         Returns:
             The estimate of `uneven_rotation`.
@@ -98,11 +110,14 @@ class UnevenRotation(_Rotation):
 
 
 class CoarseRotation(_Rotation):
-    """k1 and k2 from sections of the aperture, without a rate; see `coarse_rotation`.
+    """Relative derivatives k1 and k2 of the rotation rate, without the rate; see `coarse_rotation`.
+
+    They are found from the Doppler spectra of short sections of the aperture.
 
     Args:
         radar: Radar parameters.
-        order: Order of the warp.
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
 
     Raises:
         ValueError: If the order is below 1.
@@ -112,18 +127,27 @@ class CoarseRotation(_Rotation):
         super().__init__(radar, order, None)
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate k1 and k2 from a signal of axes (pulse, range)."""
+        """Estimate k1 and k2, the relative derivatives of the rotation rate.
+
+        Args:
+            signal: Range-compressed pulses of axes (pulse, range).
+
+        Returns:
+            The estimate of `coarse_rotation`.
+        """
         return coarse_rotation(signal.data, **self.settings(signal, None))
 
 
 class PhaseFitRotation(_Rotation):
-    """Non-uniform rotation by phase least squares of bright scatterers; see `phase_fit_rotation`.
+    """Non-uniform rotation from the phase histories of bright scatterers; see `phase_fit_rotation`.
 
     Args:
         radar: Radar parameters.
-        order: Order of the warp.
-        yc_m: Range centre deviation in metres if known a priori; None estimates it.
-        steps: Number of steps of phase least squares.
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
+        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+            rotation centre), if known a priori; None estimates it.
+        steps: Number of times that the least-squares fit to the phase histories is repeated.
         half_cells: Half width of the windows about scatterers in Doppler cells.
 
     Raises:
@@ -141,7 +165,8 @@ class PhaseFitRotation(_Rotation):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            yc_m: Range centre deviation in metres known a priori, shape (...,).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), known a priori, shape (...,).
 
         Returns:
             The estimate of `phase_fit_rotation`.
@@ -154,13 +179,15 @@ class PhaseFitRotation(_Rotation):
 class RotationAutofocus(Stage):
     """Phase per pulse common to all scatterers, from the image with the rotation compensated.
 
-    Provides `phase_rad`. Uses `autofocus` if no rotation is connected. A free phase per pulse
-    absorbs the range centre deviation: fix yc in estimators that alternate with this one.
+    Provides `phase_rad`. Uses `autofocus` if no rotation is connected. A phase that may take any
+    value in each pulse also takes up the effect of the range centre deviation yc. An estimator of
+    the rotation that alternates with this stage must therefore be given a fixed yc.
 
     Args:
         radar: Radar parameters.
         search: Largest number of iterations of the entropy fixed point.
-        polish: Largest number of iterations against the Wiener estimate.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
     """
 
     provides = ("phase_rad",)
@@ -177,18 +204,21 @@ class RotationAutofocus(Stage):
         warp_k: Tensor | None = None,
         yc_m: Tensor | None = None,
     ) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             phase_rad: Phase to start from in rad, shape (..., pulse).
-            omega_rad_s: Rotation rate in rad/s, shape (...,); without it the range term is not
-                compensated.
-            warp_k: Warp, shape (..., order - 1).
-            yc_m: Range centre deviation in metres, shape (...,); by default 0.
+            omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,); without it the
+                phase that depends on the range of a scatterer is not compensated.
+            warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+                1/s^2, ..., shape (..., order - 1).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), shape (...,); by default 0.
 
         Returns:
-            The estimate of `rotating_autofocus` or `autofocus`.
+            `phase_rad` of shape (..., pulse), to be removed: the estimate of `rotating_autofocus`,
+            or of `autofocus` if `warp_k` is None.
         """
         if warp_k is None:
             return autofocus(signal.data, start=phase_rad)
@@ -210,19 +240,27 @@ class RotationAutofocus(Stage):
 def rotating_autofocus(
     data: Tensor, prf_hz: float, warp_k: Tensor, start: Tensor | None = None, search: int = 60, polish: int = 20
 ) -> Estimate:
-    """Estimate the phase per pulse that sharpens the matched Fourier transform of a known warp.
+    """Estimate the phase error of each pulse of a target whose non-uniform rotation is known.
+
+    The phases are those with which the image, formed by the matched Fourier transform for this
+    rotation, is sharpest.
 
     Args:
-        data: Range-compressed pulses without their range term, shape (..., pulse, range), complex.
+        data: Range-compressed pulses from which `range_phase` has removed the phase that depends on
+            the range of a scatterer, shape (..., pulse, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
-        warp_k: Warp, shape (trial, order - 1).
-        start: Phase to start from in rad, shape (..., pulse); by default that of adjacent pulses.
+        warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+            1/s^2, ..., shape (trial, order - 1).
+        start: Phase to start from in rad, shape (..., pulse); by default the sum of the phases
+            between adjacent pulses, as in `sca`.
         search: Largest number of iterations of the entropy fixed point.
-        polish: Largest number of iterations against the Wiener estimate.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed. quality is the share by which the number
-        of cells that the image fills, exp(entropy), falls. `ok` is False where it grows.
+        `phase_rad` of shape (..., pulse), to be removed. quality is the relative decrease of
+        exp(entropy), the number of cells that the image fills, due to the correction. `ok` is False
+        where this number increases.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.

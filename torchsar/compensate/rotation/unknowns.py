@@ -1,4 +1,4 @@
-"""The unknowns of a search for the rotation, and the rotation that they describe."""
+"""The unknowns of a search for the rotation of a target, and conversion from and to rotations."""
 
 from __future__ import annotations
 
@@ -20,13 +20,15 @@ _LEAST_START = 1e-6
 
 
 class RotationParameters(NamedTuple):
-    """A rotation per trial.
+    """Parameters of the rotation of a target, one set per trial.
 
     Args:
         omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,).
-        warp_k: Warp, shape (..., order - 1); 0 where the rotation is not feasible.
-        yc_m: Range centre deviation in metres, shape (...,).
-        feasible: True where the warp grows at all times, shape (...,), bool.
+        warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+            1/s^2, ..., shape (..., order - 1); 0 where the rotation is not feasible.
+        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+            rotation centre), shape (...,).
+        feasible: True where the rotation neither stops nor reverses, shape (...,), bool.
     """
 
     omega_rad_s: Tensor
@@ -37,24 +39,27 @@ class RotationParameters(NamedTuple):
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The vector of unknowns (..., n) of a search over an aperture.
+    """The unknowns of a search for the rotation of a target, as vectors of shape (..., n).
 
-    In the variables "raw" it is omega (rad/s), k1, k2, ... (1/s, 1/s^2, ...), yc (m). In the
-    variables "shape" it is the total angle A = omega * phi(T) (rad), the Legendre shape q2, q3, ...
-    of the warp (`torchsar.core.warp.shape_of`), yc (m). Errors of k1 and k2 are correlated (dk1 is
-    about -T/2 dk2); those of q2 and q3 are not.
+    In the variables "raw" a vector holds the rotation rate omega at the first pulse (rad/s), its
+    relative derivatives k1, k2, ... (1/s, 1/s^2, ...), and the range centre deviation yc (m). In
+    the variables "shape" it holds the total rotation angle A over the aperture (rad), the Legendre
+    coefficients q2, q3, ... of the rotation angle over time (`torchsar.core.warp.shape_of`), and
+    yc. Errors of k1 and k2 are correlated (the error of k1 is about -T/2 times that of k2, with
+    the length T of the aperture); those of q2 and q3 are not.
 
     Args:
         duration_s: Duration of the aperture in seconds.
-        order: Order of the warp; 1 is uniform rotation.
-        range_term: Whether the range-dependent phase is compensated. Without it, omega and yc do
-            not affect the entropy and are not unknowns.
-        yc: Whether the range centre deviation is an unknown; otherwise it is known a priori.
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
+        range_term: True compensates the phase that depends on the range of a scatterer. Otherwise
+            omega and yc do not affect the entropy and are not unknowns.
+        yc: True makes the range centre deviation an unknown; otherwise it is known a priori.
         variables: "raw" or "shape".
 
     Raises:
         ValueError: If there is nothing to search for, `yc` is an unknown without the range term, or
-            the variables are unknown.
+            `variables` is neither "raw" nor "shape".
     """
 
     duration_s: float
@@ -67,16 +72,16 @@ class Unknowns:
         least = 1 if self.range_term else 2
         if self.order < least:
             raise ValueError(
-                "a rotation of order "
-                f"{self.order}{'' if self.range_term else ' without its range term'} has nothing to "
-                f"search for; choose an order of at least {least}"
+                f"order must be {least} or more{'' if self.range_term else ' without the range term'}, got "
+                f"{self.order}: such a rotation has no unknowns to search for"
             )
         if self.yc and not self.range_term:
             raise ValueError(
-                "the centre deviation appears in the range term alone; give a known yc, or compensate the range term"
+                "yc_m must be known if range_term is False, because the range centre deviation affects the range "
+                "term alone; give yc_m, or set range_term to True"
             )
         if self.variables not in ("raw", "shape"):
-            raise ValueError(f"variables {self.variables!r} are not known; choose 'raw' or 'shape'")
+            raise ValueError(f"variables must be 'raw' or 'shape', got {self.variables!r}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,13 +95,14 @@ class Unknowns:
         )
 
     def turn(self, x: Tensor, yc_m: Tensor) -> RotationParameters:
-        """Convert unknowns to the rotation that they describe.
+        """Convert vectors of unknowns to the rotations that they describe.
 
-        Differentiable where feasible.
+        Differentiable where the rotation is feasible.
 
         Args:
             x: Unknowns, shape (..., n).
-            yc_m: Range centre deviation in metres, shape (...,), used if it is not an unknown.
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), shape (...,), used if it is not an unknown.
 
         Returns:
             The rotation.
@@ -115,12 +121,14 @@ class Unknowns:
         )
 
     def at(self, omega_rad_s: Tensor, warp_k: Tensor, yc_m: Tensor) -> Tensor:
-        """Convert a rotation to unknowns; the inverse of `turn`.
+        """Convert rotations to vectors of unknowns; the inverse of `turn`.
 
         Args:
             omega_rad_s: Rotation rate in rad/s, shape (...,).
-            warp_k: Warp, shape (..., order - 1).
-            yc_m: Range centre deviation in metres, shape (...,).
+            warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+                1/s^2, ..., shape (..., order - 1).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), shape (...,).
 
         Returns:
             The unknowns, shape (..., n).
@@ -131,19 +139,20 @@ class Unknowns:
         return torch.stack(torch.broadcast_tensors(*columns), -1)
 
     def units(self, x: Tensor, wavelength_m: float, extent_m: float, n_pulse: int) -> Tensor:
-        """Compute steps that change the phase of an outer scatterer by about a radian.
+        """Compute a scale for each unknown: the change that alters phases by about a radian.
 
-        The target is assumed to be as wide as the pulse rate allows. Steps of omega or A are at
-        most its size in x, those of yc at most the depth.
+        The phases are those of scatterers at the edge of the target, which is assumed to be as wide
+        as the pulse rate allows. The change of the rotation rate (or of the angle) is limited to
+        its value in `x`, that of yc to `extent_m`.
 
         Args:
             x: Unknowns, shape (..., n).
             wavelength_m: Wavelength in metres.
-            extent_m: Depth of the target in metres.
+            extent_m: Extent of the target in range in metres.
             n_pulse: Number of pulses.
 
         Returns:
-            The steps, shape (..., n).
+            The changes, positive, shape (..., n).
         """
         bend = 4 / n_pulse
         parts = [self._k_unit(i) * bend if self.variables == "raw" else bend for i in range(1, self.order)]
@@ -162,7 +171,7 @@ class Unknowns:
         return math.factorial(2 * i + 2) / (2 * math.factorial(i + 1) * self.duration_s**i)
 
     def vector(self, values: Sequence[float] | Tensor, what: str) -> Tensor:
-        """Convert numbers, one per unknown, to a vector.
+        """Convert numbers, one per unknown, to a vector, and check how many they are.
 
         Args:
             values: The numbers, shape (..., n).
@@ -177,7 +186,8 @@ class Unknowns:
         x = torch.as_tensor(values, dtype=torch.float64)
         if x.ndim == 0 or x.shape[-1] != len(self.names):
             raise ValueError(
-                f"{what} needs the {len(self.names)} values {', '.join(self.names)}, got {x.shape[-1] if x.ndim else 1}"
+                f"{what} must hold the {len(self.names)} values {', '.join(self.names)}, got "
+                f"{x.shape[-1] if x.ndim else 1}"
             )
         return x
 
@@ -193,13 +203,13 @@ class Unknowns:
 
 
 def k_name(i: int) -> str:
-    """Name k_i with its unit: k1_per_s, k2_per_s2, and so on.
+    """Return the name, with its unit, of the relative derivative k_i of the rotation rate.
 
     Args:
-        i: Number of the term, from 1.
+        i: Order of the derivative, from 1.
 
     Returns:
-        The name.
+        The name: k1_per_s, k2_per_s2, and so on.
     """
     return f"k{i}_per_s{i if i > 1 else ''}"
 
