@@ -69,8 +69,8 @@ def cyclic_fit(y: Tensor, period: int) -> CyclicFit:
     """Fit the Fourier coefficients of timing jitter to correlations in the range spectrum.
 
     Jitter of period M correlates spectral components that lie k / M cycles per sample apart, with
-    whole k from 1 to M - 1. The variance includes the scatter of the correlations about the fit, so that lines that resemble
-    each other do not count as independent.
+    whole k from 1 to M - 1. The variance includes the scatter of the correlations about the fit, so
+    that lines that resemble each other do not count as independent.
 
     Args:
         y: Lines, shape (..., pulse, range), complex.

@@ -69,9 +69,7 @@ def _check(pilot: Tensor, max_period: int, period: int | None, origin: str) -> N
     if origin not in ORIGINS:
         raise ValueError(f"origin {origin!r} is unknown; choose one of {ORIGINS}")
     if not pilot.is_complex():
-        raise TypeError(
-            f"pilot must hold complex samples (..., n), got {pilot.dtype}; form the analytic signal first"
-        )
+        raise TypeError(f"pilot must hold complex samples (..., n), got {pilot.dtype}; form the analytic signal first")
     if pilot.ndim < 1 or pilot.shape[-1] < 4 * longest:
         length = pilot.shape[-1] if pilot.ndim else 0
         raise ValueError(
