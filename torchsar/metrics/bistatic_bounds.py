@@ -148,7 +148,7 @@ class _MovingPoint:
 
     @staticmethod
     def of(radar: BistaticRadar, time_s: Tensor, u_r: Tensor, u_a: Tensor, y0: Tensor, range_m: Tensor) -> _MovingPoint:
-        """Geometry of the point with these velocities, position and range."""
+        """Compute the range history of a point with the given velocities, position and range."""
         dx, speed = radar.channels_at(time_s.device)[:, None], radar.speed_m_s - u_a
         excess = receive_range(time_s, u_r, u_a, y0, range_m, radar.speed_m_s, dx)
         return _MovingPoint(

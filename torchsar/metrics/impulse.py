@@ -62,7 +62,7 @@ def impulse_response(
     if sidelobe_nulls < 1 or (search_m is not None and not search_m > 0):
         raise ValueError(
             "impulse_response needs sidelobe_nulls of 1 or more and search_m above 0, got "
-            f"{sidelobe_nulls} and {search_m}"
+            f"{sidelobe_nulls} nulls and search_m={search_m}"
         )
     refuse_non_finite(signal.data, "impulse_response")
     per_target = any(torch.as_tensor(a).ndim > len(signal.trials) for a in at_m)

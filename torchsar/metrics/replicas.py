@@ -67,7 +67,7 @@ def azimuth_response(
     if sidelobe_nulls < 1 or not step_m > 0:
         raise ValueError(
             "azimuth_response needs sidelobe_nulls of 1 or more and a positive step_m, got "
-            f"{sidelobe_nulls} and {step_m}"
+            f"{sidelobe_nulls} nulls and step_m={step_m}"
         )
     data = profile.to(torch.complex128)
     best = data.abs().argmax(-1)
@@ -182,7 +182,7 @@ class _Hyperbola:
 
     @staticmethod
     def of(radar: BistaticRadar, u_r: Tensor, u_a: Tensor, y0: Tensor, range_m: Tensor) -> _Hyperbola:
-        """Spectrum of the point with these velocities, position and range."""
+        """Compute the Doppler spectrum of a point with the given velocities, position and range."""
         along = radar.speed_m_s - u_a
         speed = torch.hypot(along, u_r)
         image = (u_r * range_m + along * y0) / speed.square()

@@ -328,7 +328,9 @@ def _levels(shown: ShownShip, made: MadeScene, still: Signal) -> dict[str, float
     """What images hold where a ship is, was shown, and repeats."""
 
     def of_lines(at: ImagePosition, reach_m: float) -> float:
-        """Mean power of what does not move in the lines within reach_m."""
+        """Mean power in the image of what does not move, over all azimuths within reach_m in
+        range.
+        """
         return at.power(still, (math.inf, reach_m))
 
     true = ImagePosition(float(shown.centre.y0_m), float(shown.centre.range_m))

@@ -267,7 +267,7 @@ class SparseFill(Stage):
         if reference is not None and reference not in REFERENCES:
             raise ValueError(
                 f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or "
-                "None for compressed lines"
+                "None for range-compressed lines"
             )
         if min(looks, rounds, steps) < 1:
             raise ValueError(

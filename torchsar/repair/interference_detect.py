@@ -29,22 +29,22 @@ LEVEL_SHARE = 1 / 16
 
 @dataclass(frozen=True)
 class Level:
-    """Robust mean power spectral density of the clean part of each line.
+    """Robust mean power spectral density that each line has without interference.
 
     Args:
-        density: Density in FFT order, shape (..., pulse, range).
+        density: Power of each frequency cell in FFT order, shape (..., pulse, range).
     """
 
     density: Tensor
 
     def at(self, cell: Tensor) -> Tensor:
-        """Return the density at one frequency cell of each line.
+        """Return the power spectral density without interference at one frequency cell per line.
 
         Args:
             cell: Cell of an n-point FFT, shape (..., pulse), int64.
 
         Returns:
-            Shape (..., pulse).
+            Density, shape (..., pulse).
         """
         return self.density.gather(-1, (cell % self.density.shape[-1])[..., None])[..., 0]
 

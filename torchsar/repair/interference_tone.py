@@ -482,7 +482,7 @@ def around(cell: Tensor, n: int) -> Tensor:
         n: Number of cells.
 
     Returns:
-        Shape (..., pulse, n), bool.
+        True for these cells, shape (..., pulse, n), bool.
     """
     distance = (torch.arange(n, device=cell.device) - cell[..., None]) % n
     return (distance <= n // 32) | (distance >= n - n // 32)

@@ -101,7 +101,9 @@ class _Fit:
         return self.phasor.abs().square().mean(-1)
 
     def significance(self, noise: Tensor) -> Tensor:
-        """Chi-squared statistic of the phases: M - 1 degrees of freedom without jitter."""
+        """Chi-squared statistic of the phases of the M converters; without jitter it has M - 1
+        degrees of freedom.
+        """
         information = (
             2 * self.count * self.phasor.abs().square() / noise.clamp_min(1e-30 * self.power + 1e-300)[..., None]
         )

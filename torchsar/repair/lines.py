@@ -236,7 +236,7 @@ def _check_consistency(ok: Tensor, trusted: Tensor, single: Tensor) -> None:
         return
     raise ValueError(
         f"line numbers cannot be reconciled: only {accepted} of {total} agree with those of neighbouring "
-        "lines, and half must; check that the numbers rise from line to line, or raise longest_gap"
+        "lines, and at least half must; check that the numbers rise from line to line, or raise longest_gap"
     )
 
 

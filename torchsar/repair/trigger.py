@@ -64,7 +64,9 @@ class _Windows:
         return ((self.lines.shape[-1] - 2 * self.margin) // n - 1) // 2 * 2
 
     def chosen(self, every: bool) -> tuple[Tensor, Tensor]:
-        """Lines and numbers j of their sweeps, in pairs: all, or about MAX_WINDOWS."""
+        """Lines, and numbers j of the sweeps that are used, in pairs of up and down sweep: all of
+        them, or about MAX_WINDOWS.
+        """
         pairs, n_line = self.count // 2, self.lines.shape[-2]
         step = 1 if every else max(1, pairs * n_line * 2 // MAX_WINDOWS)
         line_step = min(step, n_line)
@@ -72,7 +74,9 @@ class _Windows:
         return self.lines[..., ::line_step, :], torch.stack([j, j + 1], -1).flatten()
 
     def cut(self, start: Tensor, every: bool = False) -> Tensor:
-        """Sweeps from starts (..., o) on, (..., o, line, sweep, N); lines end in a constant."""
+        """Cut sweeps of N samples from each start sample (..., o) on, (..., o, line, sweep, N);
+        lines are continued by their last sample.
+        """
         n, (lines, j) = self.radar.sweep_samples, self.chosen(every)
         position = (start[..., None, None] + (j[:, None] * n + torch.arange(n, device=lines.device))).clamp_max(
             lines.shape[-1] - 1
