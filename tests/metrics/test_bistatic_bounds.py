@@ -154,7 +154,7 @@ def test_bounds_of_unobservable_unknowns_are_infinite():
         ({"unknown": ("u_r",)}, "unknown must name some of"),
         ({"unknown": ()}, "unknown must name some of"),
         ({"integration_s": -1.0}, "must be positive"),
-        ({"integration_s": 4.5, "gate_tells": True}, "edges of a rectangular gate"),
+        ({"integration_s": 4.5, "gate_tells": True}, "gate_tells needs the antenna pattern"),
         ({"covariance": torch.eye(3)}, "n_pulse, channel, channel"),
     ],
 )

@@ -177,7 +177,7 @@ def test_invalid_images_raise():
         contrast(flat.expand(0, 8))
     with pytest.raises(TypeError, match="got ndarray"):
         entropy(flat.expand(4, 8).numpy())
-    with pytest.raises(ValueError, match=r"one size can be compared.*\(4, 8\).*\(2, 8\)"):
+    with pytest.raises(ValueError, match=r"equal size can be compared.*\(4, 8\).*\(2, 8\)"):
         error_db(flat.expand(4, 8), flat.expand(2, 8))
     with pytest.raises(ValueError, match="complex images.*torch.float32"):
         correlation(flat.expand(4, 8).real, flat.expand(4, 8))

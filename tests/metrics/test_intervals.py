@@ -127,5 +127,5 @@ def test_half_width_shrinks_with_trials() -> None:
     assert half_width_ratio(np.full(10, 3.0), "rmse", 0) == 0 and np.isnan(
         half_width_ratio(np.array([1.0, NAN]), "rmse", 0)
     )
-    with pytest.raises(ValueError, match="choose rmse, mean or median"):
+    with pytest.raises(ValueError, match="must be 'rmse', 'mean' or 'median'"):
         half_width_ratio(x, "mode", seed=0)

@@ -208,5 +208,5 @@ def test_invalid_arguments_raise() -> None:
     kind = {"wavelength_m": WAVELENGTH, "prf_hz": 4e3, "n_pulse": 40}
     with pytest.raises(ValueError, match=r"equally many targets, got the shapes \(5,\), \(4,\), \(5,\)"):
         rotation_bounds(x, y[:4], amplitude, 0.1, 0.02, K[:2], **kind)
-    with pytest.raises(ValueError, match=r"warp_k is \(\.\.\., order - 1\)"):
+    with pytest.raises(ValueError, match=r"warp_k must have the shape \(\.\.\., order - 1\)"):
         rotation_bounds(x, y, amplitude, 0.1, 0.02, K[0], **kind)

@@ -76,7 +76,7 @@ def test_correction_is_the_inverse_and_differentiable():
 
 
 def test_too_few_lines_raise():
-    with pytest.raises(ValueError, match="at least 5 lines"):
+    with pytest.raises(ValueError, match="more than twice as many lines as channels, got 2 channels and 4 lines"):
         estimate_imbalance(torch.zeros(4, 8, dtype=torch.complex64))
 
 

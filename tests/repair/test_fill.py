@@ -213,11 +213,14 @@ def test_gradients_reach_received_lines(fill) -> None:
     "build, message",
     [
         (lambda: SparseFill(RADAR, "nearest"), "range reference 'nearest' is unknown"),
-        (lambda: SparseFill(RADAR, looks=0), "at least one look"),
-        (lambda: BandLimitedFill(steps=0), "at least one round"),
+        (lambda: SparseFill(RADAR, looks=0), "looks, rounds and steps of a sparse fill must be 1 or more, got looks=0"),
+        (
+            lambda: BandLimitedFill(steps=0),
+            "rounds and steps of a band-limited fill must be 1 or more, got rounds=2, steps=0",
+        ),
         (
             lambda: zero_fill(torch.zeros(5, 3, dtype=torch.complex64), torch.zeros(4, dtype=torch.bool)),
-            "does not fit 5 lines",
+            "one entry for each of the 5 lines",
         ),
     ],
 )

@@ -135,8 +135,8 @@ def test_one_inconsistent_trial_does_not_change_others() -> None:
     [
         (torch.randperm(N, generator=torch.Generator().manual_seed(1)), "cannot be reconciled"),
         (torch.arange(N).flip(0), "cannot be reconciled"),
-        (torch.arange(N - 1), "do not fit 600 lines"),
-        (torch.arange(N) + 0.5, "must be integers"),
+        (torch.arange(N - 1), "one number for each of the 600 lines"),
+        (torch.arange(N) + 0.5, "must hold integers"),
     ],
 )
 def test_inconsistent_or_invalid_numbers_raise(number: Tensor, message: str) -> None:

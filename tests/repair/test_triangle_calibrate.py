@@ -140,7 +140,7 @@ def test_invalid_input_raises():
     for bad in ({"method": "phase"}, {"delay_s": -1.0}, {"method": "other"}):
         with pytest.raises(ValueError, match="method must be|must be positive"):
             CalibrateSweeps(radar, **{"delay_s": 50e-9, **bad})
-    with pytest.raises(ValueError, match="complex \\(..., 2, K or 1, 512\\)"):
+    with pytest.raises(ValueError, match="calibration must be complex \\(..., 2, K or 1, 512\\)"):
         calibrate_sweeps(x, channel(radar, 50e-9)[..., :100], radar, 50e-9)
-    with pytest.raises(ValueError, match="at least half must remain"):
+    with pytest.raises(ValueError, match="delay_s of the calibration channel must be at most half a sweep"):
         calibrate_sweeps(x, channel(radar, 50e-9), radar, 5e-6)

@@ -1,7 +1,7 @@
 """Cramer-Rao bounds of a moving point seen by a receiver with several channels along track.
 
-`snr` is the power of the point over the noise variance, of one range-compressed sample of one
-channel where the weight of the antenna pattern is one.
+`snr` is the power ratio of the point to the noise in one range-compressed sample of one channel, at
+the maximum of the antenna pattern.
 """
 
 from __future__ import annotations
@@ -28,22 +28,24 @@ Value = Tensor | float
 
 
 def radial_velocity_bound_m_s(radar: BistaticRadar, snr: Value, n_seen: Value, u_a_m_s: Value = 0.0) -> Tensor:
-    """Compute the bound of u_r with u_a, y0 and the amplitude unknown, in closed form.
+    """Compute the bound of the slant-range speed of a moving point, in closed form.
 
         v lambda / (2 pi sqrt(2 Ns snr sum (dx_m - mean dx)^2))
 
-    Three channels d apart give v lambda / (4 pi d sqrt(Ns snr)). The formula describes the look
-    angle between the channels. The curvature of the Doppler history, which `bistatic_bounds`
-    includes, adds almost nothing.
+    Here v is the along-track speed of the receiver relative to the point and dx_m the along-track
+    positions of the channels. Three channels a distance d apart give v lambda / (4 pi d sqrt(Ns
+    snr)). The along-track speed, the position and the complex amplitude of the point are unknown.
+    The formula uses only the phases between the channels; the curvature of the Doppler history,
+    which `bistatic_bounds` includes, adds almost no information.
 
     Args:
         radar: Radar with the positions of the channels along track.
-        snr: Power of the point over the noise variance per sample.
+        snr: Power ratio of the point to the noise per sample.
         n_seen: Number of pulses Ns in which the point is illuminated.
         u_a_m_s: Along-track speed of the point in m/s.
 
     Returns:
-        Standard deviation of u_r in m/s, float64; infinite for a single channel.
+        Standard deviation of the slant-range speed in m/s, float64; infinite for a single channel.
     """
     along_m = radar.channels_at()
     spread = (along_m - along_m.mean()).square().sum()
@@ -69,28 +71,34 @@ def bistatic_bounds(
     """Compute the least standard deviations of the velocities and the position of a moving point.
 
     The samples are a w exp(-j 2 pi / lambda R_m(t)) over `n_pulse` pulses and all channels, with
-    the transmit range removed; the complex amplitude a is unknown, R0 and the noise are known. The
-    Fisher information is 2 snr Re(D^H C^-1 D) after projection onto the complement of the
-    amplitude. At 0 dB, PRF 180 Hz, 4.5 s and three channels 0.8 m apart the bound of u_r is 0.251
-    m/s; with u_a known 0.148 m/s; with y0 known too 0.00042 m/s. In the last case u_r is a mere
-    frequency, and its bound means little for an estimator that must find the others as well.
+    the transmit range removed. R_m is the range from the point to channel m, and w the antenna
+    pattern or a rectangular gate. The complex amplitude a is unknown; the slant range at t = 0 and
+    the noise are known. The Fisher information is 2 snr Re(D^H C^-1 D), where D holds the
+    derivatives of the samples with respect to the unknowns, made orthogonal to the samples since a
+    is unknown, and C is the covariance of noise and clutter.
+
+    At 0 dB, PRF 180 Hz, 4.5 s and three channels 0.8 m apart the bound of u_r is 0.251 m/s; with
+    u_a known 0.148 m/s; with y0 known too 0.00042 m/s. In the last case u_r follows from the
+    Doppler frequency alone, and the bound says little about an estimator that must find u_a and y0
+    as well.
 
     Args:
         radar: Radar with the positions of the channels along track.
         n_pulse: Number of pulses.
-        snr: Power of the point over the noise variance per sample.
-        u_r_m_s: Slant-range speed in m/s, closing positive.
-        u_a_m_s: Along-track speed in m/s.
-        y0_m: Along-track position at t = 0 in metres.
+        snr: Power ratio of the point to the noise per sample.
+        u_r_m_s: Slant-range speed u_r of the point in m/s, closing positive.
+        u_a_m_s: Along-track speed u_a of the point in m/s.
+        y0_m: Along-track position y0 of the point at t = 0 in metres.
         range_m: Slant range at t = 0 in metres; None for the reference range of the radar.
-        integration_s: Length T of a rectangular gate |t - y0/v| < T/2 in seconds, a number or shape
-            (...,); None for the one-way pattern of the radar's elements.
-        unknown: Names of the unknowns; the others are known.
-        gate_tells: Include the information in the slopes of the antenna pattern about the position.
-            By default only phases count.
+        integration_s: Length T in seconds of a rectangular gate |t - y0/v| < T/2 in which the point
+            is illuminated, a number or shape (...,); None for the one-way pattern of the radar's
+            elements.
+        unknown: Names of the unknowns among "u_r_m_s", "u_a_m_s" and "y0_m"; the others are known.
+        gate_tells: Whether to include what the slopes of the antenna pattern reveal about the
+            position; by default only phases are used.
         covariance: Covariance of noise and clutter across the channels, shape (..., n_pulse,
-            channel, channel), per bin of the unitary FFT over the pulses in FFT order. White noise
-            of unit variance is the identity.
+            channel, channel), for each bin of the unitary FFT over the pulses in FFT order; None
+            for white noise of unit variance.
 
     Returns:
         Bounds of the unknowns by name in m/s and m, shape (...,) each, float64; infinite for
@@ -140,7 +148,7 @@ class _MovingPoint:
 
     @staticmethod
     def of(radar: BistaticRadar, time_s: Tensor, u_r: Tensor, u_a: Tensor, y0: Tensor, range_m: Tensor) -> _MovingPoint:
-        """Geometry of the point with these velocities, position and range."""
+        """Compute the range history of a point with the given velocities, position and range."""
         dx, speed = radar.channels_at(time_s.device)[:, None], radar.speed_m_s - u_a
         excess = receive_range(time_s, u_r, u_a, y0, range_m, radar.speed_m_s, dx)
         return _MovingPoint(
@@ -166,7 +174,9 @@ class _MovingPoint:
         return torch.sinc(self._offset())
 
     def pattern_slopes(self) -> Tensor:
-        """Derivative of the pattern by (u_r, u_a, y0), (..., channel, pulse, 3)."""
+        """Derivatives of the antenna pattern with respect to the velocities u_r and u_a and the
+        position y0 of the point, (..., channel, pulse, 3).
+        """
         x = self._offset()[..., None]
         near = x.abs() < 1e-4
         safe = torch.where(near, 1.0, x)
@@ -231,7 +241,9 @@ def _check(
 ) -> None:
     """Raise ValueError for arguments that do not fit."""
     if not unknown or len(set(unknown)) != len(unknown) or not set(unknown) <= set(UNKNOWNS):
-        raise ValueError(f"bistatic_bounds: unknown must name some of {UNKNOWNS}, each once, got {tuple(unknown)}")
+        raise ValueError(
+            f"bistatic_bounds: unknown must name some of {UNKNOWNS}, each at most once, got {tuple(unknown)}"
+        )
     if integration_s is not None and not bool((torch.as_tensor(integration_s) > 0).all()):
         raise ValueError(
             "bistatic_bounds: integration_s must be positive, or None for the pattern of the "
@@ -239,8 +251,8 @@ def _check(
         )
     if integration_s is not None and gate_tells:
         raise ValueError(
-            "bistatic_bounds: the edges of a rectangular gate have no Cramer-Rao bound; leave out "
-            "gate_tells, or use the pattern (integration_s=None)"
+            "bistatic_bounds: gate_tells needs the antenna pattern (integration_s=None), since there is no "
+            "Cramer-Rao bound for the edges of a rectangular gate; leave out one of the two arguments"
         )
     expected = (n_pulse, radar.channels, radar.channels)
     if covariance is not None and tuple(covariance.shape[-3:]) != expected:

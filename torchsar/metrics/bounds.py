@@ -1,8 +1,8 @@
 """Cramer-Rao bounds for stripmap data and for phases per pulse, and a published reference curve.
 
-q is the peak signal-to-noise power ratio of a point after two-dimensional compression, equal to the
-signal energy over the noise variance per sample. All functions take numbers or tensors that
-broadcast, and return float64.
+The argument q is the peak signal-to-noise power ratio of a point after two-dimensional compression,
+equal to the signal energy over the noise variance per sample. All functions take numbers or tensors
+that broadcast, and return float64.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ def _double(value: Value) -> Tensor:
 def tone_frequency_bound_hz(q: Value, duration_s: Value) -> Tensor:
     """Compute the bound of the frequency of a tone with unknown phase and amplitude.
 
-    sqrt(6) / (2 pi T sqrt(q)) = 0.39 / (T sqrt(q)). It is also the bound of the Doppler of one
-    point at the middle of its aperture, once its known quadratic phase is removed.
+    The bound is sqrt(6) / (2 pi T sqrt(q)) = 0.39 / (T sqrt(q)). It is also the bound of the
+    Doppler frequency of one point at the middle of its aperture, once its known quadratic phase is
+    removed.
 
     Args:
-        q: Peak signal-to-noise ratio after compression.
+        q: Peak signal-to-noise power ratio after two-dimensional compression (not in dB).
         duration_s: Duration T in seconds.
 
     Returns:
@@ -39,13 +40,14 @@ def tone_frequency_bound_hz(q: Value, duration_s: Value) -> Tensor:
 
 
 def reference_doppler_std_hz(q: Value, duration_s: Value) -> Tensor:
-    """Compute the reference curve of the Doppler estimate of a point, 1 / (T sqrt(q)).
+    """Compute a published curve for the error of the Doppler estimate of a point, 1 / (T sqrt(q)).
 
-    It is 2.6 times the bound of a tone and applies to a point with a known position in the beam.
-    The centroid of the beam, estimated from one point, obeys `beam_centre_bound_hz`.
+    It is 2.6 times the Cramer-Rao bound of a tone and applies to a point with a known position in
+    the beam. The bound for the Doppler centroid of the beam, estimated from a point of unknown
+    position, is `beam_centre_bound_hz`.
 
     Args:
-        q: Peak signal-to-noise ratio after compression.
+        q: Peak signal-to-noise power ratio after two-dimensional compression (not in dB).
         duration_s: Coherent integration time T in seconds.
 
     Returns:
@@ -60,14 +62,15 @@ def reference_doppler_std_hz(q: Value, duration_s: Value) -> Tensor:
 def beam_centre_bound_hz(gain: Tensor, q: Value, rate_hz_s: Value, prf_hz: float) -> Tensor:
     """Compute the bound of the Doppler centroid of a beam from one point of unknown position.
 
-    Only the envelope carries information about the beam centre: Ka / sqrt(2 q int g'^2 / int g^2).
-    This is about 0.2 Ka T / sqrt(q) for a cosine-shaped gain of length T, larger than the bound of
-    a tone by about half the time-bandwidth product Ka T^2. A rectangular gain has no bound of this
-    kind; the position of its edges is limited by the line grid, Ka / prf.
+    Only the envelope g(t) of the echo, which is the antenna gain, carries information about the
+    beam centre. The bound is Ka / sqrt(2 q G), where G is the integral of g'^2 divided by that of
+    g^2. For a cosine-shaped gain of length T this is about 0.2 Ka T / sqrt(q), larger than the
+    bound of a tone by about half the time-bandwidth product Ka T^2. A rectangular gain has no bound
+    of this kind; its edges can be located to one line, or Ka / PRF in Doppler.
 
     Args:
         gain: Amplitude of the point over the lines of its aperture, shape (..., pulse).
-        q: Peak signal-to-noise ratio after compression.
+        q: Peak signal-to-noise power ratio after two-dimensional compression (not in dB).
         rate_hz_s: Doppler rate Ka in Hz/s.
         prf_hz: Pulse rate in Hz.
 
@@ -82,16 +85,17 @@ def beam_centre_bound_hz(gain: Tensor, q: Value, rate_hz_s: Value, prf_hz: float
 def velocity_bound_m_s(q: Value, dwell_s: Value, velocity_m_s: Value, wavelength_m: Value, range_m: Value) -> Tensor:
     """Compute the bound of the effective velocity from points with unknown position and phase.
 
-    The amplitudes are unknown too, and the gain is constant over the dwell. The phase 2 pi v^2 t^2
-    / (lambda r) determines its quadratic coefficient with the standard deviation sqrt(180) / (T^2
-    sqrt(2 q)) rad/s^2.
+    The amplitudes are unknown too, and the gain is constant over the dwell. The velocity v follows
+    from the quadratic phase 2 pi v^2 t^2 / (lambda r), whose coefficient can be estimated with the
+    standard deviation sqrt(180) / (T^2 sqrt(2 q)) rad/s^2.
 
     Args:
-        q: Sum of the peak signal-to-noise ratios of the points.
-        dwell_s: Dwell T in seconds.
-        velocity_m_s: Effective velocity in m/s.
+        q: Sum over the points of the peak signal-to-noise power ratio after two-dimensional
+            compression.
+        dwell_s: Time T for which a point is illuminated, in seconds.
+        velocity_m_s: Effective velocity v in m/s.
         wavelength_m: Carrier wavelength in metres.
-        range_m: Slant range in metres.
+        range_m: Slant range r in metres.
 
     Returns:
         Standard deviation in m/s.
@@ -104,8 +108,8 @@ def pulse_phase_bound_rad(snr: Value, n_range: int) -> Tensor:
     """Compute the bound of the phase of one pulse where the scene is known, 1 / sqrt(2 N SNR).
 
     Args:
-        snr: Mean power of all samples over the noise variance.
-        n_range: Number of range samples N.
+        snr: Mean signal power of all samples over the noise variance.
+        n_range: Number N of range samples of a pulse.
 
     Returns:
         Standard deviation in rad.
@@ -116,17 +120,20 @@ def pulse_phase_bound_rad(snr: Value, n_range: int) -> Tensor:
 def pulse_phase_bound_of_scene_rad(azimuth: Tensor, range_: Tensor, amplitude: Tensor, noise_std: Value) -> Tensor:
     """Compute the bound of the phase per pulse for scatterers with known positions.
 
-    Their complex amplitudes are unknown. The samples are
+    The complex amplitudes of the scatterers are unknown. With the phase psi_k of pulse k, the
+    samples are
 
         s[k, n] = exp(j psi_k) sum_m azimuth[k, m] range_[m, n] amplitude[m]
 
-    plus circular noise. The constant and the linear term of psi are left out, because the data do
-    not distinguish them from a phase and a shift of the scene. Amplitudes that the data do not
-    separate count as one.
+    plus circular noise. The constant and the linear term of psi over the pulses are left out of the
+    error, because the data do not distinguish them from a phase and a shift of the scene.
+    Scatterers that the data do not separate are treated as one.
 
     Args:
-        azimuth: Response of each scatterer over the pulses, shape (..., pulse, target), complex128.
-        range_: Response of each scatterer in range, shape (..., target, range), complex128.
+        azimuth: Response of each scatterer m over the pulses k, shape (..., pulse, target),
+            complex128.
+        range_: Response of each scatterer over the range samples n, shape (..., target, range),
+            complex128.
         amplitude: Complex amplitudes, shape (..., target), complex128.
         noise_std: Square root of the variance of the complex noise.
 
@@ -155,7 +162,7 @@ def turntable_responses(
 ) -> tuple[Tensor, Tensor]:
     """Compute the responses of scatterers on a turntable, over pulses and over range samples.
 
-    Echoes are taken at the level of phases: every scatterer stays in its range cell.
+    The rotation changes only the phases of the echoes: every scatterer stays in its range cell.
 
     Args:
         radar: Instrument; its wavelength and range step are used.

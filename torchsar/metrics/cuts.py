@@ -21,18 +21,19 @@ _WIDTH = 0.886
 
 
 def impulse_cuts(image: Signal, at_m: tuple[float, float]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Cut through the response nearest to a position, along both axes of an image.
+    """Cut through the point response nearest to a position, along both axes of an image.
 
-    The cuts are interpolated by 16 within the band about the centre of the local spectrum. They
-    reach over ten side lobes of a rectangular band, and over 24 samples at least, less at the
-    edges.
+    The cuts have 16 points per sample of the image, interpolated within the band about the centre
+    of the local spectrum. To either side of the peak they reach over ten side lobes of a
+    rectangular band, and over at least 24 samples; less at the edges of the image.
 
     Args:
         image: Image of one trial, (first, second).
         at_m: Coordinates on the two axes in metres.
 
     Returns:
-        By the name of the axis: offsets (m) from the peak and the complex cut, shape (n,) each.
+        A dict with the name of each axis as the key. Its values are pairs of the offsets from the
+        peak in metres and the complex cut, shape (n,) each.
     """
     measured = impulse_response(image, at_m)
     positions, windows, reaches = [], [], []
@@ -58,14 +59,14 @@ def impulse_cuts(image: Signal, at_m: tuple[float, float]) -> dict[str, tuple[Te
 
 
 def finer(line: Tensor, factor: int) -> Tensor:
-    """Interpolate a cut within its band, which is centred on zero.
+    """Interpolate a cut by zero padding of its spectrum, which must be centred on zero frequency.
 
     Args:
-        line: Samples, shape (n,), continued periodically.
-        factor: Samples of the result per sample.
+        line: Samples of the cut, shape (n,), continued periodically.
+        factor: Samples of the result per sample of `line`.
 
     Returns:
-        The cut, shape (factor n,), complex128; its level is that of `line` over factor.
+        The finer cut, shape (factor n,), complex128, with the amplitude divided by `factor`.
     """
     n = len(line)
     spectrum = torch.fft.fftshift(torch.fft.fft(line.to(torch.complex128)))
@@ -75,15 +76,15 @@ def finer(line: Tensor, factor: int) -> Tensor:
 
 
 def about_peak(image: Signal, reach: tuple[float, float], samples: int) -> Signal:
-    """Interpolate an image about its strongest sample.
+    """Interpolate the part of an image about its strongest sample.
 
     Args:
         image: Image of one trial, (first, second).
-        reach: Half extents along the axes, in their units.
+        reach: Half extents of the part along the two axes, in the units of the axes.
         samples: Samples of the result along either axis.
 
     Returns:
-        The part about the peak, complex128, on axes of offsets from it.
+        The part about the strongest sample, complex128; its axes hold the offsets from that sample.
     """
     peak = divmod(int(image.data.abs().argmax()), image.axes[1].n)
     kernels, axes = [], []

@@ -32,7 +32,7 @@ def _pair(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor, T
     a, b = _tensor(image), _tensor(reference)
     if not (a.is_complex() and b.is_complex()) or a.shape[-2:] != b.shape[-2:]:
         raise ValueError(
-            f"complex images of one size can be compared, got {a.dtype} of shape {tuple(a.shape)} "
+            f"only complex images of equal size can be compared, got {a.dtype} of shape {tuple(a.shape)} "
             f"and {b.dtype} of shape {tuple(b.shape)}"
         )
     return a, b
@@ -131,14 +131,16 @@ def contrast(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None 
     Args:
         image: Image, shape (..., azimuth, range), real or complex, or a Signal.
         of: "intensity" or "amplitude".
-        mask: Weights of the pixels as in `entropy`.
+        mask: Bool or real weights >= 0 of the pixels that broadcast to the image; pixels of weight
+            0 have no influence. None: all pixels count equally.
 
     Returns:
         Contrast, shape (...,).
 
     Raises:
         TypeError: If the image or the mask is not a tensor of numbers.
-        ValueError: As in `entropy`.
+        ValueError: If `of` is not known, the image has no pixels, or the mask does not broadcast or
+            has negative or non-finite weights.
     """
     level, weight = _levels(image, of, mask, "contrast")
     count = level.shape[-2] * level.shape[-1] if weight is None else torch.where(_sum(weight) > 0, _sum(weight), 1)
@@ -215,33 +217,35 @@ def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
 
 
 def error_after_gain_db(images: Tensor, references: Tensor) -> Tensor:
-    """Compute the relative errors of images after the one complex gain that fits them all best.
+    """Compute the relative errors of images after multiplication by a common complex gain.
 
-    Focusers and echo models may differ by such a constant without any loss.
+    One gain is used for all images: the one that fits them best to the references. Focusing methods
+    and echo models may differ by such a constant without any loss of quality.
 
     Args:
-        images: Images, shape (..., azimuth, range), complex.
-        references: Reference images, same size.
+        images: Images I, shape (..., azimuth, range), complex.
+        references: Reference images I0, same size.
 
     Returns:
-        Error in dB, shape (...,), float64.
+        Error |gain I - I0|^2 / |I0|^2 in dB, shape (...,), float64.
     """
     gain = (images.conj() * references).sum() / images.abs().square().sum()
     return error_db(images * gain, references)
 
 
 def rolled_to(image: Signal, reference: Signal) -> Signal:
-    """Shift an image along both axes to where another one of the same scene lies.
+    """Shift an image circularly along both axes onto a reference image of the same scene.
 
-    A slope of the phase over pulses shifts an image in a circle along azimuth, and range profiles
-    can be aligned only up to a common shift in range.
+    Autofocus leaves such shifts: a slope of the phase over pulses shifts an image circularly along
+    azimuth, and range profiles can be aligned only up to a common shift in range.
 
     Args:
         image: Image (azimuth, range).
         reference: Image on the same axes.
 
     Returns:
-        The image, rolled by whole samples until the circular centres of the energies agree.
+        The image, rolled by the whole numbers of samples by which the centres of energy, computed
+        on a circle, differ.
     """
     shifts = [
         round((_circular_centre(reference, dim) - _circular_centre(image, dim)) * image.axes[dim].n) for dim in (0, 1)

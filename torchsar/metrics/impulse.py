@@ -24,21 +24,23 @@ def impulse_response(
     search_m: float | None = None,
     centre_turns: tuple[float | None, float | None] = (None, None),
 ) -> dict[str, Tensor]:
-    """Measure the responses nearest to given positions of an image.
+    """Measure width, side lobes and position of the point responses nearest to given positions.
 
-    Slices are band-limited about their own spectral centre and zero-padded by two before
-    interpolation, so that full-band images and squinted spectra are measured correctly.
+    Each response is cut along both axes. The cuts are interpolated within the band about the centre
+    of their own spectrum and padded with zeros to twice their length before, so that full-band
+    images and squinted spectra are measured correctly.
 
     Args:
         signal: Image with two axes, (..., first, second).
         at_m: Coordinates on the two axes in metres, each of shape (...,) for one target per trial,
-            or (..., target). The strongest sample within `search_m` is taken.
-        sidelobe_nulls: Extent of the side lobes in null spacings of a rectangular band; 10 give an
-            ISLR of -10.17 dB for a sinc.
+            or (..., target). The response measured is that of the strongest sample within
+            `search_m`.
+        sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
+            of a rectangular band; 10 give an ISLR of -10.17 dB for a sinc.
         search_m: Half width of the search in metres; None for 8 samples.
-        centre_turns: Centre of the spectrum along each axis in turns per sample. None estimates it
-            from the neighbourhood, where other scatterers may bias it; a full band has no gap in
-            its spectrum and needs the value.
+        centre_turns: Centre of the spectrum along each axis in turns per sample. With None it is
+            estimated from the neighbourhood, where other scatterers may bias it. The value must be
+            given for images whose spectrum fills the whole sampled band.
 
     Returns:
         For each axis A of the image `irw_A_m` (-3 dB width), `pslr_A_db` (strongest side lobe
@@ -60,7 +62,7 @@ def impulse_response(
     if sidelobe_nulls < 1 or (search_m is not None and not search_m > 0):
         raise ValueError(
             "impulse_response needs sidelobe_nulls of 1 or more and search_m above 0, got "
-            f"{sidelobe_nulls} and {search_m}"
+            f"{sidelobe_nulls} nulls and search_m={search_m}"
         )
     refuse_non_finite(signal.data, "impulse_response")
     per_target = any(torch.as_tensor(a).ndim > len(signal.trials) for a in at_m)
@@ -96,8 +98,8 @@ def _nearest(index: Tensor, n: int, name: str) -> Tensor:
     """Nearest sample of each position; raises ValueError outside the axis."""
     if not bool(((index >= -0.5) & (index <= n - 0.5)).all()):
         raise ValueError(
-            f"a position given to impulse_response lies outside the {name} axis: samples "
-            f"{float(index.min()):.1f} to {float(index.max()):.1f} of {n}"
+            f"at_m of impulse_response lies outside the {name} axis of {n} samples: the positions are the "
+            f"samples {float(index.min()):.1f} to {float(index.max()):.1f}"
         )
     return index.round().long().clamp(0, n - 1)
 
@@ -158,7 +160,7 @@ def _refined(
 
 
 def cut_offset(cut: Tensor, tone: Tensor) -> Tensor:
-    """Find the interpolated maximum of cuts near their middle sample.
+    """Find the position of the interpolated maximum of cuts through point responses.
 
     Args:
         cut: Cuts whose strongest sample is n // 2, shape (..., n), complex.
@@ -219,13 +221,14 @@ def _slice_through(patch: Tensor, tone: Tensor, offset: Tensor, dim: int) -> Ten
 
 
 def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[dict[str, Tensor], Tensor]:
-    """Measure width and side lobes of cuts through responses.
+    """Measure width and side lobes of cuts through point responses.
 
     Args:
         cut: Cuts, shape (..., n), complex.
         tone: Centre of the spectrum in turns per sample, shape (...,).
         offset: Position of the maximum relative to sample n // 2 in samples, shape (...,).
-        nulls: Extent of the side lobes in null spacings of a rectangular band.
+        nulls: Distance from the peak up to which side lobes are measured, in null spacings of a
+            rectangular band.
 
     Returns:
         A dict with `irw` (-3 dB width in samples), `pslr` and `islr` in dB, and the complex peak,

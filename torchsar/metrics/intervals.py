@@ -1,4 +1,4 @@
-"""Statistics of trials, each with its confidence interval.
+"""Statistics of a figure over Monte Carlo trials, each with its confidence interval.
 
 Arrays have the shape (..., trial); missing trials are NaN.
 """
@@ -22,27 +22,30 @@ _COLUMNS = 512  # trials whose resampling weights are held at a time: 4 MB
 
 
 def trial_statistics(values: np.ndarray, seed: int, level: float = LEVEL) -> dict[str, np.ndarray]:
-    """Count, mean, median, root mean square and standard deviation, with intervals.
+    """Compute statistics over trials: mean, median, rms and standard deviation, with intervals.
 
-    Values that are not finite are left out. Intervals of mean and rmse are percentiles of a
-    bootstrap, which is too narrow for few trials: of Gaussian errors, at 95 %, it contains the
-    rmse in 81 % of cases for n = 10, 92 % for 50, 95 % for 200. It cannot include rare outliers
-    that do not occur in few trials: it contains the rmse of log-normal errors in 69 % (n = 50) and
-    80 % (200), with one error in a hundred 100 times as large in 28 % and 62 %, while the median
-    keeps 95 % or more and the mean 89 % or more. The bootstrap draws from (seed, number of trials)
-    alone: the interval of a point is the same, to rounding, whatever other points there are.
+    Values that are not finite are left out. The confidence intervals of mean and rms are
+    percentiles of a bootstrap, which are too narrow for few trials. At a nominal 95 %, the interval
+    contains the true rms of Gaussian errors in 81 % of cases for n = 10 trials, 92 % for 50 and 95
+    % for 200. Rare outliers that did not occur in the trials make it worse: for log-normal errors
+    it contains the true rms in 69 % (n = 50) and 80 % (n = 200) of cases; if one error in a hundred
+    is 100 times as large as the others, in 28 % and 62 %. In the same cases the interval of the
+    median contains the true median in 95 % or more, that of the mean the true mean in 89 % or more.
+    The random draws of the bootstrap depend only on the seed and the number of trials, so that the
+    interval of one row of trials does not depend on the other rows.
 
     Args:
-        values: Shape (..., trial), float64.
-        seed: Of the bootstrap.
-        level: Probability of the intervals.
+        values: Values of the trials, shape (..., trial), float64.
+        seed: Seed of the bootstrap.
+        level: Confidence level of the intervals, 0..1.
 
     Returns:
-        `n`, `mean`, `median`, `rmse` (about zero), `std` (with n - 1), shape (...,), and
-        `mean_interval`, `median_interval`, `rmse_interval`, shape (..., 2). The interval of the
-        median lies between two order statistics and contains the median of any distribution with
-        at least the given probability; it is NaN for fewer than log2(2 / (1 - level)) trials (six
-        at 95 %), the others are for fewer than two.
+        A dict with the number `n` of finite values, `mean`, `median`, `rmse` (root mean square
+        about zero) and `std` (with n - 1), shape (...,) each, and the intervals `mean_interval`,
+        `median_interval` and `rmse_interval`, shape (..., 2) each. The interval of the median lies
+        between two order statistics and contains the median of any distribution with at least the
+        given probability; it is NaN for fewer than log2(2 / (1 - level)) trials (six at 95 %). The
+        other intervals are NaN for fewer than two trials.
 
     Raises:
         ValueError: If there is no trial.
@@ -54,24 +57,25 @@ def trial_statistics(values: np.ndarray, seed: int, level: float = LEVEL) -> dic
 
 
 def half_width_ratio(values: np.ndarray, statistic: str, seed: int, level: float = LEVEL) -> np.ndarray:
-    """Half the width of a statistic's interval over its magnitude.
+    """Compute the half width of the confidence interval of a statistic, relative to the statistic.
 
-    It bounds how much further trials may still change the statistic.
+    It indicates by how much more trials may still change the statistic.
 
     Args:
-        values: Shape (..., trial).
-        statistic: "rmse", "mean" or "median".
-        seed: Of the bootstrap.
-        level: Probability of the interval.
+        values: Values of the trials, shape (..., trial).
+        statistic: "rmse" (root mean square), "mean" or "median".
+        seed: Seed of the bootstrap that gives the intervals of rmse and mean.
+        level: Confidence level of the interval, 0..1.
 
     Returns:
-        Shape (...,); NaN where there is no interval, 0 where all trials agree, infinite about zero.
+        Ratio, shape (...,); NaN where there are too few trials for an interval, 0 where all trials
+        agree, infinite where the statistic is zero but its interval is not.
 
     Raises:
-        ValueError: If the statistic is another one.
+        ValueError: If `statistic` is none of the three.
     """
     if statistic not in ("rmse", "mean", "median"):
-        raise ValueError(f"no interval is known for the statistic {statistic!r}; choose rmse, mean or median")
+        raise ValueError(f"statistic must be 'rmse', 'mean' or 'median', got {statistic!r}")
     found = trial_statistics(values, seed, level)
     half = np.diff(found[f"{statistic}_interval"], axis=-1)[..., 0] / 2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -79,17 +83,18 @@ def half_width_ratio(values: np.ndarray, statistic: str, seed: int, level: float
 
 
 def share_interval(hits: np.ndarray, of: np.ndarray, level: float = LEVEL) -> tuple[np.ndarray, np.ndarray]:
-    """Share of hits among some trials, and its exact interval.
+    """Compute the share of trials that are hits, and its exact (Clopper-Pearson) interval.
 
-    The interval is conservative: it contains the share with at least the given probability.
+    The interval is conservative: it contains the true probability of a hit with at least the given
+    confidence.
 
     Args:
-        hits: Shape (..., trial), bool.
-        of: The trials that count, of a shape that broadcasts with `hits`, bool.
-        level: Probability of the interval.
+        hits: Whether each trial is a hit, shape (..., trial), bool.
+        of: Trials among which hits are counted, of a shape that broadcasts with `hits`, bool.
+        level: Confidence level of the interval, 0..1.
 
     Returns:
-        The share, shape (...,), and its interval, shape (..., 2); NaN where no trial counts.
+        The share, shape (...,), and its interval, shape (..., 2); NaN where `of` has no trial.
 
     Reference:
         C. J. Clopper and E. S. Pearson, Biometrika 26 (1934), 404-413.
@@ -105,13 +110,13 @@ def share_interval(hits: np.ndarray, of: np.ndarray, level: float = LEVEL) -> tu
 
 
 def finite_rms(values: np.ndarray) -> np.ndarray:
-    """Root mean square of the finite values over the last dim; NaN where there is none.
+    """Compute the root mean square over trials, without values that are not finite.
 
     Args:
-        values: Shape (..., trial).
+        values: Values of the trials, shape (..., trial).
 
     Returns:
-        Shape (...,).
+        Root mean square, shape (...,); NaN where no value is finite.
     """
     here = np.isfinite(values)
     power = np.square(np.where(here, values, 0.0)).sum(-1)
@@ -120,7 +125,7 @@ def finite_rms(values: np.ndarray) -> np.ndarray:
 
 def _rows(values: np.ndarray) -> np.ndarray:
     if values.ndim < 1 or values.shape[-1] < 1:
-        raise ValueError(f"statistics need at least one trial in the last dim, got the shape {values.shape}")
+        raise ValueError(f"values must have at least one trial in the last dimension, got the shape {values.shape}")
     return np.asarray(values, dtype=np.float64).reshape(-1, values.shape[-1])
 
 

@@ -1,9 +1,9 @@
 """Cramer-Rao bounds of velocity and range of a triangular ladar, for one point in white noise.
 
-`snr` is the power of the point over the variance of the complex noise, of one sample before
-compression. Functions take numbers or tensors that broadcast, and return float64. With g =
-samples_per_sweep * snr every velocity bound is (lambda / 2) sqrt(c / g) / (2 pi T), where T is the
-duration of one sweep.
+`snr` is the power of the point over the variance of the complex noise, in one sample of the beat
+signal before compression. Functions take numbers or tensors that broadcast, and return float64.
+Every velocity bound is (lambda / 2) sqrt(c / g) / (2 pi T), where g = samples_per_sweep * snr, T is
+the duration of one sweep, and the factor c depends on what is known about the phases.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ def _velocity_m_s(c: float, snr: Value, samples_per_sweep: Value, wavelength_m: 
 
 
 def velocity_free_offset_bound_m_s(snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value) -> Tensor:
-    """Compute the velocity bound of one period with unknown phases of both sweeps.
+    """Compute the velocity bound of one period if the phases of up and down sweep are unknown.
 
-    The factor c of the module docstring is 3. An estimate from the spectral peaks of the full
-    sweeps reaches the bound.
+    The bound is (lambda / 2) sqrt(3 / g) / (2 pi T) with g = samples_per_sweep * snr and the
+    duration T of one sweep. An estimate from the spectral peaks of the full sweeps reaches it.
 
     Args:
-        snr: Signal-to-noise ratio per sample.
+        snr: Signal-to-noise power ratio per sample before compression.
         samples_per_sweep: Number of samples of one sweep.
-        wavelength_m: Carrier wavelength in metres.
-        sweep_s: Duration of one sweep in seconds.
+        wavelength_m: Carrier wavelength lambda in metres.
+        sweep_s: Duration T of one sweep in seconds.
 
     Returns:
         Standard deviation in m/s.
@@ -48,14 +48,16 @@ def velocity_free_offset_bound_m_s(snr: Value, samples_per_sweep: Value, wavelen
 def velocity_segmented_bound_m_s(snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value) -> Tensor:
     """Compute the velocity bound of estimates from the phases of half sweeps.
 
-    The factor c of the module docstring is 4. This is the bound of segmented interference; it
-    is 1.25 dB above `velocity_free_offset_bound_m_s`.
+    Each sweep is split into two halves, and the velocity follows from the phase between their
+    spectra (segmented interference).
+    The bound is (lambda / 2) sqrt(4 / g) / (2 pi T) with g = samples_per_sweep * snr and the
+    duration T of one sweep, 1.25 dB above `velocity_free_offset_bound_m_s`.
 
     Args:
-        snr: Signal-to-noise ratio per sample.
+        snr: Signal-to-noise power ratio per sample before compression.
         samples_per_sweep: Number of samples of one sweep.
-        wavelength_m: Carrier wavelength in metres.
-        sweep_s: Duration of one sweep in seconds.
+        wavelength_m: Carrier wavelength lambda in metres.
+        sweep_s: Duration T of one sweep in seconds.
 
     Returns:
         Standard deviation in m/s.
@@ -69,17 +71,17 @@ def velocity_segmented_bound_m_s(snr: Value, samples_per_sweep: Value, wavelengt
 def velocity_known_offset_bound_m_s(
     snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value
 ) -> Tensor:
-    """Compute the velocity bound if the phases of both sweeps agree at the turning point.
+    """Compute the velocity bound of one period if both sweeps have one phase at the turning point.
 
-    The up-sweep and the down-sweep have equal phases there if the trigger is exact. The factor c of
-    the module docstring is then 0.75. The bound is 7.3 dB
-    below `velocity_segmented_bound_m_s`.
+    Up sweep and down sweep have equal phases there if the trigger is exact. The bound is (lambda /
+    2) sqrt(0.75 / g) / (2 pi T) with g = samples_per_sweep * snr and the duration T of one sweep,
+    7.3 dB below `velocity_segmented_bound_m_s`.
 
     Args:
-        snr: Signal-to-noise ratio per sample.
+        snr: Signal-to-noise power ratio per sample before compression.
         samples_per_sweep: Number of samples of one sweep.
-        wavelength_m: Carrier wavelength in metres.
-        sweep_s: Duration of one sweep in seconds.
+        wavelength_m: Carrier wavelength lambda in metres.
+        sweep_s: Duration T of one sweep in seconds.
 
     Returns:
         Standard deviation in m/s.
@@ -90,12 +92,13 @@ def velocity_known_offset_bound_m_s(
 def range_per_sweep_bound_m(snr: Value, samples_per_sweep: Value, wavelength_m: Value) -> Tensor:
     """Compute the bound of the range from the carrier phase of a sweep, lambda / (4 pi sqrt(2 g)).
 
-    All other parameters are known. The error does not accumulate over sweeps.
+    Here g = samples_per_sweep * snr. All other parameters are known. Errors of successive sweeps
+    are independent and do not accumulate.
 
     Args:
-        snr: Signal-to-noise ratio per sample.
+        snr: Signal-to-noise power ratio per sample before compression.
         samples_per_sweep: Number of samples of one sweep.
-        wavelength_m: Carrier wavelength in metres.
+        wavelength_m: Carrier wavelength lambda in metres.
 
     Returns:
         Standard deviation in metres.
@@ -104,11 +107,12 @@ def range_per_sweep_bound_m(snr: Value, samples_per_sweep: Value, wavelength_m: 
 
 
 def integrated_range_detrended_bound_m(velocity_std_m_s: Value, pulse_step_s: Value, n_period: Value) -> Tensor:
-    """Compute the rms range error of integrated velocities, std * step * sqrt(M / 15).
+    """Compute the rms error of a range history that is integrated from estimated velocities.
 
-    The velocities have independent errors; the range error is a random walk from which the best
-    line is removed. At 10 dB, 512 samples and 8 us per sweep, 1024 segmented velocities every 16 us
-    give 57 nm.
+    The errors of M velocities are independent, so that the range error is a random walk. After
+    removal of the best line from it, its rms is velocity_std_m_s * pulse_step_s * sqrt(M / 15). At
+    10 dB, 512 samples and 8 us per sweep, 1024 velocities with the error of
+    `velocity_segmented_bound_m_s`, one every 16 us, give 57 nm.
 
     Args:
         velocity_std_m_s: Standard deviation of one velocity in m/s.

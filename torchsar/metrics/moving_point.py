@@ -1,4 +1,7 @@
-"""Velocities and images of single moving points before several channels, against the truth."""
+"""Estimated velocities and images of single moving points, compared with the truth.
+
+The points are observed by a receiver with several channels along track.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +29,12 @@ _WIDTH, _PSLR_DB, _ISLR_DB = 0.8859, -13.26, -9.92
 
 
 def error_name(key: str, what: str = "error") -> str:
-    """Return the name of the error of an unknown: u_r_m_s becomes u_r_error_m_s.
+    """Return the name under which the error of an unknown is reported.
+
+    For example, u_r_m_s becomes u_r_error_m_s.
 
     Args:
-        key: Name of the unknown in truth and estimates, one of UNKNOWNS.
+        key: Name of the unknown: u_r_m_s, u_a_m_s or y0_m.
         what: "error", or "std" for a predicted standard deviation.
 
     Returns:
@@ -40,12 +45,12 @@ def error_name(key: str, what: str = "error") -> str:
 
 @dataclass(frozen=True)
 class FoundMotion:
-    """What the estimators of a chain found of one point a row.
+    """Velocity and position estimates of a processing chain, for one moving point per row.
 
     Args:
-        value: Estimates by name, (row,); values that were known a priori are left out.
-        std: Their predicted standard deviations.
-        ok: Whether the estimates are reliable, (row,).
+        value: Estimates by name, (row,) each; values that the chain was given are left out.
+        std: Predicted standard deviations of the estimates, by the same names.
+        ok: Whether the estimates are reliable, by the same names, (row,) each.
     """
 
     value: Mapping[str, Tensor]
@@ -54,7 +59,14 @@ class FoundMotion:
 
     @staticmethod
     def by(estimates: Mapping[str, Estimate]) -> FoundMotion:
-        """From the estimates of a chain by stage; later ones replace earlier ones."""
+        """Collect the estimates of the stages of a chain; later ones replace earlier ones.
+
+        Args:
+            estimates: Estimate of each stage by its name, in the order of the chain.
+
+        Returns:
+            The last estimate of each unknown.
+        """
         last = {key: e for e in estimates.values() for key in UNKNOWNS if key in e.std}
         return FoundMotion(
             {key: e.value[key] for key, e in last.items()},
@@ -63,21 +75,29 @@ class FoundMotion:
         )
 
     def errors(self, truth: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Errors and predicted standard deviations, (row,) each."""
+        """Compute the errors of the estimates.
+
+        Args:
+            truth: True values by name, (row,) each.
+
+        Returns:
+            Estimates minus true values and predicted standard deviations, under the names that
+            `error_name` gives, (row,) each.
+        """
         errors = {error_name(key): value - truth[key] for key, value in self.value.items()}
         return {**errors, **{error_name(key, "std"): std for key, std in self.std.items()}}
 
 
 @dataclass(frozen=True)
 class FocusedPoint:
-    """How a chain formed its image of a point.
+    """The stages and motions with which a chain formed its image of a moving point.
 
     Args:
-        stage: Name of the reconstruction among the stages.
-        rebuild: The reconstruction.
-        focus: The focusing.
-        rebuilt_for: Motion (row,) that the reconstruction was given.
-        focused_for: Motion (row,) that the focusing was given.
+        stage: Name in the chain of the stage that reconstructs the Doppler spectrum.
+        rebuild: Stage that reconstructs the Doppler spectrum from the channels.
+        focus: Stage that focuses the spectrum in azimuth.
+        rebuilt_for: Motion of the point (row,) that the reconstruction was given.
+        focused_for: Motion of the point (row,) that the focusing was given.
     """
 
     stage: str
@@ -88,7 +108,16 @@ class FocusedPoint:
 
     @staticmethod
     def of(chain: Chain, trace: Trace, radar: BistaticRadar) -> FocusedPoint | None:
-        """From a chain and what it made; None where it has no reconstruction and focusing."""
+        """Find the reconstruction and the focusing of a chain, and the motions they were given.
+
+        Args:
+            chain: The chain.
+            trace: Signals and values of a run of the chain.
+            radar: The instrument.
+
+        Returns:
+            The last reconstruction and focusing; None if the chain lacks one of the two.
+        """
         kinds = (Reconstruct, FocusAzimuth)
         rebuild, focus = ([n for n, stage in chain.stages.items() if isinstance(stage, kind)] for kind in kinds)
         if not rebuild or not focus:
@@ -99,17 +128,22 @@ class FocusedPoint:
 
     @property
     def bands(self) -> int:
-        """Number of Doppler bands that are rebuilt."""
+        """Number of Doppler bands of one PRF each that are reconstructed."""
         return self.rebuild.rebuild.bands
 
     @property
     def processed_hz(self) -> float:
-        """Doppler band that is focused."""
+        """Width in Hz of the Doppler band that is focused."""
         rebuilt = self.bands * self.rebuild.radar.prf_hz
         return min(rebuilt, self.focus.bandwidth_hz or rebuilt)
 
     def conditioning(self) -> dict[str, Tensor]:
-        """Condition number, where an inverse is taken, and noise gain, (row,) each."""
+        """Compute condition number and noise gain of the reconstruction from the channels.
+
+        Returns:
+            `noise_gain_db`, and `condition_number` if there are no more bands than channels, (row,)
+            each.
+        """
         radar, motion = self.rebuild.radar, self.rebuilt_for
         found = {"noise_gain_db": noise_gain_db(radar, motion, self.rebuild.rebuild)}
         known = (
@@ -128,10 +162,11 @@ def _given(chain: Chain, stage: str, trace: Trace, radar: BistaticRadar) -> Poin
 
 @dataclass(frozen=True)
 class PeakCuts:
-    """Cuts through the peak of images, one a row.
+    """Cuts through the peak of the image of a moving point, one image per row.
 
     Args:
-        azimuth: Cut along azimuth, (row, azimuth), over x = v t with the true v = V_R - u_a.
+        azimuth: Complex cut along azimuth, (row, azimuth), over x = v t. Here t is slow time and v
+            = V_R - u_a the speed of the receiver minus the true along-track speed of the point.
         step_m, start_m: Step and first value of x in metres, (row,).
         range: Cut along range, (row, range); None for azimuth-only images.
         range_axis: First value and step of the range axis in metres.
@@ -145,12 +180,17 @@ class PeakCuts:
 
     @staticmethod
     def of(image: Signal, along_m_s: Tensor, speed_m_s: float) -> PeakCuts:
-        """From images.
+        """Cut images along both axes through their strongest sample.
 
         Args:
-            image: Images (row, azimuth[, range]), azimuth in metres at the receiver's speed.
-            along_m_s: v of the true targets, (row,).
-            speed_m_s: Speed V_R of the receiver.
+            image: Images (row, azimuth[, range]), with slow time times the speed of the receiver
+                as azimuth in metres.
+            along_m_s: Speed of the receiver minus the true along-track speed of the point in m/s,
+                (row,).
+            speed_m_s: Speed of the receiver in m/s.
+
+        Returns:
+            Cuts; the azimuth cut of images without a range axis is the image itself.
         """
         axis, scale = image.axes[0], along_m_s / speed_m_s
         if "range" not in image.names:
@@ -164,18 +204,19 @@ class PeakCuts:
 def point_responses(
     image: Signal, focused: FocusedPoint, truth: Mapping[str, Tensor], integration_s: Tensor | float | None, orders: int
 ) -> dict[str, Tensor]:
-    """Measure responses, false targets and positions in images of single points.
+    """Measure point response, false targets and position error in images of single moving points.
 
     Args:
         image: Images (row, azimuth[, range]) without noise.
-        focused: How they were formed.
+        focused: Stages and motions with which the images were formed.
         truth: True `u_r_m_s`, `u_a_m_s`, `y0_m` and `range_m`, (row,) each.
-        integration_s: Time in seconds for which targets are lit, a number or (row,); None for the
-            pattern of the elements.
-        orders: Replicas are sought up to so many pulse rates away.
+        integration_s: Time in seconds for which the points are illuminated, a number or (row,);
+            None for the antenna pattern of the elements.
+        orders: Largest Doppler distance, in pulse rates, at which replicas are sought.
 
     Returns:
-        Figures by name, (row,) each; NaN for images without any energy.
+        Widths in metres, side-lobe and false-target levels in dB and position errors in metres by
+        name, (row,) each; NaN for images without any energy.
 
     Reference:
         Remote Sens. 2020, 12, 1703, Table 4.
@@ -233,10 +274,10 @@ def _false_targets(
 
 
 def worst_image_error_db(image: Signal, exact: Signal) -> float:
-    """Relative error in dB of the worst of several images of points.
+    """Compute the largest relative error in dB among several images of points.
 
     Args:
-        image: Images of one point a row, (row, azimuth) or (row, azimuth, range).
+        image: Images of one point per row, (row, azimuth) or (row, azimuth, range).
         exact: Reference images of the same size.
 
     Returns:
@@ -250,19 +291,22 @@ def worst_image_error_db(image: Signal, exact: Signal) -> float:
 def ideal_responses(
     radar: BistaticRadar, u_r_m_s: float, u_a_m_s: float, integration_s: float | None, processed_hz: float, ranges: bool
 ) -> dict[str, float]:
-    """Figures of a point that is rebuilt and focused without any error: widths of sincs.
+    """Predict the figures of a moving point whose image is formed without any error.
+
+    The point responses are then sinc functions over the processed bands.
 
     Args:
         radar: The instrument.
-        u_r_m_s: Slant-range speed in m/s.
-        u_a_m_s: Along-track speed in m/s.
-        integration_s: Time for which it is lit; None for the pattern of the elements.
-        processed_hz: Processed Doppler band.
+        u_r_m_s: Slant-range speed of the point in m/s.
+        u_a_m_s: Along-track speed of the point in m/s.
+        integration_s: Time in seconds for which the point is illuminated; None for the antenna
+            pattern of the elements.
+        processed_hz: Width of the processed Doppler band in Hz.
         ranges: Whether images have a range axis.
 
     Returns:
-        Widths in metres, side-lobe levels in dB and errors of zero, by the names of the figures of
-        an image.
+        Widths in metres, side-lobe levels in dB and errors of zero, under the names that
+        `point_responses` gives its figures.
     """
     along, band = radar.speed_m_s - u_a_m_s, math.inf
     if integration_s is not None:

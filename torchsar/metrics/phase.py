@@ -71,9 +71,10 @@ def _newton_step(z: Tensor, cycles: Tensor, k: Tensor) -> Tensor:
 
 
 def phase_rmse(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor | None = None) -> Tensor:
-    """Compute the root mean square of `residual_phase` over the pulses.
+    """Compute the rms phase error over the pulses, without its constant and linear terms.
 
-    Independent uniform phases give 1.6 to 1.7 rad.
+    Both terms only add a phase to the image and shift it; see `residual_phase`. Estimates that have
+    nothing to do with the truth give 1.6 to 1.7 rad.
 
     Args:
         estimate_rad: Estimated phases, shape (..., pulse).
@@ -95,7 +96,7 @@ def strehl(residual_rad: Tensor, present: Tensor | None = None) -> Tensor:
     """Compute the Strehl ratio |mean exp(j residual)|^2 over pulses.
 
     Args:
-        residual_rad: Residual phases, shape (..., pulse).
+        residual_rad: Residual phase errors in radians, shape (..., pulse).
         present: False for pulses that do not count, bool, broadcastable to the phases; None if all
             pulses count.
 

@@ -20,16 +20,20 @@ SWEEPS = ("ramp", "pulse", "fast_time")
 
 @dataclass(frozen=True)
 class Course:
-    """The motion as a chain found it, beside the true one.
+    """The radial motion that a processing chain estimated, compared with the true motion.
 
     Args:
-        pulse: Starts of the periods.
-        velocity_m_s: Estimated velocity at the turning points, (..., pulse), receding positive;
-            None where the chain estimates none.
-        velocity_error_m_s: Estimated minus true velocity, likewise.
-        error_m: Range error at the middles of the up sweeps, (..., pulse).
-        coarse_m: The same without the phases that were removed from pulses.
-        lit: Periods in which a leading scatterer is lit, bool (..., pulse).
+        pulse: Slow-time axis: starts of the sweep periods.
+        velocity_m_s: Estimated velocity at the turning points of the sweeps, (..., pulse), receding
+            positive; None where the chain estimates none.
+        velocity_error_m_s: Estimated minus true velocity, (..., pulse); None where the chain
+            estimates none.
+        error_m: Estimated minus true change of range at the middles of the up sweeps in metres,
+            (..., pulse).
+        coarse_m: The same error if only the velocities are used and not the phases that the chain
+            estimated for single pulses.
+        lit: Periods in which the beam illuminates one of the strongest scatterers, bool (...,
+            pulse).
     """
 
     pulse: Axis
@@ -41,39 +45,45 @@ class Course:
 
     @property
     def detrended_m(self) -> Tensor:
-        """Range error without constant and slope, (..., pulse), zero where nothing is lit."""
+        """Range error in metres without its constant and slope, (..., pulse), zero where the beam
+        illuminates none of the strongest scatterers.
+        """
         mean, slope, k = self._line(self.error_m)
         return torch.where(self.lit, self.error_m - mean[..., None] - slope[..., None] * k, 0)
 
     @property
     def slope_m_s(self) -> Tensor:
-        """Slope of the range error over slow time, (...,)."""
+        """Slope of the range error over slow time in m/s, (...,)."""
         return self._line(self.error_m)[1] / self.pulse.step
 
     @property
     def coarse_slope_m_s(self) -> Tensor:
-        """Slope of what velocities alone leave, (...,): phases of pulses move no envelope."""
+        """Slope in m/s, (...,), of the range error if only velocities are compensated, which alone
+        move the range envelope; phases of single pulses do not.
+        """
         return self._line(self.coarse_m)[1] / self.pulse.step
 
     @property
     def largest_m(self) -> Tensor:
-        """Largest distance of the range error from its first lit value, (...,)."""
+        """Largest deviation of the range error in metres from its value in the first illuminated
+        period, (...,).
+        """
         at = self.lit.to(torch.int8).argmax(-1, keepdim=True).expand(*self.error_m.shape[:-1], 1)
         return torch.where(self.lit, (self.error_m - self.error_m.gather(-1, at)).abs(), 0).amax(-1)
 
     def rms(self, x: Tensor) -> Tensor:
-        """Root mean square of x (..., pulse) over the lit pulses, (...,)."""
+        """Root mean square of x (..., pulse) over the illuminated pulses, (...,)."""
         return (torch.where(self.lit, x.square(), 0).sum(-1) / self._count).sqrt()
 
     def metrics(self, radar: TriangularLadar) -> dict[str, Tensor]:
-        """Figures of the motion, (...,) each.
+        """Compute the errors of the estimated motion in each trial.
 
         Args:
-            radar: The instrument, whose wavelength turns ranges into phases.
+            radar: The instrument; its wavelength converts range errors into phases.
 
         Returns:
-            `velocity_rmse_m_s` (where a velocity was estimated), `range_error_max_m`,
-            `range_error_detrended_rms_m` and `residual_phase_rms_rad`.
+            `velocity_rmse_m_s` (if a velocity was estimated), `range_error_max_m`,
+            `range_error_detrended_rms_m` and `residual_phase_rms_rad`, (...,) each.
         """
         left = self.rms(self.detrended_m)
         error = self.velocity_error_m_s
@@ -107,16 +117,16 @@ class Course:
 
 
 def lit_periods(radar: TriangularLadar, pulse: Axis, azimuth_m: Tensor, range_m: Tensor) -> Tensor:
-    """Periods in which the beam lights any of some scatterers at the turning points.
+    """Find the sweep periods at whose turning point the beam illuminates any of some scatterers.
 
     Args:
         radar: The instrument.
-        pulse: Starts of the periods.
-        azimuth_m: Positions along track in metres, (..., target).
-        range_m: Ranges relative to the reference range in metres, (..., target).
+        pulse: Slow-time axis: starts of the periods.
+        azimuth_m: Positions of the scatterers along track in metres, (..., target).
+        range_m: Their ranges relative to the reference range in metres, (..., target).
 
     Returns:
-        bool (..., pulse).
+        True for illuminated periods, bool (..., pulse).
     """
     turning = pulse.values(azimuth_m.device) + radar.period_s / 2
     across = radar.speed_m_s * turning[:, None] - azimuth_m[..., None, :]
@@ -125,7 +135,7 @@ def lit_periods(radar: TriangularLadar, pulse: Axis, azimuth_m: Tensor, range_m:
 
 
 def course_of(chain: Chain, trace: Trace, truth: Mapping[str, Tensor], radar: TriangularLadar, clean: bool) -> Course:
-    """The motion as a chain found it, beside the true one.
+    """Compare the radial motion that a processing chain estimated with the true motion.
 
     Args:
         chain: The chain.
@@ -135,10 +145,10 @@ def course_of(chain: Chain, trace: Trace, truth: Mapping[str, Tensor], radar: Tr
         clean: Whether the chain ran on the recording without motion.
 
     Returns:
-        The motion, shape (..., pulse).
+        Estimated motion and its errors, shape (..., pulse).
 
     Raises:
-        ValueError: If the chain never has separated sweeps.
+        ValueError: If no signal of the chain holds separated up and down sweeps.
     """
     pulse = _sweeps_axis(trace)
     velocity = _summed(chain, trace, "velocity_m_s")
@@ -167,21 +177,26 @@ def target_responses(
     sidelobe_nulls: int,
     search_m: float,
 ) -> dict[str, dict[str, Tensor]]:
-    """Responses of named targets in an image, sought where what is left of the motion moves them.
+    """Measure the point responses of named targets in an image with residual motion.
 
-    Echo phases 4 pi DR / lambda with the slope -e' of DR shift azimuth by -e' R / V, and beats by
-    2 e' / lambda.
+    A residual motion shifts the targets: a range error (estimated minus true) with the slope s in
+    m/s shifts them by s R / V in azimuth, with the range R and the along-track speed V. The slope
+    that remains after compensation of the velocities alone shifts them by -s fc / K in range, with
+    the carrier fc and the chirp rate K. The responses are sought at the shifted positions.
 
     Args:
         image: Image (azimuth, range).
-        positions_m: Azimuth and relative range in metres, (...,) each, by name.
-        course: What is left of the motion.
+        positions_m: True azimuth and relative range in metres, (...,) each, by the name of the
+            target.
+        course: Residual motion.
         radar: The instrument.
-        sidelobe_nulls: Extent of the side lobes in null spacings.
-        search_m: How far from the predicted position a response is sought.
+        sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
+            of a rectangular band.
+        search_m: Half width in metres of the search about the predicted position.
 
     Returns:
-        Figures of `impulse_response` by name; targets outside the image are left out.
+        Figures of `impulse_response` by the name of the target; targets outside the image are left
+        out.
     """
     found, finer = {}, finer_in_range(image)
     for name, (azimuth, range_) in positions_m.items():
@@ -197,9 +212,11 @@ def target_responses(
 
 
 def finer_in_range(image: Signal) -> Signal:
-    """The image on half the range step, exact for profiles that were not cropped.
+    """Interpolate an image to half the range step.
 
-    Full-band profiles have no guard band, which measured slices need.
+    The result is exact for range profiles that were not cropped. The spectrum of such profiles
+    fills the whole sampled band; with half the step it has the guard band that measurements of
+    point responses need.
 
     Args:
         image: Image (azimuth, range).
@@ -228,8 +245,8 @@ def _sweeps_axis(trace: Trace) -> Axis:
     found = [signal for signal in (*trace.inputs.values(), *trace.outputs.values()) if signal.names == SWEEPS]
     if not found:
         raise ValueError(
-            f"no signal in the chain has separated sweeps {SWEEPS}; if the data are a continuous record, "
-            "begin the chain with split_sweeps"
+            f"the chain must have a signal with the axes {SWEEPS} of separated up and down sweeps, but has none; "
+            "if the data are a continuous record, begin the chain with split_sweeps"
         )
     return found[-1].axis("pulse")
 

@@ -1,8 +1,9 @@
 """Azimuth response of moving points rebuilt from several channels, and their false targets.
 
-Where the reconstruction does not separate the Doppler bands, part of the spectrum of a point
-appears k pulse rates from its true Doppler and focuses as a replica about k PRF lambda R0 v / V^2
-away.
+If the reconstruction does not separate the Doppler bands, part of the spectrum of a point appears k
+pulse rates from its true Doppler frequency, with k = +-1, +-2, ... It focuses as a false target
+(replica) about k PRF lambda R0 v / V^2 away in azimuth, where R0 is the slant range, v the
+along-track speed of the receiver relative to the point, and V their total relative speed.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Table 4 and Figure 17 (maximum false target amplitude, MFTA).
@@ -39,22 +40,24 @@ def azimuth_response(
 ) -> dict[str, Tensor]:
     """Measure the response of the strongest point of each azimuth profile.
 
-    A cut of 512 samples about the peak is analysed: widths beyond a quarter of it, and side lobes
-    outside it, are not measured. All-zero profiles have the width of the cut and side lobes of -300
-    dB.
+    A cut of 512 samples about the peak is analysed: widths of more than a quarter of the cut, and
+    side lobes outside the cut, are not measured. For all-zero profiles the width is that of the cut
+    and the side-lobe levels are -300 dB.
 
     Args:
         profile: Azimuth profiles, shape (..., azimuth), complex.
         step_m: Step of the axis in metres.
         start_m: Coordinate of sample 0 in metres.
         centre_turns: Centre of the spectrum in turns per sample; 0 for images formed about their
-            Doppler centre, as in this package. None estimates it, which a full band does not allow.
-        sidelobe_nulls: Extent of the side lobes to either side in null spacings of a rectangular
-            band. A sinc has an ISLR of -10.17 dB with 10, -9.92 dB with 20 and -9.68 dB with all of
-            them; its PSLR is -13.26 dB for any.
+            Doppler centre, as in this package. With None it is estimated, which is not possible if
+            the spectrum fills the whole sampled band.
+        sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
+            of a rectangular band. A sinc has an ISLR of -10.17 dB with 10, -9.92 dB with 20 and
+            -9.68 dB with all side lobes; its PSLR is always -13.26 dB.
 
     Returns:
-        `irw_m`, `pslr_db`, `islr_db`, `position_m` and the complex `peak`, shape (...,) each.
+        A dict with `irw_m` (-3 dB width), `pslr_db`, `islr_db`, `position_m` and the complex
+        `peak`, shape (...,) each.
 
     Raises:
         ValueError: If profiles are real, empty or not finite, `sidelobe_nulls` is below 1, or
@@ -64,7 +67,7 @@ def azimuth_response(
     if sidelobe_nulls < 1 or not step_m > 0:
         raise ValueError(
             "azimuth_response needs sidelobe_nulls of 1 or more and a positive step_m, got "
-            f"{sidelobe_nulls} and {step_m}"
+            f"{sidelobe_nulls} nulls and step_m={step_m}"
         )
     data = profile.to(torch.complex128)
     best = data.abs().argmax(-1)
@@ -96,21 +99,24 @@ def _tone(cut: Tensor) -> Tensor:
 def replica_level(profile: Tensor, step_m: float, zones_m: Tensor, *, centre_turns: float = 0.0) -> dict[str, Tensor]:
     """Measure the largest false target of each azimuth profile relative to its peak.
 
-    Profiles are interpolated by eight, which misses at most 0.06 dB. The side lobes of the point
-    count where they are higher than a replica; those of a sinc fall to -68 dB at 800 cells. Zones
-    outside the axis do not count: a record of 4 PRF lambda R0 / v^2 or more contains two replicas
-    on either side.
+    The false targets are replicas of the point, whose possible positions (`zones_m`) come from
+    `replica_zones`. Profiles are interpolated by eight, which misses at most 0.06 dB of a peak.
+    Where side lobes of the point are higher than a replica, their level is measured instead; those
+    of a sinc fall to -68 dB at 800 resolution cells. Zones outside the profile are left out. A
+    record of 4 PRF lambda R0 / v^2 seconds or more (R0: range, v: along-track speed) contains two
+    replicas on either side.
 
     Args:
         profile: Azimuth profiles, shape (..., azimuth), complex.
         step_m: Step of the axis in metres.
-        zones_m: First and last offset from the peak in metres of each zone, shape (..., zone, 2),
-            see `replica_zones`.
+        zones_m: First and last offset from the peak in metres of each zone in which a replica may
+            lie, shape (..., zone, 2).
         centre_turns: Centre of the spectrum in turns per sample.
 
     Returns:
-        `mfta_db` (maximum false target amplitude, -300 for all-zero profiles), `offset_m` from the
-        peak and `covered`, the share of zones on the axis, shape (...,) each.
+        A dict with `mfta_db` (maximum false target amplitude relative to the peak, -300 for
+        all-zero profiles), its offset from the peak in metres, `offset_m`, and the share of zones
+        that lie on the axis, `covered`, shape (...,) each.
 
     Raises:
         ValueError: If profiles are real, empty or not finite, or if no zone of any trial lies on
@@ -126,8 +132,8 @@ def replica_level(profile: Tensor, step_m: float, zones_m: Tensor, *, centre_tur
     if not bool((covered > 0).any()):
         reach = float(zones_m.abs().amin(-1).min())
         raise ValueError(
-            f"replica_level: the nearest replica lies {reach:.4g} m from the peak, off a profile "
-            f"of {profile.shape[-1] * step_m:.4g} m; record longer"
+            f"replica_level needs a profile that contains a replica, but the nearest lies {reach:.4g} m from "
+            f"the peak, outside the profile of {profile.shape[-1] * step_m:.4g} m; record longer"
         )
     level, index = torch.where(torch.stack(inside).any(0), power, 0).max(-1)
     ratio = level / peak.clamp_min(torch.finfo(torch.float64).tiny)
@@ -176,7 +182,7 @@ class _Hyperbola:
 
     @staticmethod
     def of(radar: BistaticRadar, u_r: Tensor, u_a: Tensor, y0: Tensor, range_m: Tensor) -> _Hyperbola:
-        """Spectrum of the point with these velocities, position and range."""
+        """Compute the Doppler spectrum of a point with the given velocities, position and range."""
         along = radar.speed_m_s - u_a
         speed = torch.hypot(along, u_r)
         image = (u_r * range_m + along * y0) / speed.square()
@@ -185,8 +191,8 @@ class _Hyperbola:
         )
 
     def curvature_s(self, doppler_hz: Tensor) -> Tensor:
-        """Delay (s) relative to the image time due to the curvature of the path, which its filter
-        removes.
+        """Delay (s) of a Doppler frequency relative to the zero-Doppler time, due to the curvature
+        of the range history; the azimuth filter removes it.
         """
         sine = (self.wavelength_m * doppler_hz / self.speed_m_s).clamp(-0.99, 0.99)
         return -self.closest_m * sine / (self.speed_m_s * torch.sqrt(1 - sine.square()))
@@ -205,32 +211,33 @@ def replica_zones(
     orders: Sequence[int] = (1, 2),
     axis_speed_m_s: Value | None = None,
 ) -> Tensor:
-    """Compute the offsets at which replicas of a point can appear.
+    """Compute the azimuth offsets from the peak at which replicas of a moving point can appear.
 
-    The exact hyperbola gives the position of each Doppler of the point that appears k pulse rates
-    off within the reconstructed band of `bands` PRF about the centre. A zone covers those
-    positions, a few metres for the parameters of the Reference, and ten resolution cells to either
-    side, beyond which the side lobes of a replica lie below -30 dB of it.
+    A replica of order k is the part of the point's spectrum that appears k pulse rates from its
+    true Doppler frequency. The zone of an order covers the positions to which the frequencies of
+    this part are focused, computed from the exact range hyperbola: a few metres for the parameters
+    of the Reference. Ten resolution cells are added on either side, beyond which the side lobes of
+    a replica lie below -30 dB relative to the replica.
 
     Args:
         radar: Radar with pulse rate, wavelength and speed.
         bands: Number of Doppler bands of one PRF that are reconstructed.
-        u_r_m_s: Slant-range speed in m/s, closing positive.
-        u_a_m_s: Along-track speed in m/s.
-        y0_m: Along-track position at t = 0 in metres.
+        u_r_m_s: Slant-range speed of the point in m/s, closing positive.
+        u_a_m_s: Along-track speed of the point in m/s.
+        y0_m: Along-track position of the point at t = 0 in metres.
         range_m: Slant range at t = 0 in metres; None for the reference range of the radar.
-        integration_s: Length of a rectangular gate in seconds, a number or shape (...,); None for
-            the main lobe of the pattern of the elements.
-        focused_at: (u_r, u_a) in m/s with which the image was reconstructed and focused; None for
-            those of the point. Where they differ, peak and replicas blur and zones widen
-            accordingly.
-        orders: Orders k of the replicas, from 1 on.
-        axis_speed_m_s: Position on the image axis over slow time in m/s; None for the speed of the
-            receiver.
+        integration_s: Length in seconds of a rectangular gate in which the point is illuminated, a
+            number or shape (...,); None for the main lobe of the pattern of the elements.
+        focused_at: Speeds (slant-range, along-track) in m/s for which the image was reconstructed
+            and focused; None for those of the point. Where they differ, peak and replicas blur and
+            zones widen accordingly.
+        orders: Orders k of the replicas to either side, 1 or more.
+        axis_speed_m_s: Speed in m/s that converts slow time into position on the image axis; None
+            for the speed of the receiver.
 
     Returns:
-        First and last offset from the peak in metres, shape (..., 2 * orders, 2), float64, with k
-        rising from the negative orders to the positive ones.
+        First and last offset of each zone from the peak in metres, shape (..., zone, 2), float64.
+        There are two zones for each order, in the order of rising k from negative to positive.
 
     Raises:
         ValueError: If `bands` or an order is below 1.
@@ -240,7 +247,7 @@ def replica_zones(
     """
     if bands < 1 or not orders or min(orders) < 1:
         raise ValueError(
-            f"replica_zones needs bands of 1 or more and orders from 1 on, got {bands} and {tuple(orders)}"
+            f"replica_zones needs bands of 1 or more and orders from 1 on, got bands={bands} and orders={tuple(orders)}"
         )
     like = next(
         (x for x in (u_r_m_s, u_a_m_s, y0_m, range_m, *(focused_at or ()), axis_speed_m_s) if isinstance(x, Tensor)),

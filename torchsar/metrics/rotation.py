@@ -22,13 +22,17 @@ _FEWEST = 8
 
 @dataclass(frozen=True)
 class FoundRotation:
-    """A rotation as the estimators of a chain found it.
+    """Estimates that a processing chain made of a non-uniform rotation.
+
+    A value is None if no stage of the chain estimates it.
 
     Args:
-        omega_rad_s: Rate at the first pulse in rad/s, (...,); None where no estimator looks for it.
-        warp_k: k1, k2, ..., (..., order - 1), likewise.
-        yc_m: Range centre deviation in metres, (...,), likewise.
-        std: Standard deviations of those values that estimators predict.
+        omega_rad_s: Rotation rate at the first pulse in rad/s, (...,).
+        warp_k: Derivatives of the rate of order 1, 2, ... at the first pulse divided by the rate,
+            k1 in 1/s, k2 in 1/s^2, ..., (..., order - 1).
+        yc_m: Range centre deviation in metres, (...,): distance from the rotation centre to the
+            assumed one.
+        std: Predicted standard deviations by the name of the value, where there are any.
     """
 
     omega_rad_s: Tensor | None
@@ -38,7 +42,17 @@ class FoundRotation:
 
     @staticmethod
     def by(chain: Chain, estimates: Mapping[str, Estimate]) -> FoundRotation:
-        """From the estimates of a chain by stage; later ones replace earlier ones."""
+        """Collect the estimates of the stages of a chain; later ones replace earlier ones.
+
+        Values that a stage was given or only assumes are left out.
+
+        Args:
+            chain: The chain.
+            estimates: Estimate of each stage by its name, in the order of the chain.
+
+        Returns:
+            The last estimate of each value.
+        """
         found: dict[str, Tensor] = {}
         std: dict[str, Tensor] = {}
         for name, estimate in estimates.items():
@@ -52,8 +66,8 @@ class FoundRotation:
         return FoundRotation(found.get("omega_rad_s"), found.get("warp_k"), found.get("yc_m"), std)
 
     def rate(self, duration_s: float) -> Tensor | None:
-        """Mean rate over the record in rad/s, (...,); NaN where the estimate is not positive, None
-        where there is none.
+        """Mean rotation rate over the record in rad/s, (...,); NaN where the estimate is not
+        positive. None if the chain does not estimate the rotation.
         """
         if self.omega_rad_s is None or self.warp_k is None:
             return None
@@ -63,18 +77,19 @@ class FoundRotation:
     def errors(
         self, truth: Mapping[str, Tensor], duration_s: float, assumed_rad_s: float | None = None
     ) -> dict[str, Tensor]:
-        """Errors and predicted standard deviations.
+        """Compute the errors of the estimated rotation, and its predicted standard deviations.
 
         Args:
             truth: True `omega_rad_s`, `warp_k`, `yc_m` and mean rate `rotation_rad_s`, as the
                 simulation gives them.
             duration_s: Length of the record in seconds.
-            assumed_rad_s: What the radar takes the rate to be, for chains that find none.
+            assumed_rad_s: Mean rate in rad/s that is assumed where the chain estimates none.
 
         Returns:
-            Figures by name, (...,) each, in % of the truth; of a k whose true value is zero in its
-            own unit, under `k1_error_per_s`, `k2_error_per_s2`, ... Where some trials have a k of
-            zero and others not, both names are there, NaN where they do not apply.
+            Errors by name, (...,) each, in % of the true value; those of yc in metres. The error of
+            a derivative k whose true value is zero is given in its own unit instead, as
+            `k1_error_per_s`, `k2_error_per_s2`, ... If a k is zero in only some of the trials, both
+            forms are returned, with NaN in the trials to which they do not apply.
         """
         found: dict[str, Tensor] = {}
         if self.omega_rad_s is not None:
@@ -103,31 +118,32 @@ class FoundRotation:
 
 
 def true_k(truth: Mapping[str, Tensor], i: int) -> Tensor:
-    """True k_i, (...,); zero beyond the order of the true rotation.
+    """Return the true derivative of order i of the rotation rate, relative to the rate.
 
     Args:
         truth: True `warp_k` (..., order - 1) and `omega_rad_s` (...,).
-        i: Number of the coefficient, from 1.
+        i: Order of the derivative, from 1.
 
     Returns:
-        k_i in 1 / s^i, shape (...,).
+        k_i in 1 / s^i, shape (...,); zero beyond the order of the true rotation.
     """
     k = truth["warp_k"]
     return k[..., i - 1] if i <= k.shape[-1] else torch.zeros_like(truth["omega_rad_s"])
 
 
 def k_scales(i: int, true: Tensor) -> dict[str, Tensor]:
-    """Factors that turn an error of k_i in its own unit into the figures of that error.
+    """Return the factors that convert an error of k_i into the form in which it is reported.
 
-    The figure is in % of the true value, or in its own unit where that is zero. Factors are NaN in
-    trials to which a name does not apply.
+    Here k_i is the derivative of order i of the rotation rate, relative to the rate. Its error is
+    reported in % of the true value, or in 1 / s^i where the true value is zero.
 
     Args:
-        i: Number of the coefficient, from 1.
-        true: True values, shape (...,).
+        i: Order of the derivative, from 1.
+        true: True values of k_i, shape (...,).
 
     Returns:
-        Factors by the name of the error, shape (...,) each.
+        Factors by the name of the reported error, shape (...,) each; NaN in trials to which the
+        name does not apply.
     """
     zero, own = true == 0, k_name(i).replace("_", "_error_", 1)
     found = {} if bool(zero.all()) else {f"k{i}_error_percent": torch.where(zero, torch.nan, 100 / true.abs())}
@@ -140,12 +156,13 @@ def _percent(std: Tensor, value: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class CrossRangeCut:
-    """Cuts through a point target along cross range, interpolated.
+    """Interpolated cuts through the images of a point target along cross range.
 
     Args:
-        offset_m: Distance from the true position in metres, (trial, point).
-        line: Complex samples, (trial, point).
-        inside: Points within the search, bool (trial, point).
+        offset_m: Cross range relative to the true position of the target in metres, (trial, point).
+        line: Complex samples of the cut, (trial, point).
+        inside: Points near enough to the true position to be searched for the peak, bool (trial,
+            point).
     """
 
     offset_m: Tensor
@@ -154,9 +171,9 @@ class CrossRangeCut:
 
     @property
     def figures(self) -> dict[str, Tensor]:
-        """`peak` (amplitude), `irw_azimuth_m` between the first crossings of -3 dB beside the peak,
-        and `pslr_azimuth_db`, the strongest response beyond the first minima beside it, (trial,)
-        each.
+        """Figures of the point response, (trial,) each: the amplitude `peak`; the width
+        `irw_azimuth_m` between the first crossings of -3 dB on either side of the peak; and
+        `pslr_azimuth_db`, the strongest response beyond the first minima on either side.
         """
         power = torch.where(self.inside, self.line.abs().square(), 0)
         top = power.argmax(-1, keepdim=True)
@@ -208,14 +225,14 @@ def cross_range_cut(
         image: Images (trial, azimuth, range).
         x_m: True cross range in metres, (trial,).
         y_m: True range in metres, (trial,).
-        metres_per_unit: Metres for one unit of the azimuth axis, (trial,): wavelength / (2 rate)
-            for an axis in Hz.
-        search_m: Half length of the cut in metres.
-        centre_turns: Middle of the spectrum of the lines in turns per line; the matched Fourier
-            transform has its band at 0..1 of the aperture.
+        metres_per_unit: Metres per unit of the azimuth axis, (trial,): wavelength / (2 rotation
+            rate) for an axis in Hz.
+        search_m: Half length in metres of the part of the cut in which the peak is sought.
+        centre_turns: Centre of the spectrum along azimuth in turns per line of the image; it is not
+            zero for images of the matched Fourier transform, whose aperture starts at time zero.
 
     Returns:
-        The cuts; None where an image has fewer than 8 lines within search_m of the target.
+        The cuts; None if any image has fewer than 8 lines within search_m of the target.
     """
     along, across = image.axes
     n, device = along.n, image.data.device

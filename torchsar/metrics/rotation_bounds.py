@@ -33,16 +33,24 @@ def rotation_bounds(
 ) -> dict[str, Tensor]:
     """Compute the least standard deviations of the rotation parameters of a target.
 
-    The noise is known; the complex amplitude and the cross range of every scatterer are unknown and
-    its range is known. The phase derivatives, after removal of a constant and a line in the warp
-    phi, determine the motion:
+    The rotation angle is Om phi(t), with the rate Om at the first pulse and the warped time phi(t)
+    = t + k1 t^2 / 2! + k2 t^3 / 3! + ... The range centre deviation yc is the distance by which the
+    rotation centre differs from the assumed one. Noise and ranges are known; the complex amplitude
+    and the cross range of every scatterer are unknown. The bounds are those of the Fisher
+    information
 
         J_ij = (2 / noise_std^2) sum_p |s_p|^2 <P d_i, P d_j>,    c4 = 4 pi / wavelength,
         d_Om = c4 y Om phi^2,    d_yc = (c4 / 2) Om^2 phi^2,
         d_ki = c4 (-x Om + y Om^2 phi) t^(i+1) / (i+1)!
 
-    Overlapping scatterers raise the true bound above this one. If all scatterers have one range, Om
-    (and a free yc) is infinite and k is finite. The bounds fall as 10^(-SNR / 20). Differentiable.
+    where scatterer p has the amplitude s_p, the cross range x and the distance y in range from the
+    rotation centre, d_i is the derivative of its phase with respect to unknown i, <,> sums over the
+    pulses, and P removes a constant and a multiple of phi, which the unknown amplitude and cross
+    range absorb.
+
+    Overlapping scatterers raise the true bound above this one. If all scatterers have one range,
+    the bounds of Om and yc are infinite and those of k finite. The bounds are proportional to
+    10^(-SNR / 20) with the SNR in dB. Differentiable.
 
     Args:
         cross_range_m: Cross range of the resolved scatterers in metres, shape (..., target).
@@ -53,12 +61,13 @@ def rotation_bounds(
             (..., target).
         noise_std: Square root of the variance of the complex noise per sample, shape (...,).
         omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,).
-        warp_k: Coefficients of the warp, shape (..., order - 1), of any order, see `core.warp`.
+        warp_k: Derivatives k1, k2, ... of the rotation rate divided by the rate, in 1/s, 1/s^2,
+            ..., shape (..., order - 1), of any order; see `core.warp`.
         yc_m: Range centre deviation in metres, shape (...,).
         wavelength_m: Carrier wavelength in metres.
         prf_hz: Pulse rate in Hz.
         n_pulse: Number of pulses.
-        free_centre: Treat yc_m as an unknown.
+        free_centre: Whether yc_m is an unknown.
 
     Returns:
         Bounds of `omega_rad_s`, `k1_per_s`, `k2_per_s2`, ... and, with `free_centre`, `yc_m`, shape
@@ -96,8 +105,8 @@ def _check(cross_range_m: Tensor, range_m: Tensor, amplitude: Tensor, warp_k: Te
         )
     if not warp_k.ndim:
         raise ValueError(
-            "rotation_bounds: warp_k is (..., order - 1), got a tensor without dims; write "
-            "torch.zeros(0) for uniform rotation"
+            "rotation_bounds: warp_k must have the shape (..., order - 1), got a tensor without dimensions; "
+            "write torch.zeros(0) for uniform rotation"
         )
 
 

@@ -1,4 +1,4 @@
-"""Images of moving ships on a sea compared with the truth."""
+"""Images of a sea with moving ships, and the estimated motions of the ships, against the truth."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ImagePosition:
     """A position in an image.
 
     Args:
-        azimuth_m: x = V_R t in metres.
+        azimuth_m: Azimuth in metres: slow time multiplied by the speed of the receiver.
         range_m: Closest range in metres.
     """
 
@@ -38,22 +38,53 @@ class ImagePosition:
 
     @staticmethod
     def of(motion: PointMotion) -> ImagePosition:
-        """Position of a target of this motion in the image focused for a stationary scene."""
+        """Return where a moving target appears in the image focused for a stationary scene.
+
+        Args:
+            motion: Motion of the target.
+
+        Returns:
+            Position in that image.
+        """
         return ImagePosition(motion.speed_m_s * float(motion.image_s), float(motion.closest_m))
 
     def window(self, image: Signal, reach_m: tuple[float, float]) -> tuple[Tensor, Tensor]:
-        """Rows (row, 1) and columns of an image within reach_m of the position."""
+        """Find the pixels of an image near the position.
+
+        Args:
+            image: Image (azimuth, range).
+            reach_m: Largest distances in azimuth and range in metres.
+
+        Returns:
+            Indices of the rows, (row, 1), and of the columns, (column,).
+        """
         azimuth, range_ = (axis.values(image.data.device) for axis in image.axes)
         rows = ((azimuth - self.azimuth_m).abs() < reach_m[0]).nonzero()
         return rows, ((range_ - self.range_m).abs() < reach_m[1]).nonzero()[:, 0]
 
     def power(self, image: Signal, reach_m: tuple[float, float]) -> float:
-        """Mean power within reach_m, zero outside of the image."""
+        """Compute the mean power of an image near the position.
+
+        Args:
+            image: Image (azimuth, range).
+            reach_m: Largest distances in azimuth and range in metres.
+
+        Returns:
+            Mean power of the pixels; zero if none is near enough.
+        """
         cut = image.data[self.window(image, reach_m)]
         return float(cut.abs().square().to(torch.float64).mean()) if cut.numel() else 0.0
 
     def centroid(self, image: Signal, reach_m: tuple[float, float]) -> ImagePosition:
-        """Centre of power within reach_m, the position itself where there is none."""
+        """Find the centre of power of an image near the position.
+
+        Args:
+            image: Image (azimuth, range).
+            reach_m: Largest distances in azimuth and range in metres.
+
+        Returns:
+            Centre of power; the position itself if there is no power near it.
+        """
         rows, columns = self.window(image, reach_m)
         power = image.data[rows, columns].abs().square().to(torch.float64)
         total = power.sum()
@@ -66,13 +97,13 @@ class ImagePosition:
 
 @dataclass(frozen=True)
 class Ship:
-    """The truth about a ship.
+    """True motion and noise-free echo of a simulated ship.
 
     Args:
-        motion: Motion of its middle, () each.
-        scatterers_m: Along-track position and closest range of the centre of the powers of its
-            scatterers.
-        echo: Its echo alone (channel, pulse, range), without the transmit range.
+        motion: Motion of the middle of the ship, () each.
+        scatterers_m: Along-track position and closest range in metres of the scatterers' mean,
+            weighted by their powers.
+        echo: Echo of the ship alone (channel, pulse, range), with the transmit range removed.
     """
 
     motion: PointMotion
@@ -81,22 +112,25 @@ class Ship:
 
     @property
     def moves(self) -> bool:
-        """Whether it is faster than what counts as at rest."""
+        """Whether the ship moves at more than 0.3 m/s in range or 1 m/s along track."""
         fast = (self.motion.u_r_m_s.abs() > _SLOWEST_M_S[0], self.motion.u_a_m_s.abs() > _SLOWEST_M_S[1])
         return any(map(bool, fast))
 
 
 @dataclass(frozen=True)
 class ShownShip:
-    """What a ship looks like without sea and noise.
+    """Where a simulated ship and its replicas appear in images without sea and noise.
 
     Args:
         ship: The ship.
-        centre: Motion of the intensity centroid of its own image, by its true velocities.
+        centre: True velocities of the ship, and position of the intensity centroid of the image
+            that is focused with them.
         image: Position in the image focused for a stationary scene.
-        replica: Position of the strongest replica, one or two pulse rates away.
-        away_m: Distance of the first replica, measured on x = V_R t, and predicted on
-            x = (V_R - u_a) t.
+        replica: Position of the strongest replica, one or two pulse rates away in Doppler, in that
+            image.
+        away_m: Distance in metres of the replica one pulse rate away: measured in that image, whose
+            azimuth axis is receiver speed times slow time; and predicted, on an axis with the speed
+            of the receiver relative to the ship.
     """
 
     ship: Ship
@@ -107,13 +141,17 @@ class ShownShip:
 
     @staticmethod
     def of(radar: BistaticRadar, ship: Ship, data: Signal, extraction: Extraction) -> ShownShip:
-        """From the ship and the whole recording, whose sea weights the image of the ship.
+        """Image the echo of a ship alone and find the positions of the ship and its replicas.
 
         Args:
             radar: The instrument.
             ship: The ship.
-            data: The recording (channel, pulse, range), without the transmit range.
+            data: The whole recording (channel, pulse, range), with the transmit range removed; the
+                covariance of its sea sets the weights with which the ship is focused.
             extraction: Extent of a ship in the data.
+
+        Returns:
+            Positions and distances.
         """
         image, motion = StationaryImage(radar)(ship.echo), ship.motion
         shown = ImagePosition.of(motion).centroid(image, _SHOWN_M)
@@ -127,7 +165,12 @@ class ShownShip:
         return ShownShip(ship, own, shown, strongest, (abs(first.azimuth_m - shown.azimuth_m), predicted))
 
     def metrics(self) -> dict[str, float]:
-        """What only the echo decides: displacements and distances of replicas."""
+        """Return the figures that do not depend on the imaging method.
+
+        Returns:
+            By name, in metres: azimuth of the ship in the image focused for a stationary scene, its
+            displacement from the true position, and, for a moving ship, distances of the replica.
+        """
         y0, along = float(self.centre.y0_m), float(self.centre.along_m_s)
         shown = {
             "image_position_m": self.image.azimuth_m,
@@ -148,10 +191,10 @@ def _repeated(image: Signal, shown: ImagePosition, off_m: float) -> ImagePositio
 
 @dataclass(frozen=True)
 class FoundTarget:
-    """A target that a method found.
+    """A moving target that an imaging method detected.
 
     Args:
-        motion: Its motion, () each.
+        motion: Estimated motion of the target, () each.
         u_r_std_m_s: Predicted standard deviation of the slant-range speed; 0 where there is none.
         ok: Whether the estimate is reliable.
     """
@@ -163,13 +206,13 @@ class FoundTarget:
 
 @dataclass(frozen=True)
 class MadeScene:
-    """What a method made of a scene.
+    """Images that a method formed of a scene, and the moving targets that it detected.
 
     Args:
-        conventional: Image (azimuth, range) of everything as if at rest.
-        rest: Image without the moving targets.
-        fused: Image with every moving target at its position.
-        targets: What it found; None for a method that does not look for targets.
+        conventional: Image (azimuth, range) that is focused as if everything were at rest.
+        rest: Image after removal of the moving targets.
+        fused: Image with every moving target focused and at its estimated position.
+        targets: Detected targets; None for a method that does not detect targets.
     """
 
     conventional: Signal
@@ -179,11 +222,12 @@ class MadeScene:
 
 
 def made_scenes(trace: Trace, speed_m_s: float) -> list[MadeScene]:
-    """Collect what a method made of every trial.
+    """Collect the images and detected targets of every trial from the run of a processing chain.
 
     Args:
-        trace: Of a chain that ends with an image of what is at rest, or with `MoversImage`.
-        speed_m_s: Speed of the platform along its track, m/s.
+        trace: Signals and estimates of the run. The chain ends with an image that is focused for a
+            stationary scene, or with `MoversImage`.
+        speed_m_s: Speed of the receiver along its track in m/s.
 
     Returns:
         One scene for each trial.
@@ -213,12 +257,12 @@ def matched(
 
     Args:
         targets: Reliable detected targets.
-        ships: The ships of the scene.
-        match_m: Largest distances in azimuth and range in metres.
+        ships: The ships of the scene by name.
+        match_m: Largest distances between target and ship in azimuth and range in metres.
 
     Returns:
-        The nearest target of each ship, by name, with distances relative to match_m; None if no
-        target is near enough. No target is assigned twice.
+        The nearest target of each ship, by the name of the ship; None if no target is within
+        match_m. Distances are compared as fractions of match_m. No target is assigned twice.
     """
     pairs = []
     for name, shown in ships.items():
@@ -237,16 +281,16 @@ def matched(
 
 
 def ship_metrics(shown: ShownShip, found: FoundTarget | None, made: MadeScene, still: Signal) -> dict[str, float]:
-    """Figures of one ship.
+    """Compute the errors of motion and image of one ship.
 
-    A ship that is not found counts as stationary, at its position in the image focused for a
-    stationary scene.
+    The motion of a ship that was not found is taken to be zero, and its position to be that in the
+    image focused for a stationary scene.
 
     Args:
-        shown: The truth.
-        found: The target that belongs to it.
-        made: What the method made of the scene.
-        still: Image, rebuilt as the method rebuilds, of what does not move.
+        shown: True motion and positions of the ship.
+        found: Detected target that belongs to the ship; None if there is none.
+        made: Images of the scene by the method.
+        still: Image of the same method of what does not move alone.
 
     Returns:
         Errors, levels and distances by name, in m/s, m and dB.
@@ -284,7 +328,9 @@ def _levels(shown: ShownShip, made: MadeScene, still: Signal) -> dict[str, float
     """What images hold where a ship is, was shown, and repeats."""
 
     def of_lines(at: ImagePosition, reach_m: float) -> float:
-        """Mean power of what does not move in the lines within reach_m."""
+        """Mean power in the image of what does not move, over all azimuths within reach_m in
+        range.
+        """
         return at.power(still, (math.inf, reach_m))
 
     true = ImagePosition(float(shown.centre.y0_m), float(shown.centre.range_m))

@@ -12,16 +12,17 @@ _LINES = 256
 
 
 def azimuth_spectrum(signal: Signal, bins: int = 256) -> tuple[Tensor, Tensor]:
-    """Mean azimuth power spectrum over range.
+    """Estimate the azimuth power spectrum of a recording, averaged over range.
 
-    Averaged over segments of `bins` lines under a raised-cosine window.
+    The spectrum is also averaged over segments of `bins` lines, each weighted by a raised-cosine
+    window.
 
     Args:
-        signal: Signal without trial dims, axes (pulse, range).
-        bins: Lines of a segment.
+        signal: Signal of one trial with the axes (pulse, range).
+        bins: Lines of a segment, and Doppler bins of the result.
 
     Returns:
-        Baseband Doppler in Hz and power over its maximum, (bins,) each, float64.
+        Baseband Doppler frequency in Hz and power relative to its maximum, (bins,) each, float64.
     """
     data, pulse = signal.data, signal.axes[-2]
     bins = min(bins, pulse.n)
@@ -34,10 +35,10 @@ def azimuth_spectrum(signal: Signal, bins: int = 256) -> tuple[Tensor, Tensor]:
 
 
 def range_spectrum(signal: Signal) -> Tensor:
-    """Range power spectrum summed over all lines.
+    """Compute the range power spectrum, summed over all lines.
 
     Args:
-        signal: Signal without trial dims, axes (pulse, range).
+        signal: Signal of one trial with the axes (pulse, range).
 
     Returns:
         Power with zero frequency in the middle, (range,), float64.
@@ -49,14 +50,14 @@ def range_spectrum(signal: Signal) -> Tensor:
 
 
 def phase_increments(signal: Signal, blocks: int = 64) -> tuple[Tensor, Tensor]:
-    """Mean phase increments between adjacent lines along a strip.
+    """Compute the mean phase increment from line to line in successive blocks of a recording.
 
     Args:
-        signal: Signal without trial dims, axes (pulse, range).
-        blocks: Blocks of lines over which the increments are averaged.
+        signal: Signal of one trial with the axes (pulse, range).
+        blocks: Number of blocks; increments are averaged over the lines of each.
 
     Returns:
-        Slow time of the blocks in s and the increments in rad, (block,) each, float64.
+        Slow time of the blocks in seconds and phase increments in radians, (block,) each, float64.
     """
     pulse = signal.axes[-2]
     blocks = min(blocks, max(1, (pulse.n - 1) // 2))

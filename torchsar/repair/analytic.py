@@ -9,9 +9,9 @@ from torchsar.core import linear_phasor
 
 
 def delayed(lines: Tensor, fraction: Tensor, analytic: bool = False) -> Tensor:
-    """Evaluate lines at the instants n + fraction, with lines taken as periodic.
+    """Interpolate lines at the instants i + fraction, where i is the number of the sample.
 
-    Differentiable.
+    Lines are taken as periodic. Differentiable.
 
     Args:
         lines: Lines, shape (..., line, n), real or complex.

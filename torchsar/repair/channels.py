@@ -1,10 +1,10 @@
 """Gain and phase imbalance of channels that record the lines in turn.
 
-Channel c records the lines i with i mod C = c and multiplies them by g_c exp(j phi_c). The product
-of a line with the conjugate of the one before, averaged over a recording, has the phase phi_c -
-phi_(c-1) + rho, where rho is the phase increment from line to line that belongs to the Doppler
-centroid. In the sum over all channels the phi cancel, so that the C products give rho and every
-phi_c - phi_0. Gains follow from the powers of the lines.
+Channel c of C channels records the lines i with i mod C = c and multiplies them by g_c exp(j
+phi_c). The product of a line with the conjugate of the line before, averaged over a recording, has
+the phase phi_c - phi_(c-1) + rho, where rho is the phase increment from line to line that belongs
+to the Doppler centroid. In the sum over all channels the phi cancel, so that the C products give
+rho and every phi_c - phi_0. Gains follow from the powers of the lines.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from torchsar.core import Estimate, Signal, Stage, cis, real_dtype
 
 
 def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
-    """Compute lag-one products and powers of the channels.
+    """Compute products of successive lines and powers, averaged for each channel.
 
-    Powers are compared with those of channel 0 interpolated to the same lines, so that a slow
-    change of the scene is not taken for a gain.
+    Channel c of C channels recorded the lines i with i mod C = c. Powers are compared with those of
+    channel 0 interpolated to the same lines, so that a slow change of the scene is not taken for a
+    gain.
 
     Args:
         x: Raw lines, shape (..., pulse, range), complex.
         channels: Number of channels C.
 
     Returns:
-        The product s[i] conj(s[i - 1]) averaged over range and over the lines i of each channel,
-        relative to the highest power of a line, shape (..., C), complex128; and ln(power / power of
-        channel 0), shape (..., C), float64.
+        The product s[i] conj(s[i - 1]) of the samples s of successive lines, averaged over range
+        and over the lines i of each channel and divided by the power of the strongest line, shape
+        (..., C), complex128; and ln(power / power of channel 0), shape (..., C), float64.
     """
     lines = x.shape[-2]
     product = (x[..., 1:, :] * x[..., :-1, :].conj()).mean(-1).to(torch.complex128)
@@ -56,23 +57,24 @@ def _relative_log_power(power: Tensor, channels: int) -> Tensor:
 def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | float | None = None) -> Estimate:
     """Estimate gain and phase of every channel relative to channel 0, which records the first line.
 
-    The products of neighbouring lines leave the phase increment rho, and with it the phases,
-    ambiguous by 2 pi / C. For two channels, phi and phi + pi cannot be distinguished; they
+    The C channels record the lines in turn. The products of neighbouring lines give the phase
+    increment from line to line only modulo 2 pi / C, and the phases of the channels are ambiguous
+    accordingly. For two channels, the phases phi and phi + pi cannot be distinguished; they
     correspond to Doppler spectra that are displaced by PRF / 2.
 
     Args:
         x: Raw lines, shape (..., pulse, range), complex.
         channels: Number of channels C.
         doppler_cycles: Baseband Doppler centroid over PRF, shape (...,), accurate to 1 / (2 C);
-            resolves the ambiguity. Without it the phases of least mean square are taken, for two
-            channels those within 90 degrees.
+            resolves the ambiguity. If it is None, the set of phases with the smallest mean square
+            is taken: for two channels, the phase within 90 degrees.
 
     Returns:
-        `gain` of shape (..., C), 1 for channel 0, and `phase_rad` of shape (..., C) in radians, 0
-        for channel 0, by which `correct_imbalance` divides. Standard deviations assume a Gaussian
-        scene and independent lines. `quality` is the coherence of neighbouring lines. `ok` is False
-        where a channel has no power (gain outside 1e-3..1e3), or the coherence is below 5 /
-        sqrt(range samples x lines per channel) and may be due to chance; gains are then 1 and
+        Estimate with `gain` of shape (..., C), 1 for channel 0, and `phase_rad` of shape (..., C)
+        in radians, 0 for channel 0, which `correct_imbalance` removes. Standard deviations assume a
+        Gaussian scene and independent lines. `quality` is the coherence of neighbouring lines. `ok`
+        is False where a channel has no power (gain outside 1e-3..1e3), or the coherence is below 5
+        / sqrt(range samples x lines per channel) and may be due to chance; gains are then 1 and
         phases 0.
 
     Raises:
@@ -80,8 +82,8 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
     """
     if channels < 2 or x.shape[-2] < 2 * channels + 1:
         raise ValueError(
-            f"channel imbalance needs 2 or more channels and at least {2 * max(channels, 2) + 1} "
-            f"lines, got {channels} channels and {x.shape[-2]} lines"
+            "estimate_imbalance needs 2 or more channels and more than twice as many lines as channels, "
+            f"got {channels} channels and {x.shape[-2]} lines"
         )
     x = x / x.detach().abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(real_dtype(x.dtype)).tiny)
     lag, log_power = lag_products(x, channels)
@@ -129,7 +131,7 @@ def _assess(x: Tensor, lag: Tensor, phase: Tensor, gain: Tensor) -> Estimate:
 def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
     """Divide the lines of channel c by gain[c] exp(j phase[c]).
 
-    Differentiable.
+    Channel c of C channels recorded the lines i with i mod C = c. Differentiable.
 
     Args:
         x: Raw lines, shape (..., pulse, range), complex.
@@ -144,8 +146,8 @@ def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
     """
     if gain.shape != phase_rad.shape:
         raise ValueError(
-            f"gain and phase need one number per channel each, got shapes {tuple(gain.shape)} and "
-            f"{tuple(phase_rad.shape)}"
+            "gain and phase_rad must have the same shape (..., channel), got the shapes "
+            f"{tuple(gain.shape)} and {tuple(phase_rad.shape)}"
         )
     real = real_dtype(x.dtype)
     factor = cis(-phase_rad.to(real)) / gain.to(real)
@@ -169,12 +171,15 @@ class EstimateImbalance(Stage):
         self.channels = channels
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None) -> Estimate:
-        """Estimate gains and phases; see `estimate_imbalance`.
+        """Estimate gain and phase of every channel; see `estimate_imbalance`.
 
         Args:
             signal: Raw lines, shape (..., pulse, range).
             doppler_hz: Baseband Doppler centroid in Hz, shape (...,); resolves the ambiguity of the
                 phases.
+
+        Returns:
+            Estimate with `gain` and `phase_rad`, shape (..., channel) each.
         """
         cycles = None if doppler_hz is None else doppler_hz * signal.axis("pulse").step
         return estimate_imbalance(signal.data, self.channels, cycles)
@@ -183,15 +188,19 @@ class EstimateImbalance(Stage):
 class CorrectImbalance(Stage):
     """Correction of the imbalance of channels that record the lines in turn.
 
-    In a chain: `use(CorrectImbalance(), gain="imbalance", phase_rad="imbalance")`.
+    In a chain, after a stage of the name "imbalance" that estimates gains and phases:
+    `use(CorrectImbalance(), gain="imbalance", phase_rad="imbalance")`.
     """
 
     def forward(self, signal: Signal, gain: Tensor, phase_rad: Tensor) -> Signal:
-        """Divide lines by the gain and phase of their channel; see `correct_imbalance`.
+        """Remove from each line the gain and phase of its channel; see `correct_imbalance`.
 
         Args:
             signal: Raw lines, shape (..., pulse, range).
-            gain: Gains, shape (..., C).
-            phase_rad: Phases in radians, shape (..., C).
+            gain: Gain of each channel, shape (..., channel).
+            phase_rad: Phase of each channel in radians, shape (..., channel).
+
+        Returns:
+            Signal with corrected lines.
         """
         return signal.with_data(correct_imbalance(signal.data, gain, phase_rad))

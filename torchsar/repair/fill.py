@@ -1,9 +1,10 @@
 """Reconstruction of missing lines by zeros, linear interpolation, azimuth spectrum or scene model.
 
 All four methods keep the received lines bit for bit and replace only the missing ones, whatever
-those hold. The image error of zero fill equals the share of missing lines. The azimuth spectrum, a
-stationary model, gains little if azimuth oversampling is low. Only a model of the scene, which uses
-where the image is dark, gains much.
+samples these contain. With zeros, the relative error power of the image equals the share of missing
+lines. The azimuth spectrum, which is the same for all parts of the scene, lowers this error little
+if azimuth oversampling is low. Only a model of the scene lowers it much, because such a model knows
+which parts of the image are dark.
 
 Reference:
     Tsvetkov 2017 (zeros or interpolation).
@@ -24,8 +25,8 @@ def _mask(lines: Tensor, missing: Tensor) -> Tensor:
     """Mask (..., pulse, 1) of missing lines; raise ValueError if it does not fit the lines."""
     if missing.shape[-1:] != lines.shape[-2:-1]:
         raise ValueError(
-            f"mask of missing lines of shape {tuple(missing.shape)} does not fit "
-            f"{lines.shape[-2]} lines; give one entry per line, as LineIntegrity does"
+            f"missing must be a mask with one entry for each of the {lines.shape[-2]} lines, as LineIntegrity "
+            f"gives it, got the shape {tuple(missing.shape)}"
         )
     return missing.bool()[..., None]
 
@@ -39,7 +40,7 @@ def _nothing_missing(missing: Tensor) -> bool:
 
 
 def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:
-    """Set missing lines to zero: the baseline.
+    """Set missing lines to zero, the simplest of the fills.
 
     Args:
         lines: Lines, shape (..., pulse, range), complex.
@@ -57,10 +58,11 @@ def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:
 def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 0.0) -> Tensor:
     """Interpolate missing lines linearly between the nearest received ones.
 
-    The interpolation is made about the Doppler centroid. Before the first and behind the last
-    received line, that line is continued. Worse than zeros if adjacent lines correlate by less than
-    0.25 about the centroid, and inside gaps of several lines if azimuth oversampling is low.
-    Differentiable.
+    The phase increment of the Doppler centroid from line to line is removed before the
+    interpolation and restored afterwards. Missing lines before the first or after the last received
+    line are copies of that line, apart from this phase. The error is larger than that of zeros if
+    the correlation of adjacent lines, without the phase of the centroid, is below 0.25, and inside
+    gaps of several lines if azimuth oversampling is low. Differentiable.
 
     Args:
         lines: Lines, shape (..., pulse, range), complex.
@@ -90,14 +92,15 @@ def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 
 
 
 def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
-    """Estimate the azimuth power spectrum from lag products of the received lines.
+    """Estimate the azimuth power spectrum from the autocorrelation of the received lines.
 
-    Smoothed over about 2 / lags of the PRF; may be slightly negative.
+    The estimate is smoothed over a Doppler interval of about 2 PRF / lags and may be slightly
+    negative.
 
     Args:
         lines: Lines with azimuth last, shape (..., range, pulse), complex, zero where not received.
         received: Received lines, shape (..., pulse), bool.
-        lags: Highest lag in lines.
+        lags: Highest lag of the autocorrelation in lines.
 
     Returns:
         Spectrum averaged over range, of unit mean, in FFT order, shape (..., pulse).
@@ -116,9 +119,10 @@ def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
 def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: int = 8) -> Tensor:
     """Fill missing lines by least squares, with the azimuth spectrum of the received ones (Wiener).
 
-    Minimises sum |D(f)|^2 / S(f) over the missing lines by conjugate gradients. The spectrum S,
-    which includes the Doppler centroid, is estimated from the received lines, then again from the
-    filled ones. Differentiable in the received lines, with the spectrum held fixed.
+    Conjugate gradients find the missing lines that minimise the sum of |D(f)|^2 / S(f) over the
+    azimuth frequencies f, where D is the azimuth spectrum of all lines and S the expected power
+    spectrum. S includes the Doppler centroid; it is estimated first from the received lines, then
+    from the filled ones. Differentiable in the received lines, with S held fixed.
 
     Args:
         lines: Lines, shape (..., pulse, range), complex.
@@ -146,7 +150,7 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
 
 
 class ZeroFill(Stage):
-    """Missing lines set to zero: the baseline."""
+    """Stage that sets missing lines to zero, the simplest of the fills."""
 
     def forward(self, signal: Signal, missing: Tensor) -> Signal:
         """Set missing lines to zero; see `zero_fill`.
@@ -154,16 +158,19 @@ class ZeroFill(Stage):
         Args:
             signal: Lines, shape (..., pulse, range).
             missing: Missing lines, shape (..., pulse), bool.
+
+        Returns:
+            Signal of the same shape.
         """
         return signal.with_data(zero_fill(signal.data, missing))
 
 
 class LinearFill(Stage):
-    """Linear interpolation over missing lines about the Doppler centroid.
+    """Linear interpolation of missing lines, with the phase of the Doppler centroid removed.
 
     Args:
         radar: Radar, whose nominal pointing gives the Doppler centroid by default.
-        doppler_hz: Doppler centroid in Hz; only its fraction of the PRF matters.
+        doppler_hz: Doppler centroid in Hz; multiples of the PRF make no difference.
     """
 
     doppler_hz: Tensor
@@ -179,6 +186,9 @@ class LinearFill(Stage):
             signal: Lines, shape (..., pulse, range).
             missing: Missing lines, shape (..., pulse), bool.
             doppler_hz: Doppler centroid in Hz, shape (...,); replaces that of the constructor.
+
+        Returns:
+            Signal of the same shape, with the missing lines interpolated.
         """
         doppler = self.doppler_hz if doppler_hz is None else doppler_hz
         return signal.with_data(linear_fill(signal.data, missing, doppler * signal.axis("pulse").step))
@@ -201,16 +211,19 @@ class BandLimitedFill(Stage):
         super().__init__()
         if rounds < 1 or steps < 1:
             raise ValueError(
-                f"band-limited fill needs at least one round of one step, got rounds={rounds}, steps={steps}"
+                f"rounds and steps of a band-limited fill must be 1 or more, got rounds={rounds}, steps={steps}"
             )
         self.rounds, self.steps = rounds, steps
 
     def forward(self, signal: Signal, missing: Tensor) -> Signal:
-        """Fill missing lines; see `band_limited_fill`.
+        """Fill missing lines by their expected azimuth spectrum; see `band_limited_fill`.
 
         Args:
             signal: Lines, shape (..., pulse, range).
             missing: Missing lines, shape (..., pulse), bool.
+
+        Returns:
+            Signal of the same shape; the signal itself if no line is missing.
         """
         if _nothing_missing(missing):
             return signal
@@ -224,12 +237,13 @@ class SparseFill(Stage):
 
     Args:
         radar: Radar.
-        reference: "matched" for raw lines, None for range-compressed ones.
+        reference: Name of the range reference with which raw lines are compressed inside the model,
+            such as "matched"; None for lines that are range-compressed already.
         velocity_m_s: Effective velocity in m/s; by default that of the radar.
         doppler_hz: Absolute Doppler centroid in Hz; by default the nominal pointing of the radar,
             or 0.
         looks: Number of sub-looks in Doppler.
-        rounds: Number of estimates of the local powers.
+        rounds: Number of estimates of the local powers of the image.
         steps: Steps of conjugate gradients in each round.
 
     Raises:
@@ -253,11 +267,11 @@ class SparseFill(Stage):
         if reference is not None and reference not in REFERENCES:
             raise ValueError(
                 f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or "
-                "None for compressed lines"
+                "None for range-compressed lines"
             )
         if min(looks, rounds, steps) < 1:
             raise ValueError(
-                f"sparse fill needs at least one look, round and step, got looks={looks}, "
+                f"looks, rounds and steps of a sparse fill must be 1 or more, got looks={looks}, "
                 f"rounds={rounds}, steps={steps}"
             )
         self.radar, self.reference = radar, reference
@@ -268,7 +282,7 @@ class SparseFill(Stage):
     def forward(
         self, signal: Signal, missing: Tensor, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None
     ) -> Signal:
-        """Reconstruct missing lines; see `sparse_fill`.
+        """Reconstruct missing lines by a model of the focused scene; see `sparse_fill`.
 
         Args:
             signal: Lines, shape (..., pulse, range).
@@ -276,6 +290,9 @@ class SparseFill(Stage):
             doppler_hz: Absolute Doppler centroid in Hz, shape (...,); replaces that of the
                 constructor.
             velocity_m_s: Effective velocity in m/s, shape (...,); replaces that of the constructor.
+
+        Returns:
+            Signal of the same shape; the signal itself if no line is missing.
         """
         lines, radar = signal.data, self.radar
         if _nothing_missing(missing):

@@ -1,8 +1,10 @@
-"""Correction of narrowband interference from external sources, by three methods of one interface.
+"""Correction of narrowband interference from external sources, by one of three methods.
 
-Each function takes raw lines (..., pulse, range) and returns a `Repaired`. Each stage returns the
-signal and an Estimate with the missing lines, for the stage that fills lines. Lines without
-interference are unchanged bit for bit. `subtract_interference` is recommended.
+The methods subtract the interference (`subtract_interference`, recommended), set its frequencies to
+zero (`notch_interference`), or set whole lines to zero (`drop_interference`). Each function takes
+raw lines (..., pulse, range) and returns a `Repaired`. Each stage returns the signal and an
+Estimate that marks the lines that are missing afterwards, for a stage that fills them. Lines
+without interference are unchanged bit for bit.
 
 Reference:
     Tsvetkov 2017, Figs. 2 and 3.
@@ -33,8 +35,8 @@ class Repaired:
         data: Lines, shape (..., pulse, range), complex.
         touched: Lines that were changed, shape (..., pulse), bool.
         missing: Lines that could not be corrected and are zero, shape (..., pulse), bool.
-        cells: Number of range-frequency cells of each line above the threshold, shape (..., pulse),
-            int64.
+        cells: Number of contaminated range-frequency cells of each line: those above the threshold,
+            or all cells of a line that is dropped, shape (..., pulse), int64.
         tone_cycles: Frequency of the strongest tone of each line in cycles per sample, 0 where
             there is none, shape (..., pulse), float64.
     """
@@ -51,9 +53,9 @@ class Contamination:
     """Lines and range-frequency cells that may hold interference.
 
     Args:
-        level: Robust level of the clean spectra.
-        excess: Power spectra over the level, FFT order, shape (..., pulse, range).
-        cells: Cells above the threshold, shape (..., pulse, range), bool.
+        level: Robust estimate of the power spectral density without interference.
+        excess: Power spectra divided by the level, FFT order, shape (..., pulse, range).
+        cells: Cells whose excess is above the threshold, shape (..., pulse, range), bool.
         lines: Lines that exceed the threshold in few parts of the band, shape (..., pulse), bool.
     """
 
@@ -64,17 +66,19 @@ class Contamination:
 
 
 def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contamination:
-    """Find cells whose tapered range spectrum exceeds the robust level, and their lines.
+    """Find range-frequency cells with more power than clutter has, and the lines that hold them.
 
-    The lines are candidates. Regularly spaced targets also make spectral lines, so the corrections
-    test in addition that the energy lasts the whole line.
+    Power is compared with a robust estimate of the clutter's spectrum. The lines found are only
+    candidates: regularly spaced targets also make narrow spectral peaks, so the corrections test in
+    addition that the energy of a peak lasts the whole line.
 
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
-        threshold: Power over the mean level of clutter.
+        threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
+            the cell counts as interference.
 
     Returns:
-        Contaminated cells (..., pulse, range) and lines (..., pulse).
+        `Contamination`, which marks cells (..., pulse, range) and lines (..., pulse).
     """
     with torch.no_grad():
         power = line_spectra(raw)
@@ -85,17 +89,18 @@ def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contaminati
 
 
 def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
-    """Set contaminated cells of the range spectrum to zero: the baseline.
+    """Set contaminated cells of the range spectrum to zero: a notch filter, the simplest method.
 
-    Removes the clutter of those cells as well, and leaves the side lobes of a tone that are below
-    the threshold. Differentiable in the lines.
+    It removes the clutter of those cells as well, and leaves the side lobes of a tone that are
+    below the threshold. Differentiable in the lines.
 
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
-        threshold: Power over the mean level of clutter.
+        threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
+            the cell counts as interference.
 
     Returns:
-        Lines of the same shape, with the lines that were changed or are missing.
+        `Repaired`: lines of the same shape, and masks of the changed and of the missing lines.
     """
     found = find_contamination(raw, threshold)
     touched = _contaminated(raw.detach(), found, threshold)
@@ -115,10 +120,11 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
-        threshold: Power over the mean level of clutter.
+        threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
+            the cell counts as interference.
 
     Returns:
-        Lines of the same shape, with the lines that were changed or are missing.
+        `Repaired`: lines of the same shape, and masks of the changed and of the missing lines.
     """
     found = find_contamination(raw, threshold)
     touched = _contaminated(raw.detach(), found, threshold)
@@ -129,20 +135,22 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones: int = 4) -> Repaired:
     """Subtract tones by maximum likelihood, and wider interference as a narrowband random process.
 
-    Tones have their own frequency, linear drift, amplitude and phase in each line. Up to three
-    bands are subtracted, each narrower than about 1/40 of the sampling rate. Of a line of n samples
-    a tone costs 1 / n to 2 / n of the clutter's power at its frequency, and a band of width B about
-    B n / fs cells. A line is missing if the interference that remains is stronger than its clutter.
-    Lines without interference are unchanged. Differentiable in the lines, with the frequencies and
-    spectra of the interference held fixed.
+    A tone has its own frequency, linear drift, amplitude and phase in each line. Up to three bands
+    of wider interference are subtracted, each narrower than about 1/40 of the sampling rate fs.
+    Some clutter is removed too: with a tone, that of 1 to 2 of the n frequency cells of a line of n
+    samples; with a band of width B, that of about B n / fs cells. A line in which the remaining
+    interference is stronger than the clutter is set to zero and marked as missing. Lines without
+    interference are unchanged. Differentiable in the lines, with the frequencies and spectra of the
+    interference held fixed.
 
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
-        threshold: Power over the mean level of clutter.
-        most_tones: Largest number of tones in a line.
+        threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
+            the cell counts as interference.
+        most_tones: Largest number of tones that are subtracted from a line.
 
     Returns:
-        Lines of the same shape, with the lines that were changed or are missing.
+        `Repaired`: lines of the same shape, and masks of the changed and of the missing lines.
     """
     found = find_contamination(raw, threshold)
     if not anything(found.lines):
@@ -214,7 +222,8 @@ class _InterferenceCorrection(Stage):
     """Common part of the three stages.
 
     Args:
-        threshold: Power over the mean level of clutter; 20 to 50 is useful.
+        threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
+            the cell counts as interference; 20 to 50 is useful.
 
     Raises:
         ValueError: If the threshold is not above 1.
@@ -227,23 +236,26 @@ class _InterferenceCorrection(Stage):
         super().__init__()
         if not threshold > 1:
             raise ValueError(
-                f"threshold {threshold} is not above the mean level of clutter (1); choose 20 to 50, "
-                f"by default {THRESHOLD:g}"
+                "threshold must be above 1 (the mean power of clutter), got "
+                f"{threshold}; 20 to 50 is useful, {THRESHOLD:g} the default"
             )
         self.threshold = float(threshold)
 
     def forward(self, signal: Signal, missing: Tensor | None = None) -> tuple[Signal, Estimate]:
-        """Correct the lines.
+        """Correct raw lines that contain narrowband interference.
 
         Args:
             signal: Raw lines, shape (..., pulse, range).
-            missing: Lines that were missing before, shape (..., pulse), bool.
+            missing: Lines that earlier stages marked as missing, shape (..., pulse), bool.
 
         Returns:
-            The corrected signal, and an Estimate: `missing` of shape (..., pulse), bool, the lines
-            missing before or now. `quality` is the share of lines that are not missing now, `ok` is
-            False where it is below one half. `info` holds the counts `lines_touched` and
-            `cells_touched` (...,), and `touched` and `tone_cycles_per_sample` (..., pulse).
+            The corrected signal, and an Estimate with `missing` of shape (..., pulse), bool: lines
+            that were missing before, or that this stage could not correct and set to zero.
+            `quality` is the share of lines that this stage did not set to zero; `ok` is False where
+            it is below one half. `info` holds, for each trial, the numbers of corrected lines,
+            `lines_touched`, and of contaminated frequency cells, `cells_touched`; and for each line
+            whether it was corrected, `touched`, and the frequency of its strongest tone,
+            `tone_cycles_per_sample`.
         """
         result = type(self).repair(signal.data, self.threshold)
         quality = 1 - result.missing.to(torch.float64).mean(-1)
@@ -258,10 +270,11 @@ class _InterferenceCorrection(Stage):
 
 
 class SubtractInterference(_InterferenceCorrection):
-    """Subtraction of interference (recommended); see `subtract_interference`.
+    """Stage that subtracts narrowband interference (recommended); see `subtract_interference`.
 
     Args:
-        threshold: Power over the mean level of clutter; 20 to 50 is useful.
+        threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
+            the cell counts as interference; 20 to 50 is useful.
 
     Raises:
         ValueError: If the threshold is not above 1.
@@ -271,10 +284,11 @@ class SubtractInterference(_InterferenceCorrection):
 
 
 class NotchInterference(_InterferenceCorrection):
-    """Notch filter for interference (baseline); see `notch_interference`.
+    """Stage that removes narrowband interference by a notch filter; see `notch_interference`.
 
     Args:
-        threshold: Power over the mean level of clutter; 20 to 50 is useful.
+        threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
+            the cell counts as interference; 20 to 50 is useful.
 
     Raises:
         ValueError: If the threshold is not above 1.
@@ -284,10 +298,13 @@ class NotchInterference(_InterferenceCorrection):
 
 
 class DropInterference(_InterferenceCorrection):
-    """Lines with interference set to zero; connect `missing` to the stage that fills lines.
+    """Stage that sets lines with interference to zero and marks them for a stage that fills lines.
+
+    The marked lines are the value `missing` of its Estimate; see `drop_interference`.
 
     Args:
-        threshold: Power over the mean level of clutter; 20 to 50 is useful.
+        threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
+            the cell counts as interference; 20 to 50 is useful.
 
     Raises:
         ValueError: If the threshold is not above 1.

@@ -4,9 +4,9 @@ A group of successive lines shares one spectrum of the interferer, estimated as 
 averaged range spectra. Each line is modelled as the sum of a stationary process with that spectrum
 and of white clutter, and the conditional mean of the process is subtracted. The model includes the
 finite length of a line (n samples of a process that is periodic with 2 n), so that the spectral
-leakage of a strong interferer, which no notch removes, is subtracted as well. This costs the
-degrees of freedom of the band: about one for each 1 / (duration of a line) of bandwidth, and a few
-for its edges.
+leakage of a strong interferer, which no notch removes, is subtracted as well. Clutter inside the
+band is lost with the interference: about one frequency cell of width 1 / (duration of a line) for
+each such width of the band, and a few cells for its edges.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ STRETCH_LINES = 32
 def lasts_the_line(lines: Tensor, cell: Tensor) -> Tensor:
     """Return whether the energy near one frequency cell is present during most of the line.
 
-    The median power of noise-like interference is 0.7 of its mean, that of a tone 1; that of a few
-    passing chirps is near 0.
+    The line is demodulated to the cell and divided into short blocks. Over the blocks, the median
+    power of noise-like interference is 0.7 of its mean power, that of a tone 1, and that of a few
+    chirps that pass the frequency is near 0; the limit is 0.35.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
         cell: Cell of an n-point FFT for each line, shape (..., pulse), int64.
 
     Returns:
-        Shape (..., pulse), bool.
+        True where the energy lasts, shape (..., pulse), bool.
     """
     n = lines.shape[-1]
     turns = (cell.to(torch.float64) / n)[..., None] * torch.arange(n, dtype=torch.float64, device=lines.device)
@@ -46,13 +47,14 @@ def lasts_the_line(lines: Tensor, cell: Tensor) -> Tensor:
 def find_band(lines: Tensor, level: Level, threshold: float = THRESHOLD) -> tuple[Tensor, Tensor]:
     """Find lines with interference that lasts the whole line.
 
-    A single line of noise-like interference may look intermittent, so the majority of the strong
-    lines nearby decides.
+    A single line of noise-like interference may look intermittent. A line therefore counts only if
+    the interference lasts in most of the neighbouring lines that exceed the threshold.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
-        level: Robust level of the clean spectra.
-        threshold: Power over the mean level of clutter.
+        level: Robust estimate of the power spectral density without interference.
+        threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
+            the cell counts as interference.
 
     Returns:
         Lines with interference, shape (..., pulse), bool, and their strongest cell of an n-point
@@ -68,7 +70,7 @@ def find_band(lines: Tensor, level: Level, threshold: float = THRESHOLD) -> tupl
 
 
 def subtract_band(lines: Tensor, touched: Tensor, level: Level) -> Tensor:
-    """Subtract the interference near the strongest cell of each group of lines.
+    """Subtract the interference near the strongest frequency cell of each group of 32 lines.
 
     Differentiable in the lines, with the spectrum of the interference held fixed.
 
@@ -76,7 +78,7 @@ def subtract_band(lines: Tensor, touched: Tensor, level: Level) -> Tensor:
         lines: Raw lines, shape (..., pulse, range), complex.
         touched: Lines with interference from `find_band`, shape (..., pulse), bool; others are
             unchanged.
-        level: Robust level of the clean spectra.
+        level: Robust estimate of the power spectral density without interference.
 
     Returns:
         Lines of the same shape.

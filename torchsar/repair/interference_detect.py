@@ -1,10 +1,11 @@
 """Detection of narrowband interference: range spectra of raw lines against a robust level.
 
-The level of a cell is the larger of two. The first is the gain of the line times the shape of the
-clean spectrum, a median over lines followed by a running median over frequency. Neither an
-interferer on all lines nor one of constant frequency raises it, and the running median preserves
-the steep edges of the pulse band. The second is the median over neighbouring cells of the line's
-own spectrum, since lines without echo have another shape than lines with echo.
+The level of a frequency cell is the larger of two estimates of its power without interference. The
+first is the gain of the line times the shape of the clean spectrum, which is a median over lines
+followed by a running median over frequency. Neither an interferer on all lines nor one of constant
+frequency raises it, and the running median preserves the steep edges of the pulse band. The second
+is the median over neighbouring cells of the line's own spectrum, since the spectrum of a line
+without echo has another shape than that of a line with echo.
 
 Reference:
     Tsvetkov 2017, Fig. 3.
@@ -28,41 +29,44 @@ LEVEL_SHARE = 1 / 16
 
 @dataclass(frozen=True)
 class Level:
-    """Robust mean power spectral density of the clean part of each line.
+    """Robust mean power spectral density that each line has without interference.
 
     Args:
-        density: Density in FFT order, shape (..., pulse, range).
+        density: Power of each frequency cell in FFT order, shape (..., pulse, range).
     """
 
     density: Tensor
 
     def at(self, cell: Tensor) -> Tensor:
-        """Return the density at one frequency cell of each line.
+        """Return the power spectral density without interference at one frequency cell per line.
 
         Args:
             cell: Cell of an n-point FFT, shape (..., pulse), int64.
 
         Returns:
-            Shape (..., pulse).
+            Density, shape (..., pulse).
         """
         return self.density.gather(-1, (cell % self.density.shape[-1])[..., None])[..., 0]
 
     def excess(self, power: Tensor) -> Tensor:
-        """Return power spectra relative to the level.
+        """Return power spectra divided by the level, cell by cell.
 
         Args:
             power: Power spectra in FFT order, shape (..., pulse, range).
 
         Returns:
-            Same shape; 0 where a line is empty.
+            Power ratios of the same shape; 0 where a line is empty.
         """
         return torch.where(self.density > 0, power / torch.where(self.density > 0, self.density, 1), 0)
 
     def lines(self, index: Tensor) -> Level:
-        """Return the level of some lines.
+        """Return the level of some of the lines.
 
         Args:
             index: Indices of the lines, shape (..., count), int64.
+
+        Returns:
+            Level of these lines in the order of the indices.
         """
         return Level(self.density.gather(-2, index[..., None].expand(*index.shape, self.density.shape[-1])))
 
@@ -100,7 +104,9 @@ def line_spectra(raw: Tensor, oversampling: int = 1) -> Tensor:
 
 
 def running_median(x: Tensor, width: int) -> Tensor:
-    """Compute a circular running median along the last dimension from at most 33 samples.
+    """Compute a circular running median along the last dimension.
+
+    Each median is taken from at most 33 samples that are spread evenly over the window.
 
     Args:
         x: Shape (..., n), real.
@@ -117,14 +123,16 @@ def running_median(x: Tensor, width: int) -> Tensor:
 
 
 def local_median(power: Tensor, width: int) -> Tensor:
-    """Return the larger median of the two half-overlapping windows that hold each cell.
+    """Return for each cell the larger median of the two windows that contain it.
+
+    Successive windows overlap by half, so that every cell lies in two of them.
 
     Args:
-        power: Circular spectrum, shape (..., n).
+        power: Power spectrum, taken as circular, shape (..., n).
         width: Width of the windows in cells.
 
     Returns:
-        Same shape.
+        Medians, same shape.
     """
     n = power.shape[-1]
     width = min(width, n)
@@ -137,13 +145,13 @@ def local_median(power: Tensor, width: int) -> Tensor:
 
 
 def clean_level(power: Tensor) -> Level:
-    """Estimate the level of the clean part of power spectra.
+    """Estimate the mean power spectral density that power spectra have without interference.
 
     Args:
         power: Power spectra in FFT order, shape (..., pulse, range).
 
     Returns:
-        Level over which the power of speckle has unit mean.
+        Level; the power of speckle divided by it has unit mean.
     """
     width = max(32, round(LEVEL_SHARE * power.shape[-1]))
 
@@ -163,16 +171,16 @@ def clean_level(power: Tensor) -> Level:
 def stands_out(excess: Tensor, threshold: float = THRESHOLD) -> Tensor:
     """Find lines that exceed the threshold in few parts of the band.
 
-    Echoes of regularly spaced targets make combs of spectral lines of similar strength over the
-    whole pulse band, interferers only a few. A line qualifies if at most a quarter of 32 parts of
-    the band come within 10 dB of its strongest cell.
+    Echoes of regularly spaced targets make many spectral peaks of similar strength over the whole
+    pulse band, interferers only a few. The band is divided into 32 parts; a line is selected if at
+    most a quarter of them contain a cell within 10 dB of its strongest cell.
 
     Args:
-        excess: Power spectra over the level, shape (..., pulse, range).
-        threshold: Power over the mean level of clutter.
+        excess: Power spectra divided by the level of clutter, shape (..., pulse, range).
+        threshold: Smallest excess of the strongest cell of a selected line.
 
     Returns:
-        Shape (..., pulse), bool.
+        True for selected lines, shape (..., pulse), bool.
     """
     n = excess.shape[-1]
     part = -(-n // 32)

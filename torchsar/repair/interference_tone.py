@@ -1,11 +1,12 @@
 """Tones in raw lines: estimated by maximum likelihood and subtracted.
 
 A tone is A exp(2j pi (f t + r t^2 / 2)) over the whole line, with t in samples from the middle of
-the line. Each line has its own amplitude, frequency and linear drift. A line demodulated with (f,
-r) is expanded in Legendre polynomials. At the maximum of the likelihood the first and second
-coefficients have no part in quadrature to the zeroth; these parts are the Gauss-Newton steps. Every
-real parameter costs a line of n samples 1 / (2 n) of the signal's power at that frequency, so f and
-r are averaged over lines wherever the tone drifts smoothly.
+the line. Each line has its own complex amplitude A, frequency f (cycles per sample) and linear
+drift r (cycles per sample^2). A line demodulated with f and r is expanded in Legendre polynomials
+over t. At the maximum of the likelihood the first and second coefficients are in phase with the
+zeroth; as long as they are not, their parts in quadrature give the Gauss-Newton steps of f and r.
+Every real parameter that is fitted to a line also removes half a frequency cell of its clutter. So
+f and r are averaged over lines wherever the tone drifts smoothly.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ class Tone:
             float64.
         rate: Drift of the frequency in cycles per sample^2, shape (..., pulse), float64.
         present: Lines that hold the tone, shape (..., pulse), bool.
-        noise_rad: Predicted standard deviation of each Legendre coefficient of the phase in
-            radians, shape (..., pulse), float64.
+        noise_rad: Predicted standard deviation, in radians, of each coefficient of an expansion of
+            the phase in orthonormal Legendre polynomials, shape (..., pulse), float64.
     """
 
     frequency: Tensor
@@ -47,24 +48,24 @@ class Tone:
     noise_rad: Tensor
 
     def phasor(self, n: int, dtype: torch.dtype) -> Tensor:
-        """Return the tone with unit amplitude.
+        """Return the samples of the tone with unit amplitude.
 
         Args:
             n: Number of samples of a line.
             dtype: complex64 or complex128.
 
         Returns:
-            Shape (..., pulse, n).
+            Complex samples with phase zero at the middle of the line, shape (..., pulse, n).
         """
         t = torch.arange(n, dtype=torch.float64, device=self.frequency.device) - (n - 1) / 2
         return unit_phasor((self.frequency[..., None] + self.rate[..., None] * (t / 2)) * t, dtype)
 
     def cell(self, n: int) -> Tensor:
-        """Return the nearest cell of an n-point FFT, shape (..., pulse), int64."""
+        """Return the cell of an n-point FFT nearest to the tone, shape (..., pulse), int64."""
         return torch.round(self.frequency * n).to(torch.int64) % n
 
     def waveform(self, lines: Tensor) -> Tensor:
-        """Return the tone with its least-squares amplitude, zero where it is not present.
+        """Return the tone with the complex amplitude that fits each line by least squares.
 
         Differentiable in the lines.
 
@@ -72,7 +73,7 @@ class Tone:
             lines: Raw lines, shape (..., pulse, n), complex.
 
         Returns:
-            Same shape.
+            Samples of the tone, same shape; zero in lines that do not hold it.
         """
         unit = self.phasor(lines.shape[-1], lines.dtype)
         amplitude = (lines * unit.conj()).mean(-1, keepdim=True)
@@ -99,13 +100,15 @@ def orthonormal_quadratics(n: int, like: Tensor) -> Tensor:
 
 
 def block_sums(x: Tensor) -> Tensor:
-    """Sum the samples of short blocks: a band of n / 16 cells or less about zero frequency.
+    """Sum the samples of short blocks, which keeps only frequencies near zero.
+
+    A line of 64 samples or more is divided into about 64 to 128 blocks.
 
     Args:
         x: Demodulated lines, shape (..., n), complex.
 
     Returns:
-        Shape (..., block).
+        Sums, shape (..., block).
     """
     n = x.shape[-1]
     length = 2 ** math.ceil(math.log2(max(1, n / 128))) if n >= 1024 else max(1, n // 64)
@@ -113,15 +116,17 @@ def block_sums(x: Tensor) -> Tensor:
 
 
 def coarse_offset(blocks: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """Search the frequency offset and the drift that collect most energy of a demodulated tone.
+    """Search for the frequency offset and the drift that collect most energy of a tone.
+
+    The tone has been demodulated with a first estimate of its frequency.
 
     Args:
         blocks: Sums of `block_sums`, shape (..., block), complex.
         n: Number of samples of a line.
 
     Returns:
-        Offset in cells of 1 / n cycles per sample and drift in cells per line, shape (...,) each,
-        float64.
+        Frequency offset in cells of 1 / n cycles per sample, and change of the frequency from the
+        beginning to the end of the line in cells, shape (...,) each, float64.
     """
     count = blocks.shape[-1]
     u = torch.linspace(-0.5, 0.5, count, dtype=torch.float64, device=blocks.device)
@@ -148,8 +153,8 @@ def phase_step(blocks: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
         basis: Polynomials of `orthonormal_quadratics`, shape (block, 3).
 
     Returns:
-        Steps of the first and second coefficient in radians, limited to +-0.7, shape (...,) each,
-        float64.
+        Steps of the first and second Legendre coefficient of the phase in radians, limited to
+        +-0.7, shape (...,) each, float64.
     """
     a = blocks @ basis.to(blocks.dtype)
     carrier = a[..., 0]
@@ -176,10 +181,10 @@ def fit_tone(lines: Tensor, cell: Tensor, present: Tensor, level: Level) -> Tone
         lines: Raw lines, shape (..., pulse, range), complex.
         cell: Cell of an n-point FFT, shape (..., pulse), int64.
         present: Lines that may hold a tone, shape (..., pulse), bool.
-        level: Robust level of the clean spectra.
+        level: Robust estimate of the power spectral density without interference.
 
     Returns:
-        One tone for each line, present only where it is steady.
+        One tone for each line, marked as present only where it lasts the whole line.
     """
     n = lines.shape[-1]
     signed = torch.where(cell > n // 2, cell - n, cell).to(torch.float64)
@@ -214,16 +219,16 @@ def is_steady(blocks: Tensor, energy: Tensor, density: Tensor) -> Tensor:
     """Return whether a spectral line comes from a tone that lasts the whole line.
 
     Echoes of regularly spaced targets make spectral lines too, but a chirp passes a frequency in
-    few blocks. A tone fills all blocks: its coherent sum holds the share z / (z + blocks) of the
-    energy, where z is its excess.
+    few blocks. A tone fills all B blocks: its coherent sum holds the share z / (z + B) of the
+    energy, where z = energy / density. At least 0.35 of this share is required.
 
     Args:
         blocks: Sums of `block_sums`, shape (..., block), complex.
-        energy: Energy of the tone over n, shape (...,).
+        energy: |sum of all blocks|^2 over the number of samples of the line, shape (...,).
         density: Power spectral density of clutter at the tone, shape (...,).
 
     Returns:
-        Shape (...,), bool.
+        True where the tone lasts, shape (...,), bool.
     """
     n_blocks = blocks.shape[-1]
     coherent = blocks.sum(-1).abs().square() / (
@@ -236,10 +241,10 @@ def is_steady(blocks: Tensor, energy: Tensor, density: Tensor) -> Tensor:
 def pooled(tone: Tone, n: int, position: Tensor) -> Tone:
     """Average frequency and drift over neighbouring lines where the tone drifts smoothly.
 
-    A tone that jumps from line to line keeps the values of each line; see `smooth_track`.
+    Where the tone jumps from line to line, every line keeps its own values; see `smooth_track`.
 
     Args:
-        tone: Tone with values of single lines.
+        tone: Tone whose frequency and drift were estimated from each line alone.
         n: Number of samples of a line.
         position: Line numbers, shape (..., pulse), float64.
 
@@ -253,19 +258,19 @@ def pooled(tone: Tone, n: int, position: Tensor) -> Tone:
 
 
 def smooth_track(value: Tensor, std: Tensor, present: Tensor, position: Tensor) -> Tensor:
-    """Replace values by local straight-line fits where these agree with the predicted scatter.
+    """Smooth one value per line by local straight-line fits where these fit within the noise.
 
-    The width of the fits grows threefold in each step. A line keeps the widest window whose
-    residuals are no larger than predicted.
+    The window of the fits grows threefold in each step. Each line keeps the fit with the widest
+    window whose residuals are no larger than predicted; without any, it keeps its own value.
 
     Args:
-        value: Values, shape (..., pulse), float64.
+        value: One value per line, such as a frequency, shape (..., pulse), float64.
         std: Predicted standard deviation of the values, shape (..., pulse), float64.
-        present: Lines that count, shape (..., pulse), bool.
+        present: Lines whose values are used, shape (..., pulse), bool.
         position: Line numbers, shape (..., pulse), float64.
 
     Returns:
-        Values of the same shape.
+        Smoothed values of the same shape.
     """
     weight = torch.where(present, 1 / std.square().clamp_min(1e-60), 0.0)
     weight = weight / weight.amax(-1, keepdim=True).clamp_min(1e-300)
@@ -323,19 +328,21 @@ def _local_line(value: Tensor, weight: Tensor, i: Tensor, box: Callable[[Tensor]
 def find_tones(
     lines: Tensor, level: Level, position: Tensor | None = None, most: int = 4, threshold: float = THRESHOLD
 ) -> list[Tone]:
-    """Find tones in lines, the strongest first, each in what remains after the earlier ones.
+    """Find tones in lines: the strongest first, then the strongest in what remains, and so on.
 
-    A line keeps no tones if they do not account for the energy around them.
+    A line keeps its tones only if their subtraction removes nine tenths of the energy around them;
+    otherwise the energy is that of a wider interferer.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
-        level: Robust level of the clean spectra.
-        position: Line numbers, shape (..., pulse), if the lines are a selection.
+        level: Robust estimate of the power spectral density without interference.
+        position: Line numbers, shape (..., pulse), if the lines are not successive.
         most: Largest number of tones in a line.
-        threshold: Power over the mean level of clutter.
+        threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
+            the cell counts as interference.
 
     Returns:
-        Tones, at most `most`, each with values (..., pulse).
+        Up to `most` tones, each with one value per line, shape (..., pulse).
     """
     rest, tones, n = lines.detach(), [], lines.shape[-1]
     blocked = torch.zeros(lines.shape, dtype=torch.bool, device=lines.device)
@@ -358,31 +365,34 @@ def find_tones(
 
 
 def accounts_for(before: Tensor, after: Tensor, near: Tensor, share: float) -> Tensor:
-    """Return whether at most a share of the energy in some cells remains, apart from clutter.
+    """Return whether the subtraction of tones left little energy in the frequency cells near them.
+
+    In each cell, twice the mean power of clutter may remain in addition to the given share.
 
     Args:
-        before: Power spectra over the level before subtraction, shape (..., pulse, range).
-        after: Power spectra over the level after subtraction, shape (..., pulse, range).
-        near: Cells that count, shape (..., pulse, range), bool.
-        share: Largest share that may remain.
+        before: Power spectra before subtraction, divided by the level of clutter, shape (...,
+            pulse, range).
+        after: The same after subtraction.
+        near: Cells near the tones, shape (..., pulse, range), bool.
+        share: Largest share of the energy in these cells that may remain.
 
     Returns:
-        Shape (..., pulse), bool.
+        True where little energy is left, shape (..., pulse), bool.
     """
     return (after * near).sum(-1) < share * (before * near).sum(-1) + 2 * near.sum(-1)
 
 
 def explaining(lines: Tensor, rest: Tensor, tones: list[Tone], level: Level) -> list[Tone]:
-    """Mark tones as absent in lines where all tones together leave more than a tenth of the energy.
+    """Mark a tone as absent in lines where more than a tenth of the energy around it is left.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
-        rest: Lines after the subtraction of the tones, same shape.
+        rest: Lines after the subtraction of all tones, same shape.
         tones: Tones of the lines.
-        level: Robust level of the clean spectra.
+        level: Robust estimate of the power spectral density without interference.
 
     Returns:
-        The tones that are present in any line.
+        The tones that are present in at least one line.
     """
     if not tones:
         return tones
@@ -396,7 +406,9 @@ def explaining(lines: Tensor, rest: Tensor, tones: list[Tone], level: Level) -> 
 
 
 def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -> list[Tone]:
-    """Fit each tone again without the others, then average over lines.
+    """Fit each tone again in lines without the others, then average it over neighbouring lines.
+
+    The averages are those of frequency and drift by `pooled`.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
@@ -426,9 +438,9 @@ def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -
 
 
 def subtract_each(lines: Tensor, tones: list[Tone], rounds: int = 3) -> list[Tensor]:
-    """Return the waveform of each tone, with amplitudes fitted jointly by alternation.
+    """Return the waveform of each tone, with amplitudes that fit the lines jointly.
 
-    Differentiable in the lines.
+    The tones are fitted in turn, each to the lines without the others. Differentiable in the lines.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
@@ -446,7 +458,7 @@ def subtract_each(lines: Tensor, tones: list[Tone], rounds: int = 3) -> list[Ten
 
 
 def subtract_tones(lines: Tensor, tones: list[Tone]) -> Tensor:
-    """Subtract tones from lines.
+    """Subtract tones, with amplitudes that fit the lines jointly, from the lines.
 
     Differentiable in the lines.
 
@@ -470,7 +482,7 @@ def around(cell: Tensor, n: int) -> Tensor:
         n: Number of cells.
 
     Returns:
-        Shape (..., pulse, n), bool.
+        True for these cells, shape (..., pulse, n), bool.
     """
     distance = (torch.arange(n, device=cell.device) - cell[..., None]) % n
     return (distance <= n // 32) | (distance >= n - n // 32)

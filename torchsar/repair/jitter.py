@@ -1,10 +1,10 @@
-"""Correction of periodic jitter of the range converter, by interpolation or exactly.
+"""Correction of the periodic timing jitter of an interleaved analogue-to-digital converter.
 
-A converter made of M interleaved ones takes sample n at the instant n + e[n mod M], in samples; the
-pattern begins with the first sample of every line. A common offset of all instants is a delay,
-which no record can distinguish from range: the estimators set the mean offset to zero (origin
-"mean"), or the first one (origin "first"). Lines are taken as periodic, as in every FFT, so that
-their ends join.
+A converter made of M interleaved converters takes sample n at the instant n + e[n mod M], in
+samples; the pattern e begins with the first sample of every line. A common offset of all instants
+is a delay, which no record can distinguish from range: the estimators set the mean offset to zero
+(origin "mean"), or the first one (origin "first"). Lines are taken as periodic, as in every FFT, so
+that their ends join.
 
 Reference:
     Tsvetkov 2017, Fig. 4.
@@ -30,7 +30,7 @@ def smallest_gap(offset_samples: Tensor) -> Tensor:
     """Return the smallest distance between neighbouring sample instants.
 
     Args:
-        offset_samples: Offsets in samples, shape (..., M).
+        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M).
 
     Returns:
         Distance in samples, shape (...,); zero or less if instants coincide or cross.
@@ -39,12 +39,13 @@ def smallest_gap(offset_samples: Tensor) -> Tensor:
 
 
 def refuse_crossing(offset_samples: Tensor) -> None:
-    """Raise ValueError if sample instants are too close for any interpolation (0.01 sample).
+    """Raise ValueError if sample instants lie less than 0.01 sample apart, or cross.
 
-    Has no effect inside torch.vmap, where values cannot be read.
+    No interpolation is accurate then. The function has no effect inside torch.vmap, where values
+    cannot be read.
 
     Args:
-        offset_samples: Offsets in samples, shape (..., M).
+        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M).
 
     Raises:
         ValueError: If an offset is not finite, or instants are too close, coincide or cross.
@@ -56,18 +57,17 @@ def refuse_crossing(offset_samples: Tensor) -> None:
         return
     if not worst >= MIN_GAP:
         shown = [round(x, 3) for x in offsets.reshape(-1, offsets.shape[-1])[0].tolist()]
-        gap = f"at least {MIN_GAP} sample apart, got a gap of {worst:.3g} (offsets {shown} ...)"
         raise ValueError(
-            f"jitter offsets must be finite and keep neighbouring sample instants {gap}; check "
-            "their sign and unit (samples)"
+            f"offset_samples must be finite and leave {MIN_GAP} sample or more between neighbouring sample "
+            f"instants, got a gap of {worst:.3g} (offsets of the first trial: {shown}); check sign and unit"
         )
 
 
 def sample_offsets(offset_samples: Tensor, n: int) -> Tensor:
-    """Return the offset of every sample of a line.
+    """Return the timing offset of every sample of a line.
 
     Args:
-        offset_samples: Offsets in samples, shape (..., M).
+        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M).
         n: Number of samples of the line.
 
     Returns:
@@ -78,16 +78,17 @@ def sample_offsets(offset_samples: Tensor, n: int) -> Tensor:
 
 
 def neighbours(offset_samples: Tensor, points: int) -> tuple[Tensor, Tensor]:
-    """Find the samples nearest to each uniform instant.
+    """Find the jittered samples nearest to each instant of the uniform grid.
 
     Args:
-        offset_samples: Offsets in samples, shape (..., M).
+        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M).
         points: Number of samples for each instant; an even number is centred on the interval that
             holds the instant.
 
     Returns:
-        True instants relative to the uniform one in samples, shape (..., M, points), and the index
-        of the first sample relative to that of the uniform instant, shape (..., M), int64.
+        True instants of these samples relative to the uniform instant, in samples, shape (..., M,
+        points); and the index of the first of them relative to the index of the uniform instant,
+        shape (..., M), int64.
     """
     m, device = offset_samples.shape[-1], offset_samples.device
     first = torch.where(offset_samples.detach() > 0, -(points // 2), -((points - 1) // 2))
@@ -97,7 +98,7 @@ def neighbours(offset_samples: Tensor, points: int) -> tuple[Tensor, Tensor]:
 
 
 def lagrange_weights(instants: Tensor) -> Tensor:
-    """Compute weights of the polynomial through samples at uneven instants, at instant 0.
+    """Compute weights with which a polynomial through uneven samples gives the value at instant 0.
 
     Args:
         instants: Instants in samples, shape (..., points).
@@ -111,9 +112,10 @@ def lagrange_weights(instants: Tensor) -> Tensor:
 
 
 def band_limited_weights(instants: Tensor, band: float, floor: float = 1e-9) -> Tensor:
-    """Compute the weights of least mean square error for a flat spectrum, at instant 0.
+    """Compute weights that interpolate a band-limited signal at instant 0 from uneven samples.
 
-    Solves sinc(band (t_i - t_j)) w = sinc(band t_i).
+    The weights w have the least mean square error for a spectrum that is flat over the band. They
+    solve sum_j sinc(band (t_i - t_j)) w_j = sinc(band t_i).
 
     Args:
         instants: Instants t in samples, shape (..., points), float64.
@@ -145,15 +147,16 @@ def _combine(y: Tensor, weights: Tensor, first: Tensor) -> Tensor:
 
 
 def correct_jitter_lagrange(y: Tensor, offset_samples: Tensor, points: int = 8) -> Tensor:
-    """Interpolate samples at uniform instants with Lagrange polynomials.
+    """Interpolate jittered samples at uniform instants with Lagrange polynomials.
 
-    Fast, but limited by the oversampling: near the edge of the band a polynomial does not follow
-    the signal. Zero offsets leave the samples unchanged. Differentiable.
+    Fast, but accurate only for oversampled signals: near the edge of the band a polynomial does not
+    follow the signal. Zero offsets leave the samples unchanged. Differentiable.
 
     Args:
         y: Lines of any length, shape (..., pulse, range), complex.
-        offset_samples: Offsets in samples, shape (..., M) or (M,).
-        points: Number of neighbours.
+        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M) or
+            (M,).
+        points: Number of neighbouring samples that are combined.
 
     Returns:
         Lines of the same shape.
@@ -167,16 +170,17 @@ def correct_jitter_lagrange(y: Tensor, offset_samples: Tensor, points: int = 8) 
 
 
 def correct_jitter_band_limited(y: Tensor, offset_samples: Tensor, points: int = 8, band: float = 0.95) -> Tensor:
-    """Interpolate samples at uniform instants with weights for a band-limited signal.
+    """Interpolate jittered samples at uniform instants with weights for a band-limited signal.
 
-    Costs as much as `correct_jitter_lagrange`. For a band of 0.8 and offsets of up to 0.18 sample
+    Takes as long as `correct_jitter_lagrange`. For a band of 0.8 and offsets of up to 0.18 sample
     the error is -29, -43 and -55 dB with 4, 8 and 12 points; that of Lagrange interpolation is -23,
     -28 and -32 dB. Differentiable.
 
     Args:
         y: Lines of any length, shape (..., pulse, range), complex.
-        offset_samples: Offsets in samples, shape (..., M) or (M,).
-        points: Number of neighbours.
+        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M) or
+            (M,).
+        points: Number of neighbouring samples that are combined.
         band: Bandwidth of the signal over the sampling rate.
 
     Returns:
@@ -193,14 +197,16 @@ def correct_jitter_band_limited(y: Tensor, offset_samples: Tensor, points: int =
 def correct_jitter_exact(y: Tensor, offset_samples: Tensor, refinements: int | None = None) -> Tensor:
     """Reconstruct uniform samples exactly from periodic non-uniform ones.
 
-    The M frequencies that alias together in the M decimated lines are separated by the inverse of
-    one M x M matrix, the same for every group except for a diagonal factor. A line whose length is
+    Each of the M interleaved converters alone samples a line M times too slowly, so that groups of
+    M frequencies alias together. They are separated by the inverse of one M x M matrix, which is
+    the same for every group except for a diagonal factor. A line whose length is
     not a multiple of M is extended to the next multiple, and the error that this leaves at its ends
     is removed by residual correction. Differentiable.
 
     Args:
         y: Lines, shape (..., pulse, range), complex.
-        offset_samples: Offsets in samples, shape (..., M) or (M,).
+        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M) or
+            (M,).
         refinements: Number of residual corrections; by default 6 in complex64, 12 in complex128.
 
     Returns:
@@ -213,7 +219,8 @@ def correct_jitter_exact(y: Tensor, offset_samples: Tensor, refinements: int | N
     offsets, n, m = offset_samples.to(torch.float64), y.shape[-1], offset_samples.shape[-1]
     if n < 2 * m:
         raise ValueError(
-            f"lines of {n} samples hold less than two periods of {m} samples; give longer lines or fewer offsets"
+            f"lines must hold two jitter periods of {m} samples or more, got lines of {n} samples; give longer "
+            "lines or fewer offsets"
         )
     if n % m == 0:
         return _separate(y, offsets)
@@ -247,14 +254,17 @@ def _separate(y: Tensor, offsets: Tensor) -> Tensor:
 
 
 def jittered(x: Tensor, offset_samples: Tensor) -> Tensor:
-    """Return the samples that a converter with these offsets takes of band-limited, periodic lines.
+    """Simulate the samples that a converter with timing offsets takes of uniformly sampled lines.
+
+    The lines are taken as band-limited and periodic.
 
     Args:
         x: Uniform samples, lines of any length, shape (..., pulse, range), complex.
-        offset_samples: Offsets in samples, shape (..., M) or (M,).
+        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M) or
+            (M,).
 
     Returns:
-        Samples of the same shape.
+        Jittered samples of the same shape.
     """
     n, m = x.shape[-1], offset_samples.shape[-1]
     spectrum = torch.fft.fftshift(torch.fft.fft(x), dim=-1)
@@ -272,7 +282,7 @@ class Lagrange:
     """Correction of jitter by Lagrange interpolation: fast, but inaccurate near the band edges.
 
     Args:
-        points: Number of neighbours, 2 to 64; 4, 8 and 12 are usual.
+        points: Number of neighbouring samples that are combined, 2 to 64; 4, 8 and 12 are usual.
 
     Raises:
         ValueError: If the number of neighbours is outside 2..64.
@@ -282,7 +292,9 @@ class Lagrange:
 
     def __post_init__(self) -> None:
         if not 2 <= self.points <= 64:
-            raise ValueError(f"Lagrange interpolation needs 2..64 points, got {self.points}; 4, 8 and 12 are usual")
+            raise ValueError(
+                f"points of Lagrange interpolation must be 2 to 64, got {self.points}; 4, 8 and 12 are usual"
+            )
 
     def __call__(self, y: Tensor, offset_samples: Tensor) -> Tensor:
         return correct_jitter_lagrange(y, offset_samples, self.points)
@@ -295,7 +307,7 @@ class BandLimited:
     As fast as `Lagrange` and much more accurate.
 
     Args:
-        points: Number of neighbours, 2 to 64.
+        points: Number of neighbouring samples that are combined, 2 to 64.
         band: Bandwidth of the signal over the sampling rate, above 0 and up to 1.
 
     Raises:
@@ -308,8 +320,8 @@ class BandLimited:
     def __post_init__(self) -> None:
         if not (2 <= self.points <= 64 and 0 < self.band <= 1):
             raise ValueError(
-                "band-limited interpolation needs 2..64 points and a band in 0..1 of the sampling "
-                f"rate, got {self.points} and {self.band}"
+                "band-limited interpolation needs points of 2 to 64 and a band (relative to the sampling rate) "
+                f"above 0 and up to 1, got points={self.points} and band={self.band}"
             )
 
     def __call__(self, y: Tensor, offset_samples: Tensor) -> Tensor:
@@ -330,16 +342,19 @@ def correct_jitter(
     period: Tensor | None = None,
     method: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Tensor:
-    """Correct jitter in trials whose periods may differ.
+    """Correct the periodic timing jitter of lines in trials whose jitter periods may differ.
 
-    Trials of one period are processed together. Trials whose offsets are all zero are unchanged if
-    `period` is given.
+    Trials with equal periods are processed together. If `period` is given, trials whose offsets are
+    all zero are unchanged.
 
     Args:
         y: Lines, shape (..., pulse, range), complex.
-        offset_samples: Offsets in samples, shape (..., P) or (P,).
-        period: Number of offsets that count in each trial, shape (...,), int64; None: all P.
-        method: Function of lines and offsets (..., M); by default `Exact()`.
+        offset_samples: Timing offsets of the interleaved converters in samples, shape (..., P) or
+            (P,).
+        period: Number of converters in each trial, shape (...,), int64: only so many of the first
+            offsets are used; None: all P.
+        method: Function of lines and offsets (..., M) that returns corrected lines; by default
+            `Exact()`.
 
     Returns:
         Lines of the same shape.
@@ -351,8 +366,8 @@ def correct_jitter(
     method = Exact() if method is None else method
     if offset_samples.ndim > 1 and offset_samples.shape[:-1] != y.shape[:-2]:
         raise ValueError(
-            f"jitter offsets of shape {tuple(offset_samples.shape)} do not match the trial dims "
-            f"{tuple(y.shape[:-2])} of the data; give (M,) or (*trials, M)"
+            f"offset_samples must have the shape (M,), or (*trials, M) with the trials {tuple(y.shape[:-2])} "
+            f"of the data, got the shape {tuple(offset_samples.shape)}"
         )
     if period is None:
         return method(y, offset_samples)
@@ -369,13 +384,14 @@ def correct_jitter(
 
 
 class CorrectJitter(Stage):
-    """Correction of periodic jitter with known or estimated offsets.
+    """Correction of periodic sampling jitter with known or estimated timing offsets.
 
-    In a chain: `use(CorrectJitter(), offset_samples="pilot", period="pilot")`, with the estimates
-    of `PilotJitter` or `BlindJitter`.
+    In a chain, after a stage of the name "pilot" that estimates the offsets (`PilotJitter` or
+    `BlindJitter`): `use(CorrectJitter(), offset_samples="pilot", period="pilot")`.
 
     Args:
-        offset_samples: Offsets in samples, shape (M,); by default zero.
+        offset_samples: Timing offsets of the M interleaved converters in samples, shape (M,); by
+            default zero.
         method: `Exact()` (default), `BandLimited(8, 0.8)`, `Lagrange(8)`, or any function of lines
             and offsets (..., M).
 
@@ -394,12 +410,17 @@ class CorrectJitter(Stage):
         refuse_crossing(self.offset_samples)
 
     def forward(self, signal: Signal, offset_samples: Tensor | None = None, period: Tensor | None = None) -> Signal:
-        """Correct the jitter; see `correct_jitter`.
+        """Correct the periodic timing jitter of lines; see `correct_jitter`.
 
         Args:
             signal: Lines, shape (..., pulse, range).
-            offset_samples: Offsets in samples, shape (..., P); replace those of the constructor.
-            period: Number of offsets that count in each trial, shape (...,), int64; None: all P.
+            offset_samples: Timing offsets of the interleaved converters in samples, shape (..., P);
+                replace those of the constructor.
+            period: Number of converters in each trial, shape (...,), int64: only so many of the
+                first offsets are used; None: all P.
+
+        Returns:
+            Signal with uniformly sampled lines.
         """
         offsets = self.offset_samples if offset_samples is None else offset_samples
         return signal.with_data(correct_jitter(signal.data, offsets, period, self.method))

@@ -26,26 +26,28 @@ from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap
 
 @dataclass(frozen=True)
 class CyclicFit:
-    """First-order jitter of one period.
+    """First-order estimate of timing jitter for one assumed period of M samples.
 
     Args:
-        coefficient: Fourier coefficients E_1 to E_(M-1) in samples, shape (..., M - 1), complex.
-        variance: Variance of each coefficient, shape (..., M - 1).
+        coefficient: Fourier coefficients E_1 to E_(M-1) of the M timing offsets in samples, shape
+            (..., M - 1), complex.
+        variance: Variance of each coefficient in samples^2, shape (..., M - 1).
     """
 
     coefficient: Tensor
     variance: Tensor
 
     def significance(self, primitive: bool = False) -> Tensor:
-        """Return the chi-squared statistic of the coefficients.
+        """Return the chi-squared statistic of the Fourier coefficients of the jitter.
 
         Without jitter it has as many degrees of freedom as there are coefficients.
 
         Args:
-            primitive: Whether to count only the coefficients that no shorter period has.
+            primitive: Whether to count only the coefficients k without a divisor in common with the
+                period; the others also belong to a shorter period.
 
         Returns:
-            Shape (...,).
+            Statistic, shape (...,).
         """
         m = self.coefficient.shape[-1] + 1
         used = [k - 1 for k in range(1, m) if not primitive or math.gcd(k, m) == 1]
@@ -53,21 +55,22 @@ class CyclicFit:
 
     @property
     def offset_samples(self) -> Tensor:
-        """Offsets of mean zero in samples, shape (..., M)."""
+        """Timing offsets of the M converters in samples, with mean zero, shape (..., M)."""
         m = self.coefficient.shape[-1] + 1
         return torch.fft.ifft(torch.nn.functional.pad(self.coefficient, (1, 0)) * m).real
 
     @property
     def std_samples(self) -> Tensor:
-        """Standard deviation of every offset in samples, shape (...,)."""
+        """Standard deviation of each timing offset in samples, equal for all, shape (...,)."""
         return torch.sqrt(self.variance.sum(-1))
 
 
 def cyclic_fit(y: Tensor, period: int) -> CyclicFit:
-    """Fit the coefficients of jitter to the correlations between frequencies k / M apart.
+    """Fit the Fourier coefficients of timing jitter to correlations in the range spectrum.
 
-    The variance includes the scatter of the correlations about the fit, so that lines that resemble
-    each other do not count as independent.
+    Jitter of period M correlates spectral components that lie k / M cycles per sample apart, with
+    whole k from 1 to M - 1. The variance includes the scatter of the correlations about the fit, so
+    that lines that resemble each other do not count as independent.
 
     Args:
         y: Lines, shape (..., pulse, range), complex.
@@ -109,10 +112,11 @@ def _smooth(power: Tensor, width: int) -> Tensor:
 
 
 def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> Tensor:
-    """Find the shortest period that contains all significant repetitions.
+    """Find the shortest period that explains all significant components of the timing jitter.
 
-    For each M the coefficients that no shorter period has are tested; false alarms are below 1e-5
-    per trial. A repetition that is weaker than the strongest one by 27 dB is taken for its leakage.
+    For each period M, those Fourier coefficients of the jitter are tested that no shorter period
+    has; the false-alarm rate is below 1e-5 per trial. Components more than 27 dB weaker than the
+    strongest are taken for its leakage and ignored.
 
     Args:
         y: Lines, shape (..., pulse, range), complex.
@@ -135,23 +139,23 @@ def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> T
 
 
 def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = None, passes: int = 3) -> Estimate:
-    """Estimate period and offsets of periodic jitter from clutter.
+    """Estimate the period and the offsets of periodic timing jitter from clutter, without a pilot.
 
-    Needs a signal that is not much oversampled. A periodic gain that accompanies the jitter is not
-    modelled. Not differentiable.
+    The signal must fill most of the sampled band. A periodic gain that accompanies the jitter is
+    not modelled. Not differentiable.
 
     Args:
         y: Raw or range-compressed lines, shape (..., pulse, range), complex, in any order.
         max_period: Longest period that is tested.
         period: Known period, which is then not tested.
-        passes: Number of fits, each after correction with the one before.
+        passes: Number of fits, each made after correction with the offsets of the fit before.
 
     Returns:
-        `offset_samples` of shape (..., P), of mean zero, with standard deviations, and `period` of
-        shape (...,), int64; offsets repeat beyond the period. P is the known period or
-        `max_period`. `quality` is the mean square of the offsets over itself plus their variance,
-        or 1 where there is no jitter. `ok` is False, and the offsets are zero, where a trial is all
-        zero or sample instants would coincide or cross.
+        Estimate with `offset_samples` of shape (..., P), in samples, with mean zero and standard
+        deviations, and `period` of shape (...,), int64; offsets repeat beyond the period. P is the
+        known period or `max_period`. `quality` is m / (m + v), with m the mean square of the
+        offsets and v their variance, or 1 where there is no jitter. `ok` is False, and the offsets
+        are zero, where a trial is all zero or sample instants would coincide or cross.
 
     Raises:
         ValueError: If the period is less than 2, or lines are shorter than 8 periods.
@@ -159,8 +163,8 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
     longest = max_period if period is None else period
     if longest < 2 or y.shape[-1] < 8 * longest:
         raise ValueError(
-            "blind jitter estimation needs a period of 2 or more and lines of at least "
-            f"{8 * longest} samples, got period {longest} and lines of {y.shape[-1]}; give longer lines"
+            "blind jitter estimation needs a period of 2 samples or more and lines of 8 periods or more, "
+            f"got a period of {longest} and lines of {y.shape[-1]} samples; give longer lines or a shorter period"
         )
     rows = y.detach().reshape(-1, *y.shape[-2:])
     periods = (
@@ -189,15 +193,15 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
 
 
 def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[CyclicFit, Tensor]:
-    """Fit offsets, correct the recording exactly, and fit what remains.
+    """Fit the timing offsets, correct the recording with them, and fit what remains, repeatedly.
 
     Args:
         y: Lines, shape (trial, pulse, range), complex.
-        period: Period M in samples.
+        period: Period M of the jitter in samples.
         passes: Number of fits.
 
     Returns:
-        The last fit, and the offsets in samples, shape (trial, M).
+        The last fit, and the total offsets in samples, shape (trial, M).
     """
     y = y[..., : y.shape[-1] - y.shape[-1] % period]
     total = torch.zeros((y.shape[0], period), dtype=torch.float64, device=y.device)
@@ -209,9 +213,10 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[CyclicFit, Tens
 
 
 class BlindJitter(Stage):
-    """Estimator of periodic jitter from the clutter of the recording.
+    """Estimator of periodic sampling jitter from the clutter of the recording.
 
-    In a chain: `use(CorrectJitter(), offset_samples="blind", period="blind")`.
+    In a chain that gives this stage the name "blind", the correction follows as
+    `use(CorrectJitter(), offset_samples="blind", period="blind")`.
 
     Args:
         max_period: Longest period that is tested, in samples.
@@ -225,9 +230,12 @@ class BlindJitter(Stage):
         self.max_period, self.period = max_period, period
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate period and offsets; see `estimate_jitter_blind`.
+        """Estimate period and offsets of the timing jitter; see `estimate_jitter_blind`.
 
         Args:
             signal: Raw or range-compressed lines, shape (..., pulse, range).
+
+        Returns:
+            Estimate with `offset_samples` in samples and `period`.
         """
         return estimate_jitter_blind(signal.data, self.max_period, self.period)

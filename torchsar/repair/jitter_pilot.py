@@ -27,7 +27,7 @@ ORIGINS = ("mean", "first")
 def estimate_jitter_pilot(
     pilot: Tensor, max_period: int = 16, period: int | None = None, origin: str = "mean"
 ) -> Estimate:
-    """Estimate period and offsets of periodic jitter from a pilot tone.
+    """Estimate the period and the offsets of periodic timing jitter from a pilot tone.
 
     The pilot cannot determine the mean offset, which is a delay; `origin` sets it by convention.
 
@@ -38,13 +38,13 @@ def estimate_jitter_pilot(
         origin: "mean" sets the mean offset to zero, "first" the first one.
 
     Returns:
-        `offset_samples` of shape (..., P), and `period` of shape (...,), int64; offsets repeat
-        beyond the period. P is the known period or `max_period`. The standard deviation is the
-        Cramer-Rao bound at the measured noise. `quality` is the share of the power that the tone
-        explains. `ok` is False, and the offsets are zero, where the record is not finite, all zero,
-        without a tone above the noise or with a tone too close to zero frequency, or where sample
-        instants would coincide or cross. `info` has the frequency of the tone, `frequency_cycles`,
-        in cycles per sample.
+        Estimate with `offset_samples` of shape (..., P), in samples, and `period` of shape (...,),
+        int64; offsets repeat beyond the period. P is the known period or `max_period`. The standard
+        deviation is the Cramer-Rao bound at the measured noise. `quality` is the share of the
+        record's power that belongs to the tone. `ok` is False, and the offsets are zero, where the
+        record is not finite or all zero, where no tone exceeds the noise or the tone is too close
+        to zero frequency, and where sample instants would coincide or cross. `info` has the
+        frequency of the tone in cycles per sample, `frequency_cycles`.
 
     Raises:
         ValueError: If the record is shorter than 4 periods, the period is less than one, or the
@@ -69,14 +69,12 @@ def _check(pilot: Tensor, max_period: int, period: int | None, origin: str) -> N
     if origin not in ORIGINS:
         raise ValueError(f"origin {origin!r} is unknown; choose one of {ORIGINS}")
     if not pilot.is_complex():
-        raise TypeError(
-            f"a pilot record is complex samples (..., n), got {pilot.dtype}; form the analytic signal first"
-        )
+        raise TypeError(f"pilot must hold complex samples (..., n), got {pilot.dtype}; form the analytic signal first")
     if pilot.ndim < 1 or pilot.shape[-1] < 4 * longest:
         length = pilot.shape[-1] if pilot.ndim else 0
         raise ValueError(
-            f"a pilot record needs at least {4 * longest} samples for periods up to {longest}, "
-            f"got {length}; record a longer tone or lower max_period"
+            f"pilot must hold 4 jitter periods of {longest} samples or more, got {length} samples; "
+            "record a longer tone or lower max_period"
         )
 
 
@@ -103,7 +101,9 @@ class _Fit:
         return self.phasor.abs().square().mean(-1)
 
     def significance(self, noise: Tensor) -> Tensor:
-        """Chi-squared statistic of the phases: M - 1 degrees of freedom without jitter."""
+        """Chi-squared statistic of the phases of the M converters; without jitter it has M - 1
+        degrees of freedom.
+        """
         information = (
             2 * self.count * self.phasor.abs().square() / noise.clamp_min(1e-30 * self.power + 1e-300)[..., None]
         )
@@ -175,9 +175,10 @@ def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: st
 
 
 class PilotJitter(Stage):
-    """Estimator of periodic jitter from a recorded pilot tone.
+    """Estimator of periodic sampling jitter from a recorded pilot tone.
 
-    In a chain: `use(PilotJitter(), pilot="aux.pilot")`. The signal is unchanged.
+    In a chain, with the side data `pilot` of the recording: `use(PilotJitter(),
+    pilot="aux.pilot")`. The signal is unchanged.
 
     Args:
         max_period: Longest period that is tested, in samples.
@@ -192,19 +193,22 @@ class PilotJitter(Stage):
         self.max_period, self.period, self.origin = max_period, period, origin
 
     def forward(self, signal: Signal, pilot: Tensor) -> Estimate:
-        """Estimate period and offsets; see `estimate_jitter_pilot`.
+        """Estimate period and offsets of the timing jitter; see `estimate_jitter_pilot`.
 
         Args:
-            signal: Lines, shape (..., pulse, range); gives only the trials.
+            signal: Lines, shape (..., pulse, range), of which only the number of trials is used.
             pilot: Record of the tone, shape (..., n), or (n,) for all trials.
+
+        Returns:
+            Estimate with `offset_samples` in samples and `period`.
 
         Raises:
             ValueError: If the record does not fit the trials of the signal.
         """
         if not pilot.ndim or (pilot.ndim > 1 and pilot.shape[:-1] != signal.trials):
             raise ValueError(
-                f"pilot record of shape {tuple(pilot.shape)} does not match the trial dims "
-                f"{tuple(signal.trials)}; give (n,) or (*trials, n)"
+                f"pilot must have the shape (n,), or (*trials, n) with the trials {tuple(signal.trials)} of the "
+                f"signal, got the shape {tuple(pilot.shape)}"
             )
         return estimate_jitter_pilot(
             pilot.expand(*signal.trials, pilot.shape[-1]), self.max_period, self.period, self.origin

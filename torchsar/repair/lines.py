@@ -1,9 +1,9 @@
 """Line integrity: verification of line numbers, and a regular azimuth grid from them.
 
-Every line number is compared with its neighbours. Of two lines in order the later one has the
-larger number, by at least their distance, since lines are lost but never added. The offset, number
-minus row, therefore never falls. A number that contradicts most of its neighbours on either side is
-taken for corrupted.
+Every line number is compared with those of the neighbouring lines. Since lines are lost but never
+added, the number of a correct line exceeds that of the k-th line before it by k or more. The
+difference between the number of a line and its row in the recording therefore never falls. A number
+that contradicts most of its neighbours on either side is taken for corrupted.
 
 Reference:
     Tsvetkov 2017 (verification of line numbers).
@@ -30,15 +30,15 @@ class LinePlan:
     """Positions of the received lines on a regular azimuth grid.
 
     Args:
-        source: Received row for each of the n rows of the grid, -1 where there is none, shape (...,
-            n).
-        number: Verified number of each received row, shape (..., received); -1 for padding,
+        source: Row of the recording for each of the n rows of the grid, -1 where there is none,
+            shape (..., n).
+        number: Verified number of each received line, shape (..., received); -1 for padding,
             repeated lines and lines without a unique position.
         missing: Rows of the grid without a line, shape (..., n), bool.
         corrected: Lines with a corrected number, shape (..., received), bool.
         repeated: Lines that repeat the line before, shape (..., received), bool.
         unplaced: Lines without a unique position, shape (..., received), bool.
-        first_number: Number of row 0 of the grid, shape (...,).
+        first_number: Line number that belongs to row 0 of the grid, shape (...,).
         trusted: Share of numbers that were accepted as received, shape (...,).
         ok: False where fewer than half of the numbers were accepted, shape (...,), bool.
     """
@@ -108,15 +108,17 @@ def _inconsistent(offset: Tensor, trusted: Tensor) -> Tensor:
 
 
 def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tensor:
-    """Return the lines whose number is accepted.
+    """Return the lines whose number agrees with those of the neighbouring lines.
 
     Args:
-        offset: Number minus row, shape (..., line), int64.
-        candidate: Lines that take part, shape (..., line), bool.
-        longest_gap: Largest step between neighbours that is not taken for an error.
+        offset: Line number minus row in the recording, shape (..., line), int64.
+        candidate: Lines that are tested; padding and repeated lines are not, shape (..., line),
+            bool.
+        longest_gap: Largest number of successive lost lines that is accepted; a larger step of the
+            numbers is taken for an error.
 
     Returns:
-        Shape (..., line), bool.
+        True for accepted lines, shape (..., line), bool.
     """
     trusted = candidate
     for reach in _REACHES:
@@ -150,20 +152,22 @@ def line_integrity(
 ) -> LinePlan:
     """Verify line numbers and plan the regular azimuth grid.
 
-    Repeated lines (equal samples) are dropped. A number that contradicts its neighbours is
-    corrected if the lines beside it leave one position only; a line that fits several positions of
-    a gap is left out and counted. Lines of zeros between others count as missing. Rows after the
-    last received line do not, since trials of different lengths are padded there. A trial with
-    fewer than half of its numbers accepted has `ok` False and keeps its rows.
+    Repeated lines (samples equal to those of the line before) are dropped. A number that
+    contradicts its neighbours is corrected if the lines beside it leave only one position for it; a
+    line that fits several positions of a gap is left out and counted. Lines of zeros between other
+    lines count as missing. Rows after the last received line do not, since trials of different
+    lengths are padded there. A trial with fewer than half of its numbers accepted has `ok` False,
+    and its lines stay in the order received.
 
     Args:
         lines: Received lines, shape (..., line, range), complex.
         line_number: Line numbers, shape (..., line), integer, -1 for padding at the end.
-        first_number: Number of row 0 of the grid; None: that of the first received line of each
-            trial.
-        n_lines: Number of rows of the grid; None: as many as there are lines, or more if the
-            numbers need more.
-        longest_gap: Largest step between neighbours that is not taken for an error.
+        first_number: Line number that belongs to row 0 of the grid; None: that of the first
+            received line of each trial.
+        n_lines: Number of rows of the grid; None: as many as there are received lines, or more if
+            the line numbers span more.
+        longest_gap: Largest number of successive lost lines that is accepted; a larger step of the
+            numbers is taken for an error.
 
     Returns:
         Plan that assigns the received lines to rows of the grid.
@@ -213,13 +217,13 @@ def _check(lines: Tensor, line_number: Tensor, longest_gap: int) -> None:
     """Raise ValueError for invalid line numbers or gaps."""
     if line_number.shape[-1:] != lines.shape[-2:-1]:
         raise ValueError(
-            f"line numbers of shape {tuple(line_number.shape)} do not fit {lines.shape[-2]} "
-            f"lines; give one number per line, {PADDING} for padding at the end"
+            f"line_number must have one number for each of the {lines.shape[-2]} lines, {PADDING} for padding "
+            f"at the end, got the shape {tuple(line_number.shape)}"
         )
     if line_number.is_floating_point() or line_number.is_complex() or line_number.dtype == torch.bool:
-        raise ValueError(f"line numbers must be integers, got {line_number.dtype}; round them before the call")
+        raise ValueError(f"line_number must hold integers, got {line_number.dtype}; round them before the call")
     if longest_gap < 1:
-        raise ValueError(f"the longest gap must be at least one line, got {longest_gap}")
+        raise ValueError(f"longest_gap must be one line or more, got {longest_gap}")
 
 
 def _check_consistency(ok: Tensor, trusted: Tensor, single: Tensor) -> None:
@@ -231,8 +235,8 @@ def _check_consistency(ok: Tensor, trusted: Tensor, single: Tensor) -> None:
     except RuntimeError:
         return
     raise ValueError(
-        f"the line numbers cannot be reconciled: only {accepted} of {total} agree with their "
-        "neighbours; check that they rise with the lines, or raise longest_gap"
+        f"line numbers cannot be reconciled: only {accepted} of {total} agree with those of neighbouring "
+        "lines, and at least half must; check that the numbers rise from line to line, or raise longest_gap"
     )
 
 
@@ -258,13 +262,14 @@ def _sources(slot: Tensor, inside: Tensor, rows: int) -> Tensor:
 
 
 def place_lines(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
-    """Put received lines on a regular grid.
+    """Put received lines on their rows of a regular azimuth grid.
 
     Differentiable.
 
     Args:
         x: Received lines, shape (..., received, range).
-        source: Received row for each row of the grid, -1 where there is none, shape (..., n).
+        source: Row of the recording for each of the n rows of the grid, -1 where there is none,
+            shape (..., n).
         fill: Value of the rows without a line.
 
     Returns:
@@ -275,28 +280,30 @@ def place_lines(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
 
 
 def place_per_line(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
-    """Put side data with one entry per received line on the same grid.
+    """Put side data with one value per received line on the regular azimuth grid of the lines.
 
     Args:
         x: Side data, shape (..., received).
-        source: Received row for each row of the grid, -1 where there is none, shape (..., n).
+        source: Row of the recording for each of the n rows of the grid, -1 where there is none,
+            shape (..., n).
         fill: Value of the rows without a line.
 
     Returns:
-        Shape (..., n).
+        Side data on the grid, shape (..., n).
     """
     return place_lines(x[..., None], source, fill)[..., 0]
 
 
 class LineIntegrity(Stage):
-    """Regular azimuth grid from verified line numbers; see `line_integrity`.
+    """Stage that verifies line numbers and puts lines on a regular grid; see `line_integrity`.
 
     Args:
-        first_number: Number of row 0 of the grid; None: that of the first received line of each
-            trial.
-        n_lines: Number of rows of the grid; None: as many as there are lines, or more if the
-            numbers need more.
-        longest_gap: Largest step between neighbours that is not taken for an error.
+        first_number: Line number that belongs to row 0 of the grid; None: that of the first
+            received line of each trial.
+        n_lines: Number of rows of the grid; None: as many as there are received lines, or more if
+            the line numbers span more.
+        longest_gap: Largest number of successive lost lines that is accepted; a larger step of the
+            numbers is taken for an error.
     """
 
     provides = ("missing",)
@@ -306,7 +313,7 @@ class LineIntegrity(Stage):
         self.first_number, self.n_lines, self.longest_gap = first_number, n_lines, longest_gap
 
     def forward(self, signal: Signal, line_number: Tensor) -> tuple[Signal, Estimate]:
-        """Put every line on its position of the grid.
+        """Put every line on the row of the azimuth grid that its verified number gives.
 
         Args:
             signal: Received lines, shape (..., pulse, range).
@@ -314,15 +321,16 @@ class LineIntegrity(Stage):
 
         Returns:
             The signal on the grid, with missing lines zero (regular input is unchanged bit for
-            bit), and an Estimate: `missing` of shape (..., pulse), bool. `quality` is the share of
-            numbers that were accepted; `ok` is False where it is below one half. `info` has
+            bit), and an Estimate with `missing` of shape (..., pulse), bool. `quality` is the share
+            of numbers that were accepted; `ok` is False where it is below one half. `info` has
             `source`, `number`, `corrected`, `repeated`, `unplaced` and `first_number` (see
             `LinePlan`), and the counts `received`, `placed`, `repeated_count`, `corrected_count`,
             `unplaced_count` and `missing_count` per trial, with received = placed + repeated +
             unplaced.
 
         Raises:
-            ValueError: As in `line_integrity`.
+            ValueError: If the numbers do not fit the lines or are not integers, `longest_gap` is
+                less than one, or fewer than half of the numbers are accepted in every trial.
         """
         plan = line_integrity(
             signal.data, line_number, first_number=self.first_number, n_lines=self.n_lines, longest_gap=self.longest_gap

@@ -1,10 +1,10 @@
-"""Phase and amplitude response of the channel along range: its correction, and its amplitude.
+"""Frequency response of the channel along range: correction, and estimation of the amplitude.
 
 The response is A(u) exp(j psi(u)), where u = f / (bandwidth / 2) is the normalised range frequency,
 -1..1 over the band of the pulse. Outside the band it keeps its values at the edges. By convention
 psi has no constant and no linear part over the band, which are a phase and a shift, and ln A has
-mean zero, which is a gain. Responses are sampled at GRID equally spaced u from -1 to 1.
-`response_phase` estimates the phase.
+mean zero, which is a gain. Responses are sampled at GRID = 1025 equally spaced u from -1 to 1.
+The module `response_phase` estimates the phase.
 
 Reference:
     Tsvetkov 2017, Figs. 8 and 9.
@@ -24,19 +24,19 @@ GRID = 1025
 
 
 def band_grid(device: torch.device | str | None = None) -> Tensor:
-    """Return the normalised frequencies at which responses are sampled.
+    """Return the normalised range frequencies, -1..1 over the band, at which responses are sampled.
 
     Args:
         device: Device of the result.
 
     Returns:
-        Shape (GRID,), float64.
+        Frequencies, shape (GRID,) with GRID = 1025, float64.
     """
     return torch.linspace(-1, 1, GRID, dtype=torch.float64, device=device)
 
 
 def band_axis(n: int, band: float, device: torch.device | str | None = None) -> Tensor:
-    """Return the normalised frequencies of an FFT.
+    """Return the frequencies of an FFT, normalised to -1..1 over the band of the pulse.
 
     Args:
         n: Length of the FFT.
@@ -50,7 +50,7 @@ def band_axis(n: int, band: float, device: torch.device | str | None = None) -> 
         ValueError: If `band` is outside its limits.
     """
     if not 0 < band <= 1:
-        raise ValueError(f"band is the pulse bandwidth over the sampling rate and lies in 0..1, got {band}")
+        raise ValueError(f"band, the pulse bandwidth over the sampling rate, must be above 0 and up to 1, got {band}")
     return torch.fft.fftfreq(n, dtype=torch.float64, device=device) / (band / 2)
 
 
@@ -72,10 +72,11 @@ def without_line(phase_rad: Tensor) -> Tensor:
     """Remove the constant and linear parts of a phase over the band, by least squares.
 
     Args:
-        phase_rad: Phase in radians, shape (..., GRID), float64.
+        phase_rad: Phase in radians at GRID = 1025 equally spaced frequencies of the band, shape
+            (..., GRID), float64.
 
     Returns:
-        Same shape.
+        Remaining phase in radians, same shape.
     """
     line = unit_legendre(band_grid(phase_rad.device), 1)
     line = line / torch.linalg.vector_norm(line, dim=-1, keepdim=True)
@@ -83,16 +84,16 @@ def without_line(phase_rad: Tensor) -> Tensor:
 
 
 def on_axis(values: Tensor, u: Tensor) -> Tensor:
-    """Interpolate values on the grid linearly; outside the band the values at the edges are kept.
+    """Interpolate a sampled response linearly at other frequencies.
 
-    Differentiable in the values.
+    Outside the band the values at its edges are kept. Differentiable in the values.
 
     Args:
-        values: Values on the grid, shape (..., GRID).
-        u: Normalised frequencies, shape (n,).
+        values: Values at GRID = 1025 equally spaced frequencies of the band, shape (..., GRID).
+        u: Frequencies, normalised to -1..1 over the band, shape (n,).
 
     Returns:
-        Shape (..., n).
+        Values at these frequencies, shape (..., n).
     """
     position = (u.clamp(-1, 1) + 1) / 2 * (values.shape[-1] - 1)
     low = position.floor().to(torch.int64).clamp(0, values.shape[-1] - 2)
@@ -103,17 +104,21 @@ def on_axis(values: Tensor, u: Tensor) -> Tensor:
 def response_filter(
     phase_rad: Tensor, amplitude: Tensor | None, n: int, band: float, dtype: torch.dtype = torch.complex128
 ) -> Tensor:
-    """Return the inverse response exp(-j psi) / A, a factor of range spectra or reference spectra.
+    """Return the inverse response exp(-j psi) / A, which corrects range or reference spectra.
+
+    Spectra are multiplied by it.
 
     Args:
-        phase_rad: Phase psi in radians, shape (..., GRID), float64.
-        amplitude: Amplitude A, shape (..., GRID), or None for one.
+        phase_rad: Phase psi of the response in radians at GRID = 1025 equally spaced frequencies of
+            the band, shape (..., GRID), float64.
+        amplitude: Amplitude A of the response at the same frequencies, shape (..., GRID), or None
+            for one.
         n: Length of the spectra.
         band: Bandwidth of the pulse over the sampling rate.
         dtype: complex64 or complex128.
 
     Returns:
-        FFT order, shape (..., n).
+        Complex factors in FFT order, shape (..., n).
     """
     u = band_axis(n, band, phase_rad.device)
     inverse = cis(-on_axis(phase_rad, u).to(real_dtype(dtype)))
@@ -121,18 +126,21 @@ def response_filter(
 
 
 def correct_response(x: Tensor, phase_rad: Tensor, amplitude: Tensor | None, band: float) -> Tensor:
-    """Remove a response along range.
+    """Remove the phase and amplitude response of the channel along range.
 
-    The range spectrum must be centred, as that of images in beam coordinates is. Differentiable.
+    The middle of the pulse band must be at zero range frequency, as it is in images in beam
+    coordinates. Differentiable.
 
     Args:
         x: Raw or range-compressed lines or image, shape (..., pulse, range), complex.
-        phase_rad: Phase in radians, shape (..., GRID), float64.
-        amplitude: Amplitude, shape (..., GRID), or None for one.
+        phase_rad: Phase of the response in radians at GRID = 1025 equally spaced frequencies of the
+            band, shape (..., GRID), float64.
+        amplitude: Amplitude of the response at the same frequencies, shape (..., GRID), or None for
+            one.
         band: Bandwidth of the pulse over the sampling rate.
 
     Returns:
-        Same shape.
+        Corrected data, same shape.
     """
     inverse = response_filter(phase_rad, amplitude, x.shape[-1], band, x.dtype)
     return torch.fft.ifft(torch.fft.fft(x) * inverse[..., None, :])
@@ -145,7 +153,7 @@ def band_power(x: Tensor) -> Tensor:
         x: Lines or image, shape (..., pulse, range), complex.
 
     Returns:
-        FFT order, shape (..., range), float64.
+        Power averaged over the lines, in FFT order, shape (..., range), float64.
     """
     return torch.fft.fft(x).abs().square().to(torch.float64).mean(-2)
 
@@ -158,13 +166,14 @@ def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, or
 
     Args:
         power: Measured power spectrum, FFT order, shape (..., n).
-        expected: Power spectrum of clean data of the same kind, FFT order, shape (..., n') of any
-            length; |pulse spectrum|^2 if noise and scene are white.
+        expected: Power spectrum of data of the same kind that the response has not changed, FFT
+            order, shape (..., n') of any length; |pulse spectrum|^2 if noise and scene are white.
         band: Bandwidth of the pulse over the sampling rate.
         order: Highest degree of the polynomials.
 
     Returns:
-        Amplitude on the grid, shape (..., GRID); one where a trial has no power.
+        Amplitude at GRID = 1025 equally spaced frequencies of the band, shape (..., GRID); one
+        where a trial has no power.
 
     Raises:
         ValueError: If the expected spectrum has a bin without power, or a spectrum has too few
@@ -175,8 +184,8 @@ def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, or
     wanted = _binned(expected.to(torch.float64), band, bins)
     if not bool((wanted > 0).all()):
         raise ValueError(
-            "the expected spectrum has bins without power inside the band; give a spectrum "
-            "of the same band with at least 4 * order samples"
+            "expected must be a power spectrum that is positive over the whole pulse band, but part of the band "
+            "has no power; give a spectrum of the same band"
         )
     ratio = _binned(power.to(torch.float64), band, bins) / wanted
     level = ratio.mean(-1, keepdim=True)
@@ -194,8 +203,8 @@ def _binned(power: Tensor, band: float, bins: int) -> Tensor:
     inside = u.abs() < 1
     if int(inside.sum()) < bins:
         raise ValueError(
-            f"a spectrum of {power.shape[-1]} samples holds fewer than {bins} inside the band; "
-            "lower the order or give longer lines"
+            f"a power spectrum must have {bins} samples or more inside the pulse band, but one of "
+            f"{power.shape[-1]} samples in all has fewer; lower the order or give longer lines"
         )
     index = ((u[inside] + 1) / 2 * bins).to(torch.int64).clamp(0, bins - 1)
     total = torch.zeros((*power.shape[:-1], bins), dtype=power.dtype, device=power.device).index_add(
@@ -207,30 +216,35 @@ def _binned(power: Tensor, band: float, bins: int) -> Tensor:
 class CorrectResponse(Stage):
     """Correction of the phase and amplitude response of the channel along range.
 
-    In a chain: `use(CorrectResponse(radar), phase_rad="response", amplitude="response")`.
+    In a chain, after a stage of the name "response" that estimates the response:
+    `use(CorrectResponse(radar), phase_rad="response", amplitude="response")`.
 
     Args:
         radar: Radar; gives bandwidth and sampling rate.
-        on: "image", or "raw" for raw and range-compressed data, where the correction equals one of
-            the reference spectrum.
+        on: "image" if the stage receives images, "raw" if it receives raw or range-compressed
+            lines, where the correction is equivalent to one of the reference spectrum.
 
     Raises:
-        ValueError: If `on` is neither of them.
+        ValueError: If `on` is neither "image" nor "raw".
     """
 
     def __init__(self, radar: StripmapRadar, on: str = "image") -> None:
         super().__init__()
         if on not in ("image", "raw"):
-            raise ValueError(f"a response is corrected on 'image' or 'raw' data, got {on!r}")
+            raise ValueError(f"on must be 'image' or 'raw', the kind of data to be corrected, got {on!r}")
         self.works_on = ("azimuth", "range") if on == "image" else ("pulse", "range")
         self.band = radar.pulse.bandwidth_hz / radar.sampling_hz
 
     def forward(self, signal: Signal, phase_rad: Tensor, amplitude: Tensor | None = None) -> Signal:
-        """Remove the response; see `correct_response`.
+        """Remove the phase and amplitude response along range; see `correct_response`.
 
         Args:
             signal: Image, shape (..., azimuth, range), or lines, shape (..., pulse, range).
-            phase_rad: Phase in radians, shape (..., GRID).
-            amplitude: Amplitude, shape (..., GRID), or None for one.
+            phase_rad: Phase of the response in radians at GRID = 1025 equally spaced frequencies of
+                the band, shape (..., GRID).
+            amplitude: Amplitude at the same frequencies, shape (..., GRID), or None for one.
+
+        Returns:
+            Corrected signal.
         """
         return signal.with_data(correct_response(signal.data, phase_rad, amplitude, self.band))

@@ -1,10 +1,10 @@
 """Phase response of the channel from bright points of the focused image.
 
-Two methods use short range windows about the brightest points. The point average (baseline) takes
-each for a single point: spectra, each without its own constant and linear phase, are averaged
-coherently. The sharpest fit (recommended) does not need single points: it determines the phase, as
-a sum of Legendre polynomials, whose removal gives range responses of least entropy. Ships, houses
-and close pairs of points are therefore useful as well.
+Two methods use short range windows about the brightest points. The point average (the simpler one)
+assumes that each window holds a single point: the spectra of the windows, each without its own
+constant and linear phase, are averaged coherently. The sharpest fit (recommended) does not need
+single points: it determines the phase, as a sum of Legendre polynomials, whose removal gives range
+responses of least entropy. Ships, houses and close pairs of points are therefore useful as well.
 
 Reference:
     Tsvetkov 2017, Figs. 8 and 9 (point average).
@@ -46,8 +46,8 @@ def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) ->
         image: Image, shape (trial, azimuth, range), complex.
         points: Number of windows.
         width: Length of the windows in samples.
-        apart: Least distance of a maximum from any brighter one in its own and the next lines, in
-            samples.
+        apart: Least distance in range, in samples, of a maximum from any brighter one in the same
+            line and in the two adjacent lines.
 
     Returns:
         Windows, shape (trial, points, width).
@@ -58,8 +58,8 @@ def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) ->
     n, half = image.shape[-1], width // 2
     if width < 16 or n < 2 * width:
         raise ValueError(
-            f"windows of {width} samples (at least 16) need at least {max(32, 2 * width)} valid "
-            f"range samples, got {n}; give longer lines"
+            f"width of a window must be 16 samples or more and at most half of the {n} valid range samples, "
+            f"got {width}; give longer lines"
         )
     size = torch.nn.functional.pad(image.abs()[..., half:-half], (half, half))
     highest = torch.nn.functional.max_pool2d(size[:, None], (3, 2 * apart + 1), 1, (1, apart))[:, 0]
@@ -73,17 +73,17 @@ def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) ->
 
 
 def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: float = 100.0) -> Tensor:
-    """Weight each window by its peak power s over the background of the image.
+    """Weight each window by the ratio s of its peak power to the background power of the image.
 
-    The weight is s / (s + full), and 0 below `floor`. The background is the mean power of Gaussian
-    speckle with the median power of the image; of a million of its pixels none exceeds the floor by
-    chance. It is never below 1e-5 (-50 dB) of the brightest peak, since weaker maxima are its side
-    lobes.
+    The weight is s / (s + full), and 0 where s is below `floor`. The background is the mean power
+    of Gaussian speckle that has the median power of the image; the floor is so high that hardly one
+    of a million speckle pixels exceeds it. The background is taken to be 1e-5 (-50 dB) of the
+    brightest peak or more, since weaker maxima are side lobes of that peak.
 
     Args:
         windows: Windows, shape (..., point, width), complex.
         image: Image, shape (..., azimuth, range), complex.
-        floor: Lowest ratio s that counts.
+        floor: Lowest ratio s with a weight above zero.
         full: Ratio s at which the weight is one half.
 
     Returns:
@@ -98,13 +98,13 @@ def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: fl
 def window_entropy(spectra: Tensor, phase_rad: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the mean entropy of windows after removal of a phase, and its gradient.
 
-    Responses are sampled twice as finely as the image, so that the position of a point between
-    samples has less influence. The removal is unitary, so p = |y|^2 sums to one and dH/dy* = -(ln p
-    + 1) y.
+    The entropy of a window is H = -sum p ln p with p = |y|^2, where y is the range response,
+    sampled twice as finely as the image so that the position of a point between samples has less
+    influence. Since the removal of a phase is unitary, p sums to one and dH/dy* = -(ln p + 1) y.
 
     Args:
         spectra: Spectra of unit energy, or zero, shape (trial, point, n), complex128.
-        phase_rad: Phase in radians, FFT order, shape (trial, n), float64.
+        phase_rad: Phase to be removed, in radians, FFT order, shape (trial, n), float64.
         weight: Weights of the windows, shape (trial, point), float64.
 
     Returns:
@@ -130,10 +130,10 @@ def minimise(
     first_step: float = 0.3,
     rtol: float = 1e-7,
 ) -> Tensor:
-    """Minimise a cost by quasi-Newton (BFGS) descent, each trial by itself.
+    """Minimise a cost by quasi-Newton (BFGS) descent, for each trial separately.
 
-    A step is halved until the cost falls enough (Armijo rule). A trial that cannot improve, or
-    improves by less than rtol, keeps its parameters.
+    A step is halved until the cost falls enough (Armijo rule). A trial stops when no step lowers
+    its cost, or when a step lowers the cost by less than the fraction rtol.
 
     Args:
         cost: Function of parameters (trial, p) that returns costs (trial,) and gradients (trial,
@@ -190,8 +190,9 @@ def sharpest_coefficients(
 ) -> Tensor:
     """Find the Legendre coefficients of the phase whose removal leaves the sharpest windows.
 
-    The degrees are admitted in stages, each starting from the result of the one before, so that a
-    large smooth phase is found before fine ripple.
+    The sharpest windows are those of least mean entropy. Higher degrees are added in stages, each
+    starting from the result of the stage before, so that a large smooth phase is found before fine
+    ripple.
 
     Args:
         windows: Range windows, shape (trial, point, n), complex.
@@ -201,7 +202,7 @@ def sharpest_coefficients(
         steps: Largest number of steps of a stage.
 
     Returns:
-        Coefficients in radians of the degrees 2 to orders[-1], shape (trial, p).
+        Coefficients in radians of the degrees 2 to orders[-1], shape (trial, orders[-1] - 1).
     """
     n = windows.shape[-1]
     spectra = torch.fft.fft(windows.to(torch.complex128), norm="ortho")
@@ -229,11 +230,13 @@ def estimate_response_sharpest(
     passes: int = 3,
     valid: int | None = None,
 ) -> Estimate:
-    """Estimate the phase response by least entropy of range windows about bright points.
+    """Estimate the phase response as that whose removal makes bright points sharpest in range.
 
-    After each pass the image is corrected and the points are chosen again. The last pass fits two
-    halves of the points separately: the estimate is their mean, shrunk by what chance may
-    contribute, and its standard deviation follows from their difference. Not differentiable.
+    Sharpness is measured by the entropy of range windows about the points. After each pass the
+    image is corrected and the points are chosen again. The last pass fits two halves of the points
+    separately. The estimate is the mean of both fits, with coefficients shrunk where they may be
+    due to chance; the standard deviation follows from the difference of the fits. Not
+    differentiable.
 
     Args:
         image: Image with centred range spectrum, shape (..., azimuth, range), complex.
@@ -243,13 +246,15 @@ def estimate_response_sharpest(
             response; at most half the valid columns are used.
         orders: Highest Legendre degree of each stage.
         passes: Number of passes.
-        valid: Number of fully compressed columns; by default all.
+        valid: Number of range columns, from the first on, that are fully compressed and may be
+            used; by default all.
 
     Returns:
-        `phase_rad` of shape (..., GRID) in radians, with standard deviation, and `amplitude`, all
-        ones; see `torchsar.repair.response` for the conventions. `quality` is 1 / (1 + variance).
-        `ok` is False, and the phase is zero, where the halves differ by more than 0.25 rad rms: the
-        image has too few bright points.
+        Estimate with `phase_rad` in radians and its standard deviation, at GRID = 1025 equally
+        spaced frequencies of the pulse band, shape (..., GRID), without constant and linear part;
+        and `amplitude` of the same shape, all ones. `quality` is 1 / (1 + variance in rad^2). `ok`
+        is False, and the phase is zero, where the fits of the two halves differ by more than 0.25
+        rad rms: the image has too few bright points.
 
     Raises:
         ValueError: If there are fewer than 32 valid columns, or the width is below 16 samples.
@@ -298,9 +303,10 @@ def point_average_coefficients(
 ) -> Tensor:
     """Average the spectra of single points coherently, and fit the phase of the average.
 
-    Begins with the spectrum of the first point, aligns all others with it in slope (at the peak of
-    their correlation) and constant, and repeats with the average. The phase of the average is the
-    running sum of its increments.
+    All spectra are first aligned with that of the first point: the slope of their phase is found
+    from the peak of their correlation, then the constant. This is repeated with the average of the
+    spectra in place of the first. The phase of the average is the running sum of its increments
+    from frequency to frequency.
 
     Args:
         windows: Range windows, the brightest first, shape (trial, point, n), complex.
@@ -310,7 +316,7 @@ def point_average_coefficients(
         rounds: Number of averages.
 
     Returns:
-        Legendre coefficients in radians of the degrees 2 to `order`, shape (trial, p).
+        Legendre coefficients in radians of the degrees 2 to `order`, shape (trial, order - 1).
     """
     n = windows.shape[-1]
     u = torch.fft.fftshift(band_axis(n, band, windows.device))
@@ -354,11 +360,11 @@ def estimate_response_points(
     passes: int = 3,
     valid: int | None = None,
 ) -> Estimate:
-    """Estimate the phase response by the coherent average of isolated bright points: the baseline.
+    """Estimate the phase response by the coherent average of the spectra of isolated bright points.
 
-    Uses one line for each point and is therefore more sensitive to noise than
-    `estimate_response_sharpest`. Fails if the brightest maxima are not single points, or if the
-    response spreads them over much of the window. Not differentiable.
+    This is the simpler method. It uses one line of the image for each point and is more sensitive
+    to noise than `estimate_response_sharpest`. It fails if the brightest maxima are not single
+    points, or if the response spreads them over much of the window. Not differentiable.
 
     Args:
         image: Image with centred range spectrum, shape (..., azimuth, range), complex.
@@ -367,10 +373,14 @@ def estimate_response_points(
         width: Length of the windows in samples; at most half the valid columns are used.
         order: Highest Legendre degree.
         passes: Number of passes.
-        valid: Number of fully compressed columns; by default all.
+        valid: Number of range columns, from the first on, that are fully compressed and may be
+            used; by default all.
 
     Returns:
-        As `estimate_response_sharpest`.
+        Estimate with `phase_rad` in radians and its standard deviation, at GRID = 1025 equally
+        spaced frequencies of the pulse band, shape (..., GRID), and `amplitude` of the same shape,
+        all ones. `quality` is 1 / (1 + variance in rad^2). `ok` is False, and the phase is zero,
+        where the results of two halves of the points differ by more than 0.25 rad rms.
 
     Raises:
         ValueError: If there are fewer than 32 valid columns, or the width is below 16 samples.
@@ -407,8 +417,8 @@ class EstimateResponse(Stage):
         method: "sharpest" for `estimate_response_sharpest` (default), "points" for
             `estimate_response_points`, or any function of (image, band, valid=columns) that returns
             such an Estimate.
-        expected_power: Range power spectrum of a clean image of this kind (`band_power(clean)`),
-            FFT order, shape (n,); None: the amplitude is one.
+        expected_power: Range power spectrum of an image of this kind that the response has not
+            changed (see `band_power`), FFT order, shape (n,); None: the amplitude is one.
     """
 
     works_on = ("azimuth", "range")
@@ -428,14 +438,15 @@ class EstimateResponse(Stage):
         self.register_buffer("expected_power", expected_power)
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the response.
+        """Estimate the phase and amplitude response of the channel along range.
 
         Args:
             signal: Image, shape (..., azimuth, range).
 
         Returns:
-            As `estimate_response_sharpest`, with the amplitude of `estimate_amplitude_response` if
-            a power spectrum is expected.
+            Estimate with `phase_rad` in radians and `amplitude` at 1025 equally spaced frequencies
+            of the pulse band. The amplitude is one unless the constructor received
+            `expected_power`.
         """
         band = self.radar.pulse.bandwidth_hz / self.radar.sampling_hz
         estimate = self.method(signal.data, band, valid=max(1, signal.data.shape[-1] - self.radar.pulse_samples))
@@ -450,8 +461,8 @@ class EstimateResponse(Stage):
 class EstimateFlatResponse(EstimateResponse):
     """Estimator of the response from images that were compressed with the `flat` reference.
 
-    Such an image, if clean, has the same power at all frequencies of the pulse band; the amplitude
-    is therefore estimated as well.
+    Without an amplitude response, such an image has the same power at all frequencies of the pulse
+    band; the amplitude is therefore estimated as well as the phase.
 
     Args:
         radar: Radar; gives bandwidth, sampling rate and length of the pulse.
@@ -464,13 +475,14 @@ class EstimateFlatResponse(EstimateResponse):
         super().__init__(radar, method)
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the response.
+        """Estimate the phase and amplitude response of the channel along range.
 
         Args:
-            signal: Image, shape (..., azimuth, range).
+            signal: Image, shape (..., azimuth, range), compressed with the `flat` reference.
 
         Returns:
-            As `EstimateResponse`, with the amplitude relative to a flat spectrum.
+            Estimate with `phase_rad` in radians and `amplitude`, relative to a flat spectrum, at
+            1025 equally spaced frequencies of the pulse band.
         """
         flat = torch.ones(signal.data.shape[-1], dtype=torch.float64, device=signal.data.device)
         return EstimateResponse(self.radar, self.method, flat)(signal)

@@ -5,11 +5,11 @@ slowly varying power v(look, pixel). The most probable missing lines minimise su
 This is a linear system in the missing lines alone, solved by conjugate gradients; v is then
 estimated from the reconstructed image, and the solution repeated.
 
-The first estimate keeps the bright part of the image (`bright_fill`), which finds points but no
-texture. Three properties of the model lower the error on recorded data further: a local power
-estimate instead of a threshold follows texture; conjugate gradients converge faster than plain
-iteration; and sub-looks include properties of the azimuth spectrum, such as band edges, noise
-floor, drift of the Doppler centroid over the scene and apertures cut by the ends of the recording.
+The first estimate keeps only the bright part of the image (`bright_fill`), which finds points but
+no texture. Three properties of the model lower the error on recorded data further. A local power
+estimate, instead of a threshold, follows texture. Conjugate gradients converge faster than plain
+iteration. Sub-looks include properties of the azimuth spectrum, such as band edges, noise floor,
+drift of the Doppler centroid over the scene, and apertures cut by the ends of the recording.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torchsar.radar import StripmapRadar
 
 
 def unit_level(lines: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale lines to a peak of one in each trial, against under- and overflow of squares.
+    """Scale lines to a peak of one in each trial, so that squares neither underflow nor overflow.
 
     Args:
         lines: Lines, shape (..., pulse, range), complex.
@@ -52,7 +52,9 @@ def power_of(x: Tensor) -> Tensor:
 
 
 def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, mask: Tensor, steps: int) -> Tensor:
-    """Change lines under a mask so that <lines, quadratic(lines)> is least, by conjugate gradients.
+    """Find the lines under a mask for which <lines, quadratic(lines)> is least.
+
+    The method is conjugate gradients; lines outside the mask are kept.
 
     Args:
         quadratic: Hermitian positive operator on lines (..., pulse, range).
@@ -85,13 +87,13 @@ def smooth(power: Tensor, azimuth: float, range_: float) -> Tensor:
     """Average power locally with Gaussian weights.
 
     Args:
-        power: Power, shape (..., range, azimuth); circular in azimuth, continued by its edges in
-            range.
+        power: Power, shape (..., range, azimuth); continued periodically in azimuth and by its edge
+            values in range.
         azimuth: Standard deviation of the weights in azimuth, in pixels.
         range_: Standard deviation of the weights in range, in pixels.
 
     Returns:
-        Same shape.
+        Averaged power, same shape.
     """
     return _smooth_last(_smooth_last(power, azimuth, "circular").mT, range_, "replicate").mT
 
@@ -106,15 +108,17 @@ def _smooth_last(x: Tensor, sigma: float, edges: str) -> Tensor:
 
 
 def look_windows(n: int, looks: int, doppler_turns: Tensor) -> Tensor:
-    """Return overlapping cosine windows over Doppler, whose squares sum to one.
+    """Return overlapping cosine windows that divide the Doppler spectrum into sub-looks.
+
+    The squares of the windows sum to one at every frequency.
 
     Args:
         n: Number of Doppler cells.
-        looks: Number of windows, centred evenly about the centroid.
+        looks: Number of windows, evenly spaced about the Doppler centroid.
         doppler_turns: Doppler centroid in cycles per line, shape (...,), float64.
 
     Returns:
-        Shape (look, ..., n), float64.
+        Windows in FFT order, shape (look, ..., n), float64.
     """
     axis = torch.arange(n, dtype=torch.float64, device=doppler_turns.device) / n - doppler_turns[..., None]
     centre = ((torch.arange(looks, dtype=torch.float64, device=axis.device) + 0.5) / looks - 0.5).reshape(
@@ -126,10 +130,11 @@ def look_windows(n: int, looks: int, doppler_turns: Tensor) -> Tensor:
 
 
 class SubLooks:
-    """Precision (inverse covariance) of lines under the scene model.
+    """Covariance model of lines from the focused scene, divided by Doppler into sub-looks.
 
-    Powers and weights of the sub-looks have azimuth last, (look, ..., range, pulse), where azimuth
-    FFTs take half the time.
+    Every pixel of every sub-look is modelled as independent zero-mean noise with a slowly varying
+    power. Powers and weights of the sub-looks have azimuth last, (look, ..., range, pulse), where
+    azimuth FFTs take half the time.
 
     Args:
         operator: Invertible focusing of the lines.
@@ -142,18 +147,18 @@ class SubLooks:
         self.share = windows.square().mean(-1)[..., None, None]
 
     def power(self, lines: Tensor, unexplained: Tensor) -> Tensor:
-        """Estimate the local power v of each sub-look.
+        """Estimate the local power of every sub-look of the image that lines form.
 
-        It is the geometric mean of the sub-look's own local power and of that expected from the
-        whole image.
+        It is the geometric mean of two estimates: the locally averaged power of the sub-look, and
+        its mean power times the relative local power of the image of all looks.
 
         Args:
             lines: Lines, shape (..., pulse, range), complex.
-            unexplained: Power that errors of the reconstructed lines may have in every pixel;
-                broadcasts against (..., range, pulse).
+            unexplained: Power that errors of the reconstructed lines may have in every pixel; it is
+                added, and broadcasts against (..., range, pulse).
 
         Returns:
-            Shape (look, ..., range, pulse).
+            Local power, shape (look, ..., range, pulse).
         """
         spectra = self.operator.to_doppler(lines).mT.contiguous()
         whole = power_of(torch.fft.ifft(spectra))
@@ -168,14 +173,17 @@ class SubLooks:
         return torch.stack(result)
 
     def precision(self, lines: Tensor, weight: Tensor) -> Tensor:
-        """Apply the precision to lines: the gradient of sum weight |sub-look|^2.
+        """Multiply lines by the inverse covariance matrix of the scene model.
+
+        The product is the gradient, with respect to the lines, of the sum of weight |pixel|^2 over
+        all pixels of all sub-looks.
 
         Args:
             lines: Lines, shape (..., pulse, range), complex.
-            weight: Inverse powers, shape (look, ..., range, pulse).
+            weight: Inverse powers of the pixels, shape (look, ..., range, pulse).
 
         Returns:
-            Same shape as the lines.
+            Product of the same shape as the lines.
         """
         spectra = self.operator.to_doppler(lines).mT.contiguous()
         total = torch.zeros_like(spectra)
@@ -204,9 +212,9 @@ def bright_fill(
         mask: Missing lines, shape (..., pulse, 1), bool.
         operator: Invertible focusing of the lines.
         steps: Number of steps.
-        first: First threshold over the strongest pixel of each trial.
-        fall: Factor by which the threshold falls in each step.
-        last: Lowest threshold over the rms amplitude of the image.
+        first: First threshold, relative to the amplitude of the strongest pixel of each trial.
+        fall: Factor by which the threshold is multiplied in each step.
+        last: Lowest threshold, relative to the rms amplitude of the image.
 
     Returns:
         Lines of the same shape.
@@ -237,21 +245,23 @@ def sparse_fill(
     rounds: int = 2,
     steps: int = 4,
 ) -> Tensor:
-    """Reconstruct the missing lines that are most probable under a model of locally varying power.
+    """Reconstruct the missing lines that are most probable under a model of the focused scene.
 
-    Begins with `bright_fill`. Two looks are enough for scenes of points; four or more are useful
-    for speckle that fills the PRF band. More than two rounds or four steps are useful only in long
-    gaps. By default the cost is that of about 110 two-dimensional FFTs. Received lines are kept bit
-    for bit. Differentiable in the lines, with thresholds and local powers held fixed.
+    The image is split by Doppler into sub-looks, whose pixels are modelled as independent noise of
+    slowly varying local power. The first estimate is that of `bright_fill`. Two looks are enough
+    for scenes of points; four or more are useful for speckle that fills the PRF band. More than two
+    rounds or four steps are useful only in long gaps. By default the computation takes as long as
+    about 110 two-dimensional FFTs. Received lines are kept bit for bit. Differentiable in the
+    lines, with thresholds and local powers held fixed.
 
     Args:
         lines: Lines, shape (..., pulse, range), complex.
         missing: Missing lines, shape (..., pulse), bool.
         radar: Radar.
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,); errors of a few Hz
-            cost little.
+            have little effect.
         velocity_m_s: Effective velocity in m/s, a number or shape (...,), by default that of the
-            radar; small relative errors cost little.
+            radar; small relative errors have little effect.
         reference: Range reference spectrum of raw lines, shape (range,), of which only the phase is
             used; None for range-compressed lines.
         looks: Number of sub-looks in Doppler.

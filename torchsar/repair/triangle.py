@@ -1,22 +1,27 @@
 """Separation of a continuous triangular beat record into sweeps, and blanking of turning points.
 
-A record (..., pulse, time) holds one block for each recorded period; the triangle starts
-`trigger_s` after the start of its block. Sweeps are (..., ramp, pulse, fast_time), ramp 0 up and 1
-down, both in natural time order, on the grid of `TriangularLadar.fast_time_axis`, which is
-symmetric about the middle of the sweep. A trigger between two samples is matched by a delay of the
-whole record (linear phase of its spectrum), never by a shifted grid: if the grid is off by dt, the
-velocity from the intercept of the mirror product is biased by 0.76 f+ dt lambda / T. A record whose
-first sample is AT the trigger has this error too, since the first sample of a symmetric grid is
-half a sample later.
+Each period of the laser's frequency is a triangle: an up sweep, then a down sweep of the same
+duration T. A record (..., pulse, time) holds one block of samples for each recorded period; the
+triangle starts `trigger_s` after the start of its block. Sweeps are (..., ramp, pulse, fast_time),
+ramp 0 up and 1 down, both in natural time order, on the grid of `TriangularLadar.fast_time_axis`,
+which is symmetric about the middle of the sweep. With range beat frequency f+ and Doppler shift fd,
+up sweeps have the beat fd + f+ and down sweeps fd - f+.
+
+A trigger between two samples is matched by a delay of the whole record (linear phase of its
+spectrum), never by a shifted grid: if the grid is off by dt, velocities that are estimated from the
+product of the up sweep and the mirrored down sweep are biased by 0.76 f+ dt lambda / T. A record
+whose first sample is AT the trigger has this error too, since the first sample of a symmetric grid
+is half a sample later.
 
 A detector with one real channel gives |f| only. Its analytic signal has the beat f+ + fd in the up
-sweep and f+ - fd in the down sweep, the latter mirrored; the conjugate of the latter is the sweep
-of a complex detector. The analytic signal is formed from the record BEFORE it is cut, since the
-record continues through turning points, where a cut sweep ends with a jump. Its rms error without
-the transient and 2 samples at the ends, for one scatterer, is 1.3 % at 350 cycles per sweep and 2.1
-% at 50 (1.6 and 2.3 % if cut first), most of it near the ends: without 40 samples at the ends 0.6
-and 0.8 % (0.65 % if cut first). A delay of half a sample costs 0.1 % in a complex record, and 0.04
-% without 40 samples at the ends.
+sweep and f+ - fd in the down sweep; the conjugate of the latter is the sweep of a complex detector.
+The analytic signal is formed from the record BEFORE it is cut, since the record continues through
+turning points, where a cut sweep ends with a jump. For one scatterer, the relative rms error of the
+analytic signal is 1.3 % at 350 cycles per sweep and 2.1 % at 50, without the transient after the
+turning point and 2 samples at either end. If the record is cut first, it is 1.6 and 2.3 %. Most of
+the error lies near the ends: without 40 samples there it is 0.6 and 0.8 % (0.65 % if cut first). A
+delay by half a sample adds an error of 0.1 % to a complex record, and 0.04 % without 40 samples at
+the ends.
 
 Reference:
     Remote Sens. 2024, 16, 793, Fig. 15.
@@ -46,13 +51,15 @@ def split_record(
     nearer: bool = False,
     first_s: float = 0.0,
 ) -> Tensor:
-    """Separate a record into up and down sweeps.
+    """Separate a record of triangular sweeps into up and down sweeps.
 
-    A contiguous record, whose blocks follow each other without a gap, is cut again from the trigger
-    on, modulo the period. The period that its end leaves incomplete is dropped: K' = K - 1, or K if
-    a trigger common to all trials is less than half a sample. Other blocks are cut individually, K'
-    = K. The first sample of a sweep is half a sample after its start. Real detection requires |fd|
-    < f+. Differentiable in record and trigger.
+    The record has K blocks, one for each recorded period. A contiguous record, whose blocks follow
+    each other without a gap, is cut into periods from the trigger on, modulo the period. The period
+    that its end leaves incomplete is dropped, so that K' = K - 1 periods remain (K if one trigger
+    is given for all trials and is less than half a sample). Other blocks are cut individually, and
+    K' = K. The first sample of a sweep is half a sample after its start. With real detection the
+    Doppler shift must be smaller than the beat frequency of the range. Differentiable in record and
+    trigger.
 
     Args:
         record: Record, shape (..., pulse, time), real or complex.
@@ -61,12 +68,12 @@ def split_record(
             (...,).
         contiguous: Whether the record is contiguous; None: it is if blocks are one period long and
             every period is recorded.
-        nearer: With real detection, whether the scene is nearer than the reference (RD < 0), so
-            that beats in up sweeps are negative.
+        nearer: With real detection, whether the scene is nearer than the reference range, so that
+            beats in up sweeps are negative.
         first_s: Time of the first sample of a block in seconds, on the time axis of `trigger_s`.
 
     Returns:
-        Sweeps of N samples, shape (..., 2, K', N), complex.
+        Sweeps of N samples, up before down, shape (..., 2, K', N), complex.
 
     Raises:
         ValueError: If a period does not fit its block, the record has no samples, or a trigger is
@@ -97,17 +104,17 @@ def refuse_no_record(record: Tensor, what: str) -> None:
     """
     if not (isinstance(record, Tensor) and (record.is_complex() or record.is_floating_point())):
         raise TypeError(
-            f"{what} works on a real or complex record (..., pulse, time), got "
+            f"{what} needs a tensor of real or complex samples (..., pulse, time), got "
             f"{getattr(record, 'dtype', type(record).__name__)}; convert the samples first"
         )
     if record.ndim < 2 or not record.numel():
-        raise ValueError(f"{what} works on a non-empty record (..., pulse, time), got shape {tuple(record.shape)}")
+        raise ValueError(f"{what} needs a record (..., pulse, time) with samples, got the shape {tuple(record.shape)}")
 
 
 def _trigger_of(trigger_s: Trigger, record: Tensor) -> Tensor:
     """The trigger as a float64 tensor, a number or one per trial of the record."""
     if not isinstance(trigger_s, Tensor | float | int):
-        raise TypeError(f"trigger_s must be seconds, a number or one per trial, got {trigger_s!r}")
+        raise TypeError(f"trigger_s must be a number of seconds, or a tensor with one per trial, got {trigger_s!r}")
     trigger, trials = torch.as_tensor(trigger_s, dtype=torch.float64, device=record.device), record.shape[:-2]
     if _any(~torch.isfinite(trigger)):
         raise ValueError(
@@ -120,16 +127,17 @@ def _trigger_of(trigger_s: Trigger, record: Tensor) -> Tensor:
         and any(a != b and 1 not in (a, b) for a, b in zip(trigger.shape[::-1], trials[::-1]))
     ):
         raise ValueError(
-            f"trigger_s must be a number or one per trial {tuple(trials)}, got shape {tuple(trigger.shape)}"
+            f"trigger_s must be one number, or one number per trial with the trials {tuple(trials)}, "
+            f"got the shape {tuple(trigger.shape)}"
         )
     return trigger
 
 
 def is_contiguous(block_samples: int, radar: TriangularLadar) -> bool:
-    """Return whether blocks follow each other without a gap.
+    """Return whether the blocks of a record follow each other without a gap.
 
     Args:
-        block_samples: Number of samples of a block.
+        block_samples: Number of samples of a block; the record has one block per recorded period.
         radar: Ladar.
 
     Returns:
@@ -158,14 +166,15 @@ def start_sample(trigger_s: Tensor, radar: TriangularLadar, joined: bool) -> tup
 
 
 def canonical_ramps(sweeps: Tensor, radar: TriangularLadar, nearer: bool) -> Tensor:
-    """Convert sweeps of an analytic signal to those of a complex detector.
+    """Convert sweeps of a real detector's analytic signal to those of a complex detector.
 
-    The ramp with negative beat is conjugated.
+    An analytic signal has positive beat frequencies only. The sweeps in which a complex detector
+    has negative ones, up or down, are conjugated.
 
     Args:
-        sweeps: Sweeps of a real detector's analytic signal, shape (..., 2, K, N), complex.
+        sweeps: Sweeps of the analytic signal, up before down, shape (..., 2, K, N), complex.
         radar: Ladar.
-        nearer: Whether the scene is nearer than the reference.
+        nearer: Whether the scene is nearer than the reference range.
 
     Returns:
         Sweeps of the same shape.
@@ -180,16 +189,15 @@ def _cut_joined(line: Tensor, start: Tensor, n_period: int, radar: TriangularLad
     period = 2 * radar.sweep_samples
     if line.shape[-1] != n_period * period:
         raise ValueError(
-            f"a contiguous record of {n_period} periods of {period} samples has "
-            f"{n_period * period}, got {line.shape[-1]}; give contiguous=False for "
-            "blocks of another length"
+            f"a contiguous record of {n_period} periods of {period} samples must hold {n_period * period} "
+            f"samples, got {line.shape[-1]}; give contiguous=False for blocks of another length"
         )
     if start.ndim == 0 and not _any(start != 0):
         return line.squeeze(-2).unflatten(-1, (n_period, period))
     if n_period < 2:
         raise ValueError(
-            f"a contiguous record of {n_period} period that starts inside a triangle has no "
-            "complete one; record 2 periods or more"
+            f"a contiguous record of {n_period} period that starts inside a triangular sweep has no "
+            "complete triangle; record 2 periods or more"
         )
     return _taken(line, start, (n_period - 1) * period).squeeze(-2).unflatten(-1, (n_period - 1, period))
 
@@ -198,14 +206,14 @@ def _cut_inside(blocks: Tensor, start: Tensor, radar: TriangularLadar) -> Tensor
     """Periods (..., K, period) of blocks (..., K, n) from sample `start` on."""
     period, n = 2 * radar.sweep_samples, blocks.shape[-1]
     if period > n or _any((start < 0) | (start + period > n)):
-        fits = (
-            f"triggers up to {(n - period) / radar.sample_rate_hz:.4g} s after their first sample fit"
+        latest_trigger = (
+            f"at most {(n - period) / radar.sample_rate_hz:.4g} s after their first sample"
             if n >= period
-            else "none fits"
+            else "none is early enough"
         )
         raise ValueError(
-            f"blocks of {n} samples do not hold a period of {period} from the trigger on "
-            f"({fits}); record longer blocks, or every period without a gap (keep_every=1)"
+            f"blocks must hold a whole period of {period} samples after the trigger, got blocks of {n} samples "
+            f"(possible triggers: {latest_trigger}); record longer blocks, or every period without a gap (keep_every=1)"
         )
     return _taken(blocks, start, period)
 
@@ -228,11 +236,12 @@ def _any(condition: Tensor) -> bool:
 
 
 def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Tensor:
-    """Shift each period circularly by whole samples, as in the paper. Not for use.
+    """Shift the samples of each period circularly, as in the Reference, to show the errors of that.
 
-    Samples that are one period apart become neighbours: a phase step of 2 pi fd period inside a
-    sweep. No method tolerates it unless the shift is a few samples at the end of a sweep.
-    `split_record` cuts the continuous record instead.
+    Samples that are one period apart become neighbours, which makes a phase step of 2 pi fd period
+    (with the Doppler shift fd) inside a sweep. No estimator of the velocity tolerates this step,
+    unless it lies a few samples from the end of a sweep. To separate sweeps use `split_record`,
+    which cuts the continuous record instead.
 
     Args:
         record: Record, shape (..., pulse, time), real or complex.
@@ -251,18 +260,19 @@ def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Te
 def blank_turning_points(
     sweeps: Tensor, radar: TriangularLadar, farthest_m: float, nearest_m: float = 0.0, margin: int = 0
 ) -> Tensor:
-    """Set the samples to zero in which reference and echo sweep in opposite directions.
+    """Set the samples to zero in which local oscillator and echo sweep in opposite directions.
 
-    The echo of relative range RD turns 2 RD / c after the reference: the first ceil(2 RD fs / c)
-    samples of each sweep. The echo of a negative relative range turns before it, in the last
-    samples. Differentiable.
+    The echo of a scatterer at a range RD beyond the reference range turns 2 RD / c after the local
+    oscillator, so that the first ceil(2 RD fs / c) samples of each sweep are set to zero (fs: the
+    sampling rate). With negative RD the echo turns earlier, and the last samples are set to zero.
+    Differentiable.
 
     Args:
-        sweeps: Sweeps, shape (..., 2, K, N), complex.
+        sweeps: Sweeps, up before down, shape (..., 2, K, N), complex.
         radar: Ladar.
-        farthest_m: Largest relative range in metres.
-        nearest_m: Smallest relative range in metres.
-        margin: Number of further samples at either end.
+        farthest_m: Largest range relative to the reference range in metres.
+        nearest_m: Smallest range relative to the reference range in metres.
+        margin: Number of further samples that are set to zero at either end.
 
     Returns:
         Sweeps of the same shape.
@@ -273,11 +283,13 @@ def blank_turning_points(
         TypeError: If the sweeps are not a tensor.
     """
     if not isinstance(sweeps, Tensor):
-        raise TypeError(f"blank_turning_points works on a tensor of sweeps (..., 2, K, N), got {type(sweeps).__name__}")
+        raise TypeError(
+            f"blank_turning_points needs a tensor of sweeps (..., ramp, pulse, fast_time), got {type(sweeps).__name__}"
+        )
     if not (nearest_m <= farthest_m and margin >= 0):
         raise ValueError(
-            "blanking needs nearest_m <= farthest_m (relative ranges) and a margin of 0 samples "
-            f"or more, got {nearest_m:g}, {farthest_m:g} and {margin}"
+            "blanking of turning points needs nearest_m <= farthest_m and a margin of 0 samples or more, "
+            f"got nearest_m={nearest_m:g}, farthest_m={farthest_m:g} and margin={margin}"
         )
     first, last = (
         math.ceil(max(0.0, d) * 2 * radar.sample_rate_hz / radar.wave_speed_m_s - 1e-9) + margin
@@ -285,12 +297,10 @@ def blank_turning_points(
     )
     n = sweeps.shape[-1]
     if not 0 <= first + last <= n // 2:
-        blanked = (
-            f"ranges {nearest_m:g}..{farthest_m:g} m and a margin of {margin} blank "
-            f"{first + last} of {n} samples of a sweep"
-        )
         raise ValueError(
-            f"{blanked}; at least half must remain, so check that the ranges are relative to the reference"
+            f"ranges of {nearest_m:g} to {farthest_m:g} m with a margin of {margin} samples would blank "
+            f"{first + last} of {n} samples of a sweep, of which half must remain; check that the ranges are "
+            "relative to the reference range"
         )
     index = torch.arange(n, device=sweeps.device)
     return sweeps * ((index >= first) & (index < n - last))
@@ -299,20 +309,22 @@ def blank_turning_points(
 class SplitSweeps(Stage):
     """Separation of a record with the axes (pulse, time) into sweeps (ramp, pulse, fast_time).
 
-    A trigger common to all trials moves the pulse axis. One per trial cannot, since all trials
-    share the axis: slow time is then early by the trigger, which is less than one period. The real
-    samples of a one-channel detector become complex ones.
+    A trigger that is common to all trials is added to the slow time of the sweeps. Triggers that
+    differ between trials are not, since all trials share one pulse axis: the slow time is then too
+    early by the trigger, which is less than one period. The real samples of a one-channel detector
+    become complex ones.
 
-    In a chain: `use(SplitSweeps(radar, "recorded"), trigger_s="aux.trigger_s")`.
+    In a chain, with the side data `trigger_s` of the recording: `use(SplitSweeps(radar,
+    "recorded"), trigger_s="aux.trigger_s")`.
 
     Args:
         radar: Ladar.
         trigger: Start of the triangle in seconds on the time axis of the record; "recorded" if
             `forward` receives it; or "search" to estimate it by `find_trigger`.
-        nearer: Whether the scene is nearer than the reference.
+        nearer: Whether the scene is nearer than the reference range.
 
     Raises:
-        ValueError: If the trigger is neither a finite number nor one of these words.
+        ValueError: If the trigger is neither a finite number nor "recorded" nor "search".
     """
 
     works_on = ("pulse", "time")
@@ -321,14 +333,14 @@ class SplitSweeps(Stage):
     def __init__(self, radar: TriangularLadar, trigger: float | str = 0.0, nearer: bool = False) -> None:
         super().__init__()
         if isinstance(trigger, str) and trigger not in ("recorded", "search"):
-            raise ValueError(f"trigger must be seconds, 'recorded' or 'search', got {trigger!r}")
+            raise ValueError(f"trigger must be a number of seconds, 'recorded' or 'search', got {trigger!r}")
         if not isinstance(trigger, str) and not math.isfinite(trigger):
             raise ValueError(f"trigger must be a finite number of seconds, got {trigger}")
         self.radar, self.trigger, self.nearer = radar, trigger, nearer
         self.provides = ("trigger_s",) if trigger == "search" else ()
 
     def forward(self, signal: Signal, trigger_s: Tensor | None = None) -> Signal | tuple[Signal, Estimate]:
-        """Separate the record; see `split_record`.
+        """Separate a record into up and down sweeps; see `split_record`.
 
         Args:
             signal: Record, shape (..., pulse, time), real or complex.
@@ -336,13 +348,13 @@ class SplitSweeps(Stage):
                 (...,).
 
         Returns:
-            Sweeps, shape (..., ramp, pulse, fast_time), complex. With a search also the Estimate of
-            `find_trigger`, whose `trigger_s` is then on the time axis of the record; unreliable
-            trials (`ok` False) are separated all the same.
+            Sweeps, shape (..., ramp, pulse, fast_time), complex. If the trigger is searched for,
+            also the Estimate of `find_trigger`, with `trigger_s` on the time axis of the record;
+            trials with an unreliable estimate (`ok` False) are separated all the same.
 
         Raises:
             ValueError: If a recorded trigger is missing, the sampling rate is not that of the
-                radar, or as in `split_record`.
+                radar, or a whole period does not fit a block after the trigger.
         """
         if self.trigger == "search":
             contiguous = self._contiguous(signal)
@@ -351,8 +363,8 @@ class SplitSweeps(Stage):
             return self._split(signal, _fitting(found["trigger_s"], signal, self.radar, contiguous)), found
         if self.trigger == "recorded" and trigger_s is None:
             raise ValueError(
-                "SplitSweeps(trigger='recorded') needs the recorded time: use(SplitSweeps(radar, "
-                "'recorded'), trigger_s='aux.trigger_s')"
+                "SplitSweeps(trigger='recorded') needs the recorded time trigger_s; in a chain write "
+                "use(SplitSweeps(radar, 'recorded'), trigger_s='aux.trigger_s')"
             )
         return self._split(
             signal, torch.as_tensor(self.trigger if trigger_s is None else trigger_s, dtype=torch.float64)
@@ -363,7 +375,7 @@ class SplitSweeps(Stage):
         if abs(time.step * self.radar.sample_rate_hz - 1) > 1e-9:
             raise ValueError(
                 f"the record is sampled at {1 / time.step:.6g} Hz, but sample_rate_hz of the radar is "
-                f"{self.radar.sample_rate_hz:.6g} Hz; give the radar of the record"
+                f"{self.radar.sample_rate_hz:.6g} Hz; give the radar with which it was recorded"
             )
         return is_contiguous(time.n, self.radar) and abs(pulse.step / (time.n * time.step) - 1) < 1e-9
 
@@ -388,13 +400,13 @@ def _fitting(trigger_s: Tensor, signal: Signal, radar: TriangularLadar, contiguo
 
 
 class BlankTurningPoints(Stage):
-    """Transients after turning points set to zero; see `blank_turning_points`.
+    """Stage that sets the transients at turning points to zero; see `blank_turning_points`.
 
     Args:
         radar: Ladar.
-        farthest_m: Largest relative range in metres.
-        nearest_m: Smallest relative range in metres.
-        margin: Number of further samples at either end.
+        farthest_m: Largest range relative to the reference range in metres.
+        nearest_m: Smallest range relative to the reference range in metres.
+        margin: Number of further samples that are set to zero at either end of a sweep.
 
     Raises:
         ValueError: If less than half a sweep remains, the ranges are not in order, or the margin is
@@ -409,10 +421,13 @@ class BlankTurningPoints(Stage):
         blank_turning_points(torch.zeros(radar.sweep_samples), radar, farthest_m, nearest_m, margin)
 
     def forward(self, signal: Signal) -> Signal:
-        """Set the transients to zero.
+        """Set the samples at the turning points of sweeps to zero; see `blank_turning_points`.
 
         Args:
             signal: Sweeps, shape (..., ramp, pulse, fast_time).
+
+        Returns:
+            Signal of the same shape.
         """
         return signal.with_data(
             blank_turning_points(signal.data, self.radar, self.farthest_m, self.nearest_m, self.margin)
@@ -420,13 +435,17 @@ class BlankTurningPoints(Stage):
 
 
 class CircularShift(Stage):
-    """Circular shift inside each period, as in the paper, to show its errors; see `circular_shift`.
+    """Circular shift of the samples inside each period, to show its errors; see `circular_shift`.
 
-    To be followed by `SplitSweeps(radar, 0.0)`.
+    It aligns the start of the triangles with the start of the blocks, and is to be followed by
+    `SplitSweeps(radar, 0.0)`.
 
     Args:
         radar: Ladar.
         shift_s: Shift to earlier times in seconds, rounded to whole samples.
+
+    Reference:
+        Remote Sens. 2024, 16, 793, Fig. 15b.
     """
 
     works_on = ("pulse", "time")
@@ -437,9 +456,12 @@ class CircularShift(Stage):
         self.radar, self.shift_s = radar, shift_s
 
     def forward(self, signal: Signal) -> Signal:
-        """Shift the samples of each period.
+        """Shift the samples of each period circularly to earlier times; see `circular_shift`.
 
         Args:
             signal: Record, shape (..., pulse, time), real or complex.
+
+        Returns:
+            Record of the same shape.
         """
         return signal.with_data(circular_shift(signal.data, self.shift_s, self.radar))

@@ -1,7 +1,9 @@
 """Correction of non-linear sweeps of a triangular ladar by its internal calibration channel.
 
-The optical frequency of the transmitter is fc +- K u + e'(u), with e in turns. The channel mixes it
-with itself delayed by tc, the echo by dtau (up +, down -, each with its own e):
+At the time u from the middle of a sweep, the optical frequency of the transmitter is fc +- K u +
+e'(u): + in the up sweep, - in the down sweep, with the carrier fc, the chirp rate K, and the
+derivative e' of a phase error e(u) in turns, which differs between up and down. The calibration
+channel mixes the transmitted signal with itself delayed by tc:
 
     channel phase / 2 pi = fc tc +- K u tc + e(u) - e(u - tc) + constant.
 
@@ -30,20 +32,23 @@ Method = Literal["resample", "phase"]
 
 
 def sweep_error_s(calibration: Tensor, radar: TriangularLadar, delay_s: float) -> Tensor:
-    """Estimate the time error w(u) - u of both ramps from the calibration channel.
+    """Estimate the time error w(u) - u of up and down sweeps from the calibration channel.
 
-    Periods are averaged after removal of their own constant phase. During the first `delay_s` of a
-    sweep, where the delayed copy is still in the sweep before, the error is extrapolated. An error
-    of `delay_s` acts as an error of the sweep rate. Phases are unwrapped along u: the noise of the
-    channel must be below about one radian per sample, and its beat below fs / 2.
+    At the time u the real sweep has the frequency that a linear sweep has at the time w(u). Periods
+    are averaged after removal of their own constant phase. During the first `delay_s` of a sweep,
+    where the delayed copy is still in the sweep before, the error is extrapolated. An error of
+    `delay_s` acts as an error of the sweep rate. Phases are unwrapped along u: the phase noise of
+    the channel must be below about one radian per sample, and its beat below half the sampling
+    rate.
 
     Args:
-        calibration: Beat of the channel, shape (..., 2, K, N), complex, K periods or one.
+        calibration: Beat signal of the channel, up before down, shape (..., 2, K, N), complex, with
+            K periods or one.
         radar: Ladar.
-        delay_s: Delay tc of the channel in seconds.
+        delay_s: Delay in seconds with which the channel mixes the transmitted signal.
 
     Returns:
-        Error in seconds, mean zero, shape (..., 2, N), float64.
+        Error w - u in seconds, with mean zero, shape (..., 2, N), float64.
 
     Raises:
         ValueError: If the delay is not positive or exceeds half a sweep.
@@ -60,7 +65,7 @@ def sweep_error_s(calibration: Tensor, radar: TriangularLadar, delay_s: float) -
 def _line(radar: TriangularLadar, delay_s: float, like: Tensor) -> Tensor:
     """Phase K u tc of a linear sweep in turns, (N,)."""
     if not delay_s > 0:
-        raise ValueError(f"the delay of the calibration channel must be positive, got {delay_s} s")
+        raise ValueError(f"delay_s of the calibration channel must be positive, got {delay_s} s")
     return radar.chirp_rate_hz_s * delay_s * radar.fast_time_axis().values(like.device)
 
 
@@ -86,8 +91,8 @@ def _shifted(error: Tensor, radar: TriangularLadar, delay_s: float) -> Tensor:
     lost, half = math.ceil(delay_s * radar.sample_rate_hz - 1e-9), delay_s * radar.sample_rate_hz / 2
     if lost > error.shape[-1] // 2:
         raise ValueError(
-            f"a calibration delay of {delay_s:g} s takes {lost} of {error.shape[-1]} samples of a "
-            "sweep; at least half must remain"
+            f"delay_s of the calibration channel must be at most half a sweep, got {delay_s:g} s, which is "
+            f"{lost} of {error.shape[-1]} samples"
         )
     instant = torch.arange(error.shape[-1], dtype=torch.float64, device=error.device) + half
     return _sampled(error[..., lost:], instant - lost)
@@ -126,30 +131,36 @@ def calibrate_sweeps(
     points: int = 12,
     band: float = 0.9,
 ) -> Tensor:
-    """Correct sweeps to those of a linear transmitter.
+    """Correct non-linear sweeps to those of a transmitter with linear sweeps.
 
-    "resample" interpolates every sweep at the instants u(w) of uniform w and is right for all
-    ranges at once. Constant carrier phases are kept; a Doppler shift fd, which does not follow w,
-    keeps the phase 2 pi fd (w - u). "phase" multiplies by the phase error of one relative range; a
-    scatterer RD beyond it keeps 4 pi K RD (w - u) / c. Differentiable in the sweeps.
+    The calibration channel gives the time w(u) at which a linear sweep has the frequency that the
+    real sweep has at the time u. The method "resample" interpolates every sweep at instants of
+    uniform w and is valid for all ranges at once. It keeps constant carrier phases; a Doppler shift
+    fd, which does not follow w, leaves the phase error 2 pi fd (w - u). The method "phase"
+    multiplies by the conjugate phase error of one relative range; a scatterer at a distance d from
+    it keeps the phase error 4 pi K d (w - u) / c, with the chirp rate K. Differentiable in the
+    sweeps.
 
-    Residual phase rms for w - u of up to 9 ns (0.11 % of the sweep), measured:
+    Residual phase rms for w - u of up to 9 ns (0.11 % of the sweep), measured for one scatterer at
+    the relative range RD:
 
-    - RD 1.5 m, no Doppler: 0.16 rad before; 0.0002 rad by "phase" (0.054 rad half a metre off);
-      0.0025 rad by "resample", 0.0012 rad with `range_m` (the same half a metre off).
-    - RD 1.5 m, 0.5 m/s: 0.016 rad by "resample".
-    - RD 10.5 m: 0.56 rad before, 1e-6 rad by "phase", 0.027 rad by "resample", 0.002 rad with
-      `range_m`.
+    - RD 1.5 m, at rest: 0.16 rad before the correction; 0.0002 rad after "phase" (0.054 rad if
+      `range_m` is wrong by half a metre); 0.0025 rad after "resample", 0.0012 rad if this is given
+      `range_m` (also if it is wrong by half a metre).
+    - RD 1.5 m, 0.5 m/s: 0.016 rad after "resample".
+    - RD 10.5 m, at rest: 0.56 rad before the correction, 1e-6 rad after "phase", 0.027 rad after
+      "resample", 0.002 rad if this is given `range_m`.
 
     Args:
-        sweeps: Sweeps, shape (..., 2, K, N), complex.
-        calibration: Beat of the channel, shape (..., 2, K or 1, N), complex.
+        sweeps: Sweeps, up before down, shape (..., 2, K, N), complex.
+        calibration: Beat signal of the calibration channel, shape (..., 2, K or 1, N), complex.
         radar: Ladar.
-        delay_s: Delay tc of the channel in seconds.
+        delay_s: Delay in seconds with which the channel mixes the transmitted signal.
         method: "resample" or "phase".
-        range_m: Relative range RD in metres: for "phase" that of the scatterer; for "resample" the
-            middle of the range gate, by which the delay of the echo is included.
-        points: Number of neighbours of the interpolation.
+        range_m: Range RD in metres relative to the reference range: for "phase" that of the
+            scatterer; for "resample" the middle of the range gate, with which the delay of the echo
+            is taken into account.
+        points: Number of neighbouring samples that are combined in the interpolation.
         band: Bandwidth over the sampling rate for which the interpolation error is least.
 
     Returns:
@@ -161,12 +172,12 @@ def calibrate_sweeps(
     """
     if method not in get_args(Method):
         raise ValueError(f"method must be one of {', '.join(get_args(Method))}, got {method!r}")
-    _check_sweeps(sweeps, "the sweeps to calibrate are", "K", radar.sweep_samples)
-    _check_sweeps(calibration, "the calibration channel is", "K or 1", radar.sweep_samples)
+    _check_sweeps(sweeps, "sweeps", "K", radar.sweep_samples)
+    _check_sweeps(calibration, "calibration", "K or 1", radar.sweep_samples)
     if calibration.shape[-2] not in (1, sweeps.shape[-2]):
         raise ValueError(
-            f"the calibration channel has {calibration.shape[-2]} periods; give one, or the "
-            f"{sweeps.shape[-2]} of the sweeps"
+            f"calibration must have one period, or the {sweeps.shape[-2]} periods of the sweeps, "
+            f"got {calibration.shape[-2]}"
         )
     refuse_non_finite(calibration, "the calibration channel")
     error = sweep_error_s(calibration, radar, delay_s)
@@ -179,13 +190,16 @@ def calibrate_sweeps(
 def _check_sweeps(x: Tensor, what: str, periods: str, n: int) -> None:
     """Raise ValueError unless x is complex (..., 2, K, n); `periods` is the name of K."""
     if not (x.is_complex() and x.ndim >= 3 and x.shape[-3] == 2 and x.shape[-1] == n):
-        raise ValueError(f"{what} complex (..., 2, {periods}, {n}), up before down, got {x.dtype} {tuple(x.shape)}")
+        raise ValueError(
+            f"{what} must be complex (..., 2, {periods}, {n}), up sweeps before down sweeps, with K periods, "
+            f"got {x.dtype} of shape {tuple(x.shape)}"
+        )
 
 
 def _phase_corrected(sweeps: Tensor, error_s: Tensor, radar: TriangularLadar, range_m: float | None) -> Tensor:
     """Sweeps times exp(-j 2 pi [e(u) - e(u - dtau)]) of one range."""
     if range_m is None:
-        raise ValueError("method 'phase' corrects one relative range: give range_m")
+        raise ValueError("method 'phase' corrects the sweeps for one relative range and needs range_m")
     dtau = 2 * range_m / radar.wave_speed_m_s
     instant = (
         torch.arange(sweeps.shape[-1], dtype=torch.float64, device=sweeps.device) - dtau / 2 * radar.sample_rate_hz
@@ -224,14 +238,16 @@ def _resampled(x: Tensor, instant: Tensor, points: int, band: float) -> Tensor:
 class CalibrateSweeps(Stage):
     """Correction of non-linear sweeps by the calibration channel; see `calibrate_sweeps`.
 
-    In a chain: `use(CalibrateSweeps(radar, delay_s), calibration="aux.calibration")`, with
-    `delay_s="aux.calibration_delay_s"` if the delay is recorded.
+    In a chain, with the side data `calibration` of the recording: `use(CalibrateSweeps(radar,
+    delay_s), calibration="aux.calibration")`; if the delay is recorded too, without the argument
+    delay_s of the constructor and with `delay_s="aux.calibration_delay_s"`.
 
     Args:
         radar: Ladar.
-        delay_s: Delay of the channel in seconds; None if `forward` receives it.
-        method: "resample" or "phase".
-        range_m: Relative range in metres; required for "phase".
+        delay_s: Delay in seconds with which the channel mixes the transmitted signal; None if
+            `forward` receives it.
+        method: "resample", valid for all ranges, or "phase", for one range.
+        range_m: Range in metres relative to the reference range; required for "phase".
 
     Raises:
         ValueError: If the method is unknown or lacks its range, or the delay is not positive.
@@ -249,28 +265,35 @@ class CalibrateSweeps(Stage):
         super().__init__()
         if method not in get_args(Method) or (method == "phase" and range_m is None):
             raise ValueError(
-                f"method must be 'resample', or 'phase' with range_m, got {method!r} with range_m={range_m}"
+                f"method must be 'resample', or 'phase' together with range_m, got {method!r} with range_m={range_m}"
             )
         if delay_s is not None and not delay_s > 0:
-            raise ValueError(f"the delay of the calibration channel must be positive, got {delay_s} s")
+            raise ValueError(f"delay_s of the calibration channel must be positive, got {delay_s} s")
         self.radar, self.delay_s, self.range_m = radar, delay_s, range_m
         self.method: Method = method
 
     def forward(self, signal: Signal, calibration: Tensor, delay_s: Tensor | None = None) -> Signal:
-        """Correct the sweeps.
+        """Correct non-linear sweeps by the calibration channel; see `calibrate_sweeps`.
 
         Args:
             signal: Sweeps, shape (..., ramp, pulse, fast_time).
-            calibration: Beat of the channel, shape (..., 2, K or 1, N), complex.
-            delay_s: Delay of the channel in seconds, one number; replaces that of the constructor.
+            calibration: Beat signal of the channel, shape (..., ramp, pulse, fast_time) with all
+                pulses or one, complex.
+            delay_s: Delay in seconds with which the channel mixes the transmitted signal, one
+                number; replaces that of the constructor.
+
+        Returns:
+            Signal with corrected sweeps.
 
         Raises:
-            ValueError: If there is no delay, or as in `calibrate_sweeps`.
+            ValueError: If neither `forward` nor the constructor received a delay, the channel does
+                not fit the sweeps or is not finite, or the delay is not positive or exceeds half a
+                sweep.
         """
         if delay_s is None and self.delay_s is None:
             raise ValueError(
-                "CalibrateSweeps needs the delay of the channel: CalibrateSweeps(radar, delay_s) or "
-                "use(..., delay_s='aux.calibration_delay_s')"
+                "CalibrateSweeps needs delay_s, the delay of the calibration channel; write "
+                "CalibrateSweeps(radar, delay_s), or use(..., delay_s='aux.calibration_delay_s') if it is recorded"
             )
         delay = self.delay_s if delay_s is None else float(delay_s)
         return signal.with_data(

@@ -1,12 +1,17 @@
 """Start of the triangular sweeps in a record of unknown timing, estimated from the record itself.
 
+The four steps are as follows, with the range RD of the scene relative to the reference range and
+the beat frequency f+ that belongs to it:
+
 1. Turning points: a short-time spectrum is least concentrated where its window contains a turning
-   point. Concentration is folded over half a period and averaged.
-2. Refinement by cutting whole sweeps: their spectra are sharpest at the middle of the transient,
-   which is 2 RD / c long and begins at the turning point; sharpness falls alike on both sides.
+   point. The concentration is averaged over all half periods.
+2. Refinement by cutting whole sweeps: their spectra are sharpest if the cuts are at the middle of
+   the transient, which is 2 RD / c long and begins at the turning point; sharpness falls equally
+   towards both sides.
 3. Fraction of a sample: the tones of the strongest scatterer in up and down sweep have equal phase
-   at that middle. Of the fringes, 1 / (2 f+) apart near the result of step 2, the one is chosen at
-   which the samples change from the strongest tones of one sweep to those of the next.
+   at that middle, but also at other times, the fringes, 1 / (2 f+) apart. Of the fringes near the
+   result of step 2, the one is chosen at which the samples change from the strongest tones of one
+   sweep to those of the next.
 4. Order: which half is the up sweep.
 
 Measured errors: complex record, RD 1.5 m, 24 periods: 0.02 ns without noise, 0.2 ns at 10 dB, 0.6
@@ -14,9 +19,9 @@ ns at 0 dB (a sample is 16 ns); real records of the ground ladar 0.01 to 0.04 ns
 periods. A record of 960 blocks of 9600 real samples takes 6 s and 1.2 GB on one core.
 
 With complex detection the order follows from the beat, which is higher in the up sweep if RD > 0. A
-real record is the same, sample by sample, for a motion v in one order and -v in the other, except
-for the envelope: the range from the beats must follow the integrated velocity and not its mirror
-image. Focusing verifies the same; here range profiles suffice.
+real record for a velocity v and one order of the sweeps has the same phases as one for -v and the
+other order. The order then follows from range migration: the range from the beats must change as
+the integrated velocity does, and not with the opposite sign.
 
 Reference:
     Remote Sens. 2024, 16, 793, Fig. 15 (separation by short-time Fourier transform).
@@ -59,7 +64,9 @@ class _Windows:
         return ((self.lines.shape[-1] - 2 * self.margin) // n - 1) // 2 * 2
 
     def chosen(self, every: bool) -> tuple[Tensor, Tensor]:
-        """Lines and numbers j of their sweeps, in pairs: all, or about MAX_WINDOWS."""
+        """Lines, and numbers j of the sweeps that are used, in pairs of up and down sweep: all of
+        them, or about MAX_WINDOWS.
+        """
         pairs, n_line = self.count // 2, self.lines.shape[-2]
         step = 1 if every else max(1, pairs * n_line * 2 // MAX_WINDOWS)
         line_step = min(step, n_line)
@@ -67,7 +74,9 @@ class _Windows:
         return self.lines[..., ::line_step, :], torch.stack([j, j + 1], -1).flatten()
 
     def cut(self, start: Tensor, every: bool = False) -> Tensor:
-        """Sweeps from starts (..., o) on, (..., o, line, sweep, N); lines end in a constant."""
+        """Cut sweeps of N samples from each start sample (..., o) on, (..., o, line, sweep, N);
+        lines are continued by their last sample.
+        """
         n, (lines, j) = self.radar.sweep_samples, self.chosen(every)
         position = (start[..., None, None] + (j[:, None] * n + torch.arange(n, device=lines.device))).clamp_max(
             lines.shape[-1] - 1
@@ -89,12 +98,12 @@ def refuse_no_samples(record: Tensor) -> None:
     """
     if not (isinstance(record, Tensor) and (record.is_complex() or record.is_floating_point())):
         raise TypeError(
-            "find_trigger works on a real or complex record (..., pulse, time), got "
+            "find_trigger needs a tensor of real or complex samples (..., pulse, time), got "
             f"{getattr(record, 'dtype', type(record).__name__)}; convert the samples first"
         )
     if record.ndim < 2 or not record.numel():
         raise ValueError(
-            f"find_trigger works on a non-empty record (..., pulse, time), got shape {tuple(record.shape)}"
+            f"find_trigger needs a record (..., pulse, time) with samples, got the shape {tuple(record.shape)}"
         )
     refuse_non_finite(record, "find_trigger")
 
@@ -102,24 +111,28 @@ def refuse_no_samples(record: Tensor) -> None:
 def find_trigger(
     record: Tensor, radar: TriangularLadar, contiguous: bool | None = None, nearer: bool = False
 ) -> Estimate:
-    """Estimate the start of the up sweep in the blocks of a record.
+    """Estimate the start of the up sweep in the blocks of a record, one block per period.
 
-    A scene on both sides of the reference has no definite sign of the beat and is unreliable.
+    A scene that extends to both sides of the reference range has beats of both signs; the estimate
+    is then unreliable.
 
     Args:
         record: Record, shape (..., pulse, time), real or complex.
         radar: Ladar.
-        contiguous: As in `split_record`; blocks with gaps need at least 1.7 periods of samples.
-        nearer: Whether the scene is nearer than the reference.
+        contiguous: Whether blocks follow each other without a gap; None: they do if they are one
+            period long and every period is recorded. Blocks with gaps need at least 1.7 periods of
+            samples.
+        nearer: Whether the scene is nearer than the reference range.
 
     Returns:
-        `trigger_s` of shape (...,), in seconds after the first sample of a block, from -1 sample to
-        one period - 1 sample. `quality` is the relative drop of concentration at turning points,
-        0..1. `ok` is False where the order of the sweeps is certain by less than 5 standard
-        deviations, the fringe by less than 3, there are no turning points (a drop below 0.05), or
-        no whole period fits its block. `info` has these certainties, `order_sigmas` and
-        `fringe_sigmas` (...,), and `coarse_s`, the result of step 2 in seconds, modulo half a
-        period.
+        Estimate with `trigger_s` of shape (...,), in seconds after the first sample of a block,
+        from -1 sample to one period - 1 sample. `quality`, 0..1, is the relative drop of the
+        concentration of short-time spectra at turning points. `info` has, for each trial, the
+        certainty in standard deviations of which sweep is up, `order_sigmas`, and of which of
+        several instants with matching phases is the turning point, `fringe_sigmas`; and the
+        estimate without use of phases, `coarse_s`, in seconds modulo half a period. `ok` is False
+        where `order_sigmas` is below 5, `fringe_sigmas` below 3 or the drop below 0.05, or where no
+        whole period fits its block.
 
     Raises:
         TypeError: If the record is not a tensor of real or complex samples.
@@ -132,8 +145,8 @@ def find_trigger(
     windows = _Windows(_scaled(lines), radar, n // 8)
     if windows.count < 2 or windows.count * windows.lines.shape[-2] < 4:
         raise ValueError(
-            f"lines of {lines.shape[-1]} samples are too short to find turning points every {n} "
-            "samples in; give 3 periods without a gap, or 2 blocks of 1.7 periods or more"
+            f"the record is too short to find turning points, which are {n} samples apart, with "
+            f"{lines.shape[-1]} samples without a gap; record 3 periods, or 2 blocks of 1.7 periods or more"
         )
     coarse, depth = _turning_by_stft(windows)
     middle = _apex(windows, coarse, windows.margin)
