@@ -16,7 +16,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchsar import compensate, core, echo, focus, io, metrics, multichannel, radar, repair, scene
-    from torchsar.core import Axis, Chain, Draws, Estimate, Recording, Signal, Stage, Trace, Truth, use
+    from torchsar.core import (
+        Axis,
+        Chain,
+        Draws,
+        Estimate,
+        Recording,
+        Signal,
+        Stage,
+        Trace,
+        Truth,
+        keep_freed_memory,
+        use,
+    )
 
 __version__ = "0.1.0"
 # subpackages that are no part of the public face: what they need is not always installed
@@ -37,6 +49,7 @@ __all__ = [
     "echo",
     "focus",
     "io",
+    "keep_freed_memory",
     "metrics",
     "multichannel",
     "radar",
@@ -44,7 +57,19 @@ __all__ = [
     "scene",
     "use",
 ]
-_OF_CORE = ("Axis", "Chain", "Draws", "Estimate", "Recording", "Signal", "Stage", "Trace", "Truth", "use")
+_OF_CORE = (
+    "Axis",
+    "Chain",
+    "Draws",
+    "Estimate",
+    "Recording",
+    "Signal",
+    "Stage",
+    "Trace",
+    "Truth",
+    "keep_freed_memory",
+    "use",
+)
 
 
 def __getattr__(name: str) -> Any:

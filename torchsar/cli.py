@@ -123,15 +123,17 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
         find_config(options.config)
     import torch
 
+    from torchsar.core import keep_freed_memory
     from torchsar.study.table import load, systems
 
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
     if options.command == "list":
         from torchsar.study.commands.listing import listing
 
         print(listing(systems))
         return 0
+    keep_freed_memory()
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
     _refuse_device(options.device, torch)
     loaded = load(options.config, options.overrides)
     out = options.out or _folder(options.command, loaded.name)

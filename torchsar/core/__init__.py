@@ -17,6 +17,7 @@ from torchsar.core.fft import (
     to_frequency,
     transform_in_blocks,
 )
+from torchsar.core.memory import PeakMemory, keep_freed_memory
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
 from torchsar.core.select import best_of, per_trial, take
@@ -30,6 +31,7 @@ __all__ = [
     "Chain",
     "Draws",
     "Estimate",
+    "PeakMemory",
     "Recording",
     "Signal",
     "Stage",
@@ -45,6 +47,7 @@ __all__ = [
     "cis",
     "fft_lines",
     "from_frequency",
+    "keep_freed_memory",
     "legendre",
     "linear_phasor",
     "outer_phasor",

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from torchsar import plot
-from torchsar.core.memory import PeakMemory
+from torchsar.core import PeakMemory
 from torchsar.study.commands.requires import aligned
 from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from torchsar.core import keep_freed_memory
 from torchsar.study.montecarlo.work import Chunk, Computed, Work
 from torchsar.study.settings.errors import ConfigError, one_line
 
@@ -70,6 +71,7 @@ def _plugin(work: Work, threads: int, own: bool) -> Any:
                 logging.CRITICAL
             )  # a failed trial is reported once, as one sentence
             torch.set_num_threads(threads)
+            keep_freed_memory()
             if own and threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
             self.work = _on_own_gpu(work, worker.name)
@@ -211,13 +213,12 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
 def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
     from dask import config
 
-    # by default dask makes malloc return memory at once, which doubled the time of chains: every
-    # operation had to map its pages again
-    environment = {
-        **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads),
-        **dict.fromkeys(("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"), 256 << 20),
+    settings = {
+        "distributed.nanny.pre-spawn-environ": dict.fromkeys(
+            ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads
+        ),
+        "distributed.scheduler.allowed-failures": _DEATHS,
     }
-    settings = {"distributed.nanny.pre-spawn-environ": environment, "distributed.scheduler.allowed-failures": _DEATHS}
     wanted = {"threads_per_worker": 1, "processes": True, "dashboard_address": ":0", "silence_logs": 50}
     with config.set(settings):
         try:
