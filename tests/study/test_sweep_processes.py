@@ -6,8 +6,6 @@ import logging
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -15,35 +13,34 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.helpers import enable_interrupts
+from tests.program import Program
 from tests.study import toy
 from tests.study.tiny import write_tiny
+from torchsar.cli import main
 from torchsar.study.montecarlo import Record, engines, read_sweep
 from torchsar.study.montecarlo.engines import engine
+from torchsar.study.output import progress
 from torchsar.study.settings.errors import ConfigError
 
-ROOT = Path(__file__).resolve().parents[2]
-# the command line with a progress line every 0.2 s
-QUICK = (
-    "import sys; from torchsar.cli import main; from torchsar.study.output import progress; "
-    "progress._PIPED_S = 0.2; sys.exit(main(sys.argv[1:]))"
-)
 needs_dask = pytest.mark.skipif(
     pytest.importorskip("importlib.util").find_spec("distributed") is None,
     reason="dask.distributed (extra cluster) is not installed",
 )
 
 
-def start(out: Path, *options: str) -> subprocess.Popen:
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        [sys.executable, "-m", "tests.study.toy", str(out), *options],
-        cwd=ROOT,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def swept(out: Path, slow_s: float, log: Path | None, workers: int | None) -> None:
+    """The program of a toy sweep, slowed down."""
+    toy.run(out, trial=toy.Logged(slow_s, None if log is None else str(log)), workers=workers, chunk=7, resume=True)
+
+
+def start(out: Path, slow_s: float = 0.0, log: Path | None = None, workers: int | None = None) -> Program:
+    return Program(swept, out, slow_s, log, workers, folder=out.parent, said=out.parent / "said.txt")
+
+
+def command_line(*words: str) -> int:
+    """The command line with a progress line every 0.2 s."""
+    progress._PIPED_S = 0.2
+    return main(words)
 
 
 def rows(log: Path) -> list[tuple[str, str]]:
@@ -77,8 +74,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Record:
     """The toy sweep in one process with one thread."""
     out = tmp_path_factory.mktemp("alone") / "s"
     done = start(out)
-    _, said = done.communicate(timeout=120)
-    assert done.returncode == 0, said[-2000:]
+    assert done.wait() == 0, done.said
     return read_sweep(out)
 
 
@@ -88,13 +84,12 @@ def test_a_program_killed_at_random_moments_loses_nothing_and_repeats_nothing(al
     while kills < 6:
         before = marked(out)
         known = len(rows(log))
-        running = start(out, "--slow", "0.05", "--log", str(log))
+        running = start(out, 0.05, log)
         deadline = time.monotonic() + 60
-        while len(rows(log)) == known and running.poll() is None and time.monotonic() < deadline:
+        while len(rows(log)) == known and running.running and time.monotonic() < deadline:
             time.sleep(0.01)
         time.sleep(moments.uniform(0.0, 0.35))
-        running.send_signal(signal.SIGKILL)
-        running.communicate()
+        assert running.kill() == -signal.SIGKILL, running.said
         after = marked(out)
         if after is None:
             continue
@@ -108,8 +103,8 @@ def test_a_program_killed_at_random_moments_loses_nothing_and_repeats_nothing(al
             # no torn chunk
             assert np.isfinite(record.metrics["level_error_m"][algorithm][after]).all()
         computed_before = addresses(after)
-    finished = start(out, "--log", str(log))
-    assert finished.wait(timeout=120) == 0
+    finished = start(out, log=log)
+    assert finished.wait() == 0, finished.said
     assert not set(rows(log)[len(rows(log)) - int((~after).sum()) :]) & computed_before
     bitwise(read_sweep(out), alone)
 
@@ -126,10 +121,10 @@ def addresses(done: np.ndarray) -> set[tuple[str, str]]:
 @pytest.mark.slow
 def test_two_workers_give_the_same_bits_and_survive_the_death_of_workers(alone: Record, tmp_path: Path) -> None:
     out, log = tmp_path / "s", tmp_path / "log"
-    running = start(out, "--workers", "2", "--slow", "0.3", "--log", str(log))
+    running = start(out, 0.3, log, workers=2)
     killed: set[int] = set()
     deadline = time.monotonic() + 120
-    while running.poll() is None and len(killed) < 3 and time.monotonic() < deadline:
+    while running.running and len(killed) < 3 and time.monotonic() < deadline:
         fresh = (
             [int(line.split()[0]) for line in log.read_text().splitlines() if line.count(" ") == 2]
             if log.exists()
@@ -140,8 +135,7 @@ def test_two_workers_give_the_same_bits_and_survive_the_death_of_workers(alone: 
             os.kill(victims[-1], signal.SIGKILL)
             killed.add(victims[-1])
         time.sleep(0.05)
-    _, said = running.communicate(timeout=120)
-    assert running.returncode == 0, said[-2000:]
+    assert running.wait() == 0, running.said
     assert len(killed) == 3
     bitwise(read_sweep(out), alone)
     assert (
@@ -163,27 +157,18 @@ def test_an_interrupted_sweep_says_how_to_go_on_and_does(tmp_path: Path) -> None
         write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}),
         tmp_path / "result",
     )
-    command = [sys.executable, "-c", QUICK, "sweep", str(config), "--out", str(out)]
+    command = ("sweep", str(config), "--out", str(out), "--resume")
     for stop in (signal.SIGINT, signal.SIGTERM):
-        running = subprocess.Popen(
-            [*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=enable_interrupts
-        )
-        assert running.stderr is not None
-        while "trials/s" not in (line := running.stderr.readline()) and line:
-            pass
-        running.send_signal(stop)
-        _, said = running.communicate(timeout=60)
-        assert running.returncode == 130, said
-        assert (
-            "interrupted" in said and "trials are recorded in" in said and said.strip().endswith("go on with --resume")
-        )
-        assert "Traceback" not in said and not (out / "report.html").exists()
+        running = Program(command_line, *command, folder=tmp_path, said=tmp_path / "said.txt")
+        running.wait_for("trials/s")
+        running.send(stop)
+        assert running.wait() == 130, running.said
+        assert "interrupted" in running.said and "trials are recorded in" in running.said
+        assert running.said.strip().endswith("go on with --resume")
+        assert "Traceback" not in running.said and not (out / "report.html").exists()
     held = int(read_sweep(out).done.sum())
     assert held >= 8
-    done = subprocess.run(
-        [*command, "--resume", f"sweep.trials={held // 2 + 2}"], capture_output=True, text=True, cwd=ROOT, timeout=300
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
+    assert main([*command, f"sweep.trials={held // 2 + 2}"]) == 0
     assert (out / "report.html").exists()
 
 
@@ -232,15 +217,10 @@ def test_ctrl_c_with_workers_is_one_sentence(tmp_path: Path) -> None:
         write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}),
         tmp_path / "result",
     )
-    command = [sys.executable, "-c", QUICK, "sweep", str(config), "--workers", "2", "--out", str(out)]
-    running = subprocess.Popen(
-        command, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=enable_interrupts, start_new_session=True
-    )
-    assert running.stderr is not None
-    while "trials/s" not in (line := running.stderr.readline()) and line:
-        pass
+    command = ("sweep", str(config), "--workers", "2", "--out", str(out))
+    running = Program(command_line, *command, folder=tmp_path, said=tmp_path / "said.txt")
+    running.wait_for("trials/s")
     time.sleep(1)
     os.killpg(running.pid, signal.SIGINT)  # as a terminal does, to all of them
-    _, said = running.communicate(timeout=60)
-    assert running.returncode == 130 and "Traceback" not in said
-    assert said.strip().endswith("go on with --resume") and read_sweep(out).done.any()
+    assert running.wait() == 130 and "Traceback" not in running.said, running.said
+    assert running.said.strip().endswith("go on with --resume") and read_sweep(out).done.any()

@@ -1,10 +1,7 @@
-"""A cheap trial function for tests of sweeps, and a program that runs it: python -m tests.study.toy
-OUT [--workers N] [--trials N] [--slow SECONDS] [--log FILE].
-"""
+"""A cheap trial function for tests of sweeps."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from pathlib import Path
@@ -61,18 +58,4 @@ def run(out: Path | None = None, **options) -> Record:
         batched=["snr_db"],
         out=out,
         **{"trials": 40, "seed": 5, **options},
-    )
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--workers", type=int)
-    parser.add_argument("--trials", type=int, default=40)
-    parser.add_argument("--slow", type=float, default=0.0)
-    parser.add_argument("--log")
-    given = parser.parse_args()
-    torch.set_num_threads(1)
-    run(
-        given.out, trial=Logged(given.slow, given.log), trials=given.trials, workers=given.workers, chunk=7, resume=True
     )
