@@ -37,7 +37,7 @@ def test_targets_outside_the_record_are_reported() -> None:
     far = MovingPoints([0.0, 0.0], [0.0, 0.0], [0.0, 9000.0], [0.0, 0.0])
     with pytest.warns(UserWarning, match="1 of 2 targets are received in no pulse"):
         simulate_bistatic(RADAR, BistaticWorld(far, BandLimited(4.5)), 90, None, Draws(1))
-    with pytest.raises(ValueError, match=r"target 1 \(counted from 0\) lies 9000 m"):
+    with pytest.raises(ValueError, match=r"target 1 \(counted from 0\) with 9000 m"):
         simulate_bistatic(
             RADAR,
             BistaticWorld(MovingPoints([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 9000.0]), BandLimited(4.5)),

@@ -151,12 +151,12 @@ MISTAKES = [
                 }
             },
         ),
-        "needs the 3 values omega_rad_s, k1_per_s, k2_per_s2",
+        "must hold the 3 values omega_rad_s, k1_per_s, k2_per_s2",
     ),
     # sal
     ("sal", {"radar": radar("sal", carrier_hz=2e14)}, "give one of carrier_hz and wavelength_m"),
     ("sal", {"radar": radar("sal", wavelength_m=None)}, "give one of carrier_hz and wavelength_m"),
-    ("sal", {"radar": radar("sal", sample_rate_hz=33.3e6)}, "makes it a whole number"),
+    ("sal", {"radar": radar("sal", sample_rate_hz=33.3e6)}, "must give a whole number of samples"),
     (
         "sal",
         {"world": world("sal", motion={"drift": {"kind": "drift", "velocity_m_s": 30.0}})},
