@@ -31,11 +31,21 @@ def readme() -> Iterator[tuple[str, str]]:
 
 def docstrings(path: Path, tree: ast.Module) -> Iterator[tuple[str, str]]:
     """(where, text) of the docstrings of a module and of its public classes and functions."""
-    named = [node for node in ast.walk(tree) if isinstance(node, (ast.ClassDef, ast.FunctionDef))]
-    for node in [tree, *(node for node in named if not node.name.startswith("_"))]:
+    for name, node in [("module", tree), *public(tree)]:
         text = ast.get_docstring(node)
         if text:
-            yield f"{path.relative_to(ROOT)}: {getattr(node, 'name', 'module')}", text
+            yield f"{path.relative_to(ROOT)}: {name}", text
+
+
+def public(
+    tree: ast.Module | ast.ClassDef, above: str = ""
+) -> Iterator[tuple[str, ast.Module | ast.ClassDef | ast.FunctionDef]]:
+    """(qualified name, node) of public classes and functions, without those of private classes."""
+    for node in tree.body:
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and not node.name.startswith("_"):
+            yield f"{above}{node.name}", node
+            if isinstance(node, ast.ClassDef):
+                yield from public(node, f"{above}{node.name}.")
 
 
 def errors(path: Path, tree: ast.Module) -> Iterator[tuple[str, str]]:
