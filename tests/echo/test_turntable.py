@@ -441,7 +441,7 @@ def test_names_of_vibrations() -> None:
         Sinusoid(1e-3, 100.0).displacement_m(at), torch.tensor([0.0, 1e-3], dtype=torch.float64), atol=1e-15, rtol=0
     )
     torch.testing.assert_close(Polynomial([2.0, 3.0]).displacement_m(at), 2 * at + 3 * at**2)
-    with pytest.raises(ValueError, match="'1_0_1_90' is no name of the form amplitude_frequency_phase"):
+    with pytest.raises(ValueError, match="'1_0_1_90' does not have the form amplitude_frequency_phase"):
         Sinusoid.named("1_0_1_90", unit="mm")
     with pytest.raises(ValueError, match="unit 'm' .* choose 'mm' or 'um'"):
         Sinusoid.named("1_100_90", unit="m")

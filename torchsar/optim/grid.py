@@ -87,9 +87,12 @@ def _checked(axes: Sequence[Tensor]) -> list[Tensor]:
                 f"grid_search: axis {i} must be a float32 or float64 tensor, got "
                 f"{axis.dtype if isinstance(axis, Tensor) else type(axis).__name__}"
             )
-        if axis.ndim == 0 or not axis.shape[-1] or not bool(torch.isfinite(axis).all()):
+        if axis.ndim == 0 or not axis.shape[-1]:
             raise ValueError(
-                f"grid_search: axis {i} needs finite values, at least one, along its last dimension, got shape "
-                f"{tuple(axis.shape)} or values that are not finite"
+                f"grid_search: axis {i} must have one value or more along its last dimension, got shape "
+                f"{tuple(axis.shape)}"
             )
+        wrong = int((~torch.isfinite(axis)).sum())
+        if wrong:
+            raise ValueError(f"grid_search: axis {i} must be finite, got {wrong} values that are NaN or infinite")
     return [axis.detach() for axis in axes]

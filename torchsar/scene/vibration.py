@@ -92,8 +92,8 @@ class Sinusoid:
         found = _NAME.fullmatch(name) if isinstance(name, str) else None
         if found is None:
             raise ValueError(
-                f"vibration {name!r} is no name of the form amplitude_frequency_phase (frequency in Hz, phase in "
-                "degrees), such as '1_100_90' or '1_0.1_90'"
+                f"vibration {name!r} does not have the form amplitude_frequency_phase (amplitude in {unit}, frequency "
+                "in Hz, phase in degrees), such as '1_100_90' or '1_0.1_90'"
             )
         amplitude, frequency, phase = (float(part) for part in found.groups())
         return cls(amplitude * _UNIT_M[unit], frequency, phase)

@@ -37,9 +37,9 @@ class Chunk:
     """Trials that run as one batch, one per row.
 
     Args:
-        case: Number of the case, the group of grid points that may share a batch.
-        points: Number of the point of each row within the case.
-        trials: Trial number of each row.
+        case: Index of the case, the group of grid points that may share a batch.
+        points: For each row, the index of its grid point, counted within the case.
+        trials: For each row, the index of its trial.
     """
 
     case: int

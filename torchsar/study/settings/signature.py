@@ -231,7 +231,7 @@ class Catalogue:
 
 
 def below(given: Given, name: str) -> dict[str, Tensor]:
-    """Return the values whose dotted keys begin with a name, which is removed from the keys."""
+    """Return the entries below a name, without the name: below "a" {"a.b": 1} has {"b": 1}."""
     return {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{name}.")}
 
 
