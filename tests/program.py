@@ -78,7 +78,7 @@ def _run(main: Callable[..., int | None], given: tuple, folder: Path, said: Path
     with said.open("ab") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    sys.stdout, sys.stderr = (open(descriptor, "w", buffering=1, closefd=False) for descriptor in (1, 2))
+    sys.stdout, sys.stderr = (os.fdopen(descriptor, "w", buffering=1, closefd=False) for descriptor in (1, 2))
     # a test that was started in the background ignores Ctrl-C
     signal.signal(signal.SIGINT, signal.default_int_handler)
     torch.set_num_threads(1)

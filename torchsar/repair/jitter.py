@@ -219,8 +219,8 @@ def correct_jitter_exact(y: Tensor, offset_samples: Tensor, refinements: int | N
     offsets, n, m = offset_samples.to(torch.float64), y.shape[-1], offset_samples.shape[-1]
     if n < 2 * m:
         raise ValueError(
-            f"lines must hold at least {2 * m} samples, two jitter periods of {m} samples, got {n} samples; give longer "
-            "lines or fewer offsets"
+            f"lines must hold at least {2 * m} samples, two jitter periods of {m} samples, got {n} samples; give "
+            "longer lines or fewer offsets"
         )
     if n % m == 0:
         return _separate(y, offsets)

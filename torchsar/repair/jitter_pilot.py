@@ -73,7 +73,7 @@ def _check(pilot: Tensor, max_period: int, period: int | None, origin: str) -> N
     if pilot.ndim < 1 or pilot.shape[-1] < 4 * longest:
         length = pilot.shape[-1] if pilot.ndim else 0
         raise ValueError(
-            f"pilot must hold at least {4 * longest} samples, 4 jitter periods of {longest} samples, got {length} samples; "
+            f"pilot must hold at least {4 * longest} samples, 4 jitter periods of {longest} samples, got {length}; "
             "record a longer tone or lower max_period"
         )
 
