@@ -395,7 +395,8 @@ class PhaseIncrement(Stage):
         """Estimate the baseband Doppler centroid of a signal of axes (pulse, range).
 
         Returns:
-            The estimate of `phase_increment`: `doppler_baseband_hz` in Hz, shape (...,).
+            `Estimate` by the function `phase_increment` with `doppler_baseband_hz` in Hz, shape
+            (...,).
         """
         return phase_increment(signal.data, self.prf_hz, self.blocks, self.over)
 
@@ -420,7 +421,8 @@ class EnergyCentre(Stage):
         """Estimate the baseband Doppler centroid of a signal of axes (pulse, range).
 
         Returns:
-            The estimate of `energy_centre`: `doppler_baseband_hz` in Hz, shape (...,).
+            `Estimate` by the function `energy_centre` with `doppler_baseband_hz` in Hz, shape
+            (...,).
         """
         return energy_centre(signal.data, self.prf_hz, self.blocks)
 

@@ -126,7 +126,8 @@ def range_model_error_db(
     lit = lit_by(scatterers, radar, middle_s).expand(turns.shape).to(torch.float64)
     if not bool(lit.any()):
         raise ValueError(
-            "the beam never illuminates the scatterer whose echo is compared; widen the beam or move the scatterer"
+            "the beam illuminates none of the scatterers during the record; widen the beam (beam_rad), record more "
+            "periods, or move the scatterers"
         )
     error = unit_phasor(turns - _sample_turns(exact, None, time_s, u)[..., 0], torch.complex128)
     mean = (lit * error).sum().abs() / lit.sum()

@@ -43,10 +43,10 @@ class Bend:
 
     @staticmethod
     def none(like: Tensor) -> Bend:
-        """Return a deviation of zero, for targets in uniform motion among others that deviate.
+        """Return deviations of zero, those of targets in uniform motion.
 
         Args:
-            like: Tensor of shape (..., target).
+            like: Tensor of shape (..., target), whose shape, dtype and device are taken.
 
         Returns:
             Deviation of zero for each target.

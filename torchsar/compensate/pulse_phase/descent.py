@@ -128,7 +128,8 @@ def minimum_entropy(data: Tensor, **options: Any) -> Estimate:
         options: Options of `sharpest_phase`.
 
     Returns:
-        The estimate of `sharpest_phase`: `phase_rad` of shape (..., pulse), to be removed.
+        `Estimate` by the function `sharpest_phase` with `phase_rad` of shape (..., pulse), to be
+        removed.
     """
     return sharpest_phase(data, objective="power_entropy", **options)
 
@@ -141,7 +142,8 @@ def maximum_contrast(data: Tensor, **options: Any) -> Estimate:
         options: Options of `sharpest_phase`.
 
     Returns:
-        The estimate of `sharpest_phase`: `phase_rad` of shape (..., pulse), to be removed.
+        `Estimate` by the function `sharpest_phase` with `phase_rad` of shape (..., pulse), to be
+        removed.
     """
     return sharpest_phase(data, objective="contrast", **options)
 

@@ -79,7 +79,7 @@ class Sca(Stage):
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Returns:
-            The estimate of `sca`: `phase_rad` of shape (..., pulse), to be removed.
+            `Estimate` by the function `sca` with `phase_rad` of shape (..., pulse), to be removed.
         """
         return sca(signal.data)
 
@@ -133,7 +133,7 @@ class Pga(Stage):
             start: Phase to start from in rad, shape (..., pulse); by default zero.
 
         Returns:
-            The estimate of `pga`: `phase_rad` of shape (..., pulse), to be removed.
+            `Estimate` by the function `pga` with `phase_rad` of shape (..., pulse), to be removed.
         """
         return pga(
             signal.data,
@@ -170,7 +170,8 @@ class PgaSca(Pga):
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Returns:
-            The estimate of `pga_sca`: `phase_rad` of shape (..., pulse), to be removed.
+            `Estimate` by the function `pga_sca` with `phase_rad` of shape (..., pulse), to be
+            removed.
         """
         return pga_sca(
             signal.data, kernel=self.kernel, windows=self.windows, iterations=self.iterations, patience=self.patience
@@ -217,7 +218,8 @@ class EntropyFixedPoint(Stage):
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `entropy_fixed_point`: `phase_rad` of shape (..., pulse), to be removed.
+            `Estimate` by the function `entropy_fixed_point` with `phase_rad` of shape (...,
+            pulse), to be removed.
         """
         return entropy_fixed_point(
             signal.data, start=start, floors=self.schedule, relaxation=self.relaxation, imaging=self.imaging
@@ -249,7 +251,8 @@ class Autofocus(Stage):
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `autofocus`: `phase_rad` of shape (..., pulse), to be removed.
+            `Estimate` by the function `autofocus` with `phase_rad` of shape (..., pulse), to be
+            removed.
         """
         return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=self.imaging)
 
@@ -282,7 +285,8 @@ class TargetAutofocus(Autofocus):
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `autofocus`: `phase_rad` of shape (..., pulse), to be removed.
+            `Estimate` by the function `autofocus` with `phase_rad` of shape (..., pulse), to be
+            removed.
         """
         imaging = None if self.target is None else self.target.operator(signal.data)
         return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=imaging)
@@ -318,6 +322,7 @@ class SharpestPhase(Stage):
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `sharpest_phase`: `phase_rad` of shape (..., pulse), to be removed.
+            `Estimate` by the function `sharpest_phase` with `phase_rad` of shape (..., pulse), to
+            be removed.
         """
         return sharpest_phase(signal.data, objective=self.objective, method=self.method, steps=self.steps, start=start)

@@ -99,7 +99,7 @@ def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: 
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
 
     Returns:
-        The estimate of `mirror_product`.
+        The `Estimate` that the function `mirror_product` returns.
     """
     velocity, info = mirror_velocity(bands, intercept)
     return velocity_estimate(

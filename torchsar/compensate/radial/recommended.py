@@ -99,7 +99,7 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
         tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.
 
     Returns:
-        The estimate of `radial_motion`.
+        The `Estimate` that the function `radial_motion` returns.
     """
     cells = deramped_lines(bands, coarse["velocity_m_s"], pulse)
     fine = phase_polish(

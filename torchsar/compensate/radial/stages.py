@@ -129,8 +129,8 @@ class RadialMotion(MirrorProduct):
         """Estimate the radial motion from sweeps of axes (ramp, pulse, fast_time).
 
         Returns:
-            The estimate of `radial_motion`: `velocity_m_s` at the turning points, receding
-            positive, and the residual `phase_rad` of the up sweeps, shape (..., pulse) each.
+            `Estimate` by the function `radial_motion` with `velocity_m_s` at the turning points,
+            receding positive, and the residual `phase_rad` of the up sweeps, shape (..., pulse) each.
         """
         return radial_motion(
             signal.data,
@@ -312,7 +312,8 @@ class PhasePolish(Stage):
         """Estimate the residual phase of every pulse of a signal of axes (pulse, range).
 
         Returns:
-            The estimate of `phase_polish`: `phase_rad` of shape (..., pulse), to be removed.
+            `Estimate` by the function `phase_polish` with `phase_rad` of shape (..., pulse), to be
+            removed.
         """
         return phase_polish(signal.data, iterations=self.iterations, tolerance_rad=self.tolerance_rad)
 

@@ -42,7 +42,7 @@ def descent_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **know
         known: The arguments wavelength_m, prf_hz, range_m, yc_m and order of `uneven_rotation`.
 
     Returns:
-        The estimate of `descend_rotation`.
+        The `Estimate` that the function `descend_rotation` returns.
     """
     objective = _entropy(data, "shape", **known)  # pyright: ignore[reportArgumentType]
     return descend_rotation(objective, objective.start(0.95 * omega_rad_s, 0.95 * warp_k, None))
@@ -61,7 +61,7 @@ def genetic_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **know
         known: The arguments wavelength_m, prf_hz, range_m, yc_m and order of `uneven_rotation`.
 
     Returns:
-        The estimate of `genetic_rotation`.
+        The `Estimate` that the function `genetic_rotation` returns.
     """
     objective = _entropy(data, "raw", **known)  # pyright: ignore[reportArgumentType]
     centre = torch.cat([omega_rad_s[..., None], warp_k], -1)

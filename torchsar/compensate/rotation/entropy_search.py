@@ -352,7 +352,7 @@ class RotationSearch(_Search):
                 rotation centre), known a priori, shape (...,).
 
         Returns:
-            The estimate of `search_rotation`.
+            The `Estimate` that the function `search_rotation` returns.
         """
         return search_rotation(self.figure(signal, yc_m), self.axes, limit=self.limit)
 
@@ -400,7 +400,7 @@ class RotationGenetic(_Search):
                 rotation centre), known a priori, shape (...,).
 
         Returns:
-            The estimate of `genetic_rotation`.
+            The `Estimate` that the function `genetic_rotation` returns.
         """
         return genetic_rotation(self.figure(signal, yc_m), self.low, self.high, draws=Draws(self.seed), **self.rules)
 
@@ -446,7 +446,7 @@ class RotationEvolution(_Search):
                 rotation centre), known a priori, shape (...,).
 
         Returns:
-            The estimate of `evolve_rotation`.
+            The `Estimate` that the function `evolve_rotation` returns.
         """
         return evolve_rotation(self.figure(signal, yc_m), self.low, self.high, draws=Draws(self.seed), **self.rules)
 
@@ -511,15 +511,17 @@ class _Descending(_Search):
 class RotationNewton(_Descending):
     """Rotation of least image entropy near a start by Newton's method; see `newton_rotation`.
 
-    Connected values (omega_rad_s, warp_k, yc_m) take precedence over the entries of `start`. If
-    neither gives the rotation rate omega, rotation_rad_s of the radar is used.
+    The unknowns are those of `objective`: the rotation rate omega, if the entropy includes the
+    compensation of the range-dependent phase, k1, k2, ..., and the range centre deviation yc if it
+    is not given. Values that other stages provide (omega_rad_s, warp_k, yc_m) take precedence over
+    the entries of `start`. If neither gives omega, rotation_rad_s of the radar is used.
 
     Args:
         radar: Radar parameters.
-        start: Values to start from, [omega (rad/s), k1, k2, ...], without omega if the
-            range-dependent phase is not compensated; None if the values are connected.
-        objective: Settings of the entropy, by default with six taps. If yc is an unknown, the
-            search starts from the connected `yc_m` or 0.
+        start: Values to start from, [omega (rad/s), k1, k2, ...], without omega if it is not an
+            unknown; None if other stages provide them.
+        objective: Settings of the image entropy, by default with a gridding kernel of six taps. If
+            yc is an unknown, the search starts from the `yc_m` that another stage provides, or 0.
         damped: True damps the steps.
         steps: Largest number of steps.
 
@@ -556,7 +558,7 @@ class RotationNewton(_Descending):
                 rotation centre), shape (...,).
 
         Returns:
-            The estimate of `newton_rotation`.
+            The `Estimate` that the function `newton_rotation` returns.
 
         Raises:
             ValueError: If a value of the start is neither given nor connected.
@@ -613,7 +615,7 @@ class RotationDescent(_Descending):
                 rotation centre), shape (...,).
 
         Returns:
-            The estimate of `descend_rotation`.
+            The `Estimate` that the function `descend_rotation` returns.
 
         Raises:
             ValueError: If a value of the start is neither given nor connected.

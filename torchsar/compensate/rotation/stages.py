@@ -102,7 +102,7 @@ class UnevenRotation(_Rotation):
                 rotation centre), known a priori, shape (...,).
 
         Returns:
-            The estimate of `uneven_rotation`.
+            The `Estimate` that the function `uneven_rotation` returns.
         """
         return uneven_rotation(
             signal.data, **self.settings(signal, yc_m), scatterers=self.scatterers, rounds=self.rounds
@@ -133,7 +133,7 @@ class CoarseRotation(_Rotation):
             signal: Range-compressed pulses of axes (pulse, range).
 
         Returns:
-            The estimate of `coarse_rotation`.
+            The `Estimate` that the function `coarse_rotation` returns.
         """
         return coarse_rotation(signal.data, **self.settings(signal, None))
 
@@ -169,7 +169,7 @@ class PhaseFitRotation(_Rotation):
                 rotation centre), known a priori, shape (...,).
 
         Returns:
-            The estimate of `phase_fit_rotation`.
+            The `Estimate` that the function `phase_fit_rotation` returns.
         """
         return phase_fit_rotation(
             signal.data, **self.settings(signal, yc_m), steps=self.steps, half_cells=self.half_cells

@@ -12,7 +12,7 @@ from torchsar.study.trials.choice import Alternative, Choice
 
 
 def tolerance_of(loaded: Loaded) -> dict[str, float]:
-    """Return the largest acceptable loss by metric, of the config or by default of the system."""
+    """Return the largest acceptable loss of each metric, by the config or else by the system."""
     unknown = next((name for name in loaded.config.trade.tolerance if name not in loaded.system.tolerance), None)
     if unknown is not None:
         known = ", ".join(loaded.system.tolerance)
