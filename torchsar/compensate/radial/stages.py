@@ -130,7 +130,8 @@ class RadialMotion(MirrorProduct):
 
         Returns:
             `Estimate` by the function `radial_motion` with `velocity_m_s` at the turning points,
-            receding positive, and the residual `phase_rad` of the up sweeps, shape (..., pulse) each.
+            receding positive, and the residual `phase_rad` of the up sweeps, each of shape
+            (..., pulse).
         """
         return radial_motion(
             signal.data,
