@@ -119,7 +119,7 @@ def plain_peaks(power: Tensor, floor: float, share: float, lines: int, cells: in
 @pytest.mark.parametrize("error", [(1.0, -60.0), (-2.0, 60.0)])
 def test_phase_histories_correct_an_error_of_the_motion(error: tuple[float, float]) -> None:
     """One step removes most of the error of a coarse warp, and finds an unknown rate."""
-    data, motion = target(0)[None], Motion.still((K + torch.tensor(error, dtype=F64))[None])
+    data, motion = target(0)[None], Motion.of_unknown_rate((K + torch.tensor(error, dtype=F64))[None])
     offset = (motion.k[0] - K).abs()
     once, found = refined_by_histories(data, SAMPLING, motion)
     assert found[0] > 5 and abs(float(once.omega_rad_s) / OMEGA - 1) < 0.25
@@ -129,7 +129,7 @@ def test_phase_histories_correct_an_error_of_the_motion(error: tuple[float, floa
 
 
 def test_an_undersampled_range_term_is_impossible() -> None:
-    still, wild, broken = Motion.still(K[None]), truth(), truth()
+    still, wild, broken = Motion.of_unknown_rate(K[None]), truth(), truth()
     assert still.possible(SAMPLING) and truth().possible(SAMPLING) and truth(centre_m=-50.0).possible(SAMPLING)
     for motion in (
         Motion(wild.k, 1e3 * wild.w, wild.v, wild.centre_m),
@@ -140,7 +140,7 @@ def test_an_undersampled_range_term_is_impossible() -> None:
 
 
 def test_histories_of_empty_data_leave_the_motion_unchanged() -> None:
-    start = Motion.still(K[None].expand(2, -1))
+    start = Motion.of_unknown_rate(K[None].expand(2, -1))
     for data in (torch.zeros(2, PULSES, 24, dtype=torch.complex128), 0 * noise(0, 2, PULSES, 24)):
         motion, found = refined_by_histories(data, SAMPLING, start)
         assert torch.equal(motion.k, start.k) and found.tolist() == [0, 0] and motion.w.tolist() == [0, 0]

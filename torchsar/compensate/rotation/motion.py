@@ -105,8 +105,8 @@ class Motion:
     centre_m: Tensor
 
     @staticmethod
-    def still(k: Tensor, centre_m: Tensor | None = None) -> Motion:
-        """Make a description of the rotation with given k and unknown rate: w and v are zero.
+    def of_unknown_rate(k: Tensor, centre_m: Tensor | None = None) -> Motion:
+        """Describe a rotation of which only k1, k2, ... are known: its rate is set to zero.
 
         Args:
             k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,

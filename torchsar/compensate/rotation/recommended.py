@@ -201,7 +201,7 @@ def _start(rows: Tensor, sampling: Sampling, order: int, known: Tensor | None) -
     )
     if order == 2:
         k = k_of_shape(shape_of(k, sampling.duration_s)[:, :1], sampling.duration_s)
-    return Motion.still(torch.nn.functional.pad(k, (0, max(0, order - 3))), known)
+    return Motion.of_unknown_rate(torch.nn.functional.pad(k, (0, max(0, order - 3))), known)
 
 
 def _over_trials(
