@@ -353,8 +353,8 @@ def correct_jitter(
             (P,).
         period: Number of converters in each trial, shape (...,), int64: only so many of the first
             offsets are used; None: all P.
-        method: Function of lines and offsets (..., M) that returns corrected lines; by default
-            `Exact()`.
+        method: Function of lines and the offsets of one period, shape (..., period), that returns
+            corrected lines; by default `Exact()`.
 
     Returns:
         Lines of the same shape.
@@ -393,7 +393,7 @@ class CorrectJitter(Stage):
         offset_samples: Timing offsets of the M interleaved converters in samples, shape (M,); by
             default zero.
         method: `Exact()` (default), `BandLimited(8, 0.8)`, `Lagrange(8)`, or any function of lines
-            and offsets (..., M).
+            and offsets that returns corrected lines.
 
     Raises:
         ValueError: If sample instants coincide or cross.

@@ -206,14 +206,14 @@ def _cut_inside(blocks: Tensor, start: Tensor, radar: TriangularLadar) -> Tensor
     """Periods (..., K, period) of blocks (..., K, n) from sample `start` on."""
     period, n = 2 * radar.sweep_samples, blocks.shape[-1]
     if period > n or _any((start < 0) | (start + period > n)):
-        latest_trigger = (
-            f"at most {(n - period) / radar.sample_rate_hz:.4g} s after their first sample"
+        allowed = (
+            f"which allows triggers from 0 to {(n - period) / radar.sample_rate_hz:.4g} s after the first sample"
             if n >= period
-            else "none is early enough"
+            else "too short for any trigger"
         )
         raise ValueError(
-            f"blocks must hold a whole period of {period} samples after the trigger, got blocks of {n} samples "
-            f"(possible triggers: {latest_trigger}); record longer blocks, or every period without a gap (keep_every=1)"
+            f"blocks must hold a whole period of {period} samples after the trigger, got blocks of {n} samples, "
+            f"{allowed}; record longer blocks, or every period without a gap (keep_every=1)"
         )
     return _taken(blocks, start, period)
 

@@ -140,8 +140,8 @@ def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True,
     Returns:
         `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
         range-dependent phase, `omega_rad_s` and `yc_m`, as in `genetic_rotation`. `ok` is False
-        where the image is not sharper than without compensation, where a trial diverges (it keeps
-        its last finite point), or where it has not converged after `steps` steps.
+        where the image is not sharper than without compensation, where the search diverges (the
+        result is then its last finite point), or where it has not converged after `steps` steps.
         info["iterations"] is the number of steps.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The world of ships on a sea: section `world`, and its simulation."""
+"""The world of ships on a sea: section `world` of a config, and its echoes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The world of a target with non-uniform rotation: section `world`, and its simulation."""
+"""The world of a target with non-uniform rotation: section `world` of a config, and its echoes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The world of a stripmap radar: section `world`, and its simulation."""
+"""The world of a stripmap radar: section `world` of a config, and its echoes."""
 
 from __future__ import annotations
 
