@@ -74,8 +74,8 @@ def test_longer_blocks_are_cut_individually(radar):
     assert float((split - sweeps(radar, 4, **SCENE[10.5]))[..., 12:-12].abs().square().mean().sqrt()) < 0.025
     with pytest.raises(
         ValueError,
-        match="a whole period of 4800 samples after the trigger, got blocks of 8000 samples "
-        ".possible triggers: at most 2.133e-05 s",
+        match="a whole period of 4800 samples after the trigger, got blocks of 8000 samples, "
+        "which allows triggers from 0 to 2.133e-05 s",
     ):
         split_record(record(radar, 0.0, 2, 8000), radar, 25e-6)
 

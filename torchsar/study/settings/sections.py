@@ -284,7 +284,8 @@ def _check_source(config: Config, system: Any, file: str) -> None:
         missing = [name for name in ("radar", "world") if getattr(config, name) is None]
         if len(missing) == 2 and system.reads:
             raise ConfigError(
-                f"{file}: data.file is not set; write data.file=PATH after the command, the path of a {system.reads} .npz file"
+                f"{file}: data.file is not set; write data.file=PATH after the command, the path of a "
+                f"{system.reads} .npz file"
             )
         if missing:
             raise ConfigError(f"{file}: section {missing[0]!r} is missing; a simulation needs 'radar' and 'world'")

@@ -1,4 +1,4 @@
-"""The world of moving points before several channels: section `world` of a config, and its echoes."""
+"""Moving points before several channels: section `world` of a config, and its echoes."""
 
 from __future__ import annotations
 
