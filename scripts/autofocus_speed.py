@@ -18,7 +18,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchsar import Draws
+from torchsar import Draws, keep_freed_memory
 from torchsar.compensate import autofocus, entropy_fixed_point, minimum_entropy, pga, pga_sca, sca
 from torchsar.core import Estimate
 from torchsar.echo import simulate_turntable
@@ -71,6 +71,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=type(default), default=default)
     options = parser.parse_args()
     torch.set_num_threads(1)
+    keep_freed_memory()  # as the commands do
     data, truth = simulated(options)
     rows = data.mT.contiguous()
     best = dict.fromkeys(METHODS, float("inf"))

@@ -14,7 +14,7 @@ import time
 
 import torch
 
-from torchsar.core import Draws
+from torchsar.core import Draws, keep_freed_memory
 from torchsar.echo import simulate
 from torchsar.metrics import error_db
 from torchsar.radar import LinearFM, StripmapRadar
@@ -46,6 +46,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=value)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
+    keep_freed_memory()  # as the commands do
     dwell = args.pulses / 4000.0 / 2
     for name, beam in (("always lit", AlwaysLit()), ("gated to half the strip", Dwell(dwell))):
         seconds, lit, error = measure(beam, args.targets, args.pulses, args.samples)

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import torch
 
-from torchsar.core import Axis, Draws, Signal
+from torchsar.core import Axis, Draws, Signal, keep_freed_memory
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK, OmegaKStolt, RangeDoppler, StoredOmegaK
 from torchsar.metrics import error_db, impulse_response
@@ -151,6 +151,7 @@ def peak_bytes() -> int:
 
 def _child(form: str, size: int) -> None:
     torch.set_num_threads(1)
+    keep_freed_memory()  # as the commands do
     radar = sensor(size)
     small = radar.raw_axes(256, 512)
     # loads the libraries

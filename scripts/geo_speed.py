@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.core import Draws, Signal, Stage
+from torchsar.core import Draws, Signal, Stage, keep_freed_memory
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import bistatic_bounds
 from torchsar.multichannel import (
@@ -256,6 +256,7 @@ def main(arguments: list[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
 
     torch.set_num_threads(1)
+    keep_freed_memory()  # as the commands do
     trials, rounds = (2, 1) if options.small else (options.trials, options.rounds)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the poor condition of three bands

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from torchsar.core import keep_freed_memory
 from torchsar.study.commands.trade import trade
 from torchsar.study.output.numbers import MISSING
 from torchsar.study.table import load
@@ -100,6 +101,7 @@ def main() -> None:
         print("\n".join(table(options.folder)))
         return
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    keep_freed_memory()  # as the commands do
     options.folder.mkdir(parents=True, exist_ok=True)
     for system in options.systems:
         (options.folder / f"{system}.json").write_text(written(measured(system)), encoding="utf-8")

@@ -21,7 +21,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchsar import Draws
+from torchsar import Draws, keep_freed_memory
 from torchsar.compensate import (
     mirror_product,
     ml_peak,
@@ -125,6 +125,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=type(default), default=default)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
+    keep_freed_memory()  # as the commands do
     for dtype in (torch.complex64, torch.complex128):
         table(options, dtype)
 

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.core import Draws, Signal
+from torchsar.core import Draws, Signal, keep_freed_memory
 from torchsar.echo import simulate_turntable
 from torchsar.focus import CompiledNufft, DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
 from torchsar.focus.transforms import Transform
@@ -204,6 +204,7 @@ def main(arguments: list[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
 
     torch.set_num_threads(1)
+    keep_freed_memory()  # as the commands do
     double, choices = simulated("tiny" if options.small else "mid"), methods()
     exact = double.image(double.flat(), Method("exact", ExplicitSum()))
     tables = {}

@@ -19,6 +19,7 @@ from dataclasses import replace
 
 import torch
 
+from torchsar.core import keep_freed_memory
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo.engines import Engine, InProcess, engine
 from torchsar.study.montecarlo.grid import Grid
@@ -47,6 +48,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_intermixed_args()
     torch.set_num_threads(1)
+    keep_freed_memory()  # as the commands do
     loaded = load(options.config, options.overrides)
     trial = SweepTrial(loaded)
     grid = first_point(sweep_grid(loaded, trial))
