@@ -4,7 +4,7 @@
 
 rho is the correlation of the complex images inside the window of full apertures and full
 compression, against the unimpaired recording; both are focused with the Doppler centroid found on
-the unimpaired one, so that only the repair is judged.
+the unimpaired one, so that only the correction is assessed.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     recording = read_stripmap(args.path)
     bench = Bench(recording, DopplerCentroid(recording.radar)(recording.signal)["doppler_hz"])
-    print(f"{'impairment':36s} {'untreated':>9s} {'repaired':>9s} {'at least':>9s} {'seconds':>8s}")
+    print(f"{'impairment':36s} {'untreated':>9s} {'corrected':>9s} {'at least':>9s} {'seconds':>8s}")
     for row in rows(recording.radar.pulse.bandwidth_hz, recording.radar.sampling_hz):
         if not any(word in row.name for word in args.only):
             continue
