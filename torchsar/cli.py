@@ -76,17 +76,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parse(given)
-    if options.version:
-        from importlib.metadata import version
-
-        print(f"torchsar-lab {version('torchsar-lab')}")
-        return 0
     try:
+        if options.version:
+            from importlib.metadata import version
+
+            print(f"torchsar-lab {version('torchsar-lab')}", flush=True)
+            return 0
         if options.command != "list":  # before the import of torch, which takes seconds
             print(f"torchsar: {options.command} {options.config}", file=sys.stderr, flush=True)
         with _log_to_stderr(), warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            return _dispatch(options, "torchsar " + shlex.join(given))
+            status = _dispatch(options, "torchsar " + shlex.join(given))
+            sys.stdout.flush()
+            return status
     except ImportError as error:
         if (error.name or "").startswith("torchsar"):  # a fault of the program, not of the installation
             raise

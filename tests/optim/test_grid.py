@@ -56,7 +56,7 @@ def test_invalid_arguments_raise() -> None:
         grid_search(sphere, AXES, limit=100)
     with pytest.raises(ValueError, match="at least one unknown"):
         grid_search(sphere, [])
-    with pytest.raises(ValueError, match="axis 1 must be finite, got 4 values"):
+    with pytest.raises(ValueError, match="axis 1 must be finite, but 4 of its values"):
         grid_search(sphere, [AXES[0], AXES[1] * torch.inf, AXES[2]])
     with pytest.raises(TypeError, match="axis 0 must be a float32 or float64"):
         grid_search(sphere, [AXES[0].long(), *AXES[1:]])

@@ -173,7 +173,7 @@ def test_swaths_fit_where_every_range_is_clear():
         (lambda: Orbit(1e7, 0.95), "eccentricity"),
         (lambda: Orbit(1e7, inclination_deg=math.inf), "inclination_deg"),
         (lambda: seen_point(*PAPER.state(torch.zeros(1, dtype=torch.float64)), 9.0), "misses the Earth"),
-        (lambda: off_nadir_ground_m(36_500e3, 9.0), "misses the Earth"),
+        (lambda: off_nadir_ground_m(36_500e3, 9.0), "off_nadir_deg must lie in"),
         (lambda: diagram(pulse_s=3e-3), "leave nothing"),
         (lambda: timing_diagram(1e6, torch.tensor([100.0]), torch.tensor([0.0, 1e7]), 1e-5), "horizon"),
     ],

@@ -100,9 +100,10 @@ def _sums(x: Tensor, sizes: list[int]) -> Tensor:
 def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
     """Compute azimuth power spectra of blocks of lines, summed over the range cells of each block.
 
-    Each block shares one line with the next and is padded with zeros, so that the first Fourier
-    coefficient of its spectrum equals the sum of the products of its adjacent lines, as
-    `lag_products` computes it.
+    Each block shares one line with the next and is padded with zeros to an even number of lines. If
+    its number of pairs is even, the first Fourier coefficient of its spectrum is the sum of the
+    products of its adjacent lines, as `lag_products` computes it; otherwise it may also contain the
+    product of its last and first line.
 
     Args:
         x: Lines, shape (..., pulse, range), complex.
@@ -275,7 +276,8 @@ def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), 
 def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) -> Estimate:
     """Estimate the baseband Doppler centroid as the circular energy centre of the azimuth spectrum.
 
-    The power spectrum is averaged over range. The result agrees with `phase_increment` to rounding.
+    The power spectrum is averaged over range. The result agrees with `phase_increment` to
+    rounding if the blocks hold an even number of pairs of lines; see `block_spectra`.
 
     Args:
         x: Lines, shape (..., pulse, range), complex.

@@ -19,7 +19,8 @@ class Use(nn.Module):
 
     Args:
         stage: Stage whose `forward` takes the values.
-        names: Source of each parameter of `forward`: "STAGE.VALUE" or "aux.NAME".
+        names: Source of each parameter of `forward`: "STAGE.VALUE", "aux.NAME" or
+            "given.NAME".
     """
 
     def __init__(self, stage: nn.Module, names: Mapping[str, str]) -> None:

@@ -4,31 +4,48 @@ from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
 # parameters of mallopt in malloc.h of the GNU C library
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 # freed blocks up to this size are kept: more than a tensor of a batch usually has
 _KEPT_BYTES = 1 << 30
+# versions of the library before 2.35 accept no larger threshold of mmap
+_OLD_LIMIT_BYTES = 32 << 20
 
 
 def keep_freed_memory() -> bool:
     """Let this process reuse the memory of freed tensors instead of returning it to the system.
 
-    By default the GNU C library returns the memory of every large tensor when it is freed, so that
-    the pages of the next one have to be mapped and cleared again. For chains on the CPU this takes
-    up to half of the time. The setting holds for the whole process and cannot be undone. The peak
-    memory of the process may grow by about a third.
+    By default the GNU C library returns the memory of freed large tensors, so that the pages of the
+    next one have to be mapped and cleared again, which takes up to half of the time of chains on
+    the CPU. The setting holds for the whole process and cannot be undone. The peak memory of the
+    process may grow by about a third. Call this function before other threads allocate memory. If
+    the environment sets MALLOC_TRIM_THRESHOLD_ or MALLOC_MMAP_THRESHOLD_, nothing is changed.
 
     Returns:
-        Whether the C library has this setting; otherwise nothing is changed.
+        Whether the C library accepted the setting.
     """
-    set_option = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
-    return set_option is not None and all(
-        set_option(name, _KEPT_BYTES) == 1 for name in (_TRIM_THRESHOLD, _MMAP_THRESHOLD)
+    set_option = _of_c_library("mallopt")
+    if set_option is None or {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"} & set(os.environ):
+        return False
+    # the threshold of trimming last: alone it would make every large block cost a mapping
+    return (
+        any(set_option(_MMAP_THRESHOLD, size) == 1 for size in (_KEPT_BYTES, _OLD_LIMIT_BYTES))
+        and set_option(_TRIM_THRESHOLD, _KEPT_BYTES) == 1
+        and set_option(_ARENA_MAX, 1) == 1  # arenas of other threads would return their memory
     )
+
+
+def _of_c_library(name: str) -> Callable[..., int] | None:
+    """A function of the C library of this process, or None if it has no such function."""
+    try:
+        return getattr(ctypes.CDLL(None), name, None) if os.name == "posix" else None
+    except OSError:  # a statically linked interpreter
+        return None
 
 
 class PeakMemory:
@@ -51,20 +68,15 @@ class PeakMemory:
             torch.cuda.reset_peak_memory_stats()
             self._before: int | None = torch.cuda.memory_allocated()
         else:
-            _return_freed_memory()
+            trim = _of_c_library("malloc_trim")
+            if trim is not None:
+                trim(0)
             self._before = _resident("VmRSS", reset=True)
         return self
 
     def __exit__(self, *_: object) -> None:
         peak = torch.cuda.max_memory_allocated() if self._gpu else _resident("VmHWM")
         self.bytes = None if peak is None or self._before is None else max(0, peak - self._before)
-
-
-def _return_freed_memory() -> None:
-    """Undo the effect of `keep_freed_memory` for what is free now, where the C library can."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
-    if trim is not None:
-        trim(0)
 
 
 def _resident(field: str, reset: bool = False) -> int | None:
@@ -74,7 +86,7 @@ def _resident(field: str, reset: bool = False) -> int | None:
     try:
         if reset:
             Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-        text = Path("/proc/self/status").read_text(encoding="ascii")
+        text = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
     except OSError:
         return None
     return next((1024 * int(line.split()[1]) for line in text.splitlines() if line.startswith(f"{field}:")), None)

@@ -251,8 +251,8 @@ def _check_side_data(side: Tensor, samples: Tensor, what: str) -> None:
         )
     if side.is_complex() or (side.ndim > 1 and side.shape[:-1] != trials):
         raise ValueError(
-            f"{what} must hold real numbers, one per line or one per trial and line: shape ({lines},) or "
-            f"{(*trials, lines)}, got {side.dtype} of shape {tuple(side.shape)}"
+            f"{what} must hold real numbers, one per line, of shape ({lines},)"
+            f"{f' or {(*trials, lines)}' if trials else ''}, got {side.dtype} of shape {tuple(side.shape)}"
         )
 
 

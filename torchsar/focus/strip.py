@@ -163,8 +163,8 @@ def plan_strip(shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int
         Plan of the blocks.
 
     Raises:
-        ValueError: If a block that fits the memory holds no more lines than blocks overlap; the
-            message names the least memory.
+        ValueError: If the memory does not hold blocks of 9/8 of the lines by which blocks overlap;
+            the message names the least memory.
     """
     n_lines = shape[-2]
     line_bytes = ARRAYS * itemsize * math.prod(shape[:-2]) * shape[-1]

@@ -196,7 +196,7 @@ def refuse_shifted(radar: BistaticRadar, pulse: Axis) -> None:
             f"slow time must be zero at pulse {pulse.n // 2} of {pulse.n}, in steps of 1 / "
             f"{radar.prf_hz:g} s, got a first pulse at {pulse.start:g} s in steps of "
             f"{pulse.step:g} s; "
-            "if pulses were cropped, crop as many from the other end, else check prf_hz of the radar"
+            "if pulses were cropped, crop as many from the other end; otherwise check prf_hz of the radar"
         )
 
 

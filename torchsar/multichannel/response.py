@@ -92,10 +92,10 @@ def shared_response(
 
     It is exp(-j 2 pi (f dx / v_e + C / (2 R0 lambda))) for the channel at the along-track position
     dx, with C = dx^2 - (v dx^2 + 2 R0 u_r dx) / v_e + 2 y0 dx u_r^2 / V^2, Eq. (7) extended by y0.
-    The Doppler f lies in the lowest band and is counted from the Doppler centre, by which the data
-    are demodulated first. v is the along-track speed of the receiver relative to the point, u_r the
-    slant-range speed, V^2 = v^2 + u_r^2, v_e = V^2 / v, y0 the along-track position at t = 0 and R0
-    the closest range.
+    f is the absolute Doppler: that of the bin in the lowest band plus the Doppler centre, by which
+    the data were demodulated. v is the along-track speed of the receiver relative to the point, u_r
+    the slant-range speed, V^2 = v^2 + u_r^2, v_e = V^2 / v, y0 the along-track position at t = 0
+    and R0 the closest range.
 
     Args:
         radar: Instrument.

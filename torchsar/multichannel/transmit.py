@@ -137,10 +137,10 @@ def _over_range(phasor: Tensor, with_range: bool) -> Tensor:
 class RemoveTransmitRange(Stage):
     """Stage that removes the transmit range with the ephemeris coefficients of the radar.
 
-    See `remove_transmit_range`. A warning is given where the coefficients that are left out
-    contribute a phase above 0.3 rad at the ends of the data. Two coefficients (k1 t and k2 t^2) are
-    enough for apertures below 20 s: in the geometry of the paper all others contribute 2.7e-4 rad
-    in 4.5 s.
+    See `remove_transmit_range`. A warning is given where the coefficients beyond k1 that are left
+    out contribute a phase above 0.3 rad at the ends of the data. Two coefficients (k1 t and k2 t^2)
+    are enough for apertures below 20 s: in the geometry of the paper all others contribute 2.7e-4
+    rad in 4.5 s.
 
     Args:
         radar: Instrument.

@@ -94,5 +94,5 @@ def _checked(axes: Sequence[Tensor]) -> list[Tensor]:
             )
         wrong = int((~torch.isfinite(axis)).sum())
         if wrong:
-            raise ValueError(f"grid_search: axis {i} must be finite, got {wrong} values that are NaN or infinite")
+            raise ValueError(f"grid_search: axis {i} must be finite, but {wrong} of its values are NaN or infinite")
     return [axis.detach() for axis in axes]

@@ -47,7 +47,8 @@ def newton(
         gradient_tolerance: A trial has converged when its gradient norm is at most this fraction of
             that at the start.
         value_tolerance: A trial has converged when a step changed the cost by at most this fraction
-            of the cost, or by at most four times the machine epsilon of the dtype.
+            of the cost; a fraction below four times the machine epsilon of the dtype is raised to
+            that.
 
     Returns:
         Last point per trial, finite where the start is: a trial that would step to a cost or

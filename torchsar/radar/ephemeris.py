@@ -49,7 +49,7 @@ class Ephemeris:
     def __post_init__(self) -> None:
         if not self.height_m > 0 or not 0 <= self.eccentricity <= 0.9 or not 1 <= self.order <= 6:
             raise ValueError(
-                "an orbit needs a positive height_m, eccentricity of 0 to 0.9 and order of 1 to 6, got "
+                "an orbit needs a positive height_m, an eccentricity of 0 to 0.9 and an order of 1 to 6, got "
                 f"height_m={self.height_m}, eccentricity={self.eccentricity} and order={self.order}"
             )
 

@@ -43,7 +43,7 @@ class TriangularLadar:
 
     Raises:
         ValueError: If a parameter lies outside its range, or a sweep does not hold a whole number
-            of 16 samples or more.
+            of samples, 16 or more.
 
     Reference:
         Remote Sens. 2024, 16, 793.

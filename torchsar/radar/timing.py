@@ -124,14 +124,16 @@ def off_nadir_ground_m(height_m: float, off_nadir_deg: float) -> float:
         Distance along the ground from the nadir point in metres.
 
     Raises:
-        ValueError: If the line of sight misses the Earth.
+        ValueError: If the height is not positive, or the line of sight misses the Earth.
     """
+    if not height_m > 0:
+        raise ValueError(f"height_m must be positive, got {height_m}")
     sine = (1 + height_m / EARTH_RADIUS_M) * math.sin(math.radians(off_nadir_deg))
     if not 0 <= sine < 1:
         raise ValueError(
-            f"a line of sight {off_nadir_deg} degrees off nadir misses the Earth from a height of "
-            f"{height_m / 1e3:g} km; give "
-            f"0..{math.degrees(math.asin(1 / (1 + height_m / EARTH_RADIUS_M))):.4g} degrees"
+            "off_nadir_deg must lie in 0.."
+            f"{math.degrees(math.asin(1 / (1 + height_m / EARTH_RADIUS_M))):.4g} degrees for a line of sight from a "
+            f"height of {height_m / 1e3:g} km to the Earth, got {off_nadir_deg}"
         )
     return EARTH_RADIUS_M * (math.asin(sine) - math.radians(off_nadir_deg))
 

@@ -111,7 +111,8 @@ def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tens
     """Return the lines whose number agrees with those of the neighbouring lines.
 
     Args:
-        offset: Line number minus row in the recording, shape (..., line), int64.
+        offset: Line number minus the row in the recording without repeated lines, shape (...,
+            line), int64.
         candidate: Lines that are tested; padding and repeated lines are not, shape (..., line),
             bool.
         longest_gap: Largest number of successive lost lines that is accepted; a larger step of the

@@ -236,7 +236,7 @@ def _any(condition: Tensor) -> bool:
 
 
 def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Tensor:
-    """Shift the samples of each period circularly, as in the Reference, to show the errors of that.
+    """Shift the samples of each period circularly, as in the Reference, to show the errors of this.
 
     Samples that are one period apart become neighbours, which makes a phase step of 2 pi fd period
     (with the Doppler shift fd) inside a sweep. No estimator of the velocity tolerates this step,

@@ -405,9 +405,9 @@ def _refuse_empty_band(lowest_hz: Tensor | float, highest_hz: Tensor | float) ->
     empty = ~(lowest <= highest)
     if bool(empty.any()):
         raise ValueError(
-            f"highest_hz of a random motion must not be below lowest_hz, got {float(highest[empty][0]):g} Hz below "
-            f"{float(lowest[empty][0]):g} Hz (by default one cycle in the recording); give lowest_hz or a larger "
-            "highest_hz"
+            "highest_hz of a random motion must not be below lowest_hz, which is by default one cycle in the "
+            f"recording, got {float(highest[empty][0]):g} Hz below {float(lowest[empty][0]):g} Hz; give lowest_hz or "
+            "a larger highest_hz"
         )
 
 

@@ -489,9 +489,11 @@ class _Descending(_Search):
         omega = self._given()[0] if omega_rad_s is None else omega_rad_s
         k = self._given()[1] if warp_k is None else warp_k
         if omega is None or k is None:
+            omega_too = self.objective.range_term
             raise ValueError(
-                f"{type(self).__name__} needs a rotation to start from: give start=[omega, k1, k2, ...], or "
-                "connect omega_rad_s and warp_k from an earlier estimator"
+                f"{type(self).__name__} needs a rotation to start from: give "
+                f"start=[{'omega, ' if omega_too else ''}k1, k2, ...], or connect "
+                f"{'omega_rad_s and ' if omega_too else ''}warp_k from an earlier estimator"
             )
         return figure.start(omega, k, yc_m)
 

@@ -212,7 +212,7 @@ def sweep(
         if not good:
             raise ConfigError(f"sweep: {name} must {expected}, got {given!r}")
     if out is None and set(save):
-        raise ConfigError("sweep: save needs the folder out, in which the arrays are kept; give out as well")
+        raise ConfigError("sweep: save needs out, the folder in which the arrays are kept; give out as well")
     needs = () if stop is None else (("stop.metric", stop.metric),)
     plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device, needs)
     plan.refuse_missing(trial)

@@ -64,8 +64,8 @@ def migration_correct(
         kind: "keystone" for deramp, keystone transform and reramp; "static_bulk" for a shift of
             each pulse along range; "none" for no correction.
         whole_swath: Whether the correction varies with the range over the swath.
-        range_m: Closest range of a target in m, for data without a range axis; None for the
-            reference range of the radar.
+        range_m: Closest range of the reference point in m; None for the reference range of the
+            radar.
     """
     kinds = {"keystone": Keystone(whole_swath), "static_bulk": StaticBulk(whole_swath), "none": NoMigration()}
     return CorrectMigration(radar, kinds[kind], range_m)
@@ -88,8 +88,7 @@ def rebuild_bands(
         band_hz: Width in Hz of the flat Doppler spectrum that "mmse" assumes; None for the spectrum
             by the antenna pattern of the channels.
         snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
-        range_m: Closest range of a target in m, for data without a range axis; None for the
-            reference range of the radar.
+        range_m: Closest range of the targets in m; None for the reference range of the radar.
     """
     return Reconstruct(radar, _rebuild(bands, method, band_hz, snr_db), range_m)
 
@@ -115,8 +114,8 @@ def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: 
     Args:
         dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
             pattern of the channels.
-        range_m: Closest range of a target in m, for data without a range axis; None for the
-            reference range of the radar.
+        range_m: Closest range of the target in m; None for that of the strongest range line, or for
+            the reference range of the radar if the data have no range axis.
     """
     return Interferometry(radar, _aperture(dwell_s), range_m)
 
@@ -131,8 +130,8 @@ def along_track_autofocus(
         dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
             pattern of the channels.
         half_m_s: Half width of the search interval of u_a about 0, in m/s.
-        range_m: Closest range of a target in m, for data without a range axis; None for the
-            reference range of the radar.
+        range_m: Closest range of the target in m; None for that of the strongest range line, or for
+            the reference range of the radar if the data have no range axis.
     """
     return AlongTrackAutofocus(radar, _aperture(dwell_s), range_m, half_m_s)
 
@@ -151,8 +150,8 @@ def likelihood_velocity(
             pattern of the channels.
         unknowns: Quantities that are estimated, of the speeds u_r_m_s (slant range) and u_a_m_s
             (along track) and the along-track position y0_m; the others keep their given values.
-        range_m: Closest range of a target in m, for data without a range axis; None for the
-            reference range of the radar.
+        range_m: Closest range of the target in m; None for that of the strongest range line, or for
+            the reference range of the radar if the data have no range axis.
     """
     return LikelihoodVelocity(radar, _aperture(dwell_s), range_m, unknowns)
 
@@ -170,8 +169,8 @@ def gradient_velocity(
             pattern of the channels.
         unknowns: Quantities that are estimated, of the speeds u_r_m_s (slant range) and u_a_m_s
             (along track) and the along-track position y0_m; the others keep their given values.
-        range_m: Closest range of a target in m, for data without a range axis; None for the
-            reference range of the radar.
+        range_m: Closest range of the target in m; None for that of the strongest range line, or for
+            the reference range of the radar if the data have no range axis.
     """
     return GradientVelocity(radar, _aperture(dwell_s), range_m, unknowns)
 
@@ -196,8 +195,8 @@ def moving_point_velocity(
         u_a_reach_m_s: Half width of the search in the along-track speed in m/s.
         y0_reach_m: Half width of the search in the along-track position in m.
         u_a_m_s: Along-track speed in m/s if it is known a priori; None to estimate it.
-        range_m: Closest range of a target in m, for data without a range axis; None for the
-            reference range of the radar.
+        range_m: Closest range of the target in m; None for that of the strongest range line, or for
+            the reference range of the radar if the data have no range axis.
     """
     reach = 1.5 * radar.ambiguous_velocity_m_s if u_r_reach_m_s is None else u_r_reach_m_s
     return MigratingLines(
@@ -226,8 +225,7 @@ def intensity_ratio(
         search_m_s: Least and largest velocity of the search in m/s; None for all that are
             unambiguous.
         step_m_s: Step of the search in m/s.
-        range_m: Closest range of a target in m, for data without a range axis; None for the
-            reference range of the radar.
+        range_m: Closest range of the targets in m; None for the reference range of the radar.
     """
     rebuild = _rebuild(bands, method)
     return SignalIntensityRatio(radar, bandwidth_hz, rebuild, search_m_s, step_m_s, range_m)

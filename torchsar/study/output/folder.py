@@ -148,6 +148,8 @@ def fresh_result(out: Path, kind: str, names: Sequence[str]) -> Iterator[Path]:
     try:
         with opened(out, kind, names) as folder, folder.staged() as new:
             yield new
+    except BrokenPipeError:  # of stdout, not of the folder
+        raise
     except OSError as error:
         raise ConfigError(
             f"--out {out}: the result cannot be written ({error.strerror or error}); make room, or choose another "
