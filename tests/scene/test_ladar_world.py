@@ -165,7 +165,7 @@ def test_unsuitable_measured_tracks_are_refused(tmp_path: Path) -> None:
         (lambda: VibrationSpectrum(1e-6, 1.0, 10.0, count=0), "count of sinusoids"),
         (
             lambda: PathFluctuation(1e-6, highest_hz=1.0).drawn(Draws(0), 0.1),
-            "must not be below lowest_hz, got .*; give lowest_hz",
+            "must not be below lowest_hz, .*; give lowest_hz",
         ),
         (lambda: RetroAndBrokenLine(range_m=math.inf), "range_m of a retro-reflector"),
     ],

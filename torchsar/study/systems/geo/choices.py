@@ -203,8 +203,9 @@ def _alone(bench: Bench, dtype: torch.dtype | None = None, fastest: bool = False
         world = replace(world, targets={name: world.targets[name]})
     if changes.get("samples") is None:
         world = replace(world, targets={name: replace(t, range_m=0.0) for name, t in world.targets.items()})
-    draws = Draws(bench.config.seed, "trade", [0])
-    return replace(world, **changes).trials_of(bench.radar, draws, dtype or bench.dtype)
+    return replace(world, **changes).trials_of(
+        bench.radar, Draws(bench.config.seed, "trade", [0]), dtype or bench.dtype
+    )
 
 
 def _image(
