@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo import Record, differences, read_sweep
 from torchsar.study.montecarlo.engines import InProcess
 from torchsar.study.montecarlo.loop import Plan, run_plan
+from torchsar.study.montecarlo.pictures import SweepPictures
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.stripmap.judge import error_name
@@ -31,6 +33,12 @@ def record_of(loaded: Loaded, chunk: int | None, trials: int) -> Record:
     trial = SweepTrial(loaded)
     plan = Plan(sweep_grid(loaded, trial), trials, loaded.config.seed, chunk)
     return run_plan(plan, trial, None, nullcontext(InProcess()))
+
+
+def one_picture(patch: pytest.MonkeyPatch) -> None:
+    """The first picture alone is drawn; test_sweep_report.py draws all of a sweep."""
+    every = SweepPictures.all
+    patch.setattr(SweepPictures, "all", lambda pictures, wanted: itertools.islice(every(pictures, wanted), 1))
 
 
 @pytest.fixture
@@ -49,7 +57,9 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder,
         sweep={**SWEEP, "show": [name], "success": {name: 10.0}, "save": {"trials": [1], "taps": ["doppler"]}},
     )
-    assert main(["sweep", str(config), "--resume", "--out", str(folder / "result")]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        one_picture(patch)
+        assert main(["sweep", str(config), "--resume", "--out", str(folder / "result")]) == 0
     return folder / "result"
 
 
@@ -115,7 +125,10 @@ def test_keys_of_any_kind_make_cases(load_tree) -> None:
     assert (np.abs(entropy[:, 0] - entropy[:, 1]) > 0.01).any()
 
 
-def test_the_log_says_what_is_batched(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_log_says_what_is_batched(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one_picture(monkeypatch)
     config = write_tiny(
         tmp_path, sweep={"world.noise.snr_db": [0.0], "precision": ["complex64", "complex128"], "trials": 1}
     )
@@ -194,11 +207,11 @@ def test_names_of_errors() -> None:
 
 @pytest.mark.parametrize("precision, tolerance", [("complex64", 1e-5), ("complex128", 1e-12)])
 def test_chunks_change_the_stripmap_chain_only_by_rounding(precision: str, tolerance: float) -> None:
-    """All metrics of all methods; trials in which a choice depends on rounding would be named here,
-    and there are none.
+    """All metrics of all methods, two noises in one batch or each alone; trials in which a choice
+    depends on rounding would be named here, and there are none.
     """
-    loaded = load("stripmap_doppler", [*SMALL, f"precision={precision}"])
-    records = {chunk: record_of(loaded, chunk, 2) for chunk in (1, None)}
+    loaded = load("stripmap_doppler", [*SMALL, "world.lines=400", "world.samples=128", f"precision={precision}"])
+    records = {chunk: record_of(loaded, chunk, 1) for chunk in (1, None)}
     assert differences(records[1], records[None], tolerance) == []
 
 
