@@ -17,6 +17,13 @@ import pytest
 from tests.helpers import enable_interrupts
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
+from torchsar.study.commands import run
+
+
+@pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are drawn in the other tests of runs."""
+    monkeypatch.setattr(run, "draw_all", lambda *_, **__: [])
 
 
 def spoken(capsys: pytest.CaptureFixture[str]) -> list[str]:
@@ -109,6 +116,7 @@ def test_run_prints_where_the_report_is(tmp_path: Path, capsys: pytest.CaptureFi
     assert "seed: 5" in (out / "config.yaml").read_text()
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("extra", [["--out", "{out}", "seed=5"], ["seed=5", "--out", "{out}"]])
 def test_options_may_stand_before_or_after_overrides(tmp_path: Path, extra: list[str]) -> None:
     out = tmp_path / "result"
@@ -147,6 +155,7 @@ def recording(path: Path, **changes: object) -> Path:
 FOCUS = {"recommended": {"stages": {"focus": {"stage": "omega_k"}}}}
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_own_recording_runs(tmp_path: Path) -> None:
     config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor=FOCUS)
     assert (
@@ -215,6 +224,7 @@ def test_doubtful_recordings_are_named_in_a_warning(
     assert len(said) == 1 and all(part in said[0] for part in expected)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_aliasing_is_named_with_both_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     logging.getLogger("torchsar").handlers.clear()
     config, expected = (

@@ -2,39 +2,42 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import resource
+from pathlib import Path
 
 import pytest
 import torch
 
 import torchsar
+from tests.program import Program
 from torchsar.core import PeakMemory
 
-FAULTS = """
-import resource, sys, torch, torchsar
-kept = sys.argv[1] == "kept" and torchsar.keep_freed_memory()
-x = torch.ones(1 << 24)  # 64 MiB
-for round in range(2):
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(10):
-        y = x + 1
-        del y
-print(kept, resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-"""
+
+def count_faults(keeps: bool) -> None:
+    kept = keeps and torchsar.keep_freed_memory()
+    x = torch.ones(1 << 24)  # 64 MiB
+    before = 0
+    for _ in range(2):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(10):
+            y = x + 1
+            del y
+    print(kept, resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
-def faults(how: str) -> tuple[str, int]:
-    done = subprocess.run([sys.executable, "-c", FAULTS, how], capture_output=True, text=True, check=True)
-    kept, count = done.stdout.split()
+def faults(keeps: bool, folder: Path) -> tuple[str, int]:
+    """In a process of its own, in which memory was not kept before."""
+    program = Program(count_faults, keeps, folder=folder, said=folder / "said.txt")
+    assert program.wait() == 0, program.said
+    kept, count = program.said.split()
     return kept, int(count)
 
 
-def test_pages_of_freed_tensors_are_mapped_once():
-    kept, count = faults("kept")
+def test_pages_of_freed_tensors_are_mapped_once(tmp_path: Path):
+    kept, count = faults(True, tmp_path)
     if kept == "False":
         pytest.skip("the C library of this machine is not that of GNU")
-    assert count < 0.01 * faults("returned")[1]
+    assert count < 0.01 * faults(False, tmp_path)[1]
 
 
 def test_kept_memory_does_not_hide_a_peak():

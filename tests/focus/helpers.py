@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -71,11 +72,17 @@ def airborne_case(doppler_hz: float = 0.0) -> PointCase:
     return point_case(radar, 2048, 1536, 3.0, doppler_hz, (-330.0, 0.0, 330.0))
 
 
+@functools.lru_cache(maxsize=1)
+def spectrum_of(image: Tensor) -> Tensor:
+    """Spectrum of a whole image, kept for the next look at the same one."""
+    return torch.fft.fftshift(torch.fft.fft2(image))
+
+
 def at_position(image: Tensor, line: Tensor, cell: Tensor) -> Tensor:
     """Band-limited interpolation of a whole image (line, cell) on the grid of fractional lines x
     cells.
     """
-    spectrum = torch.fft.fftshift(torch.fft.fft2(image))
+    spectrum = spectrum_of(image)
     rows, columns = (torch.arange(n, dtype=torch.float64) - n // 2 for n in image.shape)
     left = torch.exp(2j * math.pi * line[:, None] * rows / image.shape[0])
     right = torch.exp(2j * math.pi * cell[:, None] * columns / image.shape[1])

@@ -123,9 +123,9 @@ def test_parts_of_the_trilinear_form_are_each_others_gradients():
 
 @pytest.mark.parametrize("taps", [4, 7])
 def test_two_derivatives_in_data_and_points(taps):
-    plan = PulseNufft(9, Kernel(taps, 1.5), torch.complex128)
-    points = (torch.rand(2, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(3))).requires_grad_()
-    for function, x in ((plan.type1, noise(2, 8, 2).requires_grad_()), (plan.type2, noise(2, 9, 2).requires_grad_())):
+    plan = PulseNufft(6, Kernel(taps, 1.5), torch.complex128)
+    points = (torch.rand(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))).requires_grad_()
+    for function, x in ((plan.type1, noise(2, 3, 2).requires_grad_()), (plan.type2, noise(2, 6, 2).requires_grad_())):
 
         def of(x, p, function=function):
             return function(x, plan.points(p))
