@@ -136,15 +136,15 @@ TABLE = [
 @pytest.mark.parametrize(("prf_hz", "raw_db", "error"), TABLE)
 def test_mean_errors_of_the_second_table(prf_hz, raw_db, error):
     radar = published_radar(prf_hz=prf_hz)
-    found = SignalIntensityRatio(radar, BAND, search_m_s=(-20.0, 20.0))(noisy(radar, 12, raw_db))
+    found = SignalIntensityRatio(radar, BAND, search_m_s=(-20.0, 20.0))(noisy(radar, 24, raw_db))
     assert error / 1.8 < float((found["u_r_m_s"] - 10).abs().mean()) < error * 1.8
 
 
 def test_predicted_std_and_ok():
-    found = SignalIntensityRatio(RADAR, BAND, search_m_s=(-20.0, 20.0))(noisy(RADAR, 20, -15, seed=3))
+    found = SignalIntensityRatio(RADAR, BAND, search_m_s=(-20.0, 20.0))(noisy(RADAR, 40, -15, seed=3))
     assert bool(found.ok.all())
     assert 0.5 < float(found.std["u_r_m_s"].median() / (found["u_r_m_s"] - 10).std()) < 2
-    lost = SignalIntensityRatio(RADAR, BAND, search_m_s=(-20.0, 20.0))(noisy(RADAR, 12, -50))
+    lost = SignalIntensityRatio(RADAR, BAND, search_m_s=(-20.0, 20.0))(noisy(RADAR, 24, -50))
     assert float(lost.ok.to(F64).mean()) < 0.2 and float(lost.quality.mean()) < 0.2
 
 

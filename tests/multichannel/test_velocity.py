@@ -275,9 +275,9 @@ class TestClutter:
 def test_below_the_threshold_nothing_is_found():
     """The threshold is 19 dB over all samples, -15 dB per sample."""
     for snr_db, found in ((-300.0, False), (-20.0, False), (-8.0, True)):
-        signal = noisy(snr_db, 3, u_r=5.0)
-        assert bool(torch.equal(MovingPointVelocity(RADAR, GATE, search=NEAR)(signal).ok, torch.full((3,), found)))
-        assert bool(torch.equal(Interferometry(RADAR, GATE)(signal).ok, torch.full((3,), found)))
+        signal = noisy(snr_db, 6, u_r=5.0)
+        assert bool(torch.equal(MovingPointVelocity(RADAR, GATE, search=NEAR)(signal).ok, torch.full((6,), found)))
+        assert bool(torch.equal(Interferometry(RADAR, GATE)(signal).ok, torch.full((6,), found)))
 
 
 @pytest.mark.parametrize("aperture", [GATE, ElementBeam()], ids=["gate", "beam"])
@@ -304,12 +304,12 @@ def _small(name, radar=RADAR, aperture=GATE, **settings):
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_trials_are_independent(name, dtype):
     """Strong, weak, zero and noisy trials and one in clutter give the same together and alone."""
-    quiet = noisy(10.0, 2, u_r=3.0).data[..., N // 2 - 96 : N // 2 + 96]
-    slow = torch.exp(2j * math.pi * 0.01 * torch.arange(192, dtype=F64))
+    quiet = noisy(10.0, 2, u_r=3.0).data[..., N // 2 - 192 : N // 2 + 192]
+    slow = torch.exp(2j * math.pi * 0.01 * torch.arange(384, dtype=F64))
     data = torch.stack(
-        [1e3 * quiet[0], 1e-6 * quiet[1], torch.zeros_like(quiet[0]), noise(1, 4, 192)[0], quiet[0] + 30 * slow]
+        [1e3 * quiet[0], 1e-6 * quiet[1], torch.zeros_like(quiet[0]), noise(1, 4, 384)[0], quiet[0] + 30 * slow]
     ).to(dtype)
-    signal, start = Signal(data, RADAR.axes(192)), {} if name == "recommended" else {"u_r_m_s": 3.01}
+    signal, start = Signal(data, RADAR.axes(384)), {} if name == "recommended" else {"u_r_m_s": 3.01}
     stage = _small(name)
     together = stage(signal, **start)
     for i in range(5):
