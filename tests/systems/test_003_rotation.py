@@ -65,7 +65,6 @@ def test_entropy_falls_with_the_order_and_uniform_autofocus_fails() -> None:
         "third_order_2d",
         "pga",
         "uniform_autofocus",
-        "coarse",
         "phase_fit",
         "recommended",
     ]

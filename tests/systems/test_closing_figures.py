@@ -37,11 +37,19 @@ def test_rotations_are_found_to_their_bound_at_0_db(metric: str) -> None:
     assert recorded("isal_rotation_snr", metric, 0.0, "rmse", "Cramer-Rao") == pytest.approx(1.0, abs=0.06)
 
 
-def test_false_targets_of_moving_points_stay_below_65_db() -> None:
-    bench = Bench(load("geo_point_targets"))
+@pytest.mark.parametrize(
+    ("overrides", "names"),
+    [
+        (["world.samples=null"], ["P1", "P2", "P3", "P4"]),
+        (["world.targets={P3: {u_r_m_s: 10.0, u_a_m_s: 5.0}}"], ["P3"]),
+    ],
+    ids=["azimuth only", "with range samples"],
+)
+def test_false_targets_of_moving_points_stay_below_65_db(overrides: list[str], names: list[str]) -> None:
+    bench = Bench(load("geo_point_targets", overrides))
     batch = bench.batch(Draws(bench.config.seed, "run", [0]), methods=["recommended"], detail=True)
     targets = batch.outcomes["recommended"].judged.targets
-    assert targets and all(float(row["mfta_db"]) < -65 for row in targets.values())
+    assert list(targets) == names and all(float(row["mfta_db"]) < -65 for row in targets.values())
 
 
 def test_trials_of_a_recorded_sweep_run_again_with_that_median() -> None:
