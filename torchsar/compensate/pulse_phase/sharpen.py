@@ -127,9 +127,10 @@ class Wiener:
 
     Here p is the power, summed over three neighbouring range cells with weights 1, 2, 1 and divided
     by 4, and m is the mean power of the image. A weight is small where a cell holds no more than
-    noise and constant where it holds much more: a Wiener filter whose prior is the local power.
-    Subtracting the mean removes, to first order, the contribution of a pulse to the estimated scene
-    with which this pulse is compared; the phase steps then need no relaxation.
+    noise and constant where it holds much more: a Wiener filter whose prior is the local power. The
+    phase of a pulse is updated by comparing the pulse with the weighted image, to which the pulse
+    itself contributes, so that every update would be too short. Subtracting the mean removes this
+    contribution to first order.
 
     Args:
         level: Noise level as a multiple of the mean power.
