@@ -44,8 +44,8 @@ def checked(data: Tensor, name: str) -> tuple[Tensor, Tensor]:
         name: Name of the calling function for the error message.
 
     Returns:
-        The data, shape (trial, pulse, range), and whether each pulse has a sample other than zero (a
-        missing pulse is all zeros), shape (trial, pulse), bool.
+        The data, shape (trial, pulse, range), and whether each pulse has a sample other than zero,
+        shape (trial, pulse), bool: a missing pulse is all zeros.
 
     Raises:
         TypeError: If the data are not a tensor of complex64 or complex128.

@@ -74,7 +74,7 @@ class Strip(World):
         return StripmapWorld(scene, self.beam, self.path, self.velocity_m_s, doppler, self.noise.snr_db)
 
     def trials_of(self, radar: StripmapRadar, draws: Draws, dtype: torch.dtype, device: str) -> Trials:
-        """Simulate the trials: recordings with and without impairments, and what is true of them."""
+        """Simulate trials: recordings with and without impairments, and what is true of them."""
         world, size = self.of(radar), (self.lines, self.samples)
         recording, truth = simulate(radar, world, *size, draws, self.impairments, dtype, device)
         assert truth.clean is not None
