@@ -179,7 +179,7 @@ def test_truth_takes_the_road_of_oracles_alone(system: str, tmp_path: Path) -> N
             bench_of(tmp_path, system, processor=processor)
         processor["recommended"]["oracle"] = True
         stage["uses"][name] = "truth.colour"
-        with pytest.raises(ConfigError, match="'colour' is no true value"):
+        with pytest.raises(ConfigError, match="truth.colour does not exist"):
             bench_of(tmp_path, system, processor=processor)
 
 

@@ -88,8 +88,7 @@ def _sources(uses: Mapping[str, str], method: Method, loaded: Loaded, where: str
             )
         if true and name not in loaded.system.truths:
             raise ConfigError(
-                f"{loaded.file}: {where}.uses.{key}: {name!r} is no true "
-                f"value{did_you_mean(name, loaded.system.truths)}"
+                f"{loaded.file}: {where}.uses.{key}: {source} does not exist{did_you_mean(name, loaded.system.truths)}"
             )
         found[key] = f"{_GIVEN}{name}" if true else source
     return found
