@@ -62,7 +62,7 @@ def inverse_requirements(
         tolerance_rad: Tolerated phase in rad.
 
     Returns:
-        One row per simplification.
+        One `Requirement` per simplification: what it neglects, the error and the remedy.
 
     Raises:
         ValueError: If the rotation rate is not known, or an extent or motion is not finite, or an
@@ -135,7 +135,7 @@ class TurningTarget:
             tolerance_rad: Tolerated nonlinear phase in rad.
 
         Returns:
-            One row per simplification.
+            One `Requirement` per simplification: what it neglects, the error and the remedy.
         """
         angle, cell = self.rate_rad_s * self.aperture_s, self.radar.range_step_m
         cells = self.cross_m * angle / cell
@@ -173,15 +173,16 @@ class TurningTarget:
         )
 
     def between_samples(self, n_range: int) -> tuple[Requirement, ...]:
-        """List the phase steps between neighbouring pulses or range frequencies.
+        """List the largest phase steps between neighbouring pulses and range frequencies.
 
-        Steps beyond pi alias.
+        They are those of the echoes of the outermost scatterers and of the motion. Steps beyond pi
+        alias.
 
         Args:
             n_range: Number of range samples.
 
         Returns:
-            One row per simplification.
+            One `Requirement` per simplification: what it neglects, the error and the remedy.
         """
         per_m, period_s = 4 * math.pi / self.radar.wavelength_m, 1 / self.radar.prf_hz
         swing = sum(2 * abs(a) * math.sin(math.pi * min(f * period_s, 0.5)) for a, f in self.vibrations)
@@ -221,7 +222,7 @@ class TurningTarget:
             tolerance_rad: Tolerated phase in rad.
 
         Returns:
-            One row per simplification.
+            One `Requirement` per simplification: what it neglects, the error and the remedy.
         """
         chirp, half2 = self.radar.chirp_rate_hz_s, pulse_s**2 / 4
         coupling = self.radar.carrier_hz / chirp / self.radar.range_step_m  # cells per m/s

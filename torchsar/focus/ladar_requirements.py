@@ -322,7 +322,7 @@ def ladar_requirements(
         tolerance_rad: Tolerated phase in rad.
 
     Returns:
-        One row per simplification.
+        One `Requirement` per simplification: what it neglects, the error and the remedy.
 
     Raises:
         ValueError: If a number is not finite or negative.

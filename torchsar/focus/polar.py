@@ -235,7 +235,7 @@ class PolarOperator:
         return self._x.crop(torch.fft.ifft(columns, norm="forward"), -1) * self._unkernel
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Apply the adjoint of `image`, which maps an image to range profiles.
+        """Map an image to range profiles by the adjoint of `image`.
 
         Args:
             image: Image, shape (..., azimuth, range), complex.

@@ -213,7 +213,7 @@ def requirements(
         tolerance_db: Tolerated relative error of a response, for rows that predict one.
 
     Returns:
-        One row per simplification.
+        One `Requirement` per simplification: what it neglects, the error and the remedy.
     """
     middle = axes[-1].start + axes[-1].n // 2 * axes[-1].step  # where bulk processing is exact
     velocity = radar.velocity_m_s if velocity_m_s is None else float(velocity_m_s)

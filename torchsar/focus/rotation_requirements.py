@@ -232,7 +232,7 @@ def rotation_requirements(
         tolerance_rad: Tolerated phase in rad.
 
     Returns:
-        One row per simplification.
+        One `Requirement` per simplification: what it neglects, the error and the remedy.
     """
     warp_k, duration = torch.tensor(list(k), dtype=torch.float64), n_pulse / radar.prf_hz
     c4 = 4 * math.pi / radar.wavelength_m

@@ -423,7 +423,7 @@ def multichannel_requirements(
         tolerance_rad: Tolerance in radians of the rows that have none of their own.
 
     Returns:
-        One row per simplification.
+        One `Requirement` per simplification: what it neglects, the error and the remedy.
     """
     return (
         *_transmit_rows(radar, use),

@@ -32,9 +32,10 @@ class Pairs:
         first: First scatterer of each pair, shape (pair,).
         second: Second scatterer of each pair, shape (pair,).
         shape: Shape (trial, scatterer) of the scatterers.
-        products: For basis functions b_n and b_m of slow time, conj(s_p) s_q times the sum over
-            pulses of b_n b_m conj(e_p) e_q, shape (pair,). Here s are the amplitudes and e the
-            echoes of unit amplitude of the two scatterers p and q of a pair.
+        products: For each key (n, m) a tensor of shape (pair,): conj(s_p) s_q times the sum over
+            pulses of b_n b_m conj(e_p) e_q. Here p is the first and q the second scatterer of a
+            pair, s are their amplitudes, e their echoes of unit amplitude, and b_n and b_m are the
+            basis functions n and m of slow time.
     """
 
     trial: Tensor
