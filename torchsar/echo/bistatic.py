@@ -176,7 +176,8 @@ def simulate_bistatic(
 ) -> tuple[Recording, Truth]:
     """Simulate a recording of moving targets and a sea, batched over the trials of the draws.
 
-    Warns of targets that the gate passes at no pulse.
+    Warns of targets that the receive gain (`world.gate`) suppresses at every pulse, so that the
+    recording does not contain them.
 
     Args:
         radar: Receiver.

@@ -149,7 +149,7 @@ def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float
         raise ValueError(
             "bandwidth_hz must be above 0 and below the width of the rebuilt bands, since the intensity ratio compares "
             f"the spectrum inside bandwidth_hz with the rest, but {band} leave nothing outside "
-            f"{bandwidth_hz:g} Hz; rebuild more bands, or integrate less"
+            f"{bandwidth_hz:g} Hz; rebuild more bands, or lower bandwidth_hz"
         )
 
 
