@@ -209,9 +209,10 @@ def point_responses(
     Args:
         image: Images (row, azimuth[, range]) without noise.
         focused: Stages and motions with which the images were formed.
-        truth: True `u_r_m_s`, `u_a_m_s`, `y0_m` and `range_m`, (row,) each.
+        truth: True closing speed `u_r_m_s`, along-track speed `u_a_m_s`, along-track position
+            `y0_m` at slow time zero and closest range `range_m` of the points, (row,) each.
         integration_s: Time in seconds for which the points are illuminated, a number or (row,);
-            None for the antenna pattern of the elements.
+            None if only the antenna pattern of the array elements limits the illumination.
         orders: Largest Doppler distance, in pulse rates, at which replicas are sought.
 
     Returns:
