@@ -10,6 +10,7 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -120,23 +121,24 @@ class _Tried:
     one: Alternative
     measured: Measured
     times: list[tuple[float, float]] = field(default_factory=list)
-    peaks: list[int] = field(default_factory=list)
+    peak_bytes: int | None = None
     loss: dict[str, float] = field(default_factory=dict)
     failed: str = ""
 
     def again(self) -> None:
         """Run the alternative once more; the first run measures its loss as well."""
         try:
-            with PeakMemory() as peak:
+            # kept memory is returned before memory is measured, which takes time
+            with nullcontext() if self.times else PeakMemory() as peak:
                 spent, result = _spent(lambda: self.measured.run(self.one), _LEAST_S if self.times else 0.0)
-            if not self.times:
+            if peak is not None:
+                self.peak_bytes = peak.bytes
                 self.loss = {name: float(value) for name, value in self.measured.loss(self.one, result).items()}
         except _FAILURES as error:
             self.failed = one_line(error)
         else:
             share = self.measured.share(self.one)
             self.times.append((spent[0] / share, spent[1] / share))
-            self.peaks += [] if peak.bytes is None else [peak.bytes]
             wrong = next((name for name, x in self.loss.items() if math.isnan(x) or x == math.inf), None)
             self.failed = "" if wrong is None else f"{wrong} is not finite"
         if len(self.times) < 2:
@@ -146,7 +148,7 @@ class _Tried:
         """Return the row of the alternative in trade.json."""
         cpu, wall = (statistics.median(part) for part in zip(*self.times)) if self.times else (None, None)
         row = {"name": self.one.name, "neglects": self.one.neglects, "cpu_s": cpu, "wall_s": wall}
-        row |= {"peak_bytes": max(self.peaks, default=None), "loss": self.loss, "predicted": self.one.loss}
+        row |= {"peak_bytes": self.peak_bytes, "loss": self.loss, "predicted": self.one.loss}
         return {**row, "failed": self.failed, "within_tolerance": not self.failed and within(self.loss, tolerance)}
 
     def _line(self) -> str:

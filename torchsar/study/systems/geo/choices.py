@@ -256,10 +256,9 @@ def _migrated(bench: Bench) -> Measured:
     beyond = lines.values() - trials.truth["range_m"][:, None]
     across = torch.sinc(beyond / (radar.wave_speed_m_s / radar.pulse.bandwidth_hz))
     exact = Signal(line.data[..., None] * across[:, None], (*line.axes, lines))
-    follow = _follows(bench)
     return _compared(
         exact,
-        lambda one: _image(bench, trials, band, migration=_MIGRATIONS[one.keys["kind"]][0], follow=follow)[0],
+        lambda one: _image(bench, trials, band, migration=_MIGRATIONS[one.keys["kind"]][0], follow=_follows(bench))[0],
         size["pulses"] / bench.world().pulses,
     )
 
