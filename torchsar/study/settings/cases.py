@@ -84,6 +84,6 @@ def _check_case(name: str, values: Mapping[str, Any], loaded: Loaded) -> None:
             )
         if root == "data" and loaded.config.data.file is None:
             raise ConfigError(
-                f"{loaded.file}: cases.{name}: a simulation does not use the key {key!r}, because its impairments are "
-                "keys of the world; set data.file to process a recording"
+                f"{loaded.file}: cases.{name}: a simulation does not use the key {key!r}; change the section world "
+                "instead, or set data.file for all cases to process a recording"
             )
