@@ -154,7 +154,7 @@ class FrameGeometry:
         device: torch.device | None = None,
         band_hz: float | None = None,
     ) -> FrameGeometry:
-        """Build the geometry of the azimuth spectrum of raw data, which has one row per pulse.
+        """Build the geometry of the azimuth spectrum of raw data, with as many rows as pulses.
 
         Args:
             radar: Radar of the recording.
@@ -169,7 +169,7 @@ class FrameGeometry:
             band_hz: Processed Doppler bandwidth in Hz; None for the whole PRF.
 
         Returns:
-            Geometry of all rows.
+            Geometry of all Doppler rows.
 
         Raises:
             ValueError: If the Doppler or the velocity is neither a number nor a tensor of the

@@ -1,4 +1,4 @@
-"""Errors in the responses of moving points due to simplified ranges, predicted without echoes."""
+"""Errors of point responses due to approximate range histories, predicted without echoes."""
 
 from __future__ import annotations
 
