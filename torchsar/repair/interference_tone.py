@@ -406,9 +406,9 @@ def explaining(lines: Tensor, rest: Tensor, tones: list[Tone], level: Level) -> 
 
 
 def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -> list[Tone]:
-    """Fit each tone again in lines without the others, then average it over neighbouring lines.
+    """Fit each tone again in lines from which the others are subtracted.
 
-    The averages are those of frequency and drift by `pooled`.
+    Then frequency and drift of each are averaged over neighbouring lines, see `pooled`.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.

@@ -248,7 +248,7 @@ def random_tones(
     """Draw sinusoids whose powers follow a power law.
 
     Args:
-        draws: Random draws of the phases.
+        draws: Source of random numbers, from which the phases are drawn.
         rms: Root mean square of the sum, in the unit of its amplitudes.
         lowest_hz: Lower end of the band in hertz.
         highest_hz: Upper end of the band in hertz.
