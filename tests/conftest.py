@@ -16,7 +16,7 @@ SHARED = Path(os.environ.get("TORCHSAR_DATA", Path(__file__).resolve().parents[2
 
 @pytest.fixture(autouse=True, scope="session")
 def _process() -> None:
-    torchsar.keep_freed_memory()  # as the commands do; a third of the time of large scenes
+    torchsar.keep_freed_memory()  # as the commands do
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(min(2, os.cpu_count() or 1))
 

@@ -57,26 +57,12 @@ __all__ = [
     "scene",
     "use",
 ]
-_OF_CORE = (
-    "Axis",
-    "Chain",
-    "Draws",
-    "Estimate",
-    "Recording",
-    "Signal",
-    "Stage",
-    "Trace",
-    "Truth",
-    "keep_freed_memory",
-    "use",
-)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _OF_CORE:
-        return getattr(importlib.import_module("torchsar.core"), name)
     if name in __all__ or name in _ON_REQUEST:
-        return importlib.import_module(f"torchsar.{name}")
+        core = importlib.import_module("torchsar.core")
+        return getattr(core, name) if name in core.__all__ else importlib.import_module(f"torchsar.{name}")
     raise AttributeError(f"module 'torchsar' has no attribute {name!r}")
 
 

@@ -191,7 +191,7 @@ def test_experiment_a_stripmap_at_20_db(seed) -> None:
     assert polished < -13.0 and polished < plain + 0.05
 
 
-def test_experiment_b_in_the_order_of_the_brief() -> None:
+def test_experiment_b_in_the_order_of_the_reference() -> None:
     """Letter E, random phases: single peaks fail at 5 cm, summed bins and the mirror product do
     not, and the polish reaches 0.15 rad.
     """

@@ -13,7 +13,7 @@ import pytest
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "sweeps"
 RECORDED = json.loads((FOLDER / "sal_snr.json").read_text(encoding="utf-8"))
 VELOCITY, RANGE = "velocity_rmse_m_s", "range_error_detrended_rms_m"
-# medians of the brief 000, section 8 D: velocity (mm/s) of segmented interference, correlation x20
+# medians of an independent prototype: velocity (mm/s) of segmented interference, correlation x20
 # in the gate, periodogram peaks, mirror product
 BRIEF = {
     -10.0: {"segmented": 4.45, "cross_correlation": 4.2, "ml_peak": 3.80, "mirror": 2.21},
@@ -47,7 +47,7 @@ def test_every_point_has_its_trials() -> None:
 
 
 @pytest.mark.parametrize("snr_db", BRIEF)
-def test_every_estimator_is_within_a_fifth_of_the_brief_or_better(snr_db: float) -> None:
+def test_every_estimator_is_within_a_fifth_of_the_reference_or_better(snr_db: float) -> None:
     for algorithm, expected in BRIEF[snr_db].items():
         assert point(algorithm, snr_db)["median"] < 1.2 * expected * 1e-3, algorithm
 
@@ -58,7 +58,7 @@ def test_the_recommended_estimator_is_within_1_15_of_its_bound(snr_db: float) ->
 
 
 @pytest.mark.parametrize("snr_db", CHAIN_NM)
-def test_the_range_of_the_chain_is_that_of_the_brief_or_better(snr_db: float) -> None:
+def test_the_range_of_the_chain_is_that_of_the_reference_or_better(snr_db: float) -> None:
     found = point("recommended", snr_db, RANGE)
     assert found["median"] < 1.2e-9 * CHAIN_NM[snr_db]
     assert found["median"] < 1.15 * bound("phase of one sweep", snr_db, RANGE) or snr_db > 15

@@ -1,7 +1,6 @@
-"""What system 001 claims (Remote Sens.
+"""Figures of Remote Sens. 2020, 12, 1703 at reduced size.
 
-2020, 12, 1703; brief 001), reduced: Table 4, Table 2, velocities beyond the ambiguity, and the
-ocean scene.
+Table 4, Table 2, velocities beyond the ambiguity, and the ocean scene.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ MOTION = dict.fromkeys(("u_r_m_s", "u_a_m_s", "y0_m"), "velocity")
 
 
 def chain(radar: BistaticRadar = RADAR, lines: bool = False) -> Chain:
-    """From channels to the image of one target, told nothing."""
+    """From channels to the image of one target, without prior knowledge."""
     stages = {"transmit": multichannel.RemoveTransmitRange(radar)}
     if lines:
         stages["walk"] = multichannel.WalkAmbiguity(radar)
@@ -39,7 +38,7 @@ def chain(radar: BistaticRadar = RADAR, lines: bool = False) -> Chain:
 
 
 @pytest.mark.parametrize("speeds", [(0.0, 10.0), (10.0, 5.0), (-17.0, 14.0)])
-def test_a_target_told_nothing_is_sharp_and_without_replicas(speeds: tuple[float, float]) -> None:
+def test_a_target_without_prior_knowledge_is_sharp_and_without_replicas(speeds: tuple[float, float]) -> None:
     u_r, u_a = speeds
     world = BistaticWorld(MovingPoints([u_r], [u_a], [0.0], [0.0]), GATE, snr_db=27.0)
     recording, truth = simulate_bistatic(RADAR, world, 3600, None, Draws(5), dtype=torch.complex128)
@@ -94,10 +93,10 @@ def test_velocities_beyond_the_ambiguity_are_found_or_warned_of(u_r: float) -> N
     assert float(trace.values["walk.ambiguity"]) == (1.0 if u_r > 0 else -1.0)
     assert bool(trace.estimates["velocity"].ok) and abs(float(trace.values["velocity.u_r_m_s"]) - u_r) < 1.0
     with pytest.warns(UserWarning, match="whole pulse rates"):
-        told = multichannel.Interferometry(RADAR, multichannel.Dwell(4.5))(
+        found = multichannel.Interferometry(RADAR, multichannel.Dwell(4.5))(
             multichannel.RemoveTransmitRange(RADAR)(one.signal)
         )
-    assert not bool(told.ok.any())
+    assert not bool(found.ok.any())
 
 
 def test_a_ship_leaves_the_sea_as_it_was_and_goes_to_its_place() -> None:

@@ -13,8 +13,8 @@ FOLDER = Path(__file__).resolve().parents[2] / "docs" / "sweeps"
 RECORDED = json.loads((FOLDER / "geo_velocity_scnr.json").read_text(encoding="utf-8"))
 CLUTTER = json.loads((FOLDER / "geo_velocity_clutter.json").read_text(encoding="utf-8"))
 PRF, SCNR = "radar.prf_hz", "world.noise.raw_scnr_db"
-# brief 001: mean errors of its trial, which rms errors of ours may exceed by what 24 trials leave
-# open
+# mean errors of an independent prototype, which rms errors of ours may exceed by what 24 trials
+# leave open
 SIR_TRIAL = {
     170.0: {-20.0: 0.25, -10.0: 0.08, 0.0: 0.06, 10.0: 0.06},
     180.0: {-20.0: 0.40, -10.0: 0.05, 0.0: 0.04, 10.0: 0.03},

@@ -86,7 +86,7 @@ def test_ideal_entropy():
 
 
 @pytest.mark.parametrize("row, polluted", list(zip(TABLE_1, [1.26, 1.85, 2.87, 2.88], strict=True)))
-def test_polluted_entropies_are_those_of_the_brief(table_1, row, polluted):
+def test_polluted_entropies_are_those_of_the_reference(table_1, row, polluted):
     assert float(table_1[row]["polluted"].mean()) == pytest.approx(polluted, abs=0.2)
 
 
@@ -251,8 +251,8 @@ def injected(n: int, kind: str, seed: int) -> Tensor:
 
 
 def best_iterate(x: Tensor, true: Tensor, start: Tensor, kernel: str) -> float:
-    """Least phase error of 20 iterations of the rule that the brief states, on padded pulses,
-    without any stop.
+    """Least phase error of 20 iterations of PGA on padded pulses, whose window narrows by a fifth
+    each time, without any stop.
     """
     psi, least, n = start.double(), math.inf, len(x)
     k = torch.arange(n, dtype=torch.float64) - (n - 1) / 2

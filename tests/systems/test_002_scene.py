@@ -1,6 +1,4 @@
-"""Where methods break (brief 002, section 10), as the recorded sweep over scenes shows it (20
-trials a point).
-"""
+"""Scenes in which methods fail, as the recorded sweep over scenes shows (20 trials a point)."""
 
 from __future__ import annotations
 

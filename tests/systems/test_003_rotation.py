@@ -1,7 +1,6 @@
-"""Claims of system 003 (Remote Sens.
+"""Figures of Remote Sens. 2025, 17, 3447 at reduced size, from the configs.
 
-2025, 17, 3447, and brief 003) at reduced size, from the configs: three points, satellite, corner
-cubes, estimates against the bound.
+Three points, satellite, corner cubes, estimates against the bound.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ def metrics_of(made: Batch) -> dict[str, Mapping[str, Tensor]]:
     return {name: outcome.metrics for name, outcome in made.outcomes.items()}
 
 
-# peak (dB), width (mm; None where a smear has none) and PSLR (dB) at -12, 0 and 12 m; brief 003,
-# experiment 1
+# peak (dB), width (mm; None where a smear has none) and PSLR (dB) at -12, 0 and 12 m, of an
+# independent prototype
 POINTS = {
     "second_order_azimuth": {"points.0": (-15.4, 8.3, -2.1), "points.2": (-15.4, 8.3, -2.1)},
     "third_order_azimuth": dict.fromkeys(("points.0", "points.1", "points.2"), (-2.8, 2.16, -5.1)),

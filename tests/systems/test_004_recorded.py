@@ -1,5 +1,5 @@
 """System 004 on a recording: impairments injected, repaired, and compared with the unimpaired image
-(the brief's table, its cheaper rows).
+(the cheaper rows of the table of `scripts/recorded_impairments.py`).
 """
 
 from __future__ import annotations
