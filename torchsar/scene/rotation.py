@@ -21,16 +21,16 @@ from torchsar.scene.trials import refuse_unless_finite
 class PolynomialRotation:
     """Rotation with a polynomial angle, theta(t) = omega (t + k1 t^2 / 2! + k2 t^3 / 3! + ...).
 
-    Angle and time are zero at the FIRST pulse. A uniform rotation that is given as a number has its
-    zero at the middle pulse instead. A simulation rejects a rate that falls to zero; see
-    `refuse_turning_back`.
+    The time t and the angle theta are zero at the FIRST pulse. The uniform rotation that
+    `TurntableWorld.rotation_rad_s` gives is different: its angle is zero at the middle pulse. A
+    simulation rejects a rotation whose rate falls to zero; see `refuse_turning_back`.
 
     Args:
-        omega_rad_s: Rotation rate at the first pulse in rad/s.
-        k: k1, k2, ... in 1/s, 1/s^2, ...: the derivatives of the rate at the first pulse, divided
-            by that rate (`core.warp` converts them to polynomial coefficients and back). A sequence
-            of numbers or values per trial, or one tensor of shape (..., order - 1); empty for a
-            uniform rotation.
+        omega_rad_s: Rotation rate omega at the first pulse in rad/s.
+        k: k1, k2, ... in 1/s, 1/s^2, ...: time derivatives of the rotation rate at the first pulse,
+            divided by that rate. Either a sequence, each entry of which is a number or one value
+            per trial, or one tensor of shape (..., order - 1), with the polynomial degree `order`
+            of the angle. Empty for a uniform rotation.
 
     Raises:
         ValueError: If a number is not finite, or k is a tensor without dimensions.
@@ -153,5 +153,5 @@ class PolynomialRotation:
             raise ValueError(
                 f"the rotation rate falls to {least:.3g} of its first value within the "
                 f"{duration_s:.6g} s of the record, so that two times have the same "
-                "angle and no image can be formed; choose other k, or record fewer pulses"
+                "angle and no image can be formed; choose smaller k1, k2, ..., or record fewer pulses"
             )

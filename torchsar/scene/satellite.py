@@ -146,18 +146,21 @@ class Satellite:
     """Satellite of random scatterers: box, two gridded panels, dish and boom.
 
     The box has 26 % of the scatterers, each panel 29 %, dish and boom 8 % each. The panels lie
-    along cross range. The body is tilted about them, projected to cross range and range, and scaled
-    to the given extents exactly. Corners of box and panels, rim and feed of the dish and the end of
-    the boom are scatterers at fixed positions; the panel tips lie at +-half_width_m. All other
-    scatterers change from trial to trial and have the amplitude 0.4 + 0.6 r, with r Rayleigh
-    distributed of unit scale. Phases are uniform. The satellite of the publication has no
-    coordinates; this model stands in for it.
+    along cross range, and the body is tilted about this direction. Its projection to cross range
+    and range is scaled to exactly the given extents.
+
+    The corners of box and panels, the feed of the dish, two points of its rim and the end of the
+    boom are scatterers at fixed positions, here all called corners. The panel tips lie at
+    +-half_width_m. The positions of all other scatterers are drawn in each trial. Their amplitude
+    is 0.4 + 0.6 r, where r is Rayleigh distributed with unit scale. The phases of all scatterers
+    are uniform in 0 to 2 pi. The Reference gives no coordinates of its satellite; this model stands
+    in for it.
 
     Args:
         count: Number of scatterers, at least 60, fixed for all trials.
         half_width_m: Half the extent in cross range in metres.
         half_depth_m: Half the extent in range in metres.
-        tilt_rad: Tilt of the body about its panels in radians.
+        tilt_rad: Tilt of the body about the direction of its panels in radians.
         corner_level: Amplitude of the corners.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Stationary rough surfaces beneath moving targets, equal for all channels."""
+"""Stationary rough surfaces, such as a sea: clutter beneath moving targets."""
 
 from __future__ import annotations
 
@@ -27,22 +27,25 @@ _REACH, _NODES = 9.0, 4097
 class Sea(ABC):
     """Surface of independent circular Gaussian scatterers with a local mean intensity.
 
-    The scatterers form speckle. Their local mean intensity is the texture, in which the kinds of
-    sea differ.
+    The scatterers form speckle. Their local mean intensity is called texture; each subclass defines
+    its own.
 
     Args:
-        power_db: Mean power of one sample of azimuth-only or range-compressed data in decibels.
-            With a noise variance of -20 dB, 0 dB is a clutter-to-noise ratio of 20 dB. It is the
-            mean over draws: a record with few texture cells may have more or less.
+        power_db: Mean power in decibels of one sample of the clutter, in range-compressed data or
+            in data without a range axis. For example, 0 dB with a noise variance of -20 dB is a
+            clutter-to-noise ratio of 20 dB. The mean is over random draws: a single record with few
+            texture cells may have more or less power.
         margin_s: Time by which the surface extends beyond the record at both ends in seconds, fixed
-            for all trials. None extends it as far as the gate illuminates, for an antenna pattern
-            down to half power; the surface is periodic, so that beyond its end the antenna sees the
-            other end. With 0 the period is the length of the record: the simulation is two to three
-            times faster, but the Doppler spectrum has no leakage, unlike that of a real record.
-        lobes: Number of nulls of an antenna pattern, counted from its maximum to either side, up to
-            which it illuminates the surface, fixed for all trials. A sinc pattern has 10 % of its
-            power beyond the first null and 5 % beyond the second. With 2 the simulation needs about
-            twice the Doppler band of 1, and longer lines.
+            for all trials. With None the surface reaches to the edge of the illumination, which for
+            an antenna pattern is taken at half power. The surface is periodic: beyond one end the
+            antenna sees the other end. With 0 the period is the length of the record. The
+            simulation is then two to three times faster, but the Doppler spectrum has no leakage,
+            unlike that of a real record.
+        lobes: Number of nulls of the antenna pattern, to either side of its maximum, up to which
+            the antenna illuminates the surface, fixed for all trials. It has no effect on an
+            illumination without an antenna pattern. A sinc pattern has 10 % of its power beyond the
+            first null and 5 % beyond the second. A simulation with two nulls needs about twice the
+            Doppler band of one with a single null, and longer range lines.
 
     Raises:
         ValueError: If the power is not finite, the margin is negative or the number of lobes is not
@@ -56,9 +59,15 @@ class Sea(ABC):
     def __post_init__(self) -> None:
         refuse_unless_finite("power_db of a sea", self.power_db)
         if self.margin_s is not None and not (math.isfinite(self.margin_s) and self.margin_s >= 0):
-            raise ValueError(f"margin_s of a sea must be 0 s or more, or None to follow the gate, got {self.margin_s}")
+            raise ValueError(
+                "margin_s of a sea must be 0 s or more, or None to reach to the edge of the illumination, got "
+                f"{self.margin_s}"
+            )
         if not (isinstance(self.lobes, int) and self.lobes >= 1):
-            raise ValueError(f"lobes of a sea must be a whole number of 1 or more, got {self.lobes}")
+            raise ValueError(
+                f"lobes of a sea must be a whole number of 1 or more, got {self.lobes}; it counts the nulls of the "
+                "antenna pattern up to which the sea is illuminated"
+            )
 
     @abstractmethod
     def texture(self, azimuth_m: Tensor, range_m: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
@@ -70,9 +79,10 @@ class Sea(ABC):
             draws: Random draws.
 
         Returns:
-            Table of mean intensities, shape (..., row, column), float64, unity on average; the row
-            of the table for each azimuth, shape (a,) or (..., a), int64; and the column for each
-            range, shape (r,) or (..., r), int64.
+            The tensors table, row and column. Grid cell (i, j) has the mean intensity
+            table[..., row[..., i], column[..., j]]. The table has the shape (..., rows, columns),
+            float64, and unit mean. The indices have the shapes (a,) or (..., a) for row, and (r,)
+            or (..., r) for column, int64.
         """
 
     def reflectivity(
@@ -119,21 +129,25 @@ class KSea(Sea):
 
     Args:
         shape: Shape of the gamma distribution, 0.1 to 1000, small for spiky seas; inf for pure
-            speckle. A table is computed once for each different value.
-        cell_m: Along-track and range side of the rectangles that share one texture in metres, fixed
-            for all trials; neither may be smaller than a cell of the grid.
-        power_db: Mean power of one sample of azimuth-only or range-compressed data in decibels.
-            With a noise variance of -20 dB, 0 dB is a clutter-to-noise ratio of 20 dB. It is the
-            mean over draws: a record with few texture cells may have more or less.
+            speckle.
+        cell_m: Along-track side and range side in metres of the rectangular texture cells, fixed
+            for all trials. Each cell has one value of the texture. Neither side should be smaller
+            than a cell of the simulation grid.
+        power_db: Mean power in decibels of one sample of the clutter, in range-compressed data or
+            in data without a range axis. For example, 0 dB with a noise variance of -20 dB is a
+            clutter-to-noise ratio of 20 dB. The mean is over random draws: a single record with few
+            texture cells may have more or less power.
         margin_s: Time by which the surface extends beyond the record at both ends in seconds, fixed
-            for all trials. None extends it as far as the gate illuminates, for an antenna pattern
-            down to half power; the surface is periodic, so that beyond its end the antenna sees the
-            other end. With 0 the period is the length of the record: the simulation is two to three
-            times faster, but the Doppler spectrum has no leakage, unlike that of a real record.
-        lobes: Number of nulls of an antenna pattern, counted from its maximum to either side, up to
-            which it illuminates the surface, fixed for all trials. A sinc pattern has 10 % of its
-            power beyond the first null and 5 % beyond the second. With 2 the simulation needs about
-            twice the Doppler band of 1, and longer lines.
+            for all trials. With None the surface reaches to the edge of the illumination, which for
+            an antenna pattern is taken at half power. The surface is periodic: beyond one end the
+            antenna sees the other end. With 0 the period is the length of the record. The
+            simulation is then two to three times faster, but the Doppler spectrum has no leakage,
+            unlike that of a real record.
+        lobes: Number of nulls of the antenna pattern, to either side of its maximum, up to which
+            the antenna illuminates the surface, fixed for all trials. It has no effect on an
+            illumination without an antenna pattern. A sinc pattern has 10 % of its power beyond the
+            first null and 5 % beyond the second. A simulation with two nulls needs about twice the
+            Doppler band of one with a single null, and longer range lines.
 
     Raises:
         ValueError: If the shape or a side is out of range, or as for `Sea`.
@@ -166,9 +180,10 @@ class KSea(Sea):
             draws: Random draws.
 
         Returns:
-            Table of mean intensities, shape (..., row, column), float64, unity on average; the row
-            of the table for each azimuth, shape (a,) or (..., a), int64; and the column for each
-            range, shape (r,) or (..., r), int64.
+            The tensors table, row and column. Grid cell (i, j) has the mean intensity
+            table[..., row[..., i], column[..., j]]. The table has the shape (..., rows, columns),
+            float64, and unit mean. The indices have the shapes (a,) or (..., a) for row, and (r,)
+            or (..., r) for column, int64.
         """
         row, column = (
             _cells(positions, side) for positions, side in zip((azimuth_m, range_m), self.cell_m, strict=True)
@@ -182,29 +197,32 @@ class KSea(Sea):
 
 @dataclass(frozen=True, eq=False)
 class ImageReflectivity(Sea):
-    """Surface whose mean intensity is an image, under speckle that each trial draws.
+    """Surface whose mean intensity is a given image; each trial draws its own speckle.
 
-    A cell takes the value of the pixel in which it lies; beyond its edges the image is mirrored.
-    Differentiable in the intensity.
+    A cell of the simulation grid takes the value of the pixel in which it lies. Beyond the edges of
+    the image its mirror image follows. The echo is differentiable in the intensity.
 
     Args:
         intensity: Image of shape (..., azimuth, range), an array or a tensor, real and not negative
-            (a complex image counts by its squared magnitude). Its mean is normalised.
+            (of a complex image the squared magnitude is taken). It is divided by its mean.
         azimuth_extent_m: Along-track extent of the image in metres; its middle lies at azimuth
             zero.
         range_extent_m: Range extent of the image in metres; its middle lies at the reference range.
-        power_db: Mean power of one sample of azimuth-only or range-compressed data in decibels.
-            With a noise variance of -20 dB, 0 dB is a clutter-to-noise ratio of 20 dB. It is the
-            mean over draws: a record with few texture cells may have more or less.
+        power_db: Mean power in decibels of one sample of the clutter, in range-compressed data or
+            in data without a range axis. For example, 0 dB with a noise variance of -20 dB is a
+            clutter-to-noise ratio of 20 dB. The mean is over random draws: a single record with few
+            texture cells may have more or less power.
         margin_s: Time by which the surface extends beyond the record at both ends in seconds, fixed
-            for all trials. None extends it as far as the gate illuminates, for an antenna pattern
-            down to half power; the surface is periodic, so that beyond its end the antenna sees the
-            other end. With 0 the period is the length of the record: the simulation is two to three
-            times faster, but the Doppler spectrum has no leakage, unlike that of a real record.
-        lobes: Number of nulls of an antenna pattern, counted from its maximum to either side, up to
-            which it illuminates the surface, fixed for all trials. A sinc pattern has 10 % of its
-            power beyond the first null and 5 % beyond the second. With 2 the simulation needs about
-            twice the Doppler band of 1, and longer lines.
+            for all trials. With None the surface reaches to the edge of the illumination, which for
+            an antenna pattern is taken at half power. The surface is periodic: beyond one end the
+            antenna sees the other end. With 0 the period is the length of the record. The
+            simulation is then two to three times faster, but the Doppler spectrum has no leakage,
+            unlike that of a real record.
+        lobes: Number of nulls of the antenna pattern, to either side of its maximum, up to which
+            the antenna illuminates the surface, fixed for all trials. It has no effect on an
+            illumination without an antenna pattern. A sinc pattern has 10 % of its power beyond the
+            first null and 5 % beyond the second. A simulation with two nulls needs about twice the
+            Doppler band of one with a single null, and longer range lines.
 
     Raises:
         ValueError: If the image has fewer than two dimensions, NaN or negative pixels or a mean of
@@ -244,18 +262,19 @@ class ImageReflectivity(Sea):
         """Read the image from a .npy or .npz file.
 
         Args:
-            path: File.
+            path: Path of the file.
             azimuth_extent_m: Along-track extent of the image in metres.
             range_extent_m: Range extent of the image in metres.
             key: Name of the array in an .npz file, not needed if it holds only one.
-            **changes: Further parameters of the class.
+            **changes: Further parameters of `ImageReflectivity`, by name.
 
         Returns:
             The surface.
 
         Raises:
             FileNotFoundError: If the file does not exist.
-            ValueError: If it holds no such array; the message names the file.
+            ValueError: If the file holds no array of plain numbers with the name `key`, or several
+                arrays and no `key` is given; or as for `ImageReflectivity`.
         """
         return ImageReflectivity(_image(Path(path), key), azimuth_extent_m, range_extent_m, **changes)
 
@@ -268,9 +287,10 @@ class ImageReflectivity(Sea):
             draws: Random draws.
 
         Returns:
-            Table of mean intensities, shape (..., row, column), float64, unity on average; the row
-            of the table for each azimuth, shape (a,) or (..., a), int64; and the column for each
-            range, shape (r,) or (..., r), int64.
+            The tensors table, row and column. Grid cell (i, j) has the mean intensity
+            table[..., row[..., i], column[..., j]]. The table has the shape (..., rows, columns),
+            float64, and unit mean. The indices have the shapes (a,) or (..., a) for row, and (r,)
+            or (..., r) for column, int64.
         """
         image = self.intensity.to(azimuth_m.device)
         row, column = (

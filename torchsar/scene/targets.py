@@ -85,8 +85,8 @@ class Points:
     Args:
         azimuth_m: Azimuths in metres.
         range_m: Ranges in metres.
-        amplitude: Amplitudes, one by default.
-        random_phase: Whether each trial draws phases.
+        amplitude: Amplitudes; by default all are 1.
+        random_phase: Whether each trial draws a random phase for every point.
 
     Raises:
         ValueError: If the lists differ in length or a number is not finite.
@@ -100,7 +100,9 @@ class Points:
     def __post_init__(self) -> None:
         counts = [len(values) for values in (self.azimuth_m, self.range_m, self.amplitude) if values is not None]
         if len(set(counts)) != 1:
-            raise ValueError(f"points need as many ranges (and amplitudes, where given) as azimuths, got {counts}")
+            raise ValueError(
+                f"points need as many ranges (and amplitudes, where given) as azimuths, got lists of lengths {counts}"
+            )
         for name in ("azimuth_m", "range_m", "amplitude"):
             refuse_unless_finite(f"{name} of points", getattr(self, name))
 
@@ -229,7 +231,7 @@ class Together:
     """Several scenes in one.
 
     Args:
-        parts: Scenes by name; each draws its own random numbers, addressed by its name.
+        parts: Scenes by name. The name of a scene decides which random numbers it draws.
     """
 
     parts: Mapping[str, Scene]

@@ -135,8 +135,8 @@ def stacked(values: Sequence[Tensor | float] | Tensor, device: torch.device | st
     """Stack numbers and per-trial tensors along a new last dimension.
 
     Args:
-        values: Numbers or tensors of shape (...,), one per entry; a tensor of shape (..., entry) is
-            only converted.
+        values: Numbers or tensors of shape (...,), one per entry. A single tensor of shape
+            (..., entry) counts as already stacked; only its dtype and device are changed.
         device: Device of the result.
 
     Returns:
@@ -151,11 +151,12 @@ def stacked(values: Sequence[Tensor | float] | Tensor, device: torch.device | st
 
 
 def refuse_other_trials(thing: object, draws: Draws, recording: Recording | None = None) -> None:
-    """Raise ValueError if a per-trial parameter has another length than the trials.
+    """Raise ValueError if a per-trial parameter does not have one value for each trial.
 
-    The trials are those of the recording, otherwise those of the draws. Without either, the
-    parameters must agree among themselves. Parameters are found by their annotations in
-    dataclasses, and in the sequences, mappings and dataclasses that these hold.
+    The number of trials is that of the recording, or that of the draws if the recording has no
+    trials. If neither has trials, all per-trial parameters must have the same length. Parameters
+    are found by their annotations in dataclasses, and in the sequences, mappings and dataclasses
+    that these hold.
 
     Args:
         thing: Dataclass with parameters, such as a world or an impairment.
@@ -163,7 +164,7 @@ def refuse_other_trials(thing: object, draws: Draws, recording: Recording | None
         recording: Recording that an impairment is applied to, None for a world.
 
     Raises:
-        ValueError: If a parameter has neither one value nor one for each trial.
+        ValueError: If a parameter has neither one value for all trials nor one for each trial.
     """
     drawn = () if draws.trials is None else (len(draws.trials),)
     trials = drawn if recording is None else tuple(recording.signal.trials) or drawn
@@ -192,8 +193,9 @@ def repeated(thing: Any, times: int) -> Any:
         times: Number of rows of each trial.
 
     Returns:
-        The object with tensors of shape (trial, ...) as tensors of shape (trial * times, ...), in
-        which the rows of a trial follow each other; without any, the object itself.
+        A copy of the object in which each per-trial tensor of shape (trial, ...) has become one of
+        shape (trial * times, ...); the rows of a trial follow each other. If there is no per-trial
+        tensor, the object itself.
     """
     if not any(shape for _, shape in _per_trial_shapes(thing)):
         return thing

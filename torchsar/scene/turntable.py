@@ -44,11 +44,13 @@ class PhaseOnly:
     ) -> float:
         """Return a bound of the phase difference between this model and the dechirped echo.
 
-        The bound is the sum of the phases of four effects: range migration at the ends of the band
-        (pi x A / dr for a scatterer at the cross range x and a range step dr, where A is the
-        largest rotation angle from the angle zero); the carrier phase that rotation and residual
-        speed accumulate in half a pulse; the same at the ends of the band; and the residual video
-        phase.
+        The bound is the sum of the phases of four effects:
+
+        - range migration, at the ends of the signal band. This is about pi x A / dr, with the cross
+          range x of the scatterer, the largest rotation angle A and the range cell dr = c / (2 B);
+        - motion by rotation and residual speed during half a pulse, at the carrier frequency;
+        - what this motion adds at the ends of the signal band;
+        - the residual video phase.
 
         Args:
             radar: Radar, with a pulse length.
@@ -80,10 +82,10 @@ class PhaseOnly:
     ) -> float:
         """Return the relative error of this model for one scatterer, mean |exp(j phi) - 1|^2 in dB.
 
-        phi is the phase difference between the dechirped echo and this model, without the residual
-        video phase, which compression removes. The mean is over a grid of pulses and of times
-        within the pulse. The Doppler phase within the pulse due to the mean velocity of the
-        reference range (`track` of `Dechirped`) is not counted.
+        phi is the phase of the dechirped echo minus that of this model, and the mean is over a grid
+        of pulses and of times within a pulse. Two parts of phi are left out: the residual video
+        phase, which compression removes, and the Doppler phase within a pulse by the mean velocity
+        of the range that the receiver tracks (`Dechirped.track`).
 
         Args:
             radar: Radar, with a pulse length.
@@ -134,8 +136,9 @@ class Dechirped:
     motion during the time of flight.
 
     Args:
-        track: Motions that the reference of the receiver follows from pulse to pulse. Delays are
-            relative to this reference, whose displacement the recording holds as aux `reference_m`.
+        track: Motions that the reference range of the receiver follows from pulse to pulse. Delays
+            are relative to this reference. The recording holds its displacement in metres in
+            `Recording.aux["reference_m"]`.
     """
 
     track: Sequence[Motion] = ()
@@ -205,8 +208,9 @@ class TurntableWorld:
         fidelity: Model of the echo, `PhaseOnly` or `Dechirped`.
         rotation: Rotation with a changing rate instead of rotation_rad_s; its angle is zero at the
             FIRST pulse.
-        centre_deviation_m: Distance yc: a scatterer at the range y of the window rotates at y + yc
-            from the centre of rotation. Phases follow y + yc, while envelopes stay at y.
+        centre_deviation_m: Range yc in metres from the centre of rotation to the middle of the
+            range window. A scatterer at the range y from the middle of the window lies at the range
+            y + yc from the centre of rotation. Its phase follows y + yc; its envelope lies at y.
 
     Raises:
         TypeError: If the fidelity or the rotation has the wrong type.

@@ -1,8 +1,8 @@
 """Motions of a target along the line of sight, and start phases of pulses.
 
-An effect that does not exist is absent from the list of effects. Displacements are positive away
-from the radar; a displacement d changes the phase by -4 pi d / lambda. Time counts from the first
-pulse.
+A simulation takes motions and start phases as lists; an empty list stands for no such effect.
+Displacements are positive away from the radar; a displacement d changes the phase by
+-4 pi d / lambda. Time counts from the first pulse.
 """
 
 from __future__ import annotations
@@ -45,8 +45,9 @@ class Motion(Protocol):
 class Sinusoid:
     """Sinusoidal vibration, d(t) = A sin(2 pi f t + phase).
 
-    The results of the publication are reproduced with this SINE. With a cosine its vibration
-    `1_0.1_90` (amplitude 1, 0.1 Hz, 90 degrees) would be nearly linear in time and hardly defocus.
+    This SINE reproduces the results of the Reference. With a cosine, the vibration `1_0.1_90` of
+    the Reference (amplitude 1, 0.1 Hz, 90 degrees) would be nearly linear in time and hardly
+    defocus.
 
     Args:
         amplitude_m: Amplitude A in metres.
@@ -71,12 +72,13 @@ class Sinusoid:
 
     @classmethod
     def named(cls, name: str, *, unit: Literal["mm", "um"]) -> Sinusoid:
-        """Return the vibration of a published name amplitude_frequency_phase, such as `1_0.1_90`.
+        """Return the vibration of a name amplitude_frequency_phase as in the Reference: `1_0.1_90`.
 
         Args:
             name: Amplitude in `unit`, frequency in hertz and phase in degrees.
-            unit: "mm" or "um", without a default. The published figures correspond to mm, although
-                1 mm at 100 Hz adds 4 rad within a pulse, which the publication neglects.
+            unit: Unit of the amplitude, "mm" or "um". The figures of the Reference agree with mm,
+                although a vibration of 1 mm at 100 Hz then adds 4 rad within a pulse, which the
+                Reference neglects.
 
         Returns:
             The vibration.
@@ -99,7 +101,7 @@ class Sinusoid:
         return cls(amplitude * _UNIT_M[unit], frequency, phase)
 
     def displacement_m(self, time_s: Tensor) -> Tensor:
-        """Return the displacement; the phase is formed in cycles, which stays exact over hours.
+        """Return the displacement; its phase is reduced to one cycle, and stays exact over hours.
 
         Args:
             time_s: Time since the first pulse in seconds, any shape, float64.
@@ -133,8 +135,8 @@ class Polynomial:
     def __post_init__(self) -> None:
         if not len(self.coefficients_m):
             raise ValueError(
-                "a translation needs at least one coefficient, its velocity in m/s; leave the effect "
-                "out where there is none"
+                "a translation needs at least one coefficient, its velocity in m/s; leave the motion "
+                "out if there is no translation"
             )
         for degree, value in enumerate(self.coefficients_m, start=1):
             refuse_unless_finite(f"coefficient {degree} of a translation", value)
@@ -155,10 +157,10 @@ class Polynomial:
 
 
 def displacement_m(motion: Sequence[Motion], time_s: Tensor) -> Tensor:
-    """Return the sum of motions.
+    """Return the total displacement of several motions.
 
     Args:
-        motion: Motions, none for zero displacement.
+        motion: Motions; an empty sequence gives zero displacement.
         time_s: Time since the first pulse in seconds, any shape, float64.
 
     Returns:
@@ -234,11 +236,11 @@ class UniformStartPhase:
 
 
 def start_phase_rad(effects: Sequence[PulsePhase], draws: Draws, n_pulse: int) -> Tensor:
-    """Draw the sum of start phases.
+    """Draw the start phases of several effects and return their sum.
 
     Args:
-        effects: Start phases; each draws its own random numbers, addressed by its position in the
-            list.
+        effects: Effects. The position of an effect in the list decides which random numbers it
+            draws.
         draws: Random draws.
         n_pulse: Number of pulses.
 

@@ -1,7 +1,8 @@
-"""Experiments that are defined by configs. This package needs the extra `study`.
+"""Experiments that are defined by configs, which are YAML files.
 
-The function `torchsar.study.sweep(trial, grid, ...)` runs any function of Python over a grid of
-parameters, without a config; see `torchsar.study.montecarlo`.
+This package needs optional dependencies: pip install 'torchsar-lab[study]'. The function
+`torchsar.study.sweep(trial, grid, ...)` runs any Python function over a grid of parameters, without
+a config; see `torchsar.study.montecarlo`.
 """
 
 from __future__ import annotations

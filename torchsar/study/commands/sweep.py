@@ -145,8 +145,8 @@ def sweep(
         raise Interrupted(f"finished trials are recorded in {out}; go on with --resume") from None
     except OSError as error:
         raise ConfigError(
-            f"{out}: the report cannot be written ({error.strerror or error}), but the trials are recorded; make the "
-            "report with --resume"
+            f"{out}: the report cannot be written ({error.strerror or error}), but the trials are recorded; run the "
+            "command again with --resume to make the report"
         ) from error
     return out / "report.html"
 
@@ -170,8 +170,8 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     taken = next((name for name in loaded.config.processor if name in (BOUNDS, SAVED)), None)
     if taken is not None:
         raise ConfigError(
-            f"{file}: processor.{taken}: a method of a sweep cannot have this name, which a part of the results has; "
-            "choose another name"
+            f"{file}: processor.{taken}: a method of a sweep cannot have this name, because the results have an entry "
+            "of that name; choose another name"
         )
     for key in given:
         if key.split(".")[0] in _FIXED or key == "world.trials":

@@ -98,7 +98,8 @@ class Grid:
 def address(parameters: Mapping[str, Any]) -> str:
     """Return a hash of the names and values of parameters, in whatever order they are given.
 
-    The random numbers of a point follow from it, so that they are the same in every grid.
+    The random numbers of a grid point follow from this hash. A point therefore has the same random
+    numbers in every grid.
     """
     return hashlib.blake2b(canonical(parameters).encode(), digest_size=12).hexdigest()
 

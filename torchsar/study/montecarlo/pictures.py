@@ -99,13 +99,17 @@ class SweepPictures:
         return [self.labels[name][i] for i in self.order(name)]
 
     def cut(self, array: np.ndarray, panel: Panel, over: str, lead: int = 1) -> np.ndarray:
-        """Return an array along one parameter, with the values of the others that a panel shows.
+        """Return the part of an array that a panel shows over one parameter.
 
         Args:
             array: Array of shape (..., *parameters, ...).
-            panel: The panel.
-            over: Name of the parameter, whose values are sorted; empty for a single point.
+            panel: The panel, which fixes the values of the other parameters.
+            over: Name of the parameter on the axis; empty if the panel fixes all parameters.
             lead: Number of dims before those of the parameters.
+
+        Returns:
+            Array of shape (..., value of `over`, ...), with sorted values; without this dim if
+            `over` is empty.
         """
         index = tuple(self.order(name) if name == over else panel.index[name] for name in self.labels)
         return array[(slice(None),) * lead + index]
@@ -130,7 +134,8 @@ class SweepPictures:
     def curves(self, quantity: Quantity) -> Drawn:
         """Yield curves over each parameter with at least two numeric values.
 
-        Without such a parameter, the curves are over the parameter of words with the most values.
+        Without such a parameter, the curves are over the non-numeric parameter with the most
+        values, and if no parameter has several values, over the algorithms.
         """
         if not np.isfinite(self.values(quantity)).any():
             return
@@ -152,7 +157,10 @@ class SweepPictures:
         return self.figures[quantity.metric][quantity.field]
 
     def part(self, quantity: Quantity, panel: Panel, over: str) -> dict[str, Any]:
-        """Return the data of a panel: each algorithm over one parameter, or all side by side."""
+        """Return the data of a panel: one curve for each algorithm over the parameter `over`.
+
+        If `over` is empty, it is one curve over the algorithms.
+        """
         fields = self.figures[quantity.metric]
         y, interval = (self.cut(fields[name], panel, over) for name in (quantity.field, quantity.interval))
         bounds = self.bounds.get(quantity.metric, {}) if quantity.log else {}
@@ -172,7 +180,7 @@ class SweepPictures:
     def is_log(self, over: str) -> bool:
         """Return whether the axis of a parameter is logarithmic.
 
-        It is, if the values are positive, span at least two decades and are not in dB.
+        It is logarithmic if all values are positive, span at least two decades and are not in dB.
         """
         if over not in self.numeric or over.endswith("_db"):
             return False
@@ -271,12 +279,12 @@ class SweepPictures:
 def main_quantity(metric: str, bounded: bool = False) -> Quantity:
     """Return the statistic of a metric that is drawn, with its kind of axis.
 
-    It is the RMSE on a logarithmic axis for a metric with "error" in its name, unless that is a
-    ratio in dB, and the median for any other metric.
+    For an error, a metric with "error" in its name, it is the RMSE on a logarithmic axis. For any
+    other metric, and for errors in dB, it is the median.
 
     Args:
         metric: Name of the metric.
-        bounded: Whether the metric has lower bounds; the axis of a median is then logarithmic.
+        bounded: Whether the metric has lower bounds. The axis of a median is then logarithmic.
     """
     name, label = name_and_unit(metric)[0], axis_label(metric)
     if "error" in metric and not metric.endswith("_db"):

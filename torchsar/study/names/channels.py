@@ -79,14 +79,14 @@ def rebuild_bands(
     snr_db: float = 40.0,
     range_m: float | None = None,
 ) -> Reconstruct:
-    """Reconstruction of the full Doppler band of a target with given velocities from the channels.
+    """Reconstruction of the full Doppler band from the channels, for a target of given velocities.
 
     Args:
         bands: Number of Doppler bands, each as wide as the PRF, that are separated.
         method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
-            which is also defined where the matrix of the channels is singular.
+            which also works where the least-squares solution is singular.
         band_hz: Width in Hz of the flat Doppler spectrum that "mmse" assumes; None for the spectrum
-            by the antenna pattern of the channels.
+            that the antenna pattern of the channels gives.
         snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
         range_m: Closest range of the targets in m; None for the reference range of the radar.
     """
@@ -99,8 +99,8 @@ def channel_balance(
     """Estimator of phase, gain and delay errors of the channels from stationary clutter.
 
     Args:
-        band_hz: Width in Hz of the flat Doppler spectrum of the clutter; None for the spectrum by
-            the antenna pattern of the channels.
+        band_hz: Width in Hz of the flat Doppler spectrum of the clutter; None for the spectrum that
+            the antenna pattern of the channels gives.
         bands: Number of Doppler bands of the clutter, each as wide as the PRF.
         delays: Whether delays are estimated as well.
     """
@@ -108,8 +108,8 @@ def channel_balance(
 
 
 def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: float | None = None) -> Interferometry:
-    """Estimator of the slant-range speed u_r of a target, with a given along-track speed u_a, by
-    along-track interferometry.
+    """Estimator of the slant-range speed u_r of a target by along-track interferometry, for a given
+    along-track speed u_a.
 
     Args:
         dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
@@ -123,8 +123,8 @@ def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: 
 def along_track_autofocus(
     radar: BistaticRadar, dwell_s: float | None = None, half_m_s: float = 20.0, range_m: float | None = None
 ) -> AlongTrackAutofocus:
-    """Estimator of the along-track speed u_a of a target, whose deramped echo has most power as a
-    tone at the true speed.
+    """Estimator of the along-track speed u_a of a target. Deramping for the true speed turns the
+    echo into a tone; the estimate is the speed that gives the strongest tone.
 
     Args:
         dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
@@ -143,13 +143,14 @@ def likelihood_velocity(
     range_m: float | None = None,
 ) -> LikelihoodVelocity:
     """Maximum-likelihood estimator of the motion of a target by Gauss-Newton steps from given
-    values.
+    initial values.
 
     Args:
         dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
             pattern of the channels.
-        unknowns: Quantities that are estimated, of the speeds u_r_m_s (slant range) and u_a_m_s
-            (along track) and the along-track position y0_m; the others keep their given values.
+        unknowns: Quantities to estimate, any of u_r_m_s (slant-range speed), u_a_m_s (along-track
+            speed) and y0_m (along-track position). Quantities that are not listed keep their given
+            values.
         range_m: Closest range of the target in m; None for that of the strongest range line, or for
             the reference range of the radar if the data have no range axis.
     """
@@ -162,13 +163,15 @@ def gradient_velocity(
     unknowns: tuple[Unknown, ...] = ("u_r_m_s", "u_a_m_s", "y0_m"),
     range_m: float | None = None,
 ) -> GradientVelocity:
-    """Maximum-likelihood estimator of the motion of a target by gradient descent from given values.
+    """Maximum-likelihood estimator of the motion of a target by gradient descent from given initial
+    values.
 
     Args:
         dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
             pattern of the channels.
-        unknowns: Quantities that are estimated, of the speeds u_r_m_s (slant range) and u_a_m_s
-            (along track) and the along-track position y0_m; the others keep their given values.
+        unknowns: Quantities to estimate, any of u_r_m_s (slant-range speed), u_a_m_s (along-track
+            speed) and y0_m (along-track position). Quantities that are not listed keep their given
+            values.
         range_m: Closest range of the target in m; None for that of the strongest range line, or for
             the reference range of the radar if the data have no range axis.
     """
@@ -190,8 +193,8 @@ def moving_point_velocity(
     Args:
         dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
             pattern of the channels.
-        u_r_reach_m_s: Half width of the search in the slant-range speed in m/s; None for 1.5
-            ambiguous velocities.
+        u_r_reach_m_s: Half width of the search in the slant-range speed in m/s; None for 1.5 times
+            the ambiguous velocity of the radar.
         u_a_reach_m_s: Half width of the search in the along-track speed in m/s.
         y0_reach_m: Half width of the search in the along-track position in m.
         u_a_m_s: Along-track speed in m/s if it is known a priori; None to estimate it.
@@ -214,16 +217,16 @@ def intensity_ratio(
     step_m_s: float = 0.5,
     range_m: float | None = None,
 ) -> SignalIntensityRatio:
-    """Estimator of the slant-range speed u_r of a target by the signal intensity ratio: the rebuilt
-    spectrum is most intense inside the processed Doppler band at the true speed.
+    """Estimator of the slant-range speed u_r of a target by the signal intensity ratio. This is the
+    intensity of the rebuilt spectrum inside the processed Doppler band over that outside; it is
+    largest if the spectrum is rebuilt for the true speed.
 
     Args:
-        bandwidth_hz: Doppler bandwidth of the target in Hz.
+        bandwidth_hz: Width of the processed Doppler band in Hz.
         bands: Number of Doppler bands, each as wide as the PRF, that are separated.
         method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
-            which is also defined where the matrix of the channels is singular.
-        search_m_s: Least and largest velocity of the search in m/s; None for all that are
-            unambiguous.
+            which also works where the least-squares solution is singular.
+        search_m_s: Least and largest speed of the search in m/s; None for all unambiguous speeds.
         step_m_s: Step of the search in m/s.
         range_m: Closest range of the targets in m; None for the reference range of the radar.
     """
@@ -245,13 +248,13 @@ def alternate_velocity(
     and of its along-track speed u_a by autofocus.
 
     Args:
-        bandwidth_hz: Doppler bandwidth of the target in Hz.
+        bandwidth_hz: Width of the processed Doppler band in Hz.
         dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
             pattern of the channels.
         bands: Number of Doppler bands, each as wide as the PRF, that are separated.
         method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
-            which is also defined where the matrix of the channels is singular.
-        rounds: Number of times that both are estimated.
+            which also works where the least-squares solution is singular.
+        rounds: Number of rounds; each round estimates u_r and then u_a.
         step_m_s: Step of the search for u_r in m/s.
         half_m_s: Half width of the search interval of u_a about 0, in m/s.
 
@@ -278,12 +281,12 @@ def stationary_image(
     Args:
         bands: Number of Doppler bands, each as wide as the PRF, that are separated.
         method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
-            which is also defined where the matrix of the channels is singular.
+            which also works where the least-squares solution is singular.
         band_hz: Width in Hz of the flat Doppler spectrum that "mmse" assumes; None for the spectrum
-            by the antenna pattern of the channels.
+            that the antenna pattern of the channels gives.
         snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
-        form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
-            ranges.
+        form: "stolt", exact at every range, or "bulk", which corrects all ranges for the range
+            migration of the middle of the swath.
     """
     return StationaryImage(radar, _rebuild(bands, method, band_hz, snr_db), form)
 
@@ -310,21 +313,23 @@ def movers_image(
     Args:
         bands: Number of Doppler bands, each as wide as the PRF, that are separated.
         method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
-            which is also defined where the matrix of the channels is singular.
+            which also works where the least-squares solution is singular.
         band_hz: Width in Hz of the flat Doppler spectrum that "mmse" assumes; None for the spectrum
-            by the antenna pattern of the channels.
+            that the antenna pattern of the channels gives.
         snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
-        removal: "subtract" removes the echo fitted to a target, "zero" all data in its area.
+        removal: "subtract" removes the echo fitted to a target; "zero" removes all data in the area
+            of the target, including the sea.
         integration_s: Time in s for which a scatterer is illuminated.
-        segment_s: Length in s of the segments of slow time into which the echo of a target is
-            divided.
+        segment_s: Length in s of the segments of slow time in which the sea about a target is
+            suppressed.
         half_along_m: Half width of a target along track in m.
         half_range_m: Half width of a target in range in m.
-        threshold_db: Least mean intensity of a target relative to the median of the image, in dB.
+        threshold_db: Least contrast of a target in dB: the mean intensity of a small rectangle of
+            pixels over the median of all such means.
         most: Largest number of targets.
         u_a_reach_m_s: Half width of the search in the along-track speed in m/s.
-        suppressed_m_s: Slant-range speeds in m/s of the images with suppressed sea, in which weaker
-            targets are detected; empty to omit these.
+        suppressed_m_s: Slant-range speeds in m/s for a further image in which the sea is
+            suppressed, so that weaker targets are detected; empty to omit this image.
 
     Reference:
         Remote Sens. 2020, 12, 1703, Fig. 13.

@@ -77,13 +77,14 @@ def rotation_and_phase(
     rotation (`UnevenRotation`) of a target, each from the data after correction of the other.
 
     Args:
-        order: Order of the rotation angle as a polynomial of slow time.
+        order: Degree of the rotation angle as a polynomial of slow time.
         yc_m: Range in metres from the centre of rotation to the zero of the range axis. It is not
             estimated, because the phase errors of the pulses absorb its whole effect.
-        rounds: Number of times that both are estimated.
-        scatterers: Largest number of scatterers that are used.
-        search: Largest number of iterations of the entropy fixed point.
-        polish: Largest number of iterations against the Wiener estimate of the scene.
+        rounds: Number of rounds; each round estimates the phase and then the rotation.
+        scatterers: Largest number of scatterers by which the rotation is estimated.
+        search: Largest number of fixed-point iterations for the phase of least image entropy.
+        polish: Largest number of further iterations for the phase, which compare each pulse with a
+            Wiener estimate of the scene.
     """
     return Alternate(
         rounds,
@@ -147,8 +148,10 @@ def k_sea(
         cnr_db: Clutter-to-noise ratio of a range-compressed sample in dB.
         shape: Shape of the gamma distribution; small for spiky seas.
         cell_m: Along-track and range side of the cells of constant texture in metres.
-        margin_s: Time by which the surface extends beyond the record in s; None for the whole beam.
-        lobes: Number of nulls to either side up to which the antenna pattern is used.
+        margin_s: Time in s by which the surface extends beyond the record at both ends; None to
+            reach to the edge of the illumination.
+        lobes: Number of nulls of the antenna pattern, to either side of its maximum, up to which
+            the antenna illuminates the surface.
     """
     return KSea(power_db=cnr_db, shape=shape, cell_m=cell_m, margin_s=margin_s, lobes=lobes)
 
@@ -170,8 +173,10 @@ def image_sea(
         range_extent_m: Range extent of the image in metres.
         cnr_db: Clutter-to-noise ratio of a range-compressed sample in dB.
         key: Name of the array in an .npz file of several arrays.
-        margin_s: Time by which the surface extends beyond the record in s; None for the whole beam.
-        lobes: Number of nulls to either side up to which the antenna pattern is used.
+        margin_s: Time in s by which the surface extends beyond the record at both ends; None to
+            reach to the edge of the illumination.
+        lobes: Number of nulls of the antenna pattern, to either side of its maximum, up to which
+            the antenna illuminates the surface.
     """
     try:
         return ImageReflectivity.from_file(
@@ -192,7 +197,8 @@ def clock_errors(
     direct_samples: int = 64,
 ) -> SynchronisationError:
     """Phase and delay errors of clocks that drift apart: polynomials of slow time, sinusoids and a
-    random walk from pulse to pulse. A direct path that shows them is recorded as well.
+    random walk from pulse to pulse. The direct signal of the transmitter, which has the same
+    errors, is recorded as well.
 
     Args:
         phase_rad: Polynomial of the phase in rad, rad/s, ...
@@ -201,8 +207,8 @@ def clock_errors(
         delay_s: Polynomial of the delay in s, s/s, ...
         delay_sinusoid_s: Amplitude of a sinusoidal delay in seconds.
         sinusoid_hz: Frequency of the sinusoids in Hz.
-        direct_snr_db: Signal-to-noise ratio of the direct path in dB; None for no noise.
-        direct_samples: Number of samples of the direct path.
+        direct_snr_db: Peak signal-to-noise ratio of the direct signal in dB; None for no noise.
+        direct_samples: Number of range samples of the direct signal in each pulse.
     """
     phase = [
         PolynomialDrift(phase_rad or [0.0]),

@@ -1,7 +1,7 @@
-"""Every name that a config may use: stages, scenes, motions, beams, paths and impairments.
+"""Every name that a config may use for stages and for parts of a world, such as scenes and motions.
 
-A user's own stage joins through the entry point group `torchsar.stages` (name =
-"package.module:Class"); a config has no other way to run code.
+A package of the user adds a stage by an entry point of the group `torchsar.stages` (name =
+"package.module:Class"). A config has no other way to run code.
 """
 
 from __future__ import annotations

@@ -28,8 +28,9 @@ def number(value: Any, sd: Any = None, factor: float = 1.0) -> str:
 
     Args:
         value: A number, a text, a truth value, None, or a list of these.
-        sd: Standard deviation. Both numbers are rounded to its two leading digits; without it the
-            number has four digits.
+        sd: Standard deviation, shown after the value. Both are rounded to the two leading digits of
+            the standard deviation. A value without standard deviation has four significant digits,
+            and a whole number all its digits up to a million.
         factor: Factor of all numbers.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Figures of a run as files, and the figures that are common to all systems."""
+"""Figures of a run as files, and those figures that every kind of experiment has."""
 
 from __future__ import annotations
 

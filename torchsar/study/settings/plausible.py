@@ -1,7 +1,7 @@
 """Checks of the numbers in the sections radar and world of a config, which find most wrong units.
 
-Each number with a unit has a wide range of plausible magnitudes. Relations between numbers, which
-are products of powers, have limits as well.
+Each number with a unit has a wide range of plausible magnitudes. Some products of powers of these
+numbers, such as pulse length times PRF, have limits as well.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ _RELATIONS = (
 
 
 def refuse_implausible(system: str, radar: Any, world: Any, file: str) -> None:
-    """Check that all numbers and their relations are within their limits.
+    """Check that all numbers, and the products of powers of numbers, are within their limits.
 
     Args:
         system: Name of the system.
@@ -149,7 +149,8 @@ def refuse_implausible(system: str, radar: Any, world: Any, file: str) -> None:
         file: Name of the config, for messages.
 
     Raises:
-        ConfigError: With the unit, the accepted range and, if there is one, a likely correction.
+        ConfigError: If a number or a product is not. The message gives the unit, the accepted range
+            and, if there is one, a likely correction.
     """
     if system not in _SYSTEMS:
         return

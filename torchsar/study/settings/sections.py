@@ -165,7 +165,8 @@ class Config(Strict):
         taken = next((name for name in RESERVED if name in self.processor), None)
         if taken is not None:
             raise ValueError(
-                f"processor.{taken}: a method cannot have this name, which a part of the results has; choose another"
+                f"processor.{taken}: a method cannot have this name, because the results have an entry of that name; "
+                "choose another name"
             )
         reference = self.metrics.get("reference")
         named = [*(("beyond_limits", name) for name in self.beyond_limits), ("metrics.reference", reference)]
@@ -241,7 +242,8 @@ def checked(tree: Any, system: Any, file: str) -> Config:
         The complete config.
 
     Raises:
-        ConfigError: In one sentence that names file, key, value and what is accepted.
+        ConfigError: If the config is not valid. The message is one sentence that names file, key,
+            value and what is accepted.
     """
     try:
         config = Config.model_validate(tree)

@@ -35,8 +35,8 @@ class Key:
         type: Type of the value in YAML.
         default: The default in YAML's terms; `...` where the key is required.
         inner: The section or the catalogue that describes the value; None for plain values.
-        many: "mapping" or "sequence" if the value is a mapping of names to such sections, according
-            to the type of the parameter; empty otherwise.
+        many: Type of the parameter, "mapping" or "sequence", if the value in YAML is a mapping of
+            names to several such sections; empty otherwise.
         per_trial: Whether the constructor accepts a tensor with one entry per trial for a number.
         as_tensor: Whether the constructor accepts a tensor for a list of numbers.
     """
@@ -97,7 +97,8 @@ class Section:
             Values of all keys.
 
         Raises:
-            ConfigError: With file, key, value and the accepted values.
+            ConfigError: If the content is not valid. The message gives file, key, value and the
+                accepted values.
         """
         open_keys = [key for key in self.automatic if isinstance(tree, dict) and tree.get(key) == AUTO]
         fixed = {key: value for key, value in tree.items() if key not in open_keys} if open_keys else tree
@@ -199,7 +200,8 @@ class Catalogue:
             The complete entry.
 
         Raises:
-            ConfigError: With file, key, value and the accepted values.
+            ConfigError: If the content is not valid. The message gives file, key, value and the
+                accepted values.
         """
         if isinstance(entry, str):
             entry = {self.key: entry}
@@ -225,13 +227,19 @@ class Catalogue:
         return entry[self.key] in self.sections and self.sections[entry[self.key]].takes_tensor(path, entry)
 
     def describe(self, value: Any) -> dict[str, Any] | None:
-        """Return the config entry that builds such an object, None if no entry has its class."""
+        """Return the config entry that builds an object like `value`.
+
+        The result is None if no entry of the catalogue has the class of `value`.
+        """
         name = next((name for name, target in self.entries.items() if target is type(value)), None)
         return None if name is None else {self.key: name, **_described(value)}
 
 
 def below(given: Given, name: str) -> dict[str, Tensor]:
-    """Return the entries below a name, without the name: below "a" {"a.b": 1} has {"b": 1}."""
+    """Return the entries whose keys begin with a name and a dot, with this beginning removed.
+
+    For the name "a", {"a.b": 1, "c": 2} gives {"b": 1}.
+    """
     return {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{name}.")}
 
 

@@ -156,9 +156,10 @@ def override(
     Args:
         tree: The tree.
         assignments: Overrides key=value, with dotted keys and YAML values.
-        literal: A section whose keys contain dots themselves, the mapping in it with such keys, and
-            the keys of the section without dots. `sweep.world.noise.snr_db=[0, 10]` and
-            `sweep.grid.world.noise.snr_db=[0, 10]` both set the key "world.noise.snr_db".
+        literal: A section, a mapping in this section whose keys contain dots, and the names of the
+            other keys of the section. With ("sweep", "grid", ...) the two overrides
+            `sweep.world.noise.snr_db=[0, 10]` and `sweep.grid.world.noise.snr_db=[0, 10]` both set
+            the single key "world.noise.snr_db" in the section `sweep`.
 
     Raises:
         ConfigError: If an assignment is not of the form key=value, or its key is below a number or

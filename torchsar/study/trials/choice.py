@@ -15,9 +15,9 @@ class Alternative:
         name: Name in tables.
         keys: Keys and values that select it in the mapping of the choice.
         loss: Predicted loss by metric; None if there is no prediction.
-        neglects: The effects that it neglects.
-        effect: Name of the `Requirement` about the same simplification, whose verdict then follows
-            from this loss.
+        neglects: Description of the effects that the alternative neglects.
+        effect: Field `effect` of the `Requirement` about the same simplification; empty if there is
+            none. The verdict of that requirement then follows from `loss`.
     """
 
     name: str
@@ -59,7 +59,8 @@ class Choice:
         alternatives: The alternatives, the cheapest first and the exact one last.
         measured: Function that prepares the measurement of the alternatives, which may take long;
             None if they cannot be measured.
-        yardstick: Exact reference of the losses, if it is none of the alternatives.
+        yardstick: Exact alternative to which losses are relative, if it is not the last one of
+            `alternatives`; None otherwise.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Base of the systems: config sections, world, metrics, limits, choices and pictures of each."""
+"""Base of the systems, the kinds of experiments: their sections, metrics, limits and pictures."""
 
 from __future__ import annotations
 
@@ -81,7 +81,9 @@ class Column:
 
 
 class System(ABC):
-    """Base of the systems, which contain the physics; all other code is common to them.
+    """Base class of the systems. A system is a kind of experiment, such as stripmap SAR.
+
+    It contains the physics of the experiment; all other code is common to the systems.
 
     Class attributes:
         name: Value of the key `system`.
@@ -95,10 +97,11 @@ class System(ABC):
         columns: Metrics in reports.
         target_columns: Metrics of named targets in reports.
         tolerance: Default of the largest acceptable loss, by metric.
-        exact: Keys of the exact alternative, by the key that may be `auto` (see `Choice.at`).
+        exact: For each key that may be `auto` (see `Choice.at`), the keys and values that select
+            the exact alternative.
         images: Axes of signals that are images.
-        address: Name from which the random numbers of runs follow.
-        peak: Measured ratio of the largest tensor of a trial and its raw data.
+        address: Case of the random draws of runs (see `Draws`).
+        peak: Size of the largest tensor of a trial relative to that of its raw data, as measured.
     """
 
     name: ClassVar[str]

@@ -1,5 +1,5 @@
-"""System `geo`: moving points, one at a time, seen by a SAR with several azimuth channels and a far
-transmitter (Remote Sens. 2020, 12, 1703).
+"""Moving point targets, recorded one at a time by a SAR with several azimuth channels and a far
+transmitter: system `geo` (Remote Sens. 2020, 12, 1703).
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Judging:
     """Settings of the metrics.
 
     Args:
-        orders: Number of pulse rates to either side of a target up to which its replicas, which are
-            false targets, are measured.
+        orders: Largest order n of the replicas (false targets) that are measured. The replicas of
+            order n lie n times the PRF in Doppler to either side of a target.
         published_targets: Published values by metric, target and method.
     """
 

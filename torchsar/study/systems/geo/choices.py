@@ -88,7 +88,11 @@ def requirements(bench: Bench) -> Sequence[Requirement]:
 
 
 def use_of(chain: Chain, bench: Bench) -> MultichannelUse:
-    """Return how a chain uses the radar, with the range of velocities of the simulated targets."""
+    """Return what limits and requirements of a chain depend on, besides the radar.
+
+    This is its record, reconstruction, migration correction and estimators, and the spans of
+    velocities and positions of the simulated targets.
+    """
     world, stages = bench.world(), list(_stages(chain))
     rebuilds = [s for s in stages if isinstance(s, Reconstruct)]
     # without a reconstruction the intensity ratio tells bands apart

@@ -34,10 +34,11 @@ class Shot:
 
     Args:
         image: Its image without noise.
-        profile: Cut along azimuth through the peak.
+        profile: Cut along azimuth through the peak, shape (azimuth,).
         along_m: Positions of the cut in metres on the axis x = (V_R - u_a) t, with the speeds along
-            track V_R of the receiver and u_a of the target.
-        spectrum: Rebuilt spectrum over Doppler frequency from its centre.
+            track V_R of the receiver and u_a of the target, shape (azimuth,).
+        spectrum: Magnitude of the rebuilt spectrum over the Doppler frequency in Hz, which counts
+            from the centre of the spectrum; root of the sum of powers over range.
     """
 
     image: Signal

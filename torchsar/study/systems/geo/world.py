@@ -1,4 +1,4 @@
-"""Moving points before several channels: section `world` of a config, and its echoes."""
+"""Moving points recorded by several channels: section `world` of a config, and its echoes."""
 
 from __future__ import annotations
 
@@ -47,8 +47,9 @@ class Level:
 
     Args:
         snr_db: Power of a target over noise in a sample of one channel after range compression.
-        raw_scnr_db: The same before range compression, which adds 10 log10(B tau_p) with the
-            bandwidth B and the length tau_p of a pulse.
+        raw_scnr_db: Power of a target over noise in a sample of one channel before range
+            compression. Compression raises it by 10 log10(B tau_p) dB, with the bandwidth B and the
+            length tau_p of a pulse.
         scr_db: Power of a target over that of the sea in a sample after range compression.
     """
 
@@ -66,8 +67,8 @@ class Level:
 
 
 class Own(NamedTuple):
-    """What metrics need: the impaired echo of the targets alone, their SNR (row,) in dB, and the
-    world with the numbers of each row.
+    """What metrics need: the impaired echo of the targets alone, their SNR in dB, shape (row,), and
+    the world with the parameters of each row. A row is one target in one trial.
     """
 
     alone: Recording
@@ -82,14 +83,15 @@ class Own(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Points(World):
-    """True motion of points, sea and noise. Every target is recorded alone, with random numbers
-    of its own, which depend on its name.
+    """World of moving point targets, a sea and noise. Every target is recorded alone, with random
+    numbers of its own, which depend on its name.
 
     Args:
         pulses: Number of pulses of the record.
-        samples: Number of range samples; null for azimuth-only data, the range line of a target.
-        kind: compressed for range-compressed data, or full for chirps, which need more samples
-            by two pulse lengths.
+        samples: Number of range samples; null for azimuth-only data, a single range line through
+            the target.
+        kind: "compressed" for range-compressed data, or "full" for uncompressed chirps. Chirps need
+            more range samples, by twice the length of a pulse.
         targets: Point targets by name.
         gate: Illumination of the targets over slow time.
         sea: Clutter of a sea at rest; null for none.
@@ -135,7 +137,7 @@ class Points(World):
         if self.samples is None and (self.kind == "full" or beyond):
             raise ValueError(
                 "world.samples: azimuth-only data (null) have a single range, the reference_range_m of the radar; "
-                "give samples, or omit range_m and kind: full"
+                "give a number of samples, or leave out range_m of the targets and 'kind: full'"
             )
 
     @property

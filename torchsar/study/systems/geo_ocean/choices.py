@@ -107,7 +107,7 @@ def _swath_limits(bench: Bench, name: str) -> list[Limit]:
 
 
 def choices(bench: Bench) -> list[Choice]:
-    """Return the choices between alternatives: the form of the image of what is at rest, and the
+    """Return the choices between alternatives: the form of focusing for what is at rest, and the
     settings by which the recommended method images moving ships.
     """
     radar, world, lit = bench.radar, bench.world(), _integration_s(bench) or _PATTERN_S

@@ -34,7 +34,8 @@ class Vessel:
         u_a_m_s: Speed along the track in m/s, positive in the direction of the receiver.
         azimuth_m: Position of its middle along the track in metres at t = 0, the middle pulse.
         range_m: Closest range of its middle in metres beyond the reference range.
-        scr_db: Mean power of a sample of one of its range lines over that of the sea in dB.
+        scr_db: Signal-to-clutter ratio in dB: mean power of the ship over that of the sea, in a
+            sample of a range line that the ship covers.
         length_m: Length along the track in metres.
         range_cells: Number of range lines that it covers.
         count: Number of its scatterers.
@@ -66,9 +67,10 @@ class Frame:
 
     Args:
         ships: Ships by name.
-        still: Recording without ships that move, shape (channel, pulse, range), with the range to
-            the transmitter removed.
-        images: Images of `still` by reconstruction and form, added when they are first needed.
+        still: Recording without ships that move, shape (channel, pulse, range), without the phase
+            of the path to the transmitter.
+        images: Images of `still` by their reconstruction of Doppler bands and form of focusing;
+            each is made when it is first needed.
     """
 
     ships: Mapping[str, ShownShip]
@@ -117,9 +119,12 @@ class Ocean(World):
         Args:
             radar: The instrument.
             draws: Random numbers; those of a ship depend on its name.
-            extraction: Extent of a ship in the data, for images of its own echo.
+            extraction: Extent of a ship in the data, for the reference image of this ship alone.
             dtype: Complex type of the recording.
             device: Device of the computation.
+
+        Returns:
+            Recordings and true values; `own` holds one `Frame` for each trial.
         """
         trials = list(draws.trials if draws.trials is not None else [0])
         cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)

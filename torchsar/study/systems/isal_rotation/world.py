@@ -50,8 +50,8 @@ class Rotating(Target):
             )
         if not bool((torch.as_tensor(self.rotation.omega_rad_s) > 0).all()):
             raise ValueError(
-                f"world.rotation.omega_rad_s must be positive, got {self.rotation.omega_rad_s}; the data "
-                "depend on its square alone"
+                f"world.rotation.omega_rad_s must be positive, got {self.rotation.omega_rad_s}; a "
+                "negative rate would only mirror the image in cross range"
             )
 
     def of(self, radar: InverseRadar) -> TurntableWorld:
@@ -73,9 +73,13 @@ class Rotating(Target):
         return names
 
     def noise_std(self, amplitude: Tensor) -> float:
-        """Return the standard deviation of the noise in a sample.
+        """Return the standard deviation of the noise in a sample; 0 without noise.
 
-        It follows from the SNR and the power of all scatterers, as the mean over range cells.
+        The SNR is the total power of the scatterers, divided by the number of range cells, over the
+        noise variance.
+
+        Args:
+            amplitude: Amplitudes of all scatterers.
         """
         snr_db = self.noise.snr_db
         if snr_db is None:

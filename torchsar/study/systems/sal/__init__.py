@@ -52,9 +52,9 @@ class Judging:
     Args:
         reference: Method whose image of the same scene is the ideal one; null for none.
         target: Point target whose impulse response is measured and drawn; null for none.
-        sidelobe_nulls: Extent of the measured side lobes in spacings of the nulls.
-        search_m: Largest distance in metres at which a response is sought from its predicted
-            position.
+        sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
+            of a rectangular band.
+        search_m: Half width in metres of the search for a response about its predicted position.
         published: Published values by metric, case and method.
     """
 

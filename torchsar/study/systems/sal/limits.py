@@ -1,4 +1,4 @@
-"""Limits of ladar methods, what simplified echo models neglect, and how they compare."""
+"""Limits of ladar methods, what echo models neglect, and how models and estimators compare."""
 
 from __future__ import annotations
 
@@ -49,10 +49,11 @@ _MODELS = (
 
 
 def moved(bench: Bench) -> Moved:
-    """Return scatterers and motion in the first trial of a run, as far as the ladar observes them.
+    """Return the strongest scatterers within the range gate, and the motion, of the first trial.
 
     Raises:
-        ValueError: If the ladar observes no scatterer, or one is where no sweep can show it.
+        ValueError: If no scatterer lies within the gate, or one within it lies behind the ladar or
+            has a beat frequency that aliases.
     """
     world, radar, draws = bench.world(), bench.radar, Draws(bench.config.seed, "run", [0])
     motion = drawn_motion(world.motion, draws, world.periods * radar.pulse_step_s)
@@ -60,7 +61,7 @@ def moved(bench: Bench) -> Moved:
 
 
 def limits(bench: Bench, seen: Moved) -> dict[Limit, list[str]]:
-    """Return the limits of methods in this scene, with the methods that each stops."""
+    """Return the limits of methods in this scene, with the methods that each concerns."""
     world, radar, e = bench.world(), bench.radar, seen.extremes
     apart = torch.diff(torch.unique(seen.range_m))
     snr_db = world.noise.snr_db
@@ -155,7 +156,8 @@ def _estimates(bench: Bench) -> Measured:
     found = [name for name, stage in chain.stages.items() if "velocity_m_s" in getattr(stage, "provides", ())]
     if not found:
         raise ValueError(
-            "processor.recommended estimates no velocity, so that nothing can be compared; add such a stage"
+            "processor.recommended estimates no velocity, which the comparison of velocity estimators needs; add a "
+            "stage that estimates velocity_m_s"
         )
     sweeps = chain.trace(trials.recording).inputs[found[0]]
     window, true = getattr(chain.stages[found[0]], "window_m", None), trials.truth["velocity_m_s"]

@@ -76,8 +76,11 @@ class StripProbe:
         return simulate(self.radar, replace(self.world, **changes), *self.size, Draws(0), dtype=dtype)
 
     def seen(self) -> tuple[Signal, PointPatches, tuple[Tensor, Tensor]]:
-        """Return raw data in double precision, the image patches about the points, and the pair of
-        Doppler (Hz) and velocity (m/s).
+        """Simulate the points in double precision.
+
+        Returns:
+            The raw data; the patches of an image about the points; and the true Doppler of the beam
+            centre (Hz) and velocity (m/s).
         """
         recording, truth = self.recorded(torch.complex128)
         of = truth.values

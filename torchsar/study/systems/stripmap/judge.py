@@ -51,7 +51,8 @@ class Judging:
         margin: Edges of the image that the metrics leave out; None for lines without a full
             aperture and samples without a full pulse.
         reference: Name of the method with which images and peaks are compared.
-        sidelobe_nulls: Extent of the side lobes that are measured, in spacings of the nulls.
+        sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
+            of a rectangular band.
         found_within_m: Largest distance in metres between the peak and the true position of a
             target that counts as found.
         found_above_db: Lowest peak of a target that counts as found, in dB relative to the
@@ -89,7 +90,13 @@ def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[s
 
 @dataclass(frozen=True)
 class Used:
-    """Parameters that the focusing stage of a chain used, of shape (trial,) each."""
+    """Parameters that the focusing stage of a chain used, of shape (trial,) each.
+
+    Args:
+        doppler_hz: Doppler centroid in Hz; None if the stage used none.
+        velocity_m_s: Velocity in m/s.
+        frame_hz: Doppler frequency in Hz to which the image coordinates refer.
+    """
 
     doppler_hz: Tensor | None
     velocity_m_s: Tensor
