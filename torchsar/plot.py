@@ -250,7 +250,7 @@ def level(signal: Signal, percentile: float = 100.0, width: float = _PANEL) -> f
         width: Width of the figure in inches, on which the averaging in blocks depends.
 
     Returns:
-        The amplitude; 1 where the signal is zero.
+        The amplitude; if the percentile is zero, the peak, and if that is zero, 1.
     """
     amplitude = quicklook(_first(signal), round(_BLOCKS_PER_INCH * width)).data.cpu().numpy()
     return float(np.percentile(amplitude, percentile)) or float(amplitude.max(initial=0.0)) or 1.0
@@ -294,9 +294,9 @@ def _below(percentile: float) -> str:
 def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", percentile: float = 99.9) -> Figure:
     """Draw an image or raw data in dB, range horizontal, azimuth or slow time vertical.
 
-    Both axes have one scale where they have the same unit and the image is not too elongated. 0 dB
-    is a high percentile of the amplitude, so that a few bright ships do not darken the land; the
-    percentile 100, the peak, suits scenes of points. The first trial of a batch is drawn.
+    Both axes have one scale if they have the same unit and the image is not too elongated. 0 dB is
+    a high percentile of the amplitude, so that a few bright targets do not darken all the rest. For
+    scenes of points, choose percentile 100, the peak. The first trial of a batch is drawn.
 
     Args:
         signal: Signal with two axes, shape (..., azimuth, range).
@@ -480,8 +480,8 @@ def scatterers(
 ) -> Figure:
     """Draw the point scatterers of a scene at their positions.
 
-    With one scale on both axes, an axis along which the points hardly differ still shows at least a
-    quarter of the extent of the other axis.
+    With one scale on both axes, each axis shows at least a quarter of the extent of the other, even
+    if the points hardly differ along it.
 
     Args:
         x: Horizontal positions, shape (n,).

@@ -1,11 +1,14 @@
 """Conventional imaging of the stationary scene from all channels over the whole swath.
 
-For a stationary point, the channel at the along-track position dx_m is the reference channel
-delayed by dx_m / V_R, exactly and at every range frequency, with the speed V_R of the receiver. The
-Doppler bands can therefore be reconstructed with zero target velocity before any migration is
-corrected. The rest is ordinary focusing of an unaliased stripmap: a path that is travelled once
-equals one that is travelled both ways by waves of twice the speed, so that the monostatic omega-K
-algorithm applies unchanged.
+The transmit range has been removed from the data, so that only the receive path remains. For a
+stationary point, the data of the channel at the along-track position dx_m are then those of a
+channel at position 0, delayed by dx_m / V_R in slow time, where V_R is the speed of the receiver.
+This holds exactly, at every range frequency. The full Doppler band can therefore be reconstructed
+with zero target velocity before any migration is corrected.
+
+The reconstructed data are those of an unaliased stripmap. Waves travel the receive path only once.
+A monostatic radar, whose waves travel it twice, has the same phases if the waves are twice as fast.
+The monostatic omega-K algorithm with twice the wave speed therefore applies unchanged.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Figs. 6 and 7 (conventional processing) and section 4.3.
@@ -30,15 +33,17 @@ FORMS: dict[str, Callable[..., Tensor]] = {"bulk": omega_k, "stolt": omega_k_sto
 
 
 def two_way_radar(radar: BistaticRadar, bands: int, near_range_m: float) -> StripmapRadar:
-    """Return the monostatic stripmap radar whose two-way phases equal those of the receive path.
+    """Return a monostatic stripmap radar with the phases of the receive path.
+
+    Its waves travel the path twice, at twice the wave speed.
 
     Args:
         radar: Instrument.
-        bands: Number of reconstructed bands; the PRF of the result is bands * PRF.
+        bands: Number of reconstructed Doppler bands; the PRF of the result is bands * PRF.
         near_range_m: Range of the first sample in metres.
 
     Returns:
-        A radar that looks broadside with waves of twice the speed.
+        A radar that looks broadside.
     """
     return StripmapRadar(
         carrier_hz=radar.carrier_hz,
@@ -65,12 +70,12 @@ def stationary_image(
     The image is as long as the record and wraps around in azimuth. A point of amplitude 1 and
     closest range R0 that is illuminated for T seconds has a peak of T sqrt(V_R^2 / (lambda R0)) and
     the phase -2 pi (R0 - R_ref) / lambda, with the speed V_R of the receiver and the reference
-    range R_ref of the radar. A moving point of slant-range speed u_r and relative speed V appears
-    displaced by V_R u_r R0 / V^2 in azimuth, defocused and with false targets. Differentiable in
-    the data.
+    range R_ref of the radar. A moving point of slant-range speed u_r and along-track speed u_a
+    appears displaced by V_R u_r R0 / V^2 in azimuth, where V^2 = (V_R - u_a)^2 + u_r^2. It is
+    defocused and accompanied by false targets. Differentiable in the data.
 
     Args:
-        data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
+        data: Range-compressed channels with the transmit range removed, shape (..., channel, pulse,
             range), complex.
         radar: Instrument.
         near_range_m: Range of the first sample in metres.
@@ -78,15 +83,15 @@ def stationary_image(
         form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
             ranges.
         band_hz: Processed Doppler bandwidth about zero in Hz, None for the whole reconstructed
-            band, bands * PRF.
+            band of rebuild.bands * PRF.
 
     Returns:
-        Image (..., azimuth, range), complex, with azimuth x = V_R t; the range is the closest range
-        R0.
+        Image (..., azimuth, range), complex. Azimuth is x = V_R t with the slow time t, range is
+        the closest range R0.
 
     Raises:
         ValueError: If `form` is unknown, the data do not have the channels of the radar, or there
-            are too few channels for the bands.
+            are fewer channels than the reconstruction needs.
     """
     rebuild = LeastSquares() if rebuild is None else rebuild
     spectrum = reconstruct_lines(data, radar, PointMotion.of(radar, data.real), rebuild)
@@ -106,10 +111,11 @@ def focus_stationary(
     This is the second half of `stationary_image`.
 
     Args:
-        spectrum: Spectra about zero Doppler, shape (..., bands * pulse, range), complex.
+        spectrum: Spectra of range lines in rising order of Doppler, zero Doppler at bin n // 2 of
+            n = bands * pulse, shape (..., bands * pulse, range), complex.
         radar: Instrument.
         near_range_m: Range of the first sample in metres.
-        bands: Number of bands.
+        bands: Number of reconstructed Doppler bands.
         form: "stolt" or "bulk", see `stationary_image`.
         band_hz: Processed Doppler bandwidth about zero in Hz, None for the whole reconstructed
             band.
@@ -134,14 +140,14 @@ class StationaryImage(Stage):
 
     Args:
         radar: Instrument.
-        rebuild: Reconstruction method, `LeastSquares()` by default.
+        rebuild: Reconstruction method, `LeastSquares(2)` by default.
         form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
             ranges.
         band_hz: Processed Doppler bandwidth about zero in Hz, None for the whole reconstructed
-            band, bands * PRF.
+            band of rebuild.bands * PRF.
 
     Raises:
-        ValueError: If there are too few channels for the bands.
+        ValueError: If there are fewer channels than the reconstruction needs.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -176,8 +182,9 @@ class StationaryImage(Stage):
         """Focus a Doppler spectrum that was reconstructed from `signal` by any method.
 
         Args:
-            spectrum: Spectrum about zero Doppler, shape (..., doppler, range), complex.
-            signal: Channels from which it was reconstructed, which give the axes.
+            spectrum: Spectrum as in `focus_stationary`, shape (..., doppler, range), complex.
+            signal: Channels from which the spectrum was reconstructed; their axes give those of the
+                image.
 
         Returns:
             Image with the axes (azimuth, range) in metres.
@@ -195,7 +202,7 @@ def stationary_axis(radar: BistaticRadar, pulse: Axis, bands: int) -> Axis:
     Args:
         radar: Instrument.
         pulse: Slow-time axis of the data.
-        bands: Number of bands; the image has bands * pulse samples.
+        bands: Number of reconstructed Doppler bands; the image has bands * pulse samples.
 
     Returns:
         Azimuth axis of the image.
@@ -206,13 +213,13 @@ def stationary_axis(radar: BistaticRadar, pulse: Axis, bands: int) -> Axis:
 
 
 def bulk_error_db(radar: BistaticRadar, bands: int, half_swath_m: float, integration_s: float) -> float:
-    """Predict the error at the edge of the swath if migration is corrected as in its middle.
+    """Predict the error of a "bulk" image at the edge of the swath, for a point at rest.
 
-    The error is that of a point at rest in an image of the form "bulk", see `stationary_image`.
+    The form "bulk" of `stationary_image` corrects the migration of mid-swath at all ranges.
 
     Args:
-        radar: Receiver.
-        bands: Doppler bands that are reconstructed.
+        radar: Instrument.
+        bands: Number of reconstructed Doppler bands.
         half_swath_m: Half width of the swath in metres.
         integration_s: Integration time in seconds.
 
@@ -232,12 +239,13 @@ def swath_limit(
     range_m: float,
     integration_s: float,
 ) -> Limit:
-    """Return the limit of the half swath for finding ships of any unambiguous velocity.
+    """Return how wide a swath must be so that its ships can be found.
 
-    The swath must hold the extracted data of each ship, its curvature and its largest range walk.
+    For each ship, the swath must hold the data that are extracted about it, its range curvature,
+    and its range walk at a slant-range speed of up to lambda PRF / 2.
 
     Args:
-        radar: Receiver.
+        radar: Instrument.
         half_swath_m: Half width of the swath in metres.
         positions_m: Along-track position of each ship, and its range from the middle of the swath,
             in metres.
@@ -245,7 +253,7 @@ def swath_limit(
         integration_s: Integration time in seconds.
 
     Returns:
-        Limit with the half width of this scene and its least value.
+        Limit that compares `half_swath_m` with the least half width needed.
     """
     curve = (integration_s * radar.speed_m_s) ** 2 / (8 * radar.reference_range_m)
     walks = [

@@ -35,15 +35,15 @@ def estimate_synchronisation(direct: Tensor, radar: BistaticRadar) -> Estimate:
 
     Args:
         direct: Direct path, range compressed at the sampling rate of the echoes, shape (..., pulse,
-            sample), complex: a rectangular band of the width of the pulse whose peak lies at sample
-            n // 2 when the clocks agree.
+            sample), complex. Its spectrum is flat over the bandwidth of the pulse. Its peak lies at
+            sample n // 2 of n when the clocks agree.
         radar: Instrument.
 
     Returns:
         `phase_rad` in -pi..pi and `delay_s` in seconds, shape (..., pulse) each, with their
         standard deviations. `info` holds `snr_db` (..., pulse), the SNR of the compressed peak
-        within the band. `ok` is False in a trial where the SNR of a pulse is below 10 dB; phase and
-        delay of such pulses are zero.
+        within the band. `ok` is False in a trial where the SNR of any pulse is below 10 dB; the
+        phase and the delay of such a pulse are zero.
 
     Raises:
         ValueError: If the direct path is not complex, or has fewer than 8 samples.

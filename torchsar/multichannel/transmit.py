@@ -1,9 +1,9 @@
 """Removal of the transmit range from the phase of every pulse.
 
 Reference:
-    Remote Sens. 2020, 12, 1703, Eqs. (8)-(14), (31). The transmit range does not depend on the
-    channel, so that its removal by the ephemeris is exact; the scaling of Eq. (31) leaves the
-    linear term, which then belongs to the channel response.
+    Remote Sens. 2020, 12, 1703, Eqs. (8)-(14), (31). The transmit range is the same for all
+    channels, so that its removal with the ephemeris is exact (`remove_transmit_range`). Eq. (31)
+    leaves its linear term in the data (`scale_azimuth`).
 """
 
 from __future__ import annotations
@@ -45,8 +45,9 @@ def remove_transmit_range(
 
     Data are multiplied by exp(+j 2 pi / lambda (R_T(t) - R_T(0))) where the change of the transmit
     range is R_T(t) - R_T(0) = k1 t + k2 t^2 + .... This is exact, since the transmit range is
-    common to all channels. Envelopes stay, since the receive window follows the transmit range.
-    Differentiable in data and coefficients.
+    common to all channels. Envelopes are not shifted: the receive window follows the transmit
+    range, so that their positions depend on the receive path alone. Differentiable in data and
+    coefficients.
 
     Args:
         data: Channels, shape (..., channel, pulse, range), or (..., channel, pulse) if `with_range`
@@ -75,15 +76,18 @@ def remove_transmit_range(
 def scale_azimuth(
     data: Tensor, radar: BistaticRadar, time_s: Tensor, motion: PointMotion, order: int = 4, with_range: bool = True
 ) -> Tensor:
-    """Remove the transmit range beyond k1 t by azimuth nonlinear chirp scaling, Eq. (31).
+    """Remove all but the linear term of the transmit range by azimuth nonlinear chirp scaling.
+
+    Prefer `remove_transmit_range`, which is exact and removes the linear term as well.
 
     With the transmit range k1 t + k2 t^2 + ... over slow time t, data of channel m at the
     along-track position dx_m are multiplied by exp(j pi (q2 t'^2 + q3 t'^3 + q4 t'^4)), where t' =
-    t - dx_m / v_e, v_e is the relative sensor velocity, and q_i = 2 k_i / lambda. The term k1 t
-    remains; it centres the Doppler at (u_r - k1) / lambda for the slant-range speed u_r and belongs
-    to the channel response, Eq. (34): use `reconstruct(..., left_k1_m_s=k1)`. The phase due to 2 k2
-    t dx_m / v_e is neglected; it reaches 0.006 rad at the ends of an aperture of 4.5 s. The
-    function is differentiable. `remove_transmit_range` is exact and should be preferred.
+    t - dx_m / v_e, v_e is the relative sensor velocity of Eq. (25), and q_i = 2 k_i / lambda. The
+    shift dx_m / v_e leaves a phase error 4 pi k2 t dx_m / (lambda v_e), at most 0.006 rad at the
+    ends of an aperture of 4.5 s in the geometry of the reference.
+
+    The term k1 t remains in the data and moves the Doppler centre to (u_r - k1) / lambda for the
+    slant-range speed u_r. `reconstruct(..., left_k1_m_s=k1)` takes it into account. Differentiable.
 
     Args:
         data: Channels as in `remove_transmit_range`.
@@ -97,7 +101,7 @@ def scale_azimuth(
         Data of the same shape.
 
     Reference:
-        Remote Sens. 2020, 12, 1703, Eq. (31).
+        Remote Sens. 2020, 12, 1703, Eqs. (25), (31), (34).
     """
     delay = radar.channels_at(data.device) / motion.effective_m_s[..., None]
     higher_orders = (0.0, *radar.transmit_range[1:order])
@@ -107,14 +111,13 @@ def scale_azimuth(
 
 
 def neglected_transmit_phase_rad(radar: BistaticRadar, order: int, integration_s: float) -> float:
-    """Return a bound of the phase that higher orders of the transmit range contribute.
+    """Bound the phase due to the powers of slow time above `order` in the transmit range.
 
-    Orders are powers of slow time; those above `order` are counted, each at the ends of the
-    integration time.
+    The bound is the sum of the magnitudes of these terms at the ends of the integration time.
 
     Args:
         radar: Instrument.
-        order: Highest order that is removed and does not count.
+        order: Highest power that is removed.
         integration_s: Integration time centred on t = 0 in seconds.
 
     Returns:
@@ -137,10 +140,10 @@ def _over_range(phasor: Tensor, with_range: bool) -> Tensor:
 class RemoveTransmitRange(Stage):
     """Stage that removes the transmit range with the ephemeris coefficients of the radar.
 
-    See `remove_transmit_range`. A warning is given where the coefficients beyond k1 that are left
-    out contribute a phase above 0.3 rad at the ends of the data. Two coefficients (k1 t and k2 t^2)
-    are enough for apertures below 20 s: in the geometry of the paper all others contribute 2.7e-4
-    rad in 4.5 s.
+    See `remove_transmit_range`. A warning is given where the coefficients from k2 on that `order`
+    leaves out contribute a phase above 0.3 rad at the ends of the data. Two coefficients (k1 t and
+    k2 t^2) are enough for a geosynchronous transmitter at L band and apertures below 20 s; all
+    others contribute less than 0.03 rad.
 
     Args:
         radar: Instrument.
@@ -184,10 +187,10 @@ class RemoveTransmitRange(Stage):
 
 
 class AzimuthScaling(Stage):
-    """Stage that removes the transmit range beyond its linear term, as in the paper.
+    """Stage that removes the transmit range, except its linear term, by azimuth chirp scaling.
 
-    See `scale_azimuth`. The linear term k1 t stays in the data; `RemoveTransmitRange` removes it as
-    well and is exact.
+    See `scale_azimuth`. Prefer `RemoveTransmitRange`, which is exact and removes the linear term
+    k1 t as well.
 
     Args:
         radar: Instrument.
@@ -195,6 +198,9 @@ class AzimuthScaling(Stage):
 
     Raises:
         ValueError: If `order` lies outside 2 to 4.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eq. (31).
     """
 
     works_on = ("channel", "pulse")
@@ -204,13 +210,13 @@ class AzimuthScaling(Stage):
         super().__init__()
         if not 2 <= order <= 4:
             raise ValueError(
-                "order must be 2, 3 or 4, since azimuth scaling removes orders 2 to 4 of the transmit range (Eq. 31), "
+                "order must be 2, 3 or 4, since azimuth scaling removes orders 2 to 4 of the transmit range, "
                 f"got {order}"
             )
         self.radar, self.order = radar, order
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0) -> Signal:
-        """Remove the transmit range beyond its linear term for the motion of each trial.
+        """Remove the transmit range, except its linear term, for the motion of each trial.
 
         Args:
             signal: Channels with the axes (channel, pulse[, range]).

@@ -1,7 +1,7 @@
 """Gradient descent of a smooth cost per trial: L-BFGS and Adam.
 
-All trials are evaluated together, but each has its own line search and history, and ends
-independently of the others.
+All trials are evaluated together, but each follows its own search and ends independently of the
+others.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def lbfgs(
             Gradients come from autograd, also under no_grad.
         start: First point, shape (..., n), float32 or float64.
         steps: Largest number of steps of a trial.
-        history: Number of stored pairs of moves and gradient changes. Pairs without positive
-            curvature are dropped.
+        history: Number of stored pairs of a step and its change of the gradient. Pairs without
+            positive curvature are dropped.
         gradient_tolerance: A trial has converged when its gradient norm is at most this fraction of
             that at the start.
         value_tolerance: A trial has converged when a step lowers the cost by at most this fraction

@@ -30,7 +30,7 @@ def differential_evolution(
 
     In each generation every candidate competes with a challenger, and the better of the two is
     kept. The challenger takes each unknown from base + weight * (one - other) with the probability
-    `crossover`, at least one of them, and the rest from the candidate; base, one and other are
+    `crossover`, but at least one unknown, and the rest from the candidate; base, one and other are
     three further candidates. An unknown beyond a bound is set to that bound. A trial takes
     population * (generations + 1) evaluations, 888 by default.
 
@@ -41,8 +41,8 @@ def differential_evolution(
         high: Greatest values of the unknowns, shape (..., n).
         population: Number of candidates, at least 4.
         generations: Number of generations.
-        draws: Random numbers; with as many trials as the bounds, or without trials for the same
-            numbers in every trial. Results do not depend on how trials are batched.
+        draws: Source of random numbers for as many trials as the bounds have. If `draws.trials` is
+            None, all trials use the same numbers. Results do not depend on how trials are batched.
         strategy: "rand1bin" draws the base at random, "best1bin" takes the best candidate.
         weight: Factor on the difference of two candidates, above 0 and at most 2.
         crossover: Probability that an unknown of the challenger is not that of the candidate.

@@ -50,8 +50,8 @@ def genetic(
         high: Greatest values of the unknowns, shape (..., n).
         population: Number of candidates.
         generations: Number of generations.
-        draws: Random numbers; with as many trials as the bounds, or without trials for the same
-            numbers in every trial. Results do not depend on how trials are batched.
+        draws: Source of random numbers for as many trials as the bounds have. If `draws.trials` is
+            None, all trials use the same numbers. Results do not depend on how trials are batched.
         elites: Number of best candidates that survive a generation.
         selection: "tournament" takes the best of `entrants` candidates drawn with replacement;
             "roulette" draws with a probability proportional to how far the cost of a candidate lies

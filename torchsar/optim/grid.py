@@ -37,7 +37,8 @@ def grid_search(
 
     Raises:
         TypeError: If an axis is not a real floating tensor.
-        ValueError: If the grid has more than `limit` points, or an axis is empty or not finite.
+        ValueError: If the grid has more than `limit` points, `block` is below 1, there are no axes,
+            or an axis is empty or not finite.
     """
     axes = _checked(axes)
     shape = torch.broadcast_shapes(tuple(trials), *(axis.shape[:-1] for axis in axes))

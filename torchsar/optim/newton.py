@@ -28,22 +28,24 @@ def newton(
 ) -> Descent:
     """Minimise a smooth cost of few unknowns per trial by Newton's method.
 
-    With `damped` a multiple of the identity is added to the Hessian H (Levenberg), so that a
-    negative least eigenvalue changes its sign, and the least eigenvalue is at least 1e-6 of the
-    largest magnitude. The step is then halved until the cost falls (Armijo). Without `damped` the
-    step is -H^-1 gradient, which can also lead to maxima and saddles, and diverges where H is near
-    singular. Remote Sens. 2025, 17, 3447 reports this behaviour for its "Gauss-Newton" method. (An
-    entropy is not a sum of squares, so that no Gauss-Newton method in the strict sense exists for
-    it.) The result carries no gradient; torch.func.vmap is not supported.
+    With `damped`, a multiple of the identity is added to the Hessian H (Levenberg). It is so large
+    that a negative least eigenvalue changes its sign, and that the least eigenvalue is at least
+    1e-6 of the largest magnitude. The step is then halved until the cost falls (Armijo).
+
+    Without `damped`, the step is -H^-1 gradient. It can also lead to maxima and saddles, and
+    diverges where H is near singular. Remote Sens. 2025, 17, 3447 reports this behaviour for its
+    "Gauss-Newton" method, which minimises an entropy rather than a sum of squares.
+
+    The result carries no gradient; torch.func.vmap is not supported.
 
     Args:
         objective: Maps points (..., n) to real costs (...,), each cost from its own row alone,
             twice differentiable by autograd.
         start: First point, shape (..., n), float32 or float64.
-        damped: Whether to add a multiple of the identity to the Hessian and to search along the
-            step.
+        damped: Whether to add a multiple of the identity to the Hessian and to halve steps.
         steps: Largest number of steps of a trial.
-        search: Largest number of halvings of a step. A trial whose search finds no lower cost ends.
+        search: Largest number of lengths of a step that are tried, each half of the one before. A
+            trial in which none of them lowers the cost ends.
         gradient_tolerance: A trial has converged when its gradient norm is at most this fraction of
             that at the start.
         value_tolerance: A trial has converged when a step changed the cost by at most this fraction

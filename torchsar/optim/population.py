@@ -60,7 +60,8 @@ class Box:
 
         Raises:
             TypeError: If a bound is not a real floating tensor.
-            ValueError: If shapes do not fit, a bound is not finite, or low > high.
+            ValueError: If the bounds differ in the number of unknowns or have none, a bound is not
+                finite, or low > high.
         """
         for name, bound in (("low", low), ("high", high)):
             if not isinstance(bound, Tensor) or not bound.is_floating_point():
@@ -70,7 +71,7 @@ class Box:
                 )
         if low.ndim == 0 or high.ndim == 0 or not low.shape[-1] or low.shape[-1] != high.shape[-1]:
             raise ValueError(
-                f"{who}: low and high need the same number of unknowns in their last dim, got shapes "
+                f"{who}: low and high need the same number of unknowns, 1 or more, in their last dim, got shapes "
                 f"{tuple(low.shape)} and {tuple(high.shape)}"
             )
         low, high = torch.broadcast_tensors(low.detach(), high.detach())
@@ -114,12 +115,12 @@ class Dice:
     """Source of random numbers for all trials of a search, in the dtype of its bounds.
 
     Args:
-        draws: Source of the random numbers. If it has trials, each trial of the search gets its own
-            numbers; otherwise all trials get the same numbers.
+        draws: Source of the random numbers. Each trial of the search gets the numbers of one trial
+            of this source. If `draws.trials` is None, all trials get the same numbers.
         box: Bounds of the search, which give the trials, dtype and device.
 
     Raises:
-        ValueError: If the draws have another number of trials than the bounds.
+        ValueError: If `draws` has another number of trials than the bounds.
     """
 
     draws: Draws

@@ -69,7 +69,7 @@ class TriangularLadar:
             raise ValueError(f"radar.speed_m_s must be a number of 0 or more, got {self.speed_m_s}")
         if self.beam_rad is not None and not 0 < self.beam_rad < math.pi:
             raise ValueError(
-                "radar.beam_rad must lie in 0..pi rad, or be None where the beam covers the whole scene, "
+                "radar.beam_rad must be above 0 and below pi rad, or None where the beam covers the whole scene, "
                 f"got {self.beam_rad}"
             )
         if not (isinstance(self.keep_every, int) and self.keep_every >= 1):
@@ -111,7 +111,10 @@ class TriangularLadar:
 
     @property
     def range_step_m(self) -> float:
-        """Range cell c / (2 B) in metres, the range of one bin (1 / sweep_s) of beat frequency."""
+        """Range cell c / (2 B) in metres, with the bandwidth B of one sweep.
+
+        It corresponds to a step 1 / sweep_s of the beat frequency.
+        """
         return self.wave_speed_m_s / (2 * self.bandwidth_hz)
 
     @property
@@ -123,8 +126,9 @@ class TriangularLadar:
     def ambiguous_velocity_m_s(self) -> float:
         """Radial velocity lambda / (2 T) in m/s that shifts the phase by one cycle per sweep.
 
-        T is the length of a sweep. The segmented interference of the paper compares the phases of
-        the halves of the sweeps, and therefore measures the radial velocity modulo this interval.
+        T is the length of a sweep. An estimator that compares the phase of the first half of each
+        sweep with that of the second (segmented interference) measures the radial velocity modulo
+        this interval.
 
         Reference:
             Remote Sens. 2024, 16, 793, Eq. (17).
@@ -182,8 +186,8 @@ class TriangularLadar:
     def record_axes(self, n_period: int, n_sample: int, start_s: float | None = None) -> tuple[Axis, Axis]:
         """Return the axes (pulse, time) of a continuous record in blocks, one per recorded period.
 
-        The first sample lies half a sampling interval after the start of its block. Where the
-        triangle starts with the block, the samples of separated sweeps are samples of the record.
+        The first sample lies half a sampling interval after the start of its block. If blocks start
+        with the up sweep, the samples of separated sweeps therefore are samples of the record.
 
         Args:
             n_period: Number of recorded periods.

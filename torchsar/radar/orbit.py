@@ -34,8 +34,8 @@ class Orbit:
         mean_anomaly_deg: Mean anomaly at t = 0 in degrees.
 
     Raises:
-        ValueError: If the eccentricity is out of range, the perigee lies below the ground, or an
-            angle is not finite.
+        ValueError: If the eccentricity is out of range, the perigee does not lie above the ground,
+            or an angle is not finite.
     """
 
     semi_major_m: Tensor | float
@@ -315,9 +315,10 @@ def range_coefficients(orbit: Orbit, point_m: Tensor, time_s: Tensor, order: int
 
 
 def orbit_range(orbit: Orbit, point_m: Tensor, epoch_s: Tensor | float, time_s: Tensor) -> Tensor:
-    """Return the exact change since an epoch of the range from the transmitter to a scene point.
+    """Return how the range from the transmitter to a scene point changes after an epoch.
 
-    The change is computed without subtracting two large ranges, so that it keeps its precision.
+    The change is exact. It is computed without subtracting two large ranges, so that it keeps its
+    precision.
 
     Args:
         orbit: Orbit of the transmitter.

@@ -79,8 +79,8 @@ def frequency_step_hz(frequency_hz: Tensor) -> float:
 class FarField:
     """Plane-wave geometry: the range of a ground point (x, y) is direction . (x, y) + offset.
 
-    The curvature of the wavefront is neglected; `plane_wave_loss` bounds the resulting error, and
-    `Spotlight.neglected_range_m` gives it exactly.
+    The curvature of the wavefront is neglected. `Spotlight.neglected_range_m` gives the resulting
+    range error, `plane_wave_loss` bounds its effect on the image.
 
     Args:
         frequency_hz: Frequencies in Hz, float64 (n,), rising in equal steps.
@@ -318,12 +318,16 @@ def plane_wave_loss(
 ) -> PlaneWaveLoss:
     """Bound the displacement and defocus of a ground point by the plane-wave approximation.
 
-    With the elevation el of the line of sight and the azimuth a of the point relative to it, the
-    neglected range is d(a) = (rho^2 - (rho cos(el) cos(a))^2) / (2 R). Its mean over the aperture
-    shifts the point in range, and its slope shifts it in cross range. What no shift explains is
-    d'' + d, with the second derivative d'' in a; it is at most rho^2 (1 + cos(el)^2) / (2 R), and
-    its phase at the ends of the aperture is `defocus_rad`. The bounds hold for apertures below
-    about 1 rad, and leave out terms of order rho^3 / R^2.
+    With the elevation el of the line of sight and the azimuth a of the point relative to the line
+    of sight, the neglected range is d(a) = (rho^2 - (rho cos(el) cos(a))^2) / (2 R). Its mean over
+    the aperture displaces the point in range, its slope in cross range.
+
+    A displacement changes the range by terms in cos(a) and sin(a), for which the second derivative
+    plus the function is zero. The defocus therefore follows from d'' + d, which is at most
+    rho^2 (1 + cos(el)^2) / (2 R). At the ends of an aperture A it leaves the range error
+    (d'' + d) (A / 2)^2 / 2, whose phase is `defocus_rad`.
+
+    The bounds hold for apertures below about 1 rad, and leave out terms of order rho^3 / R^2.
 
     Args:
         radius_m: Distance rho of the point from the scene centre in metres.

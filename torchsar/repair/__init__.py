@@ -1,6 +1,7 @@
-"""Correction of impaired raw data: lost lines, interference, converters, channels and sweeps.
+"""Correction of impaired raw data.
 
-A line is the record of one pulse along range.
+It covers missing lines, interference, sampling jitter and frequency response of the receiver,
+imbalance of its channels, and the sweeps of ladars. A line is the record of one pulse along range.
 """
 
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance

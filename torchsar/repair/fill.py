@@ -2,9 +2,9 @@
 
 All four methods keep the received lines bit for bit and replace only the missing ones, whatever
 samples these contain. With zeros, the relative error power of the image equals the share of missing
-lines. The azimuth spectrum, which is the same for all parts of the scene, lowers this error little
-if azimuth oversampling is low. Only a model of the scene lowers it much, because such a model knows
-which parts of the image are dark.
+lines. If azimuth oversampling is low, the azimuth spectrum lowers this error little, because the
+spectrum is the same for all parts of the scene. Only a model of the scene lowers it much, because
+such a model knows which parts of the image are dark.
 
 Reference:
     Tsvetkov 2017 (zeros or interpolation).
@@ -60,9 +60,11 @@ def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 
 
     The phase increment of the Doppler centroid from line to line is removed before the
     interpolation and restored afterwards. Missing lines before the first or after the last received
-    line are copies of that line, apart from this phase. The error is larger than that of zeros if
-    the correlation of adjacent lines, without the phase of the centroid, is below 0.25, and inside
-    gaps of several lines if azimuth oversampling is low. Differentiable.
+    line are copies of that line, apart from this phase.
+
+    The error is larger than that of `zero_fill` in two cases: if the correlation of adjacent lines,
+    without the phase of the centroid, is below 0.25; or inside gaps of several lines, if azimuth
+    oversampling is low. Differentiable.
 
     Args:
         lines: Lines, shape (..., pulse, range), complex.

@@ -1,8 +1,9 @@
 """Along-track velocity of a moving point by the power of its deramped tone.
 
-Data are deramped with the phase history of each candidate velocity; the right one leaves a tone of
-most power. This is azimuth autofocus with a known form of the phase history. The Doppler bands are
-not reconstructed, so that it also works at speeds at which the channels sample the same positions.
+Data are deramped with the phase history of each candidate velocity; the right velocity leaves the
+strongest tone. This is azimuth autofocus with a known form of the phase history. The Doppler bands
+are not reconstructed. The method therefore also works at speeds at which the channels sample the
+same positions, so that a reconstruction is singular.
 
 Reference:
     Remote Sens. 2020, 12, 1703, section 4.2, which prescribes autofocus for this velocity
@@ -39,13 +40,15 @@ def along_track_velocity(
 ) -> Estimate:
     """Estimate the along-track speed u_a of a point of known slant-range speed and position.
 
-    A grid of `step_m_s` is followed by `fine` grids of five points, whose step each time is 2/5 of
-    the previous one; a parabola through the maximum refines every grid. The curvature of the phase
-    is what is measured, so that an acceleration along the line of sight has the same effect as a
-    speed: 0.05 m/s^2 act as 0.42 m/s in the geometry of the paper.
+    A grid with the step `step_m_s` is followed by `fine` grids of five points, each with 2/5 of the
+    previous step. In every grid, a parabola through the maximum refines the speed.
+
+    What is measured is the curvature of the phase. An acceleration along the line of sight
+    therefore acts as a speed: 0.05 m/s^2 act as 0.42 m/s for a receiver at 300 m/s and a range of
+    5 km.
 
     Args:
-        data: Channels without the transmit range, shape (..., channel, pulse), complex.
+        data: Channels with the transmit range removed, shape (..., channel, pulse), complex.
         radar: Instrument.
         start: Motion about which u_a is searched, shape (...,). Its slant-range speed and
             along-track position are kept.
@@ -58,7 +61,7 @@ def along_track_velocity(
         `u_a_m_s` of shape (...,), positive in the direction of the receiver, with its standard
         deviation from the curvature of the likelihood. `info` holds `snr_db`, the SNR over all
         samples, and `at_the_end`, True where the maximum lies at an end of the search. `ok` is
-        False where the tone has less than 19 dB over all samples, or where `at_the_end` is True.
+        False where this SNR is below 19 dB, or where `at_the_end` is True.
 
     Raises:
         ValueError: If `half_m_s` is not positive, or the search reaches the speed of the receiver.
@@ -118,8 +121,8 @@ def _best(
 def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
     """Return the energy of the strongest tone in the deramped data, summed over channels.
 
-    It equals the energy of the echo of the point if the motion gives the right curvature of the
-    phase.
+    If the motion gives the right curvature of the phase, this is the energy of the echo of the
+    point.
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
@@ -175,7 +178,7 @@ def motion_from(
         range_m: Closest range in metres, None for the reference range of the radar.
 
     Returns:
-        Motion, shape (...,) each.
+        Motion with parameters of shape (...,).
 
     Raises:
         ValueError: If the motion is impossible, see `PointMotion.of`.

@@ -1,7 +1,8 @@
 """Detection of Doppler ambiguities by the cubic phase of the range history.
 
-The channels measure the slant-range velocity modulo lambda PRF. Neither the Doppler frequency nor
-the phases across the channels show the ambiguity number, but the cubic phase does.
+The channels measure the slant-range velocity modulo lambda PRF. The ambiguity number counts these
+intervals. It shows neither in the Doppler frequency nor in the phases across the channels, but in
+the cubic phase.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ _FASTEST = 0.9
 
 
 def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
-    """Return the Doppler ambiguity number that explains clearly more of the data than a fit.
+    """Find by how many PRFs the Doppler of a fitted motion is wrong.
 
-    The alternatives to the fitted motion are a slant-range velocity larger or smaller by lambda
-    PRF, which is one PRF of Doppler. For each, the along-track position is fitted again, and the
-    along-track speed is searched within 22 m/s of the one that keeps the curvature of the phase,
-    since the speed that an estimator assumed may be wrong.
+    Three slant-range speeds are compared: the fitted one, and those larger and smaller by lambda
+    PRF, which is one PRF of Doppler. For each, the along-track position is fitted again. The
+    along-track speed is searched as well, since the fit may have assumed a wrong one: within 22 m/s
+    of the speed that keeps the curvature of the phase.
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
@@ -44,8 +45,8 @@ def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, a
         aperture: Expected amplitude over slow time.
 
     Returns:
-        Number of PRFs to add to the Doppler, -1, 0 or 1, float64 (...,); 0 where no alternative
-        explains at least 1.3 times the energy of the fitted motion.
+        Number of PRFs to add to the Doppler, -1, 0 or 1, float64 (...,). It is 0 unless another
+        slant-range speed explains more than 1.3 times the energy that the fitted one explains.
     """
     begin = motion.each(lambda value: value.expand(data.shape[:-2])[..., None])
     offsets = torch.arange(
@@ -75,8 +76,6 @@ def warned_of_ambiguity(
 ) -> Estimate:
     """Check an estimate for a Doppler ambiguity, and warn where one is found.
 
-    The number of PRFs by which the Doppler is wrong is that of `better_pulse_rate`.
-
     Args:
         estimate: Estimate of the velocity.
         data: Channels, shape (..., channel, pulse), complex.
@@ -85,8 +84,8 @@ def warned_of_ambiguity(
         aperture: Expected amplitude over slow time.
 
     Returns:
-        The estimate with this number as `pulse_rates` in its info; `ok` is False where it is not
-        zero.
+        The estimate with `pulse_rates` in its info: the number of PRFs to add to the Doppler, see
+        `better_pulse_rate`. `ok` is False where this number is not zero.
     """
     off = better_pulse_rate(data, radar, motion, aperture)
     wrong = (off != 0) & estimate.ok

@@ -36,8 +36,8 @@ class Aperture(Protocol):
 class Dwell:
     """Expected amplitude 1 for a duration centred on the time at broadside, 0 outside.
 
-    Begin and end follow from the position of a point, but estimators do not use them to find that
-    position.
+    The time at broadside follows from the motion of the point, without a gradient. Estimators
+    therefore do not fit the ends of the interval to the data.
 
     Args:
         duration_s: Duration in seconds.

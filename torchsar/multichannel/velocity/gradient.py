@@ -26,9 +26,9 @@ def explained_energy(data: Tensor, radar: BistaticRadar, motion: PointMotion, we
         data: Channels, shape (..., channel, pulse), complex.
         radar: Instrument.
         motion: Motion of the point, shape (...,).
-        weight: Expected amplitude, shape (..., pulse): `aperture.weight(...)` at the start of a
-            search and fixed from then on, so that the ends of the aperture do not determine the
-            position.
+        weight: Expected amplitude, shape (..., pulse). In a search, compute it once for the
+            starting motion with `aperture.weight(...)` and keep it. Otherwise the search fits the
+            position to the ends of the aperture.
 
     Returns:
         Energy, shape (...,).
@@ -54,7 +54,7 @@ def gradient_likelihood(
     other objectives.
 
     Args:
-        data: Channels without the transmit range, shape (..., channel, pulse), complex.
+        data: Channels with the transmit range removed, shape (..., channel, pulse), complex.
         radar: Instrument.
         start: Starting motion, shape (...,). Its residual Doppler must lie within half a Doppler
             cell, as for `maximum_likelihood`.
@@ -65,7 +65,7 @@ def gradient_likelihood(
     Returns:
         `u_r_m_s`, `u_a_m_s`, `y0_m` of shape (...,) with standard deviations of the unknowns.
         `info` holds `snr_db` (over all samples), `noise_power` (per sample) and `converged`. `ok`
-        is False where the search failed or the point has less than 19 dB over all samples.
+        is False where the search failed or `snr_db` is below 19.
 
     Raises:
         ValueError: If `unknowns` holds other names or a name twice.

@@ -1,10 +1,11 @@
 """Along-track interferometry: slant-range velocity from the Doppler of a deramped point.
 
-The Doppler is corrected by the look angle, which the phases across the channels measure. After
-deramping with an assumed motion, a position error dy shows as the phase -2 pi dx dy / (lambda R0)
-in the channel at dx, and a residual tone F remains. The update is u_r <- u_r + lambda F - v dy / R0
-for the slant-range speed and y0 <- y0 + dy for the along-track position, with the closest range R0
-and the along-track speed v of the receiver relative to the point.
+The channels are deramped with the phase history of an assumed motion, and two quantities are
+measured. The first is the phase slope across the channels: an error dy of the along-track position
+gives the phase -2 pi dx dy / (lambda R0) in the channel at the along-track position dx. The second
+is the frequency F of the residual tone. The updates are y0 <- y0 + dy for the along-track position
+and u_r <- u_r + lambda F - v dy / R0 for the slant-range speed. R0 is the closest range, and v the
+along-track speed of the receiver relative to the point.
 """
 
 from __future__ import annotations
@@ -35,12 +36,13 @@ def interferometry(
 ) -> Estimate:
     """Estimate slant-range speed and position of one point per trial by along-track interferometry.
 
-    The first pass uses all pulses, later passes the expected amplitude about the position found so
-    far. The slant-range speed u_r is measured modulo lambda PRF and returned within lambda PRF / 2
-    of the start. The along-track speed u_a keeps the value of the start.
+    The first pass weights all pulses equally. Later passes weight them by the expected amplitude of
+    a point at the position found so far. The slant-range speed u_r is measured modulo lambda PRF
+    and returned within lambda PRF / 2 of the start. The along-track speed u_a keeps the value of
+    the start.
 
     Args:
-        data: Channels without the transmit range, shape (..., channel, pulse), complex.
+        data: Channels with the transmit range removed, shape (..., channel, pulse), complex.
         radar: Instrument with at least two channels.
         start: Starting motion, shape (...,).
         aperture: Expected amplitude over slow time.
@@ -49,8 +51,7 @@ def interferometry(
     Returns:
         `u_r_m_s` (closing positive), `u_a_m_s` and `y0_m` of shape (...,). Standard deviations of
         u_r and y0 follow from the residual noise. `info` holds `snr_db` (over all samples) and
-        `noise_power` (per sample). `ok` is False where the tone has less than 19 dB over all
-        samples.
+        `noise_power` (per sample). `ok` is False where `snr_db` is below 19.
 
     Raises:
         ValueError: If the radar has a single channel.
@@ -58,7 +59,7 @@ def interferometry(
     if radar.channels < 2:
         raise ValueError(
             "interferometry needs two channels or more, got 1: one channel cannot separate position and "
-            "velocity; give the velocities to the reconstruction instead"
+            "velocity; use data of more channels"
         )
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     motion, data = start, data.to(torch.complex128)

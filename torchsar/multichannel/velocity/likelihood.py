@@ -1,7 +1,8 @@
 """Maximum likelihood of velocity and position of a moving point by Gauss-Newton steps.
 
-The complex amplitude is fitted for each motion in closed form. Noise is white or clutter of known
-covariance. In white noise the estimate reaches the Cramer-Rao bound of `metrics.bistatic_bounds`.
+The complex amplitude is fitted for each motion in closed form. The noise is white, or clutter of
+known covariance. In white noise the estimate reaches the Cramer-Rao bound of
+`metrics.bistatic_bounds`.
 """
 
 from __future__ import annotations
@@ -60,15 +61,18 @@ def maximum_likelihood(
 ) -> Found:
     """Find the motion of highest likelihood near a starting motion by Gauss-Newton steps.
 
-    The start may be wrong by du_r in slant-range speed and by dy0 in along-track position as long
-    as the residual Doppler (du_r + v dy0 / R0) / lambda lies within half a Doppler cell (0.03 m/s
-    for 4.5 s), with the closest range R0 and the along-track speed v of the receiver relative to
-    the point. `interferometry` and `bank_search` give such starts. The expected amplitude stays
-    where the start places it, so that the ends of the aperture do not determine the position. A
-    step that does not explain more energy is halved or omitted, separately in each trial.
+    The start must be so near that its error in Doppler is below half a Doppler cell: |du_r + v dy0
+    / R0| < lambda / (2 T) for an aperture of T seconds. Here du_r and dy0 are the errors of the
+    start in slant-range speed and along-track position, R0 is the closest range, and v the
+    along-track speed of the receiver relative to the point. `interferometry` and `bank_search` give
+    such starts.
+
+    The expected amplitude is computed once, for the start, so that the steps do not fit the
+    position to the ends of the aperture. A step that does not explain more energy is halved or
+    omitted, separately in each trial.
 
     Args:
-        data: Channels with slow time zero at pulse n // 2 and without the transmit range, shape
+        data: Channels with the transmit range removed and slow time zero at pulse n // 2, shape
             (..., channel, pulse), complex.
         radar: Instrument.
         start: Starting motion, shape (...,).
@@ -99,8 +103,8 @@ class PointLikelihood:
     """Likelihood of the motion of one point: data and settings that do not change in a search.
 
     Args:
-        data: Channels, shape (..., channel, pulse), complex128, or their whitened spectra (...,
-            channel, bin) where there is a covariance.
+        data: Channels, shape (..., channel, pulse), complex128. With a clutter covariance, their
+            whitened Doppler spectra, shape (..., channel, bin).
         radar: Instrument.
         weight: Expected amplitude, shape (..., 1, pulse).
         time_s: Slow time in seconds, float64 (pulse,).
@@ -147,8 +151,8 @@ class PointLikelihood:
     def noise_power(self, fit: PointFit) -> Tensor:
         """Return the residual power per sample in the pulses in which the point is illuminated.
 
-        With a clutter covariance it is the power per sample of the whitened residual, over all
-        samples.
+        With a clutter covariance, return the power per sample of the whitened residual, averaged
+        over all samples.
 
         Args:
             fit: Fit of the point for one motion.

@@ -14,9 +14,10 @@ from torchsar.radar import BistaticRadar
 class MigratingLines(Stage):
     """Stage that estimates a velocity from range lines whose migration has not been corrected.
 
-    For the estimator alone, the migration of a point at rest and the range walk of the strongest
-    point are corrected. The signal itself is not changed, so that a later `CorrectMigration` can
-    use the estimated velocity. Azimuth-only data do not migrate and go to the estimator directly.
+    The estimator gets a copy of the data in which the migration of a point at rest and the range
+    walk of the strongest point are corrected. The signal itself is not changed, so that a later
+    `CorrectMigration` can use the estimated velocity. Data without a range axis do not migrate and
+    go to the estimator directly.
 
     Args:
         radar: Instrument.

@@ -84,14 +84,14 @@ class Found:
 
     @property
     def snr_db(self) -> Tensor:
-        """SNR of the point over all its samples in dB, within +-300 dB; it decides detection."""
+        """SNR of the point over all its samples in dB, limited to +-300 dB."""
         return energy_ratio_db(self.energy, self.noise_power)
 
 
 def energy_ratio_db(energy: Tensor, noise_power: Tensor) -> Tensor:
     """Return the ratio of an energy to a noise power in dB.
 
-    It is limited to +-300 dB, and -300 dB where both are zero.
+    The ratio is limited to +-300 dB, and is -300 dB where energy and noise power are zero.
 
     Args:
         energy: Energies, any shape, float64.
@@ -139,15 +139,16 @@ def solved(normal: Tensor, right: Tensor) -> Tensor:
 
 
 def round_units(normal: Tensor) -> Tensor:
-    """Return combinations of the unknowns along which the explained energy falls off equally.
+    """Return coordinates in which the explained energy falls off equally in all directions.
 
-    A change x of the combinations changes the unknowns by the returned matrix times x.
+    The coordinates x are related to the unknowns by a matrix U: a step x changes the unknowns by U
+    x. With the normal matrix N, U^T N U is a multiple of the identity.
 
     Args:
-        normal: Normal matrices of the fit, shape (..., n, n).
+        normal: Normal matrices N of the fit, shape (..., n, n).
 
     Returns:
-        Matrices with one combination in each column, shape (..., unknown, n).
+        Matrices U, shape (..., n, n), of Frobenius norm 1.
     """
     unit, scale = _of_unit_diagonal(normal)
     units = scale[..., :, None] * torch.linalg.inv(torch.linalg.cholesky(unit)).mT
@@ -176,7 +177,7 @@ def moved(motion: PointMotion, step: Tensor, unknowns: tuple[str, ...]) -> Point
     """Return a motion with a step added to some of its parameters.
 
     Args:
-        motion: Motion, shape (...,) each.
+        motion: Motion with parameters of shape (...,).
         step: Steps in the units of the unknowns, shape (..., unknown).
         unknowns: Names of these parameters, in the order of the steps.
 
@@ -190,12 +191,12 @@ def chosen(motion: PointMotion, other: PointMotion, first: Tensor) -> PointMotio
     """Select one of two motions per trial: `motion` where first (...,) is True, else `other`.
 
     Args:
-        motion: First motion, shape (...,) each.
+        motion: First motion, parameters of shape (...,).
         other: Second motion, same shape.
-        first: Where the first motion is taken, shape (...,), bool.
+        first: True where the first motion is taken, shape (...,), bool.
 
     Returns:
-        Motion, shape (...,) each.
+        Motion with parameters of shape (...,).
     """
     pairs = {
         name: torch.where(first, getattr(motion, name), getattr(other, name))

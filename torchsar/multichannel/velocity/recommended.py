@@ -41,11 +41,12 @@ def moving_point_velocity(
     """Estimate velocity and position of the strongest moving point per trial, without a start.
 
     If no clutter covariance is given, the point is first sought in white noise. If the residual
-    then shows clutter, it is also sought with the covariance of the data. Each fit is refined with
-    the covariance of its residual, and in each trial the fit of higher likelihood is used.
+    shows clutter, the search is repeated with the covariance of the data. Each of the two fits is
+    refined with the covariance of its own residual. In each trial, the fit of higher likelihood is
+    returned.
 
     Args:
-        data: Channels with slow time zero at pulse n // 2 and without the transmit range, shape
+        data: Channels with the transmit range removed and slow time zero at pulse n // 2, shape
             (..., channel, pulse), complex.
         radar: Instrument.
         aperture: Expected amplitude over slow time.
@@ -59,10 +60,10 @@ def moving_point_velocity(
     Returns:
         Slant-range speed `u_r_m_s` (closing positive), along-track speed `u_a_m_s` and along-track
         position at t = 0 `y0_m` of shape (...,), with standard deviations. `info` holds `snr_db`
-        (over all samples), `noise_power` (per sample) and `coloured` (True where clutter was
-        found). `ok` is False where the point has less than 19 dB over all samples, the estimate
-        lies outside the search, or the standard deviation of u_r exceeds the half width of the
-        search, as with a single channel.
+        (over all samples), `noise_power` (per sample) and `coloured` (True where clutter was found,
+        and everywhere if `whitening` is given). `ok` is False where `snr_db` is below 19, the
+        estimate lies outside the search, or the standard deviation of u_r exceeds the half width of
+        the search, as with a single channel.
 
     Raises:
         ValueError: If the search reaches the speed of the receiver.

@@ -1,9 +1,10 @@
 """Slant-range velocity by the signal intensity ratio (SIR) of reconstructed spectra.
 
-A spectrum that is reconstructed with the right velocity concentrates in the processed band. Data
-are demodulated by the Doppler centre of each candidate before reconstruction (see `reconstruct`),
-so that the band edges do not jump between bins and the ratio is continuous in the velocity. A
-stationary scene beside the target concentrates at u_r = 0 and biases the estimate towards zero.
+A spectrum that is reconstructed with the right velocity concentrates in the processed band. Before
+reconstruction, data are demodulated by the Doppler centre of each candidate velocity (see
+`reconstruct`). The band edges then do not jump between bins, and the ratio is continuous in the
+velocity. A stationary scene beside the target concentrates at the slant-range speed zero and biases
+the estimate towards zero.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Eqs. (37)-(39).
@@ -104,7 +105,7 @@ def signal_intensity(
     Differentiable in data and motion.
 
     Args:
-        data: Range lines of one target without the transmit range, shape (..., channel, pulse,
+        data: Range lines of one target with the transmit range removed, shape (..., channel, pulse,
             range), complex.
         radar: Instrument.
         motion: Motion assumed, shape (...,).
@@ -115,8 +116,8 @@ def signal_intensity(
         Energies and summed amplitudes of shape (...,).
 
     Raises:
-        ValueError: If the reconstructed band does not exceed `bandwidth_hz`, or there are too few
-            channels for the bands.
+        ValueError: If the reconstructed band does not exceed `bandwidth_hz`, or there are fewer
+            channels than the reconstruction needs.
     """
     return _intensity_of_bins(data, radar, motion, rebuild, bandwidth_hz).total
 
@@ -179,7 +180,7 @@ class SignalIntensityRatio(Stage):
 
     Raises:
         ValueError: If the search interval is shorter than two steps, the reconstructed band does
-            not exceed `bandwidth_hz`, or there are too few channels for the bands.
+            not exceed `bandwidth_hz`, or there are fewer channels than the reconstruction needs.
 
     Reference:
         Remote Sens. 2020, 12, 1703, Eqs. (37)-(39).
@@ -211,7 +212,7 @@ class SignalIntensityRatio(Stage):
         low, high = self.search_m_s
         if not (low < high and 0 < step_m_s <= (high - low) / 2):
             raise ValueError(
-                "search_m_s must be (least, largest) velocity with at least two steps of step_m_s between, got "
+                "search_m_s must be (least, largest) velocity with at least two steps of step_m_s between them, got "
                 f"search_m_s={self.search_m_s} and step_m_s={step_m_s}"
             )
         why = self.rebuild.refusal(radar.channels)
@@ -223,17 +224,18 @@ class SignalIntensityRatio(Stage):
         """Estimate the slant-range speed from channels with the axes (channel, pulse[, range]).
 
         Args:
-            signal: Channels without the transmit range.
+            signal: Channels with the transmit range removed.
             u_a_m_s: Along-track speed in m/s, shape (...,) or a number.
             y0_m: Along-track position at t = 0 in metres, shape (...,) or a number.
 
         Returns:
             `u_r_m_s` of shape (...,), closing positive, with a jackknife standard deviation. The
             quality is 1 - median / maximum of the intensity ratio Gamma over the grid of speeds.
-            `info` holds `log_ratio`, log Gamma over the grid, and `pulse_rates`, the number of PRFs
-            by which the Doppler is wrong. `ok` is False if the data are zero (the value is then the
-            middle of the search interval), the maximum lies at an end of the interval, the quality
-            is below `least_quality`, or the velocity is wrong by a multiple of lambda PRF.
+            `info` holds `log_ratio`, ln Gamma over the grid, shape (..., speed), and `pulse_rates`,
+            the number of PRFs to add to the Doppler (-1, 0 or 1), shape (...,). `ok` is False if
+            the data are zero (the value is then the middle of the search interval), the maximum
+            lies at an end of the interval, the quality is below `least_quality`, or `pulse_rates`
+            is not zero.
 
         Raises:
             ValueError: If the reconstruction is singular.

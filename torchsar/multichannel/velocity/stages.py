@@ -1,7 +1,7 @@
 """Velocity estimators of a moving point as stages.
 
-They work on signals (channel, pulse) or on the strongest range line of each trial of signals
-(channel, pulse, range).
+They work on signals with the axes (channel, pulse). If there is also a range axis, they work on the
+strongest range line of each trial.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ class Interferometry(_Velocity):
         aperture: Expected amplitude over slow time.
         range_m: Closest range in metres, None for that of the strongest range line, or for the
             reference range of the radar if there is no range axis.
-        check_ambiguity: Whether to check for a velocity wrong by a multiple of lambda * PRF, in
-            about 10 ms per trial. If one is found, a warning is given and `ok` is False.
+        check_ambiguity: Whether to check that the velocity is not wrong by lambda * PRF, in about
+            10 ms per trial. Where it is wrong, a warning is given and `ok` is False.
     """
 
     def __init__(
@@ -112,8 +112,8 @@ class Interferometry(_Velocity):
 
         Returns:
             `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), see `interferometry`. With
-            `check_ambiguity`, `info` also holds `pulse_rates`, the number of PRFs by which the
-            Doppler is wrong.
+            `check_ambiguity`, `info` also holds `pulse_rates`, the number of PRFs to add to the
+            Doppler (-1, 0 or 1).
 
         Raises:
             ValueError: If the radar has one channel, the data have other channels than the radar or
@@ -193,7 +193,7 @@ class LikelihoodVelocity(_Velocity):
         refuse_unknowns(self.unknowns)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
-        """Estimate those parameters that are unknown, near a start.
+        """Estimate the parameters that `unknowns` names, near a starting motion.
 
         Args:
             signal: Channels with the axes (channel, pulse[, range]).
@@ -203,7 +203,7 @@ class LikelihoodVelocity(_Velocity):
 
         Returns:
             `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), with standard deviations of those
-            estimated. `ok` is False where the point has less than 19 dB over all samples.
+            estimated. `ok` is False where the SNR of the point over all samples is below 19 dB.
 
         Raises:
             ValueError: If the data have other channels than the radar or fewer than 4 pulses, or
@@ -241,7 +241,7 @@ class GradientVelocity(_Velocity):
         refuse_unknowns(self.unknowns)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
-        """Estimate those parameters that are unknown, near a start.
+        """Estimate the parameters that `unknowns` names, near a starting motion.
 
         Args:
             signal: Channels with the axes (channel, pulse[, range]).

@@ -1,8 +1,8 @@
 """PRF ambiguity number of a moving point from its range walk.
 
-One ambiguity is lambda PRF of slant-range velocity, which gives lambda PRF T metres of range walk:
-far more than a range cell. Migration correction with the right number concentrates the point in one
-range line.
+The channels measure the slant-range velocity only modulo lambda PRF; the ambiguity number counts
+these intervals. Each adds a range walk of lambda PRF T in T seconds of illumination, far more than
+a range cell. Migration correction with the right number concentrates the point in one range line.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ def walk_ambiguity(
     strongest range line, which depends neither on phases nor on aliasing in azimuth.
 
     Args:
-        data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
+        data: Range-compressed channels with the transmit range removed, shape (..., channel, pulse,
             range), complex.
-        frame: Geometry of the data.
+        frame: Radar, slow time and range axis of the data.
         reference: Motion of the reference point, whose range history is removed, shape (...,).
         most: Largest magnitude of the ambiguity numbers that are tried.
         migration: Method of migration correction, `Keystone(whole_swath=False)` by default.
 
     Returns:
-        Three tensors (...,): the ambiguity number, float64; the energy of its strongest range line
-        minus that for the next best number, in standard deviations of the energy of a line of
-        noise; and the index of the strongest line.
+        Three tensors (...,). First, the ambiguity number, float64. Second, the energy of the
+        strongest range line with this number minus that with the next best number, in standard
+        deviations of the energy of a line of noise. Third, the index of the strongest line.
     """
     numbers = torch.arange(-most, most + 1, dtype=torch.float64, device=data.device)
     energies = torch.stack(
@@ -69,7 +69,7 @@ def _noise_std(energy: Tensor) -> Tensor:
 class WalkAmbiguity(Stage):
     """Stage that estimates the PRF ambiguity number of the strongest point from its range walk.
 
-    The value connects to `CorrectMigration`; see `walk_ambiguity`.
+    See `walk_ambiguity`. `CorrectMigration` accepts the estimate as its input `ambiguity`.
 
     Args:
         radar: Instrument.
@@ -101,8 +101,9 @@ class WalkAmbiguity(Stage):
 
         Returns:
             `ambiguity` of shape (...,). `info` holds `line`, the index of the range line of the
-            point, and `contrast`, the energy of this line minus that for the next best number, in
-            standard deviations of the noise. `ok` is False where the contrast is below 5.
+            point, and `contrast`, the energy of this line minus that of the strongest line with the
+            next best number, in standard deviations of the energy of a line of noise. `ok` is False
+            unless the contrast is above 5.
         """
         reference = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         number, contrast, line = walk_ambiguity(signal.data, Frame.of(self.radar, signal), reference, self.most)

@@ -1,10 +1,10 @@
 """Whitening of stationary clutter by the covariance of the channels in each Doppler bin.
 
-For a stationary scene the phases across the channels are known in each Doppler band. In a Doppler
-bin of one channel only few bands overlap, so that the clutter fills few dimensions of the space of
-the channels. After removal of the known phase ramp over Doppler, the covariance of the channels
-changes slowly from bin to bin, so that it can be averaged over neighbouring bins, and over range
-lines where there are several.
+In each Doppler bin, only a few aliased Doppler bands overlap. In each of these bands the phases of
+a stationary scene across the channels are known. The covariance of the clutter across the channels
+is therefore of low rank. When the known phase ramp over Doppler has been removed, this covariance
+changes slowly from bin to bin. It can then be averaged over neighbouring bins, and over range lines
+where there are several.
 
 Reference:
     Reed, Mallett and Brennan 1974 (sample covariance).
@@ -67,7 +67,7 @@ class Whitening:
     def backed(self, data: Tensor) -> Tensor:
         """Return channels weighted by their inverse covariance in each Doppler bin.
 
-        The result over slow time serves for correlation with the model of an echo in clutter.
+        The correlation of the result with the model of an echo is the matched filter in clutter.
 
         Args:
             data: Channels, shape (..., channel, pulse), complex.
@@ -101,7 +101,8 @@ def sample_whitening(data: Tensor, radar: BistaticRadar, samples: int = _SAMPLES
         samples: Number of neighbouring bins averaged.
 
     Returns:
-        Whitening of each Doppler bin; that of white noise in trials without clear structure.
+        Whitening of each Doppler bin. Where the covariance shows no more structure than that of
+        white noise by chance, the covariance of white noise is used.
     """
     return line_whitening(data[..., None, :, :], radar, samples)
 
@@ -110,9 +111,9 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES)
     """Estimate the whitening of the channels in each Doppler bin from several range lines.
 
     The covariance of the channels is averaged over the lines, which should be independent and not
-    contain the point to be found, and over neighbouring bins. In trials where it shows no more
-    structure than white noise does by chance, that of white noise is used. A trial of zeros gets a
-    noise power of 1.
+    contain the point to be found, and over neighbouring bins. In trials where the covariance shows
+    no more structure than that of white noise by chance, the covariance of white noise is used. A
+    trial of zeros gets a noise power of 1.
 
     Args:
         lines: Range lines, shape (..., line, channel, pulse), complex.
