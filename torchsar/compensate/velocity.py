@@ -58,9 +58,9 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
     """Make the function whose minimum is the effective velocity: the entropy of a group's image.
 
     The function maps a velocity to the weighted entropies of blocks of range cells and is
-    differentiable. Range cells whose targets migrate out of the group do not contribute. The others
-    are weighted with their signal above the background, in the image focused with the nominal
-    velocity.
+    differentiable. A block is weighted with its signal above the background in the image focused
+    with the nominal velocity. Range cells whose targets migrate out of the group add nothing to the
+    weight, except those of the middle half of the group.
 
     Args:
         group: Group of range cells.
@@ -105,9 +105,10 @@ def minimum_entropy_velocity(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Find the velocity of least entropy: a grid search, then a refinement.
 
-    The group is divided into eight parts. The standard deviation follows from the scatter of their
-    separate minima about the common minimum, predicted from the slope of the entropy of each part
-    at the common minimum and from the common curvature.
+    The standard deviation is predicted from eight parts of the group. The slope of the entropy of
+    each part is taken at the common minimum. The scatter of the eight slopes gives the standard
+    deviation of their sum; divided by the curvature of the whole entropy it is that of the
+    velocity.
 
     Args:
         group: Group of range cells.
@@ -147,12 +148,12 @@ def _scatter_std(blocks: Callable[[Tensor], Tensor], velocity: Tensor, curvature
 class EffectiveVelocity(Stage):
     """Effective velocity of least image entropy.
 
-    Provides `velocity_m_s` and leaves the signal unchanged. The absolute Doppler centroid is to be
-    connected as `doppler_hz`. Only lines about the middle of the record are used: as many as four
-    synthetic apertures, or 1024 if that is more.
+    Provides `velocity_m_s` and leaves the signal unchanged. In a chain, connect `doppler_hz` to the
+    stage that estimates the absolute Doppler centroid. Only lines about the middle of the record
+    are used: as many as four synthetic apertures, or 1024 if that is more.
 
     Args:
-        focuser: Focusing stage of the chain, of which the radar and the range reference are used.
+        focuser: Focusing stage of the chain, whose radar and range reference spectrum are used.
         reach_m_s: Largest error of the nominal velocity in m/s.
         lines: Number of range cells in the group, at least 16.
         refine: `parabola_minimum` or `gradient_minimum` of `torchsar.optim.scalar`.
@@ -210,12 +211,13 @@ class EffectiveVelocity(Stage):
         Args:
             signal: Lines, shape (..., pulse, range), complex.
             doppler_hz: Absolute Doppler centroid in Hz, shape (...,), positive when closing; by
-                default the pointing of the radar, or 0.
+                default `pointing_doppler_hz` of the radar, or 0 if that is None.
 
         Returns:
-            `velocity_m_s` of shape (...,) with its standard deviation in m/s. `ok` is False where
-            the entropy is least at an end of the searched interval, or the standard deviation is 5
-            m/s or more. info: grid_velocity_m_s, the velocities of the grid search, shape (grid,);
+            `velocity_m_s` of shape (...,) with its standard deviation in m/s. quality falls
+            exponentially with the standard deviation, to 1/e at 5 m/s. `ok` is False where the
+            entropy is least at an end of the searched interval, or the standard deviation is 5 m/s
+            or more. info: grid_velocity_m_s, the velocities of the grid search, shape (grid,);
             grid_entropy, their entropies in nats, shape (..., grid); and group_start, the first
             range sample of the group of range cells used, shape (...,).
         """
@@ -247,7 +249,7 @@ class EffectiveVelocity(Stage):
             signal: Lines, shape (..., pulse, range), complex.
             velocity_m_s: Effective velocities in m/s, shape (n,).
             doppler_hz: Absolute Doppler centroid in Hz, shape (...,), positive when closing; by
-                default the pointing of the radar, or 0.
+                default `pointing_doppler_hz` of the radar, or 0 if that is None.
 
         Returns:
             The entropy in nats, a weighted mean over blocks of range cells, shape (..., n).

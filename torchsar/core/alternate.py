@@ -30,13 +30,15 @@ class Turn:
 class Alternate(Stage):
     """Joint estimate of several effects, by running one estimator for each of them in turn.
 
-    Each estimator has a turn, which may also have a corrector. One round runs all estimators in the
-    order given. An estimator receives the original signal, corrected by the correctors of all other
-    turns, each with the latest values of its own estimator. Correction always starts from the
-    original signal, so that errors of an early round do not remain in the data. An estimator also
-    receives, as arguments, the latest values (its own included) whose names are parameters of its
-    `forward`. A value that no turn has estimated yet is not passed, so that the default of the
-    parameter applies.
+    Each turn has an estimator of one effect. It may also have a corrector, a stage that removes
+    this effect from the signal. One round runs the estimators of all turns in the order given.
+
+    Before an estimator runs, the correctors of all other turns are applied to the original signal,
+    each with the latest values of its own estimator. Correction always starts from the original
+    signal, so that errors of an early round do not remain in the data. An estimator also receives,
+    as arguments, the latest values (its own included) whose names are parameters of its `forward`.
+    A value that no turn has estimated yet is not passed, so that the default of the parameter
+    applies.
 
         Alternate(rounds=3, phase=Turn(autofocus, corrector), rotation=Turn(estimator))
 

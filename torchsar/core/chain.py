@@ -19,8 +19,9 @@ class Use(nn.Module):
 
     Args:
         stage: Stage whose `forward` takes the values.
-        names: Source of each parameter of `forward`: "STAGE.VALUE", "aux.NAME" or
-            "given.NAME".
+        names: Source of each parameter of `forward`: "STAGE.VALUE" for the value VALUE that the
+            stage named STAGE of the chain estimates, "aux.NAME" for side data of the recording, or
+            "given.NAME" for a value that the caller of the chain gives.
     """
 
     def __init__(self, stage: nn.Module, names: Mapping[str, str]) -> None:

@@ -32,10 +32,11 @@ def generator_at(*address: str | int) -> np.random.Generator:
 class Draws:
     """Source of random numbers, each of which depends only on its address.
 
-    The address of a draw is (seed, purpose, case, trial). A draw therefore does not depend on draws
-    made before it, on the division of trials into chunks, or on the device; a repeated draw gives
-    the same numbers. Numbers are drawn in float64 on the CPU and then converted, so that all
-    precisions and devices see the same noise.
+    The address of a draw is (seed, purpose, case, trial), where the purpose is the name of the
+    quantity that is drawn. A draw therefore does not depend on draws made before it, on the
+    division of trials into chunks, or on the device; a repeated draw gives the same numbers.
+    Numbers are drawn in float64 on the CPU and then converted, so that all precisions and devices
+    see the same noise.
 
     Args:
         seed: Seed of the whole study.

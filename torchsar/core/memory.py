@@ -21,11 +21,11 @@ def keep_freed_memory() -> bool:
     """Let this process reuse the memory of freed tensors instead of returning it to the system.
 
     By default the GNU C library returns the memory of freed large tensors, so that the pages of the
-    next one have to be mapped and cleared again. For the config stripmap_damaged the setting saves
-    a third of the CPU time (94 s without, 63 s with it) and raises the peak memory by 40 % (1.6 and
-    2.2 GB). It holds for the whole process and cannot be undone. Call this function before other
-    threads allocate memory. If the environment sets MALLOC_TRIM_THRESHOLD_ or
-    MALLOC_MMAP_THRESHOLD_, nothing is changed.
+    next one have to be mapped and cleared again. The setting saves time and costs memory: for the
+    simulation `stripmap_damaged.yaml` in the folder `configs` it reduces the CPU time from 94 s to
+    63 s and raises the peak memory from 1.6 GB to 2.2 GB. It holds for the whole process and cannot
+    be undone. Call this function before other threads allocate memory. If the environment sets
+    MALLOC_TRIM_THRESHOLD_ or MALLOC_MMAP_THRESHOLD_, nothing is changed.
 
     Returns:
         Whether the C library accepted the setting.

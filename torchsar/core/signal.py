@@ -141,7 +141,7 @@ class Recording:
     """Samples of an instrument, with its description and the side data recorded beside them.
 
     Args:
-        signal: Raw samples on true axes.
+        signal: Raw samples with their axes.
         radar: Description of the instrument (carrier, waveform, nominal path), such as a
             StripmapRadar.
         aux: Side data by name, such as `line_number` or `agc_db`, both of shape (..., pulse).

@@ -121,12 +121,12 @@ class UniformSpline:
 def second_differences(values: Tensor) -> Tensor:
     """Return the second derivatives at the knots of a not-a-knot spline with unit step.
 
-    At the inner knots the second derivatives M of the spline through the values y solve M[i-1] +
-    4 M[i] + M[i+1] = 6 (y[i-1] - 2 y[i] + y[i+1]). The not-a-knot condition makes M linear over the
-    first three knots, so that M[1] is the second difference of y there, and likewise over the last
-    three. The equations between these two knots are solved all at once: by convolution with the
-    response of the infinite grid, z^|k| / (2 sqrt 3) at a distance of k knots with z = sqrt 3 - 2,
-    plus two decaying terms that satisfy the conditions at the ends.
+    At the inner knots the second derivatives M of the spline through the values y solve M[i-1] + 4
+    M[i] + M[i+1] = 6 (y[i-1] - 2 y[i] + y[i+1]). The not-a-knot condition makes M linear over the
+    first three knots and over the last three. Then M[1] and M[n-2] are the second differences of y
+    at these two knots. The equations for the knots between them are solved all at once: by
+    convolution with the response of the infinite grid, z^|k| / (2 sqrt 3) at a distance of k knots
+    with z = sqrt 3 - 2, plus two decaying terms that give M[1] and M[n-2] their values.
 
     Args:
         values: Values y at the knots, shape (..., n) with n >= 2, float64.

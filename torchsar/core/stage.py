@@ -22,10 +22,11 @@ class Stage(nn.Module):
     - `works_on`: names of the trailing axes that it needs.
     - `also_on`: further tuples of axes that it accepts.
     - `provides`: names of the values in its Estimate.
-    - `takes_real`: True if it accepts the real samples of a one-channel detector.
+    - `takes_real`: True if it also accepts the real samples of a one-channel detector.
 
     Raises:
-        TypeError: On a call, if the argument is not a Signal or the samples are not complex.
+        TypeError: On a call, if the argument is not a Signal, or if the samples are not complex
+            and, with `takes_real`, not real floating-point numbers either.
         ValueError: On a call, if the axes do not fit or a sample is not finite.
     """
 

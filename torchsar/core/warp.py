@@ -122,9 +122,10 @@ def least_rate(k: Tensor, duration_s: float, points: int = 513) -> Tensor:
 def shape_of(k: Tensor, duration_s: float) -> Tensor:
     """Convert relative derivatives of a rotation rate to Legendre coefficients of the warped time.
 
-    The warped time is c1 (s + q2 P2(s) + q3 P3(s) + ...) + constant, with the Legendre polynomials
-    P2, P3, ... and s = 2 t / duration - 1. The coefficients q are better suited to a search than
-    the relative derivatives k, whose estimation errors are strongly correlated.
+    The warped time is c0 + c1 (s + q2 P2(s) + q3 P3(s) + ...), with constants c0 and c1, the
+    Legendre polynomials P2, P3, ... and s = 2 t / duration - 1. The coefficients q are better
+    suited to a search than the relative derivatives k, whose estimation errors are strongly
+    correlated.
 
     Args:
         k: Derivatives k1, k2, ... of the rotation rate at the first pulse divided by that rate, in
@@ -142,9 +143,10 @@ def shape_of(k: Tensor, duration_s: float) -> Tensor:
 def k_of_shape(shape: Tensor, duration_s: float) -> Tensor:
     """Convert Legendre coefficients of the warped time to relative derivatives of the rate.
 
-    This is the inverse of `shape_of`. The warped time c1 (s + q2 P2(s) + q3 P3(s) + ...), with the
-    Legendre polynomials P_j and s = 2 t / duration - 1, must rise at the first pulse, that is
-    1 + sum_j q_j P_j'(-1) > 0.
+    This is the inverse of `shape_of`. The warped time is c0 + c1 (s + q2 P2(s) + q3 P3(s) + ...),
+    with constants c0 and c1, the Legendre polynomials P_j and s = 2 t / duration - 1. It must rise
+    at the first pulse (s = -1), that is, 1 + sum_j q_j P_j'(-1) > 0 with the derivatives P_j' of
+    the polynomials.
 
     Args:
         shape: Legendre coefficients q2, q3, ..., without unit, shape (..., order - 1).

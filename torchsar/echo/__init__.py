@@ -1,7 +1,8 @@
-"""Simulation: from radar and world to recording and truth, with noise and receiver impairments.
+"""Simulation of recordings and their true values, with noise and errors of the receiver.
 
-An impairment is called with a recording and random draws; it returns the impaired recording and the
-true values of the impairment. It works on recorded data as well. A parameter annotated
+The functions take the description of the radar and a world: the scene, its motion and the noise. An
+impairment is called with a recording and random draws; it returns the impaired recording and the
+true values of the impairment. The recording may be simulated or recorded. A parameter annotated
 `Tensor | float` is a number, equal in all trials, or a tensor with one value per trial.
 """
 

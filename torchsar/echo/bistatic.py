@@ -38,14 +38,17 @@ def bistatic_echo(
 ) -> Tensor:
     """Return the echo of moving points without noise.
 
-    R_T(t) is the range from the transmitter to the scene and R_m(t) the range from a target to the
-    receiver at slow time t. The phase of the echo is
-    -2 pi / lambda (R_T(t) - R_T(0) + R_m(t) - radar.reference_range_m), one way for each range. The
-    receive window follows the ephemeris of the transmitter: the envelope lies at R_m plus the
-    difference between the true R_T(t) - R_T(0) and that of radar.transmit_range. Ranges are
-    constant during a pulse. Echoes partly outside the range axis are cut and do not wrap; for the
-    kind "compressed" what wraps lies below -35 dB. Differentiable in speeds, positions and
-    amplitudes.
+    R_T(t) is the range from the transmitter to the scene, and R_m(t) the range from a target to
+    receive channel m, at slow time t. The phase of the echo is -2 pi / lambda (R_T(t) - R_T(0) +
+    R_m(t) - radar.reference_range_m). Where a target moves towards the transmitter (`movers.bend`),
+    the change of its own range to the transmitter is added to R_m. Ranges are constant during a
+    pulse.
+
+    The receive window follows the range from the transmitter that `radar.transmit_range` predicts.
+    The envelope of the echo therefore lies at R_m plus the error of this prediction, the true
+    R_T(t) - R_T(0) minus the predicted one. What lies outside the range axis is cut off; only range
+    side lobes below -35 dB may wrap round, with the kind "compressed". Differentiable in speeds,
+    positions and amplitudes.
 
     Args:
         movers: Targets, shape (..., target).
@@ -181,7 +184,7 @@ def simulate_bistatic(
 
     Args:
         radar: Receiver.
-        world: World.
+        world: Targets, receive gain, sea, range models and noise.
         n_pulse: Number of pulses.
         n_range: Number of range samples, None for azimuth-only data, in which every target lies on
             the one recorded line.
@@ -198,7 +201,7 @@ def simulate_bistatic(
         the along-track speed `u_a_m_s`, the along-track position `y0_m` at slow time zero (also as
         `azimuth_m`), the closest range `range_m`, `amplitude`, and the closing speed towards the
         transmitter `u_t_m_s` where the scene gives it. It further holds `transmit_range_m`, the
-        true change R_T(t) - R_T(0) of the range to the transmitter, shape (..., pulse);
+        true change R_T(t) - R_T(0) of the range R_T to the transmitter, shape (..., pulse);
         `noise_std`, the standard deviation of the noise of a recorded sample, shape (...,); and the
         values of each impairment under "<impairment>.<name>". `clean` is the recording without
         noise and impairments.

@@ -225,12 +225,14 @@ class WalkDrift:
 class SynchronisationError:
     """Impairment: phase and delay of every pulse due to clocks that drift apart.
 
-    Both errors are common to all channels. The data are delayed without a change of their carrier
-    phases and then multiplied by exp(j phase). The recording gets aux `direct_path`, a record of
-    the direct signal of the transmitter in each pulse after range compression, shape (..., pulse,
-    direct_samples). The direct signal has a rectangular band, and its known range is removed, so
-    that its peak exp(j phase) lies at sample direct_samples // 2 + delay_s * sampling_hz. The truth
-    holds `phase_rad` and `delay_s`, shape (..., pulse) each, float64.
+    The errors are common to all channels. The data are delayed without a change of their carrier
+    phases and then multiplied by exp(j phase).
+
+    From the direct path, from the transmitter straight to the receiver, these errors can be
+    measured. The recording gets aux `direct_path`, shape (..., pulse, direct_samples): the
+    range-compressed samples of the direct path in each pulse. Its band is rectangular and its known
+    range is removed, so that its peak exp(j phase) lies at sample direct_samples // 2 + delay_s *
+    sampling_hz. The truth holds `phase_rad` and `delay_s`, shape (..., pulse) each, float64.
 
     Args:
         phase_rad: Drifts whose sum is the phase in radians.

@@ -91,9 +91,9 @@ class Tone:
 class WideInterferer:
     """Impairment: band-limited noise on randomly chosen lines, independent from line to line.
 
-    The noise is stationary: the noise of a line is cut out of a longer process and does not join at
-    the ends of the line. The truth holds `contaminated`, shape (..., pulse), bool, true for the
-    lines with this noise, and `bandwidth_hz`, shape (...,).
+    The noise of a line is cut out of a longer periodic process and is therefore not itself
+    periodic. The truth holds `contaminated`, shape (..., pulse), bool, true for the lines with this
+    noise, and `bandwidth_hz`, shape (...,).
 
     Args:
         over_signal_db: Ratio in decibels of the power of the noise to the mean power per sample

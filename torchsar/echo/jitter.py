@@ -36,10 +36,11 @@ def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
 class PeriodicJitter:
     """Impairment: sample n of every line is taken at the instant n + e[n mod M], with M offsets e.
 
-    A pilot tone through the same converter is recorded as aux `pilot`, shape (..., pilot_samples),
-    with a random phase. A pilot tone shows only the differences between offsets. Where positions in
-    images are compared, choose offsets of mean zero, or e_0 = 0 if the estimator sets its first
-    offset to zero. The truth holds `offset_samples`, shape (..., M), and `pilot_cycles`.
+    A pilot tone through the same converter is recorded as aux `pilot`, shape (..., pilot_samples).
+    Its phase is random, so that it shows only the differences between the offsets; an offset that
+    is common to all samples cannot be estimated from it. Where positions in images are compared,
+    therefore choose offsets of mean zero, or e_0 = 0 if the estimator sets its first offset to
+    zero. The truth holds `offset_samples`, shape (..., M), and `pilot_cycles`.
 
     Args:
         offset_samples: Offsets e_0 to e_{M-1} in samples: numbers or values per trial, or one

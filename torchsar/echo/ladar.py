@@ -44,11 +44,12 @@ def ladar_echo(
 ) -> Tensor:
     """Return dechirped sweeps without noise.
 
-    The phase of a scatterer in cycles is fc dtau +- (K u dtau - K dtau^2 / 2), with the carrier fc,
-    the chirp rate K, the time u from the middle of the sweep and the upper sign in the up-sweep.
-    The delay is dtau = 2 RD / c, where RD is the range relative to the reference range. This holds
-    for radar.dechirp_sign "lo_conj_echo"; for "echo_conj_lo" the samples are conjugated. A
-    scatterer at azimuth x is illuminated in a sweep if |V t - x| is at most half the width of the
+    The phase of a scatterer in cycles is fc dtau +- (K u dtau - K dtau^2 / 2), with + in up-sweeps
+    and - in down-sweeps. Here fc is the carrier, K the chirp rate, u the time from the middle of
+    the sweep and dtau = 2 RD / c the delay, with the range RD relative to the reference range. This
+    holds for radar.dechirp_sign "lo_conj_echo"; for "echo_conj_lo" the samples are conjugated.
+
+    A scatterer at azimuth x is illuminated in a sweep if |V t - x| is at most half the width of the
     beam at the slow time t of the middle of the sweep, with the speed V of the ladar.
     Differentiable in positions, amplitudes and motions.
 
@@ -56,7 +57,7 @@ def ladar_echo(
         scatterers: Scatterers, shape (..., target).
         radar: Ladar.
         n_period: Number of periods.
-        motion: Motions along the line of sight, random ones already drawn.
+        motion: Motions along the line of sight; draw random ones first with `drawn_motion`.
         fidelity: Model of the range within a sweep.
         sweep_error: Phase error of the laser. All models of the range but `EverySample` compute it
             as for scatterers at rest.
@@ -96,14 +97,14 @@ def range_model_error_db(
 
     The error is 1 - |mean exp(j phi)|^2 in dB, where phi is the phase difference between the model
     and the exact echo, in which the range is evaluated at every sample with all effects. A complex
-    gain that is common to the whole echo counts as no error. The phase is evaluated in some of the
-    periods and at some of the samples of a sweep.
+    gain that is common to the whole echo counts as no error. To save time the mean is taken over a
+    regular selection of periods and samples.
 
     Args:
         scatterers: One scatterer without trial dimensions, shape (1,).
         radar: Ladar.
         n_period: Number of recorded periods.
-        motion: Motions along the line of sight.
+        motion: Motions along the line of sight; draw random ones first with `drawn_motion`.
         fidelity: Model of the range within a sweep.
 
     Returns:
@@ -185,7 +186,7 @@ class SweepLines:
         start: Phase at the middle of the sweep in cycles, shape (*trials, 2, pulse, target),
             float64.
         slope: Frequency in hertz, same shape.
-        curve: Quadratic coefficient of all scatterers together in cycles per square second, shape
+        curve: Quadratic coefficient in cycles per square second, the mean of all scatterers, shape
             (*trials, 2, pulse); None for straight lines.
     """
 
@@ -197,10 +198,11 @@ class SweepLines:
     def of(history: RangeHistory, fidelity: Fidelity, middle_s: Tensor) -> SweepLines:
         """Form the phase polynomials of a range history.
 
+        For the range model `EverySample` the polynomials serve only to check beat frequencies.
+
         Args:
             history: Range of the scatterers.
-            fidelity: Model of the range within a sweep; the lines of `EverySample` serve only to
-                check beat frequencies.
+            fidelity: Model of the range within a sweep.
             middle_s: Slow times of the sweep middles in seconds, shape (2, pulse).
 
         Returns:
@@ -329,7 +331,7 @@ def simulate_ladar(
 
     Args:
         radar: Ladar.
-        world: World.
+        world: Scene, motion, propagation, laser errors and noise.
         n_period: Number of periods.
         draws: Random draws.
         impairments: Impairments by name, applied in order.
@@ -339,16 +341,20 @@ def simulate_ladar(
     Returns:
         The recording, shape (..., 2, pulse, fast_time), and the truth. With a calibration fibre the
         recording has aux `calibration`, shape (..., 2, pulse or 1, fast_time), and
-        `calibration_delay_s`. The truth holds at the turning points, half a period after the start
-        of each recorded period, shape (..., pulse): `velocity_m_s` of the motion alone in m/s,
-        receding positive; `range_error_m`, the displacement in metres; and `log_amplitude` if it is
-        modelled. `range_error_up_m` and `range_error_down_m` are the displacement at the middles of
-        the up-sweeps and down-sweeps. Where the flight time is modelled, all these are the values
-        at the times of reflection, R / c earlier. It further holds `azimuth_m`, `range_m` and
-        `amplitude` of the scatterers, shape (..., target); `noise_std`, the standard deviation of
-        the noise of a sample, shape (...,); and the values of each impairment under
-        "<impairment>.<name>". `clean` is the recording without motion and impairments, with the
+        `calibration_delay_s`. `clean` is the recording without motion and impairments, with the
         same noise and scintillation.
+
+        Some true values are given once per period, shape (..., pulse). At the turning point, half a
+        period after the start of the period: `velocity_m_s`, the velocity of the motion alone,
+        receding positive; `range_error_m`, the displacement in metres; and `log_amplitude` if it is
+        modelled. At the middles of the up-sweeps and down-sweeps: `range_error_up_m` and
+        `range_error_down_m`, the displacement in metres. Where the flight time is modelled, all
+        these are the values at the time of reflection, which is earlier by the reference range over
+        the speed of light.
+
+        Further true values are `azimuth_m`, `range_m` and `amplitude` of the scatterers, shape
+        (..., target); `noise_std`, the standard deviation of the noise of a sample, shape (...,);
+        and the values of each impairment under "<impairment>.<name>".
 
     Raises:
         TypeError: If radar, world or draws has the wrong type.

@@ -28,7 +28,7 @@ class LadarCourse:
 
     Args:
         scatterers: Scatterers, with amplitude zero outside the range gate, shape (..., target).
-        motion: Motions along the line of sight, random ones already drawn.
+        motion: Motions along the line of sight; random ones are already drawn.
         chi: Log-amplitude of the scintillation, None for no scintillation.
         start_s: Start of the first recorded period in seconds.
     """
@@ -46,7 +46,7 @@ class LadarCourse:
 
         Args:
             radar: Ladar.
-            world: World.
+            world: Scene, motion, propagation, laser errors and noise.
             n_period: Number of periods.
             draws: Random draws.
             device: Device of the scatterers.
@@ -118,21 +118,23 @@ class LadarCourse:
     ) -> dict[str, Tensor]:
         """Return the true values of a recording.
 
-        Where the flight time is modelled they are the values at the times of reflection, R / c
-        before reception.
+        Where the flight time is modelled, values that depend on time are those at the time of
+        reflection, which is earlier than the reception by the reference range over the speed of
+        light.
 
         Args:
             radar: Ladar.
-            world: World.
+            world: Scene, motion, propagation, laser errors and noise.
             middle_s: Slow times of the sweep middles in seconds, shape (2, pulse).
             later_s: Time in seconds by which all sweeps come later than middle_s, a number or shape
                 (...,); None for zero.
 
         Returns:
             Tensors by name: the velocity `velocity_m_s` and the displacement `range_error_m` at the
-            turning points, `range_error_up_m` and `range_error_down_m` at the middles of the
-            sweeps, `azimuth_m`, `range_m` and `amplitude` of the scatterers, `noise_std`, and
-            `log_amplitude` if it is modelled.
+            turning points between up-sweep and down-sweep, the displacements `range_error_up_m` and
+            `range_error_down_m` at the middles of the sweeps, `azimuth_m`, `range_m` and
+            `amplitude` of the scatterers, `noise_std`, and `log_amplitude` at the turning points if
+            it is modelled.
         """
         then = (
             middle_s
@@ -181,12 +183,12 @@ def noise_std(snr_db: Tensor | float | None, like: Tensor) -> Tensor:
     """Return the standard deviation of the complex noise of a sample.
 
     Args:
-        snr_db: Signal-to-noise ratio per sample in decibels, a number or one value per trial; None
-            for no noise.
+        snr_db: Power of a scatterer of amplitude 1 over the noise variance per sample in decibels,
+            a number or one value per trial; None for no noise.
         like: Tensor that gives the device.
 
     Returns:
-        10^(-snr / 20), shape (...,), float64.
+        10^(-snr_db / 20), or 0 without noise, shape (...,), float64.
     """
     return (
         torch.zeros((), dtype=torch.float64, device=like.device)
@@ -225,7 +227,7 @@ def calibration_aux(
 
     Args:
         radar: Ladar.
-        world: World.
+        world: Scene, motion, propagation, laser errors and noise.
         n_period: Number of periods.
         draws: Random draws.
         dtype: Complex dtype of the channel.
@@ -254,7 +256,9 @@ def hand_over(
     impairments: Mapping[str, Impairment] | None,
     draws: Draws,
 ) -> tuple[Recording, Truth]:
-    """Form recording and truth with the trials of the draws, and apply impairments.
+    """Form the recording and its truth, and apply impairments.
+
+    Samples and true values that are equal in all trials are expanded to the trials of the draws.
 
     Args:
         data: Samples, shape (..., *axes).

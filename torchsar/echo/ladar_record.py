@@ -51,19 +51,22 @@ def ladar_record(
 
     The phase of a scatterer in cycles is fc dtau + psi(t') - psi(t' - dtau), with the carrier fc,
     the delay dtau relative to the reference range, the phase psi of the triangular frequency sweep
-    and the time t' within the triangle. In each block a triangle starts trigger_s after the start
-    of the block, and others one period before and after. At the time u from the middle of a sweep
-    of the rate K, psi(t') - psi(t' - dtau) is +-(K u dtau - K dtau^2 / 2); where the echo was sent
-    a time o before the last turning point, +-K o^2 is added. Within a block the range of each
-    scatterer follows a parabola, the motion a spline with 64 knots per period, and the
-    log-amplitude a straight line. Differentiable.
+    and the time t' since the start of a triangle. In each block a triangle starts trigger_s after
+    the start of the block; it is repeated before and after with the period.
+
+    In an up-sweep psi(t') - psi(t' - dtau) is K (u dtau - dtau^2 / 2 + o^2), in a down-sweep its
+    negative. Here K is the chirp rate, u the time from the middle of the sweep, and o the time by
+    which t' - dtau lies outside this sweep, or 0 if it lies inside.
+
+    Within a block the range of each scatterer follows a parabola, the motion a spline with 64 knots
+    per period, and the log-amplitude a straight line. Differentiable.
 
     Args:
         scatterers: Scatterers, shape (..., target).
         radar: Ladar.
         n_period: Number of recorded periods, one block each.
         n_sample: Number of samples of a block.
-        motion: Motions along the line of sight, random ones already drawn.
+        motion: Motions along the line of sight; draw random ones first with `drawn_motion`.
         trigger_s: Time from the start of a block to the start of an up-sweep in seconds, a number
             or one value per trial.
         without: Physical effects that are left out: "residual_video", "hyperbola" or "flight".
@@ -181,14 +184,12 @@ class BlockPaths:
     ) -> BlockPaths:
         """Compute the range history of every scatterer in each block of the record.
 
-        A block is one recorded modulation period; `BlockPaths` holds its range history.
-
         Args:
             scatterers: Scatterers, shape (..., target).
             radar: Ladar.
             start_s: Start times of the blocks in seconds, shape (pulse,), float64.
             n_sample: Number of samples in a block.
-            motion: Motions along the line of sight.
+            motion: Motions along the line of sight; draw random ones first with `drawn_motion`.
             without: Names of physical effects that are left out of the model.
 
         Returns:
@@ -318,7 +319,7 @@ def _refuse_folding(beat_hz: Tensor, contributing: Tensor) -> None:
     if low <= 0 <= high:
         raise ValueError(
             f"beat frequencies of {low / 1e6:.6g} to {high / 1e6:.6g} MHz fold at zero in real samples; move the "
-            "reference range so far off the scene that the beat frequency by range exceeds the Doppler frequency, "
+            "reference range so far off the scene that the beat frequency due to range exceeds the Doppler shift, "
             '2 v / lambda, or record complex samples (detection "complex")'
         )
 
@@ -343,14 +344,14 @@ def simulate_ladar_record(
 
     Args:
         radar: Ladar.
-        world: World.
+        world: Scene, motion, propagation, laser errors and noise.
         n_period: Number of recorded periods.
         draws: Random draws.
         block_s: Length of a block in seconds. By default one period if all periods are recorded, so
             that blocks adjoin, otherwise two periods.
         trigger_s: Time from the start of a block to the start of an up-sweep in seconds, a number
-            or one value per trial. Whole samples, zero among them, put samples on the symmetric
-            grid of separated sweeps.
+            or one value per trial. If it is a whole number of sampling intervals, such as 0, the
+            samples of separated sweeps are samples of the record.
         trigger_known: Whether the recording holds the trigger times, as aux `trigger_s`.
         impairments: Impairments by name, applied in order.
         dtype: Complex dtype of the recording; real samples have the corresponding real dtype.
@@ -359,15 +360,21 @@ def simulate_ladar_record(
     Returns:
         The recording, shape (..., pulse, time), and the truth. With a calibration fibre the
         recording has aux `calibration`, shape (..., 2, pulse or 1, fast_time), and
-        `calibration_delay_s`. The truth holds at the turning points, trigger_s plus half a period
-        after the start of each block, shape (..., pulse): `velocity_m_s` of the motion alone in
-        m/s, receding positive; `range_error_m`, the displacement in metres; and `log_amplitude` if
-        it is modelled. `range_error_up_m` and `range_error_down_m` are the displacement at the
-        middles of the up-sweeps and down-sweeps. All these are exact for up to 16 different trigger
-        times, and interpolated for more. It further holds `azimuth_m`, `range_m`
-        and `amplitude` of the scatterers, shape (..., target); `noise_std`, shape (...,);
-        `trigger_s`; and the values of each impairment under "<impairment>.<name>". `clean` is the
-        recording without motion and impairments, with the same noise and scintillation.
+        `calibration_delay_s`. `clean` is the recording without motion and impairments, with the
+        same noise and scintillation.
+
+        Some true values are given once per block, shape (..., pulse). At the turning point,
+        trigger_s plus half a period after the start of the block: `velocity_m_s`, the velocity of
+        the motion alone, receding positive; `range_error_m`, the displacement in metres; and
+        `log_amplitude` if it is modelled. At the middles of the up-sweeps and down-sweeps:
+        `range_error_up_m` and `range_error_down_m`, the displacement in metres. Where the flight
+        time is modelled, all these are the values at the time of reflection, which is earlier by
+        the reference range over the speed of light. They are exact for up to 16 different trigger
+        times, and interpolated for more.
+
+        Further true values are `azimuth_m`, `range_m` and `amplitude` of the scatterers, shape
+        (..., target); `noise_std`, the standard deviation of the noise of a complex sample, shape
+        (...,); `trigger_s`; and the values of each impairment under "<impairment>.<name>".
 
     Raises:
         TypeError: If radar, world or draws has the wrong type.

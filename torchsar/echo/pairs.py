@@ -18,13 +18,13 @@ class SimulatedPairs:
     """Iterable over batches of trials of one world, for training and for tests over many scenes.
 
     Batch b holds the trials b * batch to (b + 1) * batch - 1 of the seed. Every trial draws its own
-    scene, phases, noise and impairments, and is the same in any batch size. World parameters must
-    be plain numbers, since a batch may hold any of the trials. Each item is a Recording and its
-    Truth.
+    scene, phases, noise and impairments, and is the same in any batch size. Each item is a
+    Recording and its Truth.
 
     Args:
         radar: Radar.
-        world: World.
+        world: World whose parameters are numbers that hold for all trials, not tensors with one
+            value per trial.
         n_pulse: Number of pulses.
         n_range: Number of range samples.
         seed: Seed of the random draws.

@@ -15,11 +15,11 @@ def echo_spectrum(
 ) -> Tensor:
     """Return the range spectrum of a sum of delayed echoes.
 
-    The spectrum is the sum over targets of weight exp(-2j pi (carrier_turns + f delay)) at the
-    frequencies f = (-n//2, ...) step_hz. The factor exp(-2j pi f delay) separates into a coarse and
-    a fine factor, so that the sum over targets is one batched matrix product. This is exact to the
-    working precision and differentiable, and no array of targets times pulses times samples is
-    formed.
+    The spectrum is the sum over targets of weight exp(-2j pi (carrier_turns + f delay_s)) at the
+    frequencies f = i step_hz with i = -(n // 2), ..., n - n // 2 - 1. The phasor of f is the
+    product of one on a coarse grid and one on a fine grid of frequencies, so that the sum over
+    targets is a batched matrix product. This is exact to the working precision and needs no array
+    of targets times pulses times samples. Differentiable.
 
     Args:
         delay_s: Delay in seconds, shape (..., pulse, target), float64.

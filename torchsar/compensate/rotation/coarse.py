@@ -67,17 +67,18 @@ class _Agreement:
 def coarse_warp(data: Tensor, prf_hz: float, sections: int | None = None) -> Tensor:
     """Estimate how the rotation rate changes, from the Doppler spectra of short sections.
 
-    The rate at time t after the first pulse is modelled as that at the first pulse times 1 + k1 t +
-    k2 t^2 / 2. This relative rate is found to about a percent. Rates between a quarter and four
-    times that of the first pulse are searched. At least one range cell must hold scatterers off the
-    rotation axis.
+    The ratio of the rotation rate at time t after the first pulse to that at the first pulse is
+    modelled as 1 + k1 t + k2 t^2 / 2 and is found to about a percent. In the middle and at the end
+    of the aperture, ratios from a quarter to four are searched. At least one range cell must hold
+    scatterers off the rotation axis.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
         sections: Number of half-overlapping sections; by default half the square root of the number
             of pulses, within 8..28. The Doppler of a scatterer then changes within a section by
-            about the Doppler resolution.
+            about the Doppler resolution. The number is limited to an eighth of the number of
+            pulses, but is at least 4.
 
     Returns:
         k1 in 1/s and k2 in 1/s^2, shape (trial, 2), float64.

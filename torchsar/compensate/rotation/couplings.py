@@ -23,19 +23,20 @@ _TABLE = 16  # steps of the table per Doppler cell, enough for linear interpolat
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of scatterers that are close enough in Doppler to couple.
+    """Pairs of neighbouring scatterers, with the inner products of their echoes.
 
-    Each scatterer also forms a pair with itself.
+    A pair consists of two scatterers of one trial that lie less than 64 Doppler cells apart. Each
+    scatterer also forms a pair with itself.
 
     Args:
         trial: Trial of each pair, shape (pair,).
-        first: First scatterer of each pair, shape (pair,).
-        second: Second scatterer of each pair, shape (pair,).
-        shape: Shape (trial, scatterer) of the scatterers.
-        products: For each key (n, m) a tensor of shape (pair,): conj(s_p) s_q times the sum over
-            pulses of b_n b_m conj(e_p) e_q. Here p is the first and q the second scatterer of a
-            pair, s are their amplitudes, e their echoes of unit amplitude, and b_n and b_m are the
-            basis functions n and m of slow time.
+        first: Index p of the first scatterer of each pair, shape (pair,).
+        second: Index q of the second scatterer of each pair, shape (pair,).
+        shape: Shape (trial, scatterer) of tensors with one value per scatterer.
+        products: Inner products of the echoes over slow time, weighted with basis functions b_0,
+            b_1, ... of slow time. The entry (n, m), shape (pair,), is the sum over pulses of b_n
+            b_m conj(s_p e_p) s_q e_q, where s is the amplitude of a scatterer and e its echo of
+            unit amplitude.
     """
 
     trial: Tensor
@@ -46,18 +47,18 @@ class Pairs:
 
     @staticmethod
     def find(sampling: Sampling, k: Tensor, amplitude: Tensor, cell: Tensor, bases: Tensor) -> Pairs:
-        """Find the pairs of scatterers that are close enough in Doppler to couple.
+        """Find the pairs of scatterers less than 64 Doppler cells apart, and their inner products.
 
         Args:
             sampling: Sampling of the data.
             k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
                 1/s^2, ..., shape (trial, order - 1).
-            amplitude: Amplitudes, shape (trial, scatterer), complex; 0 for none.
-            cell: Doppler cells, shape (trial, scatterer).
-            bases: Basis functions, shape (trial, base, pulse); zero in pulses that are not present.
+            amplitude: Amplitudes, shape (trial, scatterer), complex; 0 where there is no scatterer.
+            cell: Doppler of the scatterers in Doppler cells, shape (trial, scatterer).
+            bases: Basis functions of slow time, shape (trial, base, pulse); zero in missing pulses.
 
         Returns:
-            The pairs.
+            The pairs with their inner products.
         """
         separation = cell[:, :, None] - cell[:, None]
         used = amplitude != 0
@@ -87,15 +88,16 @@ class Pairs:
         return values[self.trial, self.second if side else self.first]
 
     def matrix(self, blocks: list[list[Tensor]]) -> Tensor:
-        """Assemble a dense matrix over the scatterers from values per pair of scatterers.
+        """Assemble a matrix of blocks, each of which has one entry for each pair of scatterers.
 
         Args:
-            blocks: Square list of blocks, by row and column; each holds one value per pair, shape
-                (pair,).
+            blocks: The blocks, as a list of n rows of n blocks. A block is given by the entries of
+                its pairs, shape (pair,): that of a pair (p, q) stands in row p and column q of the
+                block.
 
         Returns:
-            The matrix, shape (trial, blocks * scatterer, blocks * scatterer); zero where two
-            scatterers do not form a pair.
+            The matrix, shape (trial, n * scatterer, n * scatterer); zero where two scatterers do
+            not form a pair.
         """
         count, n = self.shape[1], len(blocks)
         result = blocks[0][0].new_zeros(self.shape[0], n * count, n * count)
@@ -155,7 +157,8 @@ def band_response(x: Tensor, cells: int) -> tuple[Tensor, Tensor, Tensor]:
         cells: Number of range cells.
 
     Returns:
-        The response, of unit peak, and its first and second derivative, same shape, complex128.
+        The response, of unit peak, and its first and second derivative with respect to `x`, same
+        shape, complex128.
     """
     cycles = (torch.arange(cells, dtype=torch.float64, device=x.device) - cells // 2) / cells
     turn = 2j * math.pi * cycles

@@ -48,11 +48,12 @@ def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int 
         limit: Largest number of grid points per trial.
 
     Returns:
-        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
-        range-dependent phase, `omega_rad_s` and `yc_m`, as in `genetic_rotation`. `ok` is False
-        where the image is not sharper than without compensation, or the best point lies at the end
-        of an axis of several values. info["entropy_grid_nats"], shape (..., m_1, m_2, ...), is the
-        entropy on the grid.
+        `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
+        range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
+        the range centre deviation. `genetic_rotation` describes these values and quality in full.
+        `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
+        or the best point lies on the edge of the grid. info["entropy_grid_nats"], shape (..., m_1,
+        m_2, ...), is the entropy on the grid.
 
     Raises:
         ValueError: If there is not one list of values per unknown, or the grid exceeds the limit.
@@ -78,17 +79,23 @@ def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: 
         options: Options of `torchsar.optim.genetic`.
 
     Returns:
-        `warp_k`, the relative derivatives of the rotation rate, shape (..., order - 1), and its
-        entries `k1_per_s`, `k2_per_s2`, ... If `figure` compensates the range-dependent phase, also
-        the rotation rate `omega_rad_s` at the first pulse, shape (...,), made positive since its
-        sign is not observable (the image may be mirrored in cross range), and the range centre
-        deviation `yc_m`, shape (...,). There are no standard deviations, because an entropy is not
-        a likelihood. quality is the relative decrease of exp(entropy), the number of cells that the
-        image fills, due to the compensation. `ok` is False where this number does not decrease, or
-        the minimum lies on the edge of the box; with few image lines the result may be biased even
-        where `ok` is True, see `EntropyObjective`. info: evaluations, entropy_nats,
-        uncompensated_entropy_nats, on_edge, shape (..., n), and best_entropy_nats, shape (...,
-        generation).
+        `warp_k`, the relative derivatives k1 (1/s), k2 (1/s^2), ... of the rotation rate at the
+        first pulse, shape (..., order - 1), and each of them as `k1_per_s`, `k2_per_s2`, ..., shape
+        (...,). If `figure` compensates the range-dependent phase, also `omega_rad_s`, the rotation
+        rate at the first pulse, and `yc_m`, the range centre deviation yc, shape (...,) each. A
+        cell at range y lies at y + yc from the rotation centre. The data do not show the sign of
+        the rotation rate, so `omega_rad_s` is positive and the image may be mirrored in cross
+        range. There are no standard deviations, because an entropy is not a likelihood.
+
+        quality is the relative decrease of exp(entropy), the number of cells that the image fills,
+        due to the compensation. `ok` is False where the entropy decreases by less than 0.01 nats,
+        or where the minimum lies on the edge of the box. With few image lines the result may be
+        biased even where `ok` is True, see `EntropyObjective`.
+
+        info holds the number of evaluations; entropy_nats and uncompensated_entropy_nats, the
+        entropy with and without compensation; on_edge, shape (..., n), True for unknowns on the
+        edge of the box; and best_entropy_nats, shape (..., generations + 1), the least entropy up
+        to each generation.
 
     Raises:
         ValueError: If there is not one bound per unknown, or an option is invalid.
@@ -112,9 +119,10 @@ def evolve_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: D
         options: Options of `torchsar.optim.differential_evolution`.
 
     Returns:
-        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
-        range-dependent phase, `omega_rad_s` and `yc_m`; quality, `ok` and info are defined as for
-        `genetic_rotation`.
+        `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
+        range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
+        the range centre deviation. `genetic_rotation` describes these values, quality, `ok` and
+        info in full.
 
     Raises:
         ValueError: If there is not one bound per unknown, or an option is invalid.
@@ -127,22 +135,24 @@ def evolve_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: D
 def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True, steps: int = 20) -> Estimate:
     """Find a rotation of least image entropy near a start by Newton's method.
 
-    The paper (see Reference) calls the method Gauss-Newton; its Table 2 shows that the result
-    depends on the start.
+    Remote Sens. 2025, 17, 3447 calls this method Gauss-Newton. Table 2 of that paper shows that the
+    result depends on the start.
 
     Args:
         figure: Image entropy as a function of the unknowns of the rotation.
-        start: Unknowns to start from, shape (..., n), see `figure.start`.
+        start: Unknowns to start from, shape (..., n), see `figure.start`. A start at which the
+            rotation stops or reverses is replaced by zeros.
         damped: True damps the steps. Undamped steps diverge on most targets, even from the true
             rotation, because the entropy is nearly flat in one direction.
         steps: Largest number of steps.
 
     Returns:
-        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
-        range-dependent phase, `omega_rad_s` and `yc_m`, as in `genetic_rotation`. `ok` is False
-        where the image is not sharper than without compensation, where the search diverges (the
-        result is then its last finite point), or where it has not converged after `steps` steps.
-        info["iterations"] is the number of steps.
+        `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
+        range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
+        the range centre deviation. `genetic_rotation` describes these values and quality in full.
+        `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
+        where the search diverges (the result is then its last finite point), or where it has not
+        converged after `steps` steps. info["iterations"] is the number of steps.
 
     Raises:
         ValueError: If the start does not have one value per unknown.
@@ -159,22 +169,27 @@ def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True,
 def descend_rotation(figure: ImageEntropy, start: Tensor, *, steps: int = 60, tolerance: float = 1e-4) -> Estimate:
     """Find a rotation of least image entropy near a start by L-BFGS with exact gradients.
 
-    The descent converges best in the variables "shape", see `Unknowns`. With order 2 and without
-    compensation of the range-dependent phase this is the second-order method (SM) of Remote Sens.
-    2025, 17, 3447. For a target of order 3, that method finds about k1 + k2 T / 2 in place of k1,
-    where T is the length of the aperture.
+    The search converges best if `variables` of the `EntropyObjective` is "shape", see `Unknowns`.
+
+    With a rotation angle of order 2 and without compensation of the range-dependent phase, this is
+    the second-order method (SM) of Remote Sens. 2025, 17, 3447. If the angle of the target is of
+    order 3, SM finds about k1 + k2 T / 2 instead of k1. Here k1 and k2 are the relative derivatives
+    of the rotation rate, and T is the length of the aperture.
 
     Args:
         figure: Image entropy as a function of the unknowns of the rotation.
-        start: Unknowns to start from, shape (..., n), see `figure.start`.
+        start: Unknowns to start from, shape (..., n), see `figure.start`. A start at which the
+            rotation stops or reverses is replaced by zeros.
         steps: Largest number of steps.
-        tolerance: Norm of the gradient, relative to that at the start, at which a trial ends.
+        tolerance: A trial ends when the norm of its gradient is at most this fraction of that at
+            the start.
 
     Returns:
-        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
-        range-dependent phase, `omega_rad_s` and `yc_m`, as in `genetic_rotation`. `ok` is False
-        where the image is not sharper than without compensation, or where a trial has not converged
-        after `steps` steps.
+        `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
+        range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
+        the range centre deviation. `genetic_rotation` describes these values and quality in full.
+        `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
+        or where a trial has not converged after `steps` steps.
 
     Raises:
         ValueError: If the start does not have one value per unknown.
@@ -308,17 +323,19 @@ class _Search(Stage):
 class RotationSearch(_Search):
     """Rotation of least image entropy on a grid; see `search_rotation`.
 
-    Along unknown i the grid has counts[i] values from low[i] to high[i]. The unknowns are the
-    rotation rate omega at the first pulse (rad/s), its relative derivatives k1, k2, ... (1/s,
-    1/s^2, ...), and the range centre deviation yc (m) if it is not known (see `Unknowns`).
+    Along unknown i the grid has counts[i] equally spaced values from low[i] to high[i]. With the
+    default settings the unknowns are the rotation rate omega at the first pulse (rad/s) and its
+    relative derivatives k1 (1/s) and k2 (1/s^2). Other settings change their number and meaning,
+    see `Unknowns`.
 
     Args:
         radar: Radar parameters.
-        low: Lowest value of each unknown.
+        low: Lowest value of each unknown: by default omega (rad/s), k1 (1/s) and k2 (1/s^2).
         high: Highest value of each unknown.
         counts: Number of values of each unknown.
-        objective: Settings of the entropy. A connected `yc_m` replaces the value in the settings,
-            unless they make yc an unknown.
+        objective: Settings of the entropy. If another stage provides `yc_m` (range centre
+            deviation), this value replaces that of the settings, unless the settings make it an
+            unknown.
         limit: Largest number of grid points per trial.
 
     Raises:
@@ -360,14 +377,17 @@ class RotationSearch(_Search):
 class RotationGenetic(_Search):
     """Rotation of least image entropy in a box by a genetic algorithm; see `genetic_rotation`.
 
-    All trials use the same random numbers.
+    All trials use the same random numbers. With the default settings the unknowns are the rotation
+    rate omega at the first pulse (rad/s) and its relative derivatives k1 (1/s) and k2 (1/s^2).
+    Other settings change their number and meaning, see `Unknowns`.
 
     Args:
         radar: Radar parameters.
-        low: Lower bound of each unknown: omega (rad/s), k1, k2, ..., and yc (m) if it is not known.
+        low: Lower bound of each unknown: by default omega (rad/s), k1 (1/s) and k2 (1/s^2).
         high: Upper bound of each unknown.
-        objective: Settings of the entropy. A connected `yc_m` replaces the value in the settings,
-            unless they make yc an unknown.
+        objective: Settings of the entropy. If another stage provides `yc_m` (range centre
+            deviation), this value replaces that of the settings, unless the settings make it an
+            unknown.
         population: Number of candidates in a generation.
         generations: Number of generations.
         elites: Number of best candidates that pass unchanged to the next generation.
@@ -408,14 +428,17 @@ class RotationGenetic(_Search):
 class RotationEvolution(_Search):
     """Rotation of least image entropy in a box by differential evolution; see `evolve_rotation`.
 
-    All trials use the same random numbers.
+    All trials use the same random numbers. With the default settings the unknowns are the rotation
+    rate omega at the first pulse (rad/s) and its relative derivatives k1 (1/s) and k2 (1/s^2).
+    Other settings change their number and meaning, see `Unknowns`.
 
     Args:
         radar: Radar parameters.
-        low: Lower bound of each unknown: omega (rad/s), k1, k2, ..., and yc (m) if it is not known.
+        low: Lower bound of each unknown: by default omega (rad/s), k1 (1/s) and k2 (1/s^2).
         high: Upper bound of each unknown.
-        objective: Settings of the entropy. A connected `yc_m` replaces the value in the settings,
-            unless they make yc an unknown.
+        objective: Settings of the entropy. If another stage provides `yc_m` (range centre
+            deviation), this value replaces that of the settings, unless the settings make it an
+            unknown.
         population: Number of candidates in a generation.
         generations: Number of generations.
         strategy: Mutation strategy, "rand1bin" or "best1bin".
@@ -513,22 +536,23 @@ class _Descending(_Search):
 class RotationNewton(_Descending):
     """Rotation of least image entropy near a start by Newton's method; see `newton_rotation`.
 
-    The unknowns are those of `objective`: the rotation rate omega, if the entropy includes the
-    compensation of the range-dependent phase, k1, k2, ..., and the range centre deviation yc if it
-    is not given. Values that other stages provide (omega_rad_s, warp_k, yc_m) take precedence over
-    the entries of `start`. If neither gives omega, rotation_rad_s of the radar is used.
+    The search starts from the values `omega_rad_s` and `warp_k` that other stages provide. A value
+    that no stage provides is taken from `start`. Without `start` the rotation rate is
+    `rotation_rad_s` of the radar.
 
     Args:
         radar: Radar parameters.
-        start: Values to start from, [omega (rad/s), k1, k2, ...], without omega if it is not an
-            unknown; None if other stages provide them.
-        objective: Settings of the image entropy, by default with a gridding kernel of six taps. If
-            yc is an unknown, the search starts from the `yc_m` that another stage provides, or 0.
+        start: Values to start from, [omega (rad/s), k1 (1/s), k2 (1/s^2), ...]: the rotation rate
+            omega at the first pulse and its relative derivatives. Leave omega out if `objective`
+            does not compensate the range-dependent phase. None if other stages provide the values.
+        objective: Settings of the image entropy, by default with a gridding kernel of six taps. A
+            range centre deviation `yc_m` that another stage provides replaces that of the settings.
+            If they make it an unknown, the search starts from that of the stage, or from 0.
         damped: True damps the steps.
         steps: Largest number of steps.
 
     Raises:
-        ValueError: If the start does not have one value per unknown.
+        ValueError: If `start` has the wrong number of values.
     """
 
     def __init__(
@@ -553,17 +577,18 @@ class RotationNewton(_Descending):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            omega_rad_s: Rotation rate in rad/s to start from, shape (...,).
+            omega_rad_s: Rotation rate in rad/s to start from, shape (...,); None takes that of the
+                stage or of the radar.
             warp_k: Relative derivatives k1, k2, ... of the rotation rate to start from, in 1/s,
-                1/s^2, ..., shape (..., order - 1).
+                1/s^2, ..., shape (..., order - 1); None takes those of the stage.
             yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-                rotation centre), shape (...,).
+                rotation centre), shape (...,); None takes that of the settings.
 
         Returns:
             The `Estimate` that the function `newton_rotation` returns.
 
         Raises:
-            ValueError: If a value of the start is neither given nor connected.
+            ValueError: If there is no rotation rate or no `warp_k` to start from.
         """
         figure = self.figure(signal, yc_m)
         return newton_rotation(
@@ -577,16 +602,22 @@ class RotationDescent(_Descending):
     With order 2 and without compensation of the range-dependent phase it is the second-order method
     (SM) of Remote Sens. 2025, 17, 3447.
 
+    The search starts from the values `omega_rad_s` and `warp_k` that other stages provide. A value
+    that no stage provides is taken from `start`. Without `start` the rotation rate is
+    `rotation_rad_s` of the radar.
+
     Args:
         radar: Radar parameters.
-        start: Values to start from, [omega (rad/s), k1, k2, ...], without omega if the
-            range-dependent phase is not compensated; None if the values are connected.
-        objective: Settings of the entropy, by default with the variables "shape". If yc is an
-            unknown, the search starts from the connected `yc_m` or 0.
+        start: Values to start from, [omega (rad/s), k1 (1/s), k2 (1/s^2), ...]: the rotation rate
+            omega at the first pulse and its relative derivatives. Leave omega out if `objective`
+            does not compensate the range-dependent phase. None if other stages provide the values.
+        objective: Settings of the entropy, by default with the variables "shape". A range centre
+            deviation `yc_m` that another stage provides replaces that of the settings. If they make
+            it an unknown, the search starts from that of the stage, or from 0.
         steps: Largest number of steps.
 
     Raises:
-        ValueError: If the start does not have one value per unknown.
+        ValueError: If `start` has the wrong number of values.
     """
 
     def __init__(
@@ -610,17 +641,18 @@ class RotationDescent(_Descending):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            omega_rad_s: Rotation rate in rad/s to start from, shape (...,).
+            omega_rad_s: Rotation rate in rad/s to start from, shape (...,); None takes that of the
+                stage or of the radar.
             warp_k: Relative derivatives k1, k2, ... of the rotation rate to start from, in 1/s,
-                1/s^2, ..., shape (..., order - 1).
+                1/s^2, ..., shape (..., order - 1); None takes those of the stage.
             yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-                rotation centre), shape (...,).
+                rotation centre), shape (...,); None takes that of the settings.
 
         Returns:
             The `Estimate` that the function `descend_rotation` returns.
 
         Raises:
-            ValueError: If a value of the start is neither given nor connected.
+            ValueError: If there is no rotation rate or no `warp_k` to start from.
         """
         figure = self.figure(signal, yc_m)
         return descend_rotation(figure, self.started(figure, omega_rad_s, warp_k, yc_m), steps=self.steps)

@@ -1,17 +1,20 @@
 """Refinement of an estimated rotation from the phase histories of bright isolated scatterers.
 
-A window is set about each scatterer in the image and transformed back to slow time, which gives the
-history of the scatterer over the aperture. Errors of the estimated rotation leave a curved phase in
-it, apart from a constant and a line:
+The history of a scatterer is its signal over the aperture. It is cut out of the image by a window
+about the scatterer and transformed back to slow time. If the rotation is estimated without error,
+the phase of the history is a straight line. Errors add a curved phase:
 
-- an error dk of a relative derivative k of the rotation rate leaves -2 pi c (du/dk) dk, where c is
-the Doppler cell of the scatterer and u the warped time over its value at the end of the aperture;
-- errors dw of the squared rotation rate w, and dv of v = w times the range centre deviation, leave
-(2 pi / lambda) (y dw + dv) phi^2, where y is the range of the scatterer and phi the warped time.
+- an error dk of a relative derivative k of the rotation rate adds -2 pi c (du/dk) dk, where c is
+the Doppler cell of the scatterer. The warped time phi is the rotation angle over the rate at the
+first pulse, and u is phi over its value at the end of the aperture.
+- an error dw of the squared rotation rate w, and an error dv of v = w times the error of the
+assumed rotation centre in range, add (2 pi / lambda) (y dw + dv) phi^2, where y is the range of the
+scatterer from the assumed centre.
 
-The errors are found by least squares. The fit uses products of a history with itself a sixth of the
-aperture later, which need no unwrapping. It can start from any rotation rate, even from w = 0,
-because the phase that depends on range changes little in that time.
+The errors are found by least squares. The fit uses the phases of products of a history with its
+conjugate a sixth of the aperture earlier. They need no unwrapping, because the curved phase changes
+little within a sixth of the aperture. The fit can therefore start from any rotation rate, even from
+w = 0.
 """
 
 from __future__ import annotations
@@ -54,7 +57,8 @@ def refined_by_histories(
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
         motion: Rotation to start from.
-        free_centre: True estimates the range centre deviation; False holds it.
+        free_centre: True also estimates the range of the rotation centre; False keeps that of
+            `motion`.
         count: Largest number of scatterers.
         half_cells: Half width of a window in Doppler cells, wide enough for the blur that the error
             of the start causes.

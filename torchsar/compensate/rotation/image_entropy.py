@@ -1,7 +1,8 @@
 """Entropy of the image as a function of the rotation, for many candidates at once.
 
-For each candidate rotation, the phase that depends on the range of a scatterer is removed, the
-image is formed by the matched Fourier transform, and the entropy of the image is computed.
+For each candidate rotation, the phase that depends on the range of a scatterer is removed (if the
+settings say so), the image is formed by the matched Fourier transform
+(`torchsar.focus.matched_fourier`), and the entropy of the image is computed.
 """
 
 from __future__ import annotations
@@ -22,23 +23,23 @@ from torchsar.radar import InverseRadar
 
 @dataclass(frozen=True)
 class EntropyObjective:
-    """Settings of the image entropy that searches for the rotation of a target minimise.
+    """Settings of the image entropy as a function of the rotation of a target, see `ImageEntropy`.
 
     Args:
         order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
             rotation.
-        range_term: True compensates the phase that depends on the range of a scatterer (and on
-            omega and yc), see `Unknowns`.
+        range_term: True compensates the phase that depends on the range of a scatterer. The entropy
+            then also depends on the rotation rate omega and on yc.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
             rotation centre), if known a priori, a number or shape (...,). None makes it an unknown.
         variables: Variables of the search, "raw" (rate and its relative derivatives) or "shape"
             (less correlated ones), see `Unknowns`.
-        oversampling: Image lines per Doppler cell. With few lines, peaks between lines bias the
-            minimum. On a target of 120 points at 20 dB the bias is 2 % of k and 24 % of omega with
-            1 line, 0.2 % and 1 % with 2, and 0.07 % and 0.2 % with 4; it is larger on smaller
-            targets.
-        lines: Number of image lines about zero Doppler; None computes all that the pulse rate
-            holds.
+        oversampling: Image lines per Doppler cell. With few lines, peaks that fall between lines
+            shift the minimum of the entropy. On a target of 120 points at 20 dB, 1 line per cell
+            shifts k by 2 % and omega by 24 %, 2 lines by 0.2 % and 1 %, and 4 lines by 0.07 % and
+            0.2 %; the shifts are larger on smaller targets.
+        lines: Number of image lines about zero Doppler; None computes the whole unambiguous Doppler
+            band.
         taps: Number of taps of the interpolation kernel of the matched Fourier transform. The error
             of the entropy is 2e-6 nats with 4 taps and 1e-7 with 6.
     """
@@ -58,18 +59,18 @@ _DEFAULT = EntropyObjective()
 class ImageEntropy:
     """Entropy in nats of the image of range-compressed pulses, as a function of the rotation.
 
-    Every search for the rotation minimises it. For an instance `figure`, figure(x) returns the
-    entropies, shape (..., candidate), of candidates x, shape (..., candidate, n), each a vector of
-    the unknowns in `figure.unknowns`. The entropy is +inf, never NaN, where the rotation would
-    stop or reverse. Twice differentiable in x. Candidates are processed in blocks; if derivatives
-    are required, the intermediate results of all candidates stay in memory.
+    An instance `figure` is called with candidates x, shape (..., candidate, n). A candidate is a
+    vector of the n unknowns that `figure.unknowns` describes. figure(x) returns the entropies,
+    shape (..., candidate). The entropy is +inf, never NaN, where the rotation would stop or
+    reverse. Twice differentiable in x. Candidates are processed in blocks; if derivatives are
+    required, the intermediate results of all candidates stay in memory.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
         objective: Settings.
         wavelength_m: Wavelength in metres.
         prf_hz: Pulse repetition frequency in Hz.
-        range_m: Range coordinates y_n of the cells in metres, zero in the middle of the window,
+        range_m: Range y_n of the cells from the assumed rotation centre in metres, evenly spaced,
             shape (range,).
 
     Raises:

@@ -82,17 +82,17 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Motion:
-    """Rotation of a target, described by w and v, in which the phases of echoes are linear.
+    """Rotation of a target, described by k1, k2, ... and by two parameters w and v.
 
-    The phase that depends on the range y_n of a scatterer (the range term) is (2 pi / lambda) (w
-    (y_n + centre_m) + v) phi^2, where phi is the warped time t + k1 t^2 / 2 + ... and w the square
-    of the rotation rate. Estimates of w and v may start at zero, and may become negative where the
-    data are noise.
+    The phase of an echo is linear in w and v: the part that depends on the range y_n of the
+    scatterer (the range term) is (2 pi / lambda) (w (y_n + centre_m) + v) phi^2, where phi is the
+    warped time t + k1 t^2 / 2 + ... Estimates of w and v may start at zero, and may become negative
+    where the data are noise.
 
     Args:
         k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s, 1/s^2,
             ..., shape (trial, order - 1), float64.
-        w: Square of the rotation rate in rad^2/s^2, shape (trial,), float64.
+        w: Square of the rotation rate at the first pulse in rad^2/s^2, shape (trial,), float64.
         v: w times (yc - centre_m), where yc is the estimated range centre deviation, in m
             rad^2/s^2, shape (trial,), float64.
         centre_m: Range centre deviation yc known a priori, in metres (a cell at range y lies at y +
@@ -130,10 +130,7 @@ class Motion:
 
     @property
     def offset(self) -> Tensor:
-        """Product of the squared rotation rate w and the range centre deviation yc, shape (trial,).
-
-        In m rad^2/s^2.
-        """
+        """Squared rotation rate times range centre deviation in m rad^2/s^2, shape (trial,)."""
         return self.w * self.centre_m + self.v
 
     @property
@@ -149,7 +146,7 @@ class Motion:
         """Check whether the data can hold an echo with this rotation.
 
         Its parameters must be finite, and the phase that depends on range must change by less than
-        half a turn from pulse to pulse in every range cell.
+        about half a turn from pulse to pulse in every range cell.
 
         Args:
             sampling: Sampling of the data.
@@ -170,7 +167,7 @@ class Motion:
             other: The rotation taken for the other trials.
 
         Returns:
-            The chosen rotations, with this `centre_m`.
+            The chosen rotations. Their `centre_m` is that of this rotation in all trials.
         """
         w, v = (torch.where(keep, getattr(self, name), getattr(other, name)) for name in ("w", "v"))
         return Motion(torch.where(keep[:, None], self.k, other.k), w, v, self.centre_m)

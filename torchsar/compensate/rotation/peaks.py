@@ -21,7 +21,8 @@ class Peaks:
     """Peaks of an image, brightest first.
 
     Args:
-        power: Power, shape (trial, peak); 0 where there is none.
+        power: Power, shape (trial, peak); 0 in the places that a trial with fewer peaks does not
+            fill.
         line: Image line, shape (trial, peak), int64.
         cell: Range cell, shape (trial, peak), int64.
     """

@@ -54,8 +54,8 @@ def uneven_rotation(
     the rotation and every scatterer (`fit_scatterers`).
 
     The rotation rate is found only from the phase curvature, which grows with range. Scatterers at
-    several ranges are therefore needed; the rate cannot be found if all lie in one range cell and
-    yc is unknown.
+    several ranges are therefore needed: if all lie in one range cell and `yc_m` is not given, the
+    rate cannot be found.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
@@ -66,20 +66,24 @@ def uneven_rotation(
             rotation, 2, 3 or more.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
             rotation centre), if known a priori, a number or shape (...,); None estimates it.
-        scatterers: Largest number of scatterers; more are more accurate and take longer.
+        scatterers: Largest number of scatterers; more are more accurate and take longer. By default
+            one for every 1450 samples of a trial, within 128..800.
         rounds: Largest number of maximum-likelihood steps.
 
     Returns:
-        `omega_rad_s`, the rotation rate at the first pulse, shape (...,), whose sign is not
-        observable (the image may be mirrored in cross range); `warp_k`, its relative derivatives
-        k1, k2, ..., shape (..., order - 1), and their entries `k1_per_s`, `k2_per_s2`, ...; and
-        `yc_m`, the range centre deviation, shape (...,). Standard deviations follow from the Fisher
-        information of the scatterers found. quality is the share of the energy above the noise that
-        these scatterers explain. info["focused"] is False where fewer than 3 scatterers are found,
-        they explain less than 40 % of the energy, the entropy is higher than without compensation,
-        or the fit has not converged. `ok` is False there, and where the standard deviation of the
-        rate is 5 % or more; in the second case k and yc may still serve to form an image, whose
-        cross-range scale is unknown. Further info: scatterers (their number), noise_power, steps,
+        `omega_rad_s`, the rotation rate at the first pulse, shape (...,); `warp_k`, its relative
+        derivatives k1, k2, ... in 1/s, 1/s^2, ..., shape (..., order - 1), and each of them as
+        `k1_per_s`, `k2_per_s2`, ...; and `yc_m`, the range centre deviation, shape (...,). The data
+        do not show the sign of the rotation rate, so `omega_rad_s` is positive and the image may be
+        mirrored in cross range. Standard deviations follow from the Fisher information of the
+        scatterers found. quality is the share of the energy above the noise that these scatterers
+        explain.
+
+        info["focused"] is True where the rotation is good enough to form an image: at least 3
+        scatterers are found, they explain 40 % of the energy or more, the entropy is not higher
+        than without compensation, and the fit has converged. `ok` is True where, in addition, the
+        standard deviation of the rate is below 5 %. Where only `ok` is False, the cross-range scale
+        of the image is unknown. Further info: scatterers (their number), noise_power, steps,
         entropy_nats, uncompensated_entropy_nats.
 
     Raises:
@@ -110,24 +114,24 @@ def coarse_rotation(
 ) -> Estimate:
     """Estimate k1 and k2 from the spectra of short sections, the first step of `uneven_rotation`.
 
-    The rotation rate at time t after the first pulse is modelled as that at the first pulse times 1
-    + k1 t + k2 t^2 / 2. This relative rate is found to about a percent. The absolute rate is not
-    estimated; `omega_rad_s` is 0.
+    The ratio of the rotation rate at time t after the first pulse to that at the first pulse is
+    modelled as 1 + k1 t + k2 t^2 / 2 and is found to about a percent. The rotation rate itself is
+    not estimated; `omega_rad_s` is nearly 0.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
         wavelength_m: Wavelength in metres.
         prf_hz: Pulse repetition frequency in Hz.
         range_m: Range coordinates y_n of the cells in metres, evenly spaced, shape (range,).
-        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
-            rotation.
+        order: Degree of the polynomial of time that describes the rotation angle. 1 is uniform
+            rotation; with 2 only k1 is returned, and beyond 3 the further derivatives are 0.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
             rotation centre), if known a priori, a number or shape (...,).
 
     Returns:
         `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
-        standard deviations. `ok` is False where the image entropy is higher than without
-        compensation.
+        standard deviations. quality is the relative decrease of exp(entropy) of the image due to
+        the compensation. `ok` is False where the entropy is higher than without compensation.
 
     Raises:
         TypeError: If the data are not complex.
@@ -173,8 +177,8 @@ def phase_fit_rotation(
 
     Returns:
         `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
-        standard deviations. `ok` is False where the image entropy is higher than without
-        compensation.
+        standard deviations. quality is the relative decrease of exp(entropy) of the image due to
+        the compensation. `ok` is False where the entropy is higher than without compensation.
 
     Raises:
         TypeError: If the data are not complex.

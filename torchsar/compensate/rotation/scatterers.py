@@ -1,11 +1,13 @@
 """Joint maximum-likelihood estimation of the rotation of a target and of all its scatterers.
 
 The unknowns are the amplitude, Doppler cell and range of each scatterer, and the common rotation.
-Each round subtracts the model of all known scatterers from the data and takes a Gauss-Newton step
-of all unknowns at once, with the couplings of neighbouring scatterers. Some rounds first find
-further scatterers in the image of the residual. The steps follow from the exact residual, so
-neighbours and side lobes leave no error at the end. The influence of the range-dependent phase on
-the couplings, a few percent, is neglected. The echoes are assumed to be range-compressed with a
+Each round subtracts the model of all known scatterers from the data and takes one Gauss-Newton step
+of all unknowns. Some rounds first find further scatterers in the image of the residual.
+
+The Gauss-Newton matrix holds the inner products of the echoes of neighbouring scatterers. They are
+computed without the range-dependent phase, which changes them by a few percent. This slows the
+convergence, but leaves no error at the end, because the gradient follows from the exact residual.
+For the same reason side lobes leave no error. The echoes are assumed to be range-compressed with a
 flat spectrum that fills the whole band (`band_response`).
 """
 
@@ -117,11 +119,15 @@ class Scatterers:
 class Fit:
     """State of the joint fit of a rotation and its scatterers.
 
+    The estimated parameters of the rotation are its relative derivatives k1, k2, ..., the squared
+    rate w and, if the rotation centre is estimated, the parameter v of `Motion`.
+
     Args:
         motion: Rotation of the target.
         scatterers: Scatterers.
-        covariance: Covariance per unit noise power of the parameters of the rotation that are
-            estimated, out of k1, k2, ..., w and v (see `Motion`), shape (trial, unknown, unknown).
+        covariance: Covariance of the estimated parameters of the rotation for a noise power of 1,
+            shape (trial, parameter, parameter); infinite variance where the data do not determine
+            one.
         noise: Noise power per sample, shape (trial,).
         steps: Number of steps taken, shape (trial,).
         settled: True for trials that have ended, shape (trial,), bool.
@@ -149,16 +155,18 @@ def fit_scatterers(
 ) -> Fit:
     """Fit the rotation of a target and all its scatterers by maximum likelihood.
 
-    A trial ends when a step changes each parameter of the rotation by less than a fifth of its
-    standard deviation.
+    The first, third and fifth round search for further scatterers. From the fifth step on, a trial
+    ends when a step changes each parameter of the rotation by at most a fifth of its standard
+    deviation.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
         start: Rotation to start from.
-        free_centre: True estimates the range centre deviation; False holds it.
-        count: Largest number of scatterers, reached over the first rounds; by default one for every
-            1450 samples, within 128..800.
+        free_centre: True also estimates the range of the rotation centre; False keeps that of
+            `start`.
+        count: Largest number of scatterers; by default one for every 1450 samples of a trial,
+            within 128..800.
         rounds: Largest number of steps.
 
     Returns:

@@ -75,7 +75,8 @@ class UnevenRotation(_Rotation):
             rotation.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
             rotation centre), if known a priori; None estimates it.
-        scatterers: Largest number of scatterers that are fitted.
+        scatterers: Largest number of scatterers that are fitted, by default as in
+            `uneven_rotation`.
         rounds: Largest number of maximum-likelihood steps.
 
     Raises:
@@ -177,16 +178,19 @@ class PhaseFitRotation(_Rotation):
 
 
 class RotationAutofocus(Stage):
-    """Phase per pulse common to all scatterers, from the image with the rotation compensated.
+    """Phase error of each pulse of a rotating target, common to all its scatterers.
 
-    Provides `phase_rad`. Uses `autofocus` if no rotation is connected. A phase that may take any
-    value in each pulse also takes up the effect of the range centre deviation yc. An estimator of
-    the rotation that alternates with this stage must therefore be given a fixed yc.
+    Provides `phase_rad`. If another stage provides `warp_k`, the phases are found by
+    `rotating_autofocus`, otherwise by `autofocus`.
+
+    The phase of every pulse is free and therefore also takes up the effect of the range centre
+    deviation yc. If an estimator of the rotation alternates with this stage, give it a fixed yc.
 
     Args:
         radar: Radar parameters.
-        search: Largest number of iterations of the entropy fixed point.
-        polish: Largest number of further iterations, which compare each pulse with a Wiener
+        search: Largest number of fixed-point iterations of `rotating_autofocus` that minimise the
+            image entropy.
+        polish: Largest number of its further iterations, which compare each pulse with a Wiener
             estimate of the scene.
     """
 
@@ -250,10 +254,10 @@ def rotating_autofocus(
             the range of a scatterer, shape (..., pulse, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
         warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
-            1/s^2, ..., shape (trial, order - 1).
-        start: Phase to start from in rad, shape (..., pulse); by default the sum of the phases
-            between adjacent pulses, as in `sca`.
-        search: Largest number of iterations of the entropy fixed point.
+            1/s^2, ..., shape (trial, order - 1), with all trial dimensions of the data as one.
+        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`: the phases
+            between adjacent pulses, added up.
+        search: Largest number of fixed-point iterations that minimise the image entropy.
         polish: Largest number of further iterations, which compare each pulse with a Wiener
             estimate of the scene.
 

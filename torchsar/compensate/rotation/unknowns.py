@@ -41,19 +41,20 @@ class RotationParameters(NamedTuple):
 class Unknowns:
     """The unknowns of a search for the rotation of a target, as vectors of shape (..., n).
 
-    In the variables "raw" a vector holds the rotation rate omega at the first pulse (rad/s), its
-    relative derivatives k1, k2, ... (1/s, 1/s^2, ...), and the range centre deviation yc (m). In
-    the variables "shape" it holds the total rotation angle A over the aperture (rad), the Legendre
-    coefficients q2, q3, ... of the rotation angle over time (`torchsar.core.warp.shape_of`), and
-    yc. Errors of k1 and k2 are correlated (the error of k1 is about -T/2 times that of k2, with
-    the length T of the aperture); those of q2 and q3 are not.
+    With the variables "raw" a vector holds the rotation rate omega at the first pulse (rad/s), its
+    relative derivatives k1, k2, ... (1/s, 1/s^2, ...), and the range centre deviation yc (m): a
+    cell at range y lies at y + yc from the rotation centre. With the variables "shape" it holds the
+    total rotation angle A over the aperture (rad), the Legendre coefficients q2, q3, ... of the
+    rotation angle over time (`torchsar.core.warp.shape_of`), and yc. Estimation errors of k1 and k2
+    are correlated: the error of k1 is about -T/2 times that of k2, with the length T of the
+    aperture. Those of q2 and q3 are not.
 
     Args:
         duration_s: Duration of the aperture in seconds.
         order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
             rotation.
         range_term: True compensates the phase that depends on the range of a scatterer. Otherwise
-            omega and yc do not affect the entropy and are not unknowns.
+            omega (or A) and yc do not affect the entropy and are not unknowns.
         yc: True makes the range centre deviation an unknown; otherwise it is known a priori.
         variables: "raw" or "shape".
 
