@@ -1,18 +1,19 @@
 """Absolute Doppler centroid: the PRF ambiguity is resolved from range migration.
 
-The absolute centroid f_dc is the baseband centroid plus k PRFs. The whole number k is found without
-prior knowledge. Three kinds of evidence give a log-likelihood for each candidate k, from statistics
-over independent blocks of data:
+The absolute centroid f_dc is the baseband centroid plus k PRFs. The whole number k, the ambiguity,
+is found without prior knowledge. Three kinds of evidence give a log-likelihood for each candidate
+k:
 
-- looks: if k is wrong by dk, azimuth looks of the image whose centres differ by df in Doppler are
-displaced in range by lambda dk PRF df / (2 Ka), where Ka is the azimuth FM rate.
-- lines: the phase increment between adjacent lines grows with the range frequency f as
-f_dc (f0 + f) / f0, where f0 is the carrier frequency.
-- entropy: a small group of range cells is focused with every candidate; the entropy of its image
-is least for the right one.
+- Looks: the image is focused with the baseband centroid. If the true centroid lies k PRFs away, two
+  azimuth looks whose Doppler centres differ by df are displaced against each other in range by
+  lambda k PRF df / (2 Ka), with wavelength lambda and azimuth FM rate Ka.
+- Lines: the phase increment between adjacent lines is proportional to f_dc (f0 + f) / f0, with the
+  range frequency f and the carrier frequency f0. Its slope over f gives f_dc without ambiguity.
+- Entropy: a small group of range cells is focused with each candidate. The right candidate gives
+  the least image entropy.
 
-The looks are the strongest evidence wherever there is contrast. The lines are the only evidence on
-featureless speckle. The log-likelihoods are added.
+The looks are the strongest evidence wherever the scene has contrast. On featureless speckle only
+the lines give evidence. The three log-likelihoods are added.
 
 Doppler is positive when closing. Range changes by -lambda f_dc / 2 metres per second.
 """
@@ -87,21 +88,22 @@ def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turn
     """Correlate neighbouring azimuth looks at the range displacement of every candidate ambiguity.
 
     The group is focused with the baseband Doppler as if it were absolute. If the true centroid lies
-    k PRFs away, each look is displaced in range against the look before it by lambda k PRF df /
-    (2 Ka), where df is the Doppler spacing of the looks and Ka the azimuth FM rate. Looks one, two
-    and three spacings apart are correlated at this displacement. Intensities are limited to 20
-    times their mean, so that one ship cannot dominate.
+    k PRFs away, each look is displaced in range against the look before it by
+    lambda k PRF df / (2 Ka), where lambda is the wavelength, df the Doppler spacing of the looks
+    and Ka the azimuth FM rate. Looks one, two and three spacings apart are correlated at one, two
+    and three times this displacement. Intensities are limited to 20 times their mean, so that one
+    ship cannot dominate.
 
     Args:
         group: Group of range cells.
         doppler_hz: Baseband centroid in Hz, shape (...,), positive when closing.
         velocity_m_s: Velocity of the platform in m/s.
-        turns: Candidate numbers of PRFs, shape (candidate,).
+        turns: Candidates for the ambiguity in PRFs, shape (candidate,).
         looks: Number of azimuth looks.
 
     Returns:
-        The correlations, shape (..., block, candidate), float64; the right candidate has the
-        largest. A block is one eighth of the lines of the look images.
+        The correlations, shape (..., block, candidate), float64. The right candidate has the
+        largest one. Each of the 8 blocks holds an eighth of the lines of the look images.
     """
     rows = beam_spectrum(group, doppler_hz).rows(doppler_hz, velocity_m_s)
     height = rows.shape[-2] // looks
@@ -177,12 +179,13 @@ def entropy_scores(
         group: Group of range cells.
         doppler_hz: Baseband centroid in Hz, shape (...,), positive when closing.
         velocity_m_s: Velocity of the platform in m/s.
-        turns: Candidate numbers of PRFs, shape (candidate,).
+        turns: Candidates for the ambiguity in PRFs, shape (candidate,).
         dwell_s: Time that a target stays in the beam, in seconds.
 
     Returns:
         The negative entropies in nats, shape (..., block, candidate), and the weights of the
-        blocks, shape (..., block), with sum 1.
+        blocks, shape (..., block), with sum 1. A block consists of about 32 neighbouring range
+        cells.
     """
     spectrum, weight = beam_spectrum(group, doppler_hz), block_weights(group.data, group.radar, doppler_hz, dwell_s)
     scores = []
@@ -197,9 +200,11 @@ def ambiguity_evidence(
 ) -> dict[str, Tensor]:
     """Compute the log-likelihood of every candidate ambiguity from each kind of evidence.
 
-    Only lines about the middle of the record are used: as many as four synthetic apertures, or 1024
-    if that is more. Of these, the looks use the 4096 neighbouring range cells with the most signal,
-    the entropy uses 512, and the lines use all.
+    There are three kinds of evidence: the range displacement between azimuth looks ("looks"), the
+    change of the phase increment between adjacent lines over range frequency ("lines"), and the
+    image entropy ("entropy"). Only the middle of the record is used: four synthetic apertures, or
+    1024 lines if that is more. "looks" uses the 4096 neighbouring range cells with the most signal,
+    "entropy" the 512 with the most signal, and "lines" all range cells.
 
     Args:
         raw: Lines, shape (..., pulse, range), complex.
@@ -207,14 +212,12 @@ def ambiguity_evidence(
         doppler_baseband_hz: Baseband centroid in Hz, shape (...,), positive when closing.
         reference: Range reference spectrum, shape (range,); None if `raw` is already
             range-compressed.
-        reach: The candidates are -reach..reach PRFs.
+        reach: Largest candidate in PRFs; the candidates are -reach..reach.
 
     Returns:
         A dictionary. "looks", "lines" and "entropy" hold the log-likelihoods of the candidates,
-        shape (..., candidate), up to a constant: from the range displacement between azimuth looks,
-        from the phase increment between adjacent lines, and from the image entropy.
-        "line_doppler_hz" and "line_doppler_std_hz", shape (...,), are the results of
-        `line_doppler`.
+        shape (..., candidate), each up to a constant. "line_doppler_hz" and "line_doppler_std_hz",
+        shape (...,), hold the two results of `line_doppler`.
 
     Raises:
         ValueError: If `reach` is negative.
@@ -254,11 +257,12 @@ def possible_reach(radar: StripmapRadar, reach: int) -> int:
 class DopplerCentroid(Stage):
     """Absolute Doppler centroid with its ambiguity and the squint angle; the recommended estimator.
 
-    The baseband centroid comes from the phase increment, and the ambiguity from range migration,
-    without prior knowledge. If the dwell of the beam is known (`radar.integration_s`) and shorter
-    than the record, the centroid is refined with targets whose whole dwell lies in the record (see
-    `complete_aperture_centroid`), because targets that the ends of the record cut would bias it.
-    The signal is left unchanged.
+    The baseband centroid comes from the phase increment between adjacent lines. The ambiguity is
+    found without prior knowledge, see `ambiguity_evidence`. Targets whose apertures are cut by the
+    ends of the record bias the centroid. If the dwell of the beam is known (`radar.integration_s`)
+    and the record is at least 1.15 dwells long, the centroid is therefore refined with targets
+    whose whole dwell lies in the record, see `complete_aperture_centroid`. The signal is left
+    unchanged.
 
     Provides `doppler_hz` (absolute, positive when closing), `doppler_baseband_hz`, `ambiguity`
     (whole number of PRFs, as float64) and `squint_deg` (positive ahead, for the nominal velocity).
@@ -317,13 +321,16 @@ class DopplerCentroid(Stage):
 
         Returns:
             `doppler_hz` (absolute) and `doppler_baseband_hz`, with their standard deviations in Hz,
-            `ambiguity` (whole number of PRFs) and `squint_deg`, shape (...,) each. quality is the
+            `ambiguity` (whole number of PRFs) and `squint_deg`, shape (...,) each. `quality` is the
             probability that the ambiguity is right. `ok` is False where that probability is 0.9 or
-            less, or where the baseband centroid is unreliable. info: block_hz and block_power (see
-            `baseband_estimate`); the log-likelihoods looks, lines and entropy of the candidates,
-            line_doppler_hz and line_doppler_std_hz (see `ambiguity_evidence`); candidates (in
-            PRFs); margin (log-likelihood of the best candidate minus that of the second-best); and
-            coherence (of adjacent lines, 0..1).
+            less, or where the baseband centroid is unreliable. `info` holds
+
+            - "block_hz" and "block_power", see `baseband_estimate`;
+            - "looks", "lines", "entropy", "line_doppler_hz" and "line_doppler_std_hz", see
+              `ambiguity_evidence`;
+            - "candidates": the candidates for the ambiguity in PRFs, shape (candidate,);
+            - "margin": summed log-likelihood of the best candidate minus that of the second-best;
+            - "coherence": coherence of adjacent lines, 0..1.
         """
         raw, radar = signal.data, self.radar
         first = phase_increment(raw, radar.prf_hz, self.blocks)

@@ -1,10 +1,10 @@
 """Doppler centroid from targets that are illuminated for their whole dwell within the record.
 
-The ends of a record cut the apertures of the targets near them. In a strip with a few bright points
-this biases the centroid by a considerable part of the beam's Doppler band. In an image each target
-lies at the time when the beam centre crosses it, so image lines whose targets have complete
-apertures can be separated from the others. The azimuth spectrum of these lines alone has the shape
-of the beam, whatever the scene.
+Targets near the ends of a record are illuminated for a part of their dwell only. In a strip with a
+few bright points they bias the centroid by a considerable part of the beam's Doppler band. In an
+image each target lies at the time when the beam centre crosses it. The image lines whose targets
+have complete apertures can therefore be selected. Their azimuth spectrum has the shape of the beam,
+whatever the scene.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ def complete_aperture_centroid(
 ) -> tuple[Tensor, Tensor]:
     """Refine an absolute Doppler centroid with targets whose whole dwell lies within the record.
 
-    Targets whose apertures are cut by the ends of the record would bias the centroid; they are
-    excluded in the image. `doppler_hz` and `std_hz` are returned unchanged if the dwell of the beam
-    is not known (`radar.integration_s` is None), or if the record is shorter than 1.1 dwells.
+    Targets whose apertures are cut by the ends of the record would bias the centroid. The image
+    lines that show them are excluded. `doppler_hz` and `std_hz` are returned unchanged if the dwell
+    of the beam is not known (`radar.integration_s` is None), or if the record is shorter than 1.15
+    dwells.
 
     Args:
         raw: Lines, shape (..., pulse, range), complex.
@@ -48,8 +49,9 @@ def complete_aperture_centroid(
         rounds: Number of rounds, each of which forms the image anew with the current centroid.
 
     Returns:
-        The refined centroid and its standard deviation in Hz, shape (...,) each. A trial keeps
-        `doppler_hz` and `std_hz` if its new standard deviation is twice `std_hz` or more.
+        The refined centroid and its standard deviation in Hz, shape (...,) each. Where the new
+        standard deviation is twice `std_hz` or more, `doppler_hz` and `std_hz` are returned
+        instead.
     """
     if radar.integration_s is None:
         return doppler_hz, std_hz

@@ -1,8 +1,9 @@
 """Doppler centroid within one PRF: mean phase increment and energy centre of the azimuth spectrum.
 
-Neither estimator needs the velocity (Tsvetkov 2017, Doppler estimation). Both are the first Fourier
-coefficient of the azimuth power spectrum, taken once in time (the products of adjacent lines) and
-once in frequency. They agree to rounding and are therefore not independent evidence.
+Neither estimator needs the velocity (Tsvetkov 2017, Doppler estimation). Both take the phase of the
+first Fourier coefficient of the azimuth power spectrum. The mean phase increment computes this
+coefficient in time, from products of adjacent lines; the energy centre computes it in frequency.
+The results agree to rounding and are therefore not independent evidence.
 
 Doppler is positive when closing. Lines that are all zero (missing) enter no product and bias
 neither estimator.
@@ -110,7 +111,7 @@ def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
         blocks: Number of blocks a along pulses and b along range.
 
     Returns:
-        Power spectra in FFT order, shape (..., a, b, n), float64.
+        Power spectra in FFT order, shape (..., a, b, n) for n Doppler bins, float64.
 
     Raises:
         ValueError: If there are fewer pairs of lines or range cells than blocks.
@@ -221,15 +222,17 @@ def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz
     Args:
         products: Block products, shape (..., a, b), complex, as from `lag_products`.
         power: Mean power of the same pairs of lines, shape (..., a, b).
-        phase_rad: Phase increment that all blocks were combined to, in rad, shape (...,).
+        phase_rad: Phase increment from line to line, combined from all blocks, in rad, shape
+            (...,).
         prf_hz: Pulse repetition frequency in Hz.
-        info: Further entries of the estimate's info.
+        info: Further entries for `info` of the estimate.
 
     Returns:
         `doppler_baseband_hz` of shape (...,), positive when closing, with its standard deviation in
-        Hz. quality is the coherence of adjacent lines. `ok` is False where there is no energy, or
-        where the standard deviation of the increment is a tenth of a turn or more. info: block_hz
-        (centroid of each block) and block_power, both of shape (..., a, b), and the entries given.
+        Hz. `quality` is the coherence of adjacent lines. `ok` is False where there is no energy, or
+        where the standard deviation of the increment is a tenth of a turn or more. `info` holds
+        "block_hz" (centroid of each block) and "block_power", both of shape (..., a, b), and the
+        entries given.
     """
     scale = prf_hz / (2 * math.pi)
     std = increment_std_rad(products, phase_rad)
@@ -258,7 +261,7 @@ def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), 
 
     Returns:
         `doppler_baseband_hz` in Hz, shape (...,), positive when closing, with its standard
-        deviation; quality is the coherence of adjacent lines; further details are those of
+        deviation. `quality` is the coherence of adjacent lines; `ok` and `info` are those of
         `baseband_estimate`. info["block_hz"] shows how the centroid varies along the strip and over
         range.
 
@@ -286,9 +289,10 @@ def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) ->
 
     Returns:
         `doppler_baseband_hz` in Hz, shape (...,), positive when closing, with its standard
-        deviation; quality, `ok` and info are those of `baseband_estimate`. info also holds
-        spectrum, shape (..., n) in FFT order, and plain_baseband_hz, the non-circular centre of
-        mass, which is wrong where the spectrum wraps.
+        deviation. `quality`, `ok` and `info` are those of `baseband_estimate`. `info` also holds
+        "spectrum", the azimuth power spectrum in FFT order, shape (..., n) for n Doppler bins, and
+        "plain_baseband_hz", its non-circular centre of mass, shape (...,), which is wrong where the
+        spectrum wraps.
 
     Raises:
         ValueError: If there are fewer pairs of lines or range cells than blocks.
@@ -313,9 +317,9 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
     """Fit a robust polynomial to the phase increment over range blocks.
 
     The polynomial is a sum of Legendre polynomials of the position of the block, which runs from -1
-    to 1 across the swath. Blocks are weighted with the square of their coherence. Blocks that lie
-    off the curve by more than the common scatter are weighted down (Cauchy weights), so that a few
-    very bright targets do not bend the curve.
+    to 1 across the swath. Blocks are weighted with the square of their coherence. Blocks whose
+    residuals are large compared with the median residual are weighted down (Cauchy weights), so
+    that a few very bright targets do not bend the curve.
 
     Args:
         products: Block products, shape (..., b), complex.
@@ -459,10 +463,10 @@ class RangeDependentCentroid(Stage):
 
         Returns:
             `doppler_range_hz` of every range cell, shape (..., range), and `doppler_baseband_hz` in
-            the middle of the swath, shape (...,), in Hz, the latter with its standard deviation.
-            `ok` is False where there is no energy, or where that standard deviation is a tenth of
-            the PRF or more. info: block_hz (centroid of each of the b range blocks), shape (...,
-            b), and coefficients_hz of the Legendre polynomials, shape (..., order + 1).
+            the middle of the swath, shape (...,), in Hz. The latter has a standard deviation. `ok`
+            is False where there is no energy, or where that standard deviation is a tenth of the
+            PRF or more. `info` holds "block_hz" (centroid of each of the b range blocks), shape
+            (..., b), and "coefficients_hz" (of the Legendre polynomials), shape (..., order + 1).
 
         Raises:
             ValueError: If there are too few lines or range cells for the blocks, or too few blocks
@@ -496,20 +500,21 @@ class RangeDependentCentroid(Stage):
 def point_doppler(
     x: Tensor, prf_hz: float, rate_hz_s: Tensor | float = 0.0, centre_hz: Tensor | float = 0.0, rounds: int = 6
 ) -> Tensor:
-    """Estimate the Doppler of one point at the middle line of its aperture by maximum likelihood.
+    """Estimate the Doppler of one point at the middle line of its history by maximum likelihood.
 
-    The known quadratic phase is removed first. The peak of the zero-padded spectrum is then refined
-    by Newton steps. The result reaches the Cramer-Rao bound of a tone, a standard deviation of 0.39
-    / (T sqrt(q)) in Hz, where T is the length of the history in seconds and q the SNR after
-    compression as a power ratio. This lies below the reference curve 1 / (T sqrt(q)) of Tsvetkov
-    (2017). It is the Doppler of that point at that time, not the centroid of the beam.
+    The quadratic phase that `rate_hz_s` predicts is removed first. The peak of the zero-padded
+    spectrum is then refined by Newton steps. The standard deviation of the result is the Cramer-Rao
+    bound of a tone, 0.39 / (T sqrt(q)) in Hz, where T is the length of the history in seconds and q
+    the SNR after compression as a power ratio. This bound lies below the reference curve 1 / (T
+    sqrt(q)) of Tsvetkov (2017). The result is the Doppler of the point at that time, not the
+    Doppler centroid of the beam.
 
     Args:
         x: Azimuth history of the point, shape (..., pulse), complex.
         prf_hz: Pulse repetition frequency in Hz.
         rate_hz_s: Magnitude of the Doppler rate in Hz/s, shape (...,) or a number; 0 for a tone.
-        centre_hz: Frequency in Hz, shape (...,) or a number, within half a PRF of which the result
-            lies.
+        centre_hz: Middle of the interval, one PRF wide, in which the result is given, in Hz, shape
+            (...,) or a number.
         rounds: Number of Newton steps.
 
     Returns:

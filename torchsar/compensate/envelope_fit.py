@@ -35,11 +35,11 @@ _STANDS_OUT = 6.0
 
 @dataclass(frozen=True)
 class Envelopes:
-    """Power envelopes of pulses, as half spectra over range.
+    """Power envelopes of pulses, stored as their one-sided spectra over range.
 
     Args:
-        spectra: Half spectra, shape (trial, pulse, frequency), complex; frequency i is i / n cycles
-            per cell. Zero for pulses that are not present.
+        spectra: One-sided spectra (of `torch.fft.rfft`), shape (trial, pulse, frequency), complex;
+            frequency i is i / n cycles per cell. Zero for pulses that are not present.
         present: False where a pulse holds only zeros, shape (trial, pulse), bool.
         n: Number of range cells.
     """
@@ -80,7 +80,7 @@ class Envelopes:
             shift: Shifts to remove in cells, shape (trial, pulse), positive towards greater range.
 
         Returns:
-            Half spectra of the envelopes moved by -shift, shape (trial, pulse, frequency).
+            One-sided spectra of the envelopes moved by -shift, shape (trial, pulse, frequency).
         """
         return self.spectra * linear_phasor(shift / self.n, 0, self.spectra.shape[-1], self.spectra.dtype)
 
@@ -93,14 +93,14 @@ class Envelopes:
         return Envelopes(torch.fft.rfft(self.on_grid(self.spectra).clamp_min(0).sqrt()), self.present, self.n)
 
     def on_grid(self, spectra: Tensor, per_cell: int = _HALF) -> Tensor:
-        """Compute samples of envelopes over range from their half spectra.
+        """Compute samples of envelopes over range from their one-sided spectra.
 
         Args:
-            spectra: Half spectra, shape (..., frequency).
+            spectra: One-sided spectra, shape (..., frequency).
             per_cell: Samples per range cell.
 
         Returns:
-            The samples, shape (..., per_cell * n).
+            The samples, shape (..., per_cell * n) for n range cells.
         """
         return torch.fft.irfft(spectra, per_cell * self.n) * (per_cell / _HALF)
 
@@ -111,10 +111,10 @@ class Envelopes:
         shift of that pulse.
 
         Args:
-            mean: Half spectrum of T, shape (..., frequency).
+            mean: One-sided spectrum of T, shape (..., frequency).
 
         Returns:
-            The half spectrum, shape (..., frequency).
+            The one-sided spectrum of -1 / T, shape (..., frequency).
         """
         weight = -1 / self.on_grid(mean, _QUARTER).clamp_min(_FLOOR)
         return torch.fft.rfft(weight)[..., : self.spectra.shape[-1]] * (_HALF / _QUARTER)
@@ -125,10 +125,10 @@ class Envelopes:
         The samples are a quarter of a cell apart.
 
         Args:
-            spectra: Half spectrum of the correlation, shape (..., frequency).
+            spectra: One-sided spectrum of the correlation, shape (..., frequency).
 
         Returns:
-            The position in cells, -n/2..n/2, shape (...,), float64.
+            The position in cells, -n/2..n/2 for n range cells, shape (...,), float64.
         """
         # the mean does not affect the maximum; without it, rounding errors are smaller
         samples = self.on_grid(torch.cat([torch.zeros_like(spectra[..., :1]), spectra[..., 1:]], -1), _QUARTER)
@@ -157,11 +157,11 @@ def _half_cells(lines: Tensor) -> Tensor:
 def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
     """Find the shift of each pulse against an exponentially running mean of the pulses before it.
 
-    Shifts continue over the ends of the window from pulse to pulse.
+    Shifts are unwrapped: they may leave the range window and continue from pulse to pulse.
 
     Args:
         pulses: Envelopes.
-        gain: Weight of a new pulse in the mean, 0..1; the mean before it keeps 1 - gain.
+        gain: Weight of a new pulse in the mean, 0..1; the old mean has the weight 1 - gain.
 
     Returns:
         The shifts in cells, shape (trial, pulse), float64, of mean zero.
@@ -211,6 +211,9 @@ def single_shifts(pulses: Envelopes, start: Tensor, match: Match, iterations: in
 def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> tuple[Tensor, Tensor]:
     """Fit a polynomial of slow time to the shifts of blocks of pulses.
 
+    Each of several rounds estimates the shift of each block against the mean envelope of the other
+    blocks and fits the polynomial to these shifts.
+
     Args:
         pulses: Envelopes.
         degree: Degree of the polynomial.
@@ -219,7 +222,7 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
 
     Returns:
         The shifts in cells, shape (trial, pulse), float64, of mean zero; and their standard
-        deviation in cells by the scatter of the blocks about the polynomial, shape (trial,).
+        deviation in cells, from the scatter of the blocks about the polynomial, shape (trial,).
     """
     k = pulses.present.shape[-1]
     basis = legendre(unit_time(k, pulses.present.device), degree)
@@ -244,9 +247,9 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
 def mean_drift(pulses: Envelopes) -> Tensor:
     """Find the mean drift of the envelopes: the straight line along which they add up best.
 
-    Maximises sum_f |sum_k P_k(f) exp(2j pi f v k / n)|^2 over the drift v, where P_k is the
-    spectrum of the power envelope of pulse k over the n range cells. Only the 16 lowest frequencies
-    f are used. One zero-padded transform along pulses gives the sum for all v.
+    Maximises sum_f |sum_k P_k(f) exp(2j pi f v k / n)|^2 over the drift v in cells per pulse. P_k
+    is the spectrum of the power envelope of pulse k over the n range cells, and f runs over the 16
+    lowest frequencies only. One zero-padded transform along pulses gives the sum for all v.
 
     Args:
         pulses: Envelopes.
@@ -406,8 +409,8 @@ def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
         present: False for pulses without samples, shape (trial, pulse), bool.
 
     Returns:
-        The frequency in cycles per pulse, shape (trial,); and True where the sinusoid is stronger
-        than noise alone would give, except in about one of 400 trials, shape (trial,), bool.
+        The frequency in cycles per pulse, shape (trial,); and whether the sinusoid stands out from
+        noise, shape (trial,), bool, which on pure noise is True in about one of 400 trials.
     """
     k = rest.shape[-1]
     limit = 3 * rest.abs().median(-1, keepdim=True).values

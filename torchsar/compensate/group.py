@@ -176,8 +176,8 @@ class BeamSpectrum:
 def full_spectrum(group: RangeGroup, doppler_hz: Tensor) -> BeamSpectrum:
     """Compute the whole spectrum of a group of range cells.
 
-    The Doppler of each row is taken within half a PRF of the centroid. The rows are in FFT order;
-    images of this spectrum keep the phase from line to line.
+    The Doppler of each row is taken within half a PRF of the centroid. The rows are in FFT order,
+    so that images of this spectrum have the true phase increment from line to line.
 
     Args:
         group: The group of range cells.
@@ -194,8 +194,9 @@ def full_spectrum(group: RangeGroup, doppler_hz: Tensor) -> BeamSpectrum:
 def beam_spectrum(group: RangeGroup, doppler_hz: Tensor, margin: float = 1.2) -> BeamSpectrum:
     """Compute the spectrum of a group of range cells within the Doppler band of the beam.
 
-    Outside that band there is only noise. The azimuth filter turns the phase of this noise fastest
-    when the velocity changes, which would make objective functions of the velocity rough.
+    Outside that band there is only noise. When the velocity changes, the phase of the azimuth
+    filter changes most there, so that this noise would make objective functions of the velocity
+    rough.
 
     Args:
         group: The group of range cells.
@@ -281,14 +282,14 @@ def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: 
 
 
 def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """Compute the weights with which the blocks of range cells of a group enter an objective.
+    """Compute the weights of the blocks of about 32 range cells into which a group is divided.
 
-    A block is weighted with its signal above the background (`column_signal`). Range cells whose
-    targets migrate out of the group within the aperture do not contribute, except those of the
-    middle half of the group.
+    They serve to average a quantity such as `block_entropy` over the blocks. The weight of a block
+    is its signal above the background (`column_signal`). Range cells whose targets migrate out of
+    the group within the aperture do not contribute, except those of the middle half of the group.
 
     Args:
-        columns: Lines or an image of the group, shape (..., n, width), complex.
+        columns: Lines or an image of the group, shape (..., pulse, width), complex.
         radar: Radar parameters.
         doppler_hz: Absolute centroid in Hz, shape (...,).
         dwell_s: Time that a target stays in the beam, in seconds.
@@ -329,10 +330,10 @@ def block_entropy(image: Tensor) -> Tensor:
 
 
 def student_log_likelihood(t: Tensor, degrees: Tensor | int) -> Tensor:
-    """Compute the logarithm of Student's density, without its constant.
+    """Compute the logarithm of Student's t density, without its constant.
 
-    It measures how plausible an error of t predicted standard deviations is. Large errors are less
-    implausible than under a normal distribution, so outliers do not dominate.
+    It measures how plausible an error of t predicted standard deviations is. Large errors are more
+    plausible than under a normal distribution, so that outliers do not dominate.
 
     Args:
         t: Error divided by its predicted standard deviation.

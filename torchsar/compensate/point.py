@@ -1,11 +1,12 @@
 """Doppler centroid of the beam from the position of one point in a focused image.
 
-If the time is known at which the beam centre crosses a point, such as a corner reflector, the
-azimuth position of the point in the image gives the Doppler at that time: the image holds the point
-at the time when its Doppler equals the frame Doppler, a constant that was set when the image was
-focused. The position of the peak gives the Doppler with a standard deviation of 0.39 / (T sqrt(q)),
-the Cramer-Rao bound of a tone of duration T with the SNR q after compression (a power ratio). No
-estimator that uses the envelope of the beam's spectrum reaches this accuracy from one point.
+A focused image holds each point at the time when its Doppler equals the frame Doppler, a constant
+that was set when the image was focused. If the time is known at which the beam centre crosses a
+point, such as a corner reflector, the azimuth position of the point in the image therefore gives
+its Doppler at that time, which is the Doppler centroid. The standard deviation is
+0.39 / (T sqrt(q)) in Hz, the Cramer-Rao bound of a tone of duration T in seconds with the SNR q
+after compression (a power ratio). No estimator that uses the envelope of the beam's spectrum
+reaches this accuracy from one point.
 
 Reference: Tsvetkov 2017, text after Fig. 5.
 """
@@ -110,10 +111,14 @@ class PointDoppler(Stage):
     """Doppler centroid of the beam from the brightest point of an image.
 
     Provides `doppler_hz` and `doppler_baseband_hz`. Assumes that the beam centre crosses the point
-    at `crossing_s`. The Doppler band of the beam must lie within half a PRF of the frame Doppler,
-    with which the image was focused, because focusing folds frequencies outside. The centroid must
-    differ from the frame Doppler by less than rate * n / (2 PRF), with the Doppler rate in Hz/s and
-    n image lines; otherwise the point leaves the image at its end and appears at the other.
+    at `crossing_s`. The image holds each point at the time when its Doppler equals the frame
+    Doppler with which the image was focused. Two limits apply:
+
+    - The Doppler band of the beam must lie within half a PRF of the frame Doppler; frequencies
+      outside are aliased in focusing.
+    - The centroid must differ from the frame Doppler by less than rate * n / (2 PRF), with the
+      Doppler rate in Hz/s and n image lines. Otherwise the point leaves the image at one end and
+      appears at the other.
 
     Args:
         radar: Radar parameters.
@@ -144,22 +149,22 @@ class PointDoppler(Stage):
 
         Returns:
             `doppler_hz` and `doppler_baseband_hz` in Hz, shape (...,), positive when closing. Their
-            standard deviation is the Cramer-Rao bound of a tone, for the measured SNR q after
-            compression (info["q"], a power ratio) and the part of the dwell that the record
-            observed; it holds if radar.integration_s is the true dwell. quality is 1 - 1 / (1 + q).
-            `ok` is False where the time at which the beam centre crosses the point lies outside the
-            record, or where noise alone would have as high a peak more often than once in 10,000
-            images.
+            standard deviation is the Cramer-Rao bound of a tone. It uses the measured SNR q after
+            compression (info["q"], a power ratio) and the part of the dwell that lies in the
+            record, and holds if radar.integration_s is the true dwell. `quality` is
+            1 - 1 / (1 + q). `ok` is False where the time at which the beam centre crosses the point
+            lies outside the record, or where noise alone would have as high a peak in more than one
+            of 22,000 images.
 
         Raises:
-            ValueError: If neither the radar nor a connected value gives the frame Doppler.
+            ValueError: If neither `frame_hz` nor radar.pointing_doppler_hz gives the frame Doppler.
         """
         radar, image, (azimuth, slant) = self.radar, signal.data, signal.axes
         frame = radar.pointing_doppler_hz if frame_hz is None else frame_hz
         if frame is None:
             raise ValueError(
                 "PointDoppler: frame_hz, the Doppler (Hz) that the image was focused with, is not known; "
-                "connect it, or set radar.pointing_doppler_hz"
+                "connect it with torchsar.use, or set radar.pointing_doppler_hz"
             )
         power = image.real.square() + image.imag.square()
         line, sample = torch.unravel_index(power.flatten(-2).argmax(-1), power.shape[-2:])

@@ -1,10 +1,11 @@
 """Phase gradient autofocus (PGA).
 
 The strongest scatterer of every range cell is isolated by a window that narrows from iteration to
-iteration. The window acts on an image of twice as many Doppler cells, made from pulses padded with
-as many zeros. Without padding, a narrow window mixes the last pulses with the first, and the
-iterations drift away from their optimum: on images of 1024 x 1024 cells the phase error rises from
-0.07 rad at the best iteration to 0.4 rad after 20 iterations. With padding it stays at 0.03 rad.
+iteration. The window acts on an image of twice as many Doppler cells as pulses, made from pulses
+that are padded with zeros. Without padding, a narrow window mixes the last pulses with the first,
+and the iterations drift away from their optimum. On images of 1024 x 1024 cells the phase error
+then rises from 0.07 rad at the best iteration to 0.4 rad after 20 iterations; with padding it stays
+at 0.03 rad.
 """
 
 from __future__ import annotations
@@ -100,9 +101,9 @@ class Shrinking:
 class Measured:
     """A PGA window that follows the width of the blur.
 
-    The power is summed over the range cells, with their peaks shifted to zero Doppler. The window
-    is `margin` times as wide as the interval centred on the peak that holds all cells in which this
-    sum is at most `level_db` below the peak.
+    The peak of each range cell is shifted to zero Doppler, and the power is summed over the range
+    cells. The width of the blur is that of the interval, centred on the peak of this sum, that
+    holds all cells at most `level_db` below the peak. The window is `margin` times as wide.
 
     Args:
         level_db: Level below the peak in dB, positive.
@@ -180,11 +181,11 @@ def pga(
 
     Every iteration works on the original data with the present phase removed. It shifts the
     strongest cell of each range cell to zero Doppler, applies a window, transforms back to pulses,
-    and estimates the remaining phase with the kernel; a constant and a linear part are dropped.
-    Once the window no longer narrows, a trial ends after `patience` iterations that do not lower
-    the image entropy. The phase of the iteration with the least entropy is returned, because
-    iterations with narrow windows drift away. Differentiable except for the choice of peaks and of
-    that iteration.
+    and estimates the remaining phase with the kernel. A constant and a linear part of this phase
+    are dropped. Once the window no longer narrows, a trial ends after `patience` iterations that do
+    not lower the image entropy. The result is the phase of the iteration with the least entropy,
+    because iterations with narrow windows drift away. Differentiable, except for the choice of the
+    peaks and of that iteration.
 
     From a zero start PGA fails on phase errors that are large or independent from pulse to pulse;
     use `pga_sca` or `autofocus` for these.
@@ -204,8 +205,10 @@ def pga(
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
-        unless the image is 1.5 times sharper than noise can be made, more than one range cell
-        contributes to the sharpness, and the predicted Strehl ratio exceeds 0.8.
+        unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
+        cell contributes to the sharpness, and the Strehl ratio predicted from the standard
+        deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of
+        speckle.
 
     Raises:
         TypeError: If the data are not complex, the start is not a tensor, or `windows` is not a
@@ -231,8 +234,8 @@ def pga_sca(
 ) -> Estimate:
     """Estimate the phase of each pulse by phase gradient autofocus (PGA) that starts from `sca`.
 
-    Phase errors of any size are removed alike, because `sca` does so: a phase added to a pulse of
-    the data is added to the estimate.
+    A phase that is added to a pulse of the data is added to the estimate of `sca`. The size of the
+    phase errors therefore has no effect on the result.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
@@ -240,11 +243,11 @@ def pga_sca(
             same products of adjacent pulses as `sca`.
         windows: Schedule of window widths, by default `Shrinking()`.
         iterations: Largest number of iterations.
-        patience: Number of iterations without a lower entropy after which a trial ends.
+        patience: Number of iterations without a lower image entropy after which a trial ends.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation; quality, `ok`
-        and info are those of `pga`.
+        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `quality`,
+        `ok` and `info` are those of `pga`.
 
     Raises:
         TypeError: If the data are not complex or `windows` is not a schedule.

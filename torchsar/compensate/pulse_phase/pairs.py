@@ -1,6 +1,7 @@
 """Spatial correlation algorithm (SCA), an autofocus by the phases between adjacent pulses.
 
-The phase between two pulses is that of their product, summed over range.
+The phase between two pulses is that of the product of one with the conjugate of the other, summed
+over range.
 """
 
 from __future__ import annotations
@@ -16,21 +17,23 @@ from torchsar.core import Estimate
 def sca(data: Tensor) -> Estimate:
     """Estimate the phase of each pulse from the products of adjacent pulses.
 
-    The phase between two pulses is that of their product summed over range; these are added up from
-    pulse to pulse. The compensated data are data * exp(-j phase_rad)[..., None]. If a phase a[k] is
-    added to pulse k of the data, the estimate grows by exactly a[k], up to a constant, so the size
-    of the phase error has no effect. Noise and the scene limit the accuracy; a scene of many
-    scatterers per range cell leaves an error of about 1.2 rad. Differentiable.
+    The phase between two adjacent pulses is that of the product of one with the conjugate of the
+    other, summed over range. The phases between adjacent pulses are added up. The compensated data
+    are data * exp(-j phase_rad)[..., None]. If a phase a[k] is added to pulse k of the data, the
+    estimate grows by exactly a[k], up to a constant, so the size of the phase error has no effect.
+    Noise and the scene limit the accuracy; a scene of many scatterers per range cell leaves an
+    error of about 1.2 rad. Differentiable.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed, with a standard deviation from two halves
-        of the range cells. A pulse of zeros is bridged by the product of its neighbours and has the
-        phase of the pulse before. `ok` is False unless the image is 1.5 times sharper than noise
-        can be made, more than one range cell contributes to the sharpness, and the predicted Strehl
-        ratio exceeds 0.8.
+        of the range cells. At a pulse of zeros the phase stays that of the pulse before; the next
+        pulse is paired with the last one that holds samples. `ok` is False unless the image is 1.5
+        times as sharp as autofocus can make pure noise, more than one range cell contributes to the
+        sharpness, and the Strehl ratio predicted from the standard deviation exceeds 0.8. Sharpness
+        is the amount by which the image entropy lies below that of speckle.
 
     Raises:
         TypeError: If the data are not complex.
@@ -66,7 +69,8 @@ def pair_phase(rows: Tensor, present: Tensor) -> Tensor:
 def pair_products(rows: Tensor, present: Tensor) -> Tensor:
     """Sum over range the product of each pulse and the conjugate of the pulse before it.
 
-    Pulses without samples are skipped: the pulse after them is paired with the one before them.
+    Pulses without samples are skipped: the next pulse that holds samples is paired with the last
+    one that does.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
@@ -86,7 +90,7 @@ def pair_products(rows: Tensor, present: Tensor) -> Tensor:
 
 
 def previous_present(present: Tensor) -> Tensor:
-    """Find, for each pulse but the first, the last pulse before it that holds samples.
+    """Find, for each pulse after the first, the last earlier pulse that holds samples.
 
     Args:
         present: False for pulses without samples, shape (trial, pulse), bool.

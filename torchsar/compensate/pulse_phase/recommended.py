@@ -40,11 +40,12 @@ def autofocus(
 ) -> Estimate:
     """Estimate the phase of each pulse; the recommended autofocus.
 
-    The method starts from `sca`. The iterations of `entropy_fixed_point` follow, with a low power
-    floor (a higher one for the first six iterations where noise is weak), until the phases no
-    longer change. In the last iterations the phase of each pulse is measured against a Wiener
-    estimate of the scene, on an image of twice as many Doppler cells. These reduce the remaining
-    error by half or more. Differentiable without `imaging`.
+    The method has three steps. The first is `sca`. The second repeats the iterations of
+    `entropy_fixed_point` until the phases no longer change; cells below 2.5 times the mean power of
+    the image get no weight (5 times in the first six iterations if noise is weak). In the third
+    step the phase of each pulse is measured against a Wiener estimate of the scene, on an image of
+    twice as many Doppler cells. The third step reduces the remaining error by half or more.
+    Differentiable without `imaging`.
 
     Do not use it for homogeneous clutter that fills a large part of the Doppler band. Wrong phases
     lower the entropy of such an image, and `ok` may be True although the phase is wrong.
@@ -52,26 +53,28 @@ def autofocus(
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
         start: Phase to start from in rad, shape (..., pulse); by default that of `sca`. With this
-            default, phase errors of any size are removed alike.
-        search: Largest number of iterations of the entropy fixed point, approximately; only hard
-            cases of low SNR need them all.
-        polish: Largest number of iterations against the Wiener estimate.
-        search_tolerance_rad: Step in rad, rms over the pulses, below which the iterations of the
-            entropy fixed point end.
-        tolerance_rad: Step in rad, rms over the pulses, below which the iterations against the
-            Wiener estimate end.
+            default the size of the phase errors has no effect on the result.
+        search: Largest number of iterations of the second step, approximately; only hard cases of
+            low SNR need them all.
+        polish: Largest number of iterations of the third step.
+        search_tolerance_rad: Phase change in rad, rms over the pulses, below which the iterations
+            of the second step end.
+        tolerance_rad: Phase change in rad, rms over the pulses, below which the iterations of the
+            third step end.
         imaging: Image formation that corrects range migration, for data in which scatterers migrate
             through range cells; see `entropy_fixed_point`. Its image must cover the whole
-            unambiguous cross range. The migration of a displaced image is wrong, so the slope of
-            the phase over pulses is then determined too: after the steps above, 48 slopes over one
-            turn per pulse are tried, the best is refined, and both kinds of iterations are run with
-            `imaging`.
+            unambiguous cross range. A slope of the phase over pulses displaces the image, and a
+            displaced image has the wrong migration; therefore the slope is then estimated too.
+            After the three steps, 48 slopes over one turn per pulse are tried and the best is
+            refined; then the second and the third step are repeated with `imaging`.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
-        halves of the range cells and is close to the true error on targets of points. `ok` is False
-        unless the image is 1.5 times sharper than noise can be made, more than one range cell
-        contributes to the sharpness, and the predicted Strehl ratio exceeds 0.8.
+        halves of the range cells; for point targets it is close to the true error. `ok` is False
+        unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
+        cell contributes to the sharpness, and the Strehl ratio predicted from the standard
+        deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of
+        speckle.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.

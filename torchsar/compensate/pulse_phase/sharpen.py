@@ -26,14 +26,17 @@ Weights = Callable[[Tensor, Tensor], Tensor]
 class Run:
     """Settings of fixed-point iterations with one kind of weights.
 
-    The iterations of a trial end after `iterations`, or once a step is below `tolerance_rad`.
+    The iterations of a trial end after `iterations`, or once the phase step is below
+    `tolerance_rad`.
 
     Args:
-        weights: Function of the power of the cells and its mean that returns their real weights.
+        weights: Function that is given the power of the image cells, shape (trial, range, Doppler),
+            and its mean, shape (trial, 1, 1), and returns the real weights of the cells.
         imaging: Image formation.
         iterations: Largest number of iterations.
         relaxation: Factor applied to the phase step.
-        tolerance_rad: Step in rad, rms over the pulses, below which a trial ends.
+        tolerance_rad: Phase step in rad, rms over the pulses, below which the iterations of a trial
+            end.
     """
 
     weights: Weights
@@ -90,8 +93,8 @@ def weighted(image: Tensor, weights: Weights) -> Tensor:
 
     Args:
         image: Image, shape (..., range, Doppler), complex.
-        weights: Function of the power of the cells and its mean over the image that returns the
-            real weights of the cells.
+        weights: Function that is given the power of the cells and its mean over the image, and
+            returns the real weights of the cells.
 
     Returns:
         The weighted image, same shape.
@@ -107,12 +110,13 @@ def weighted(image: Tensor, weights: Weights) -> Tensor:
 
 @dataclass(frozen=True)
 class LogAbove:
-    """Weights ln(max(p, floor) / floor) of image cells, where p is the power over its mean.
+    """Weights ln(max(p, floor) / floor) of image cells, with p the power over the mean power.
 
-    Above the floor they are the gradient of the image entropy, below it they are zero.
+    Above the floor the weights are, up to a constant, the gradient of the image entropy; below it
+    they are zero.
 
     Args:
-        floor: Floor as a multiple of the mean power, a number or shape (trial, 1, 1).
+        floor: Floor as a multiple of the mean power of the image, a number or shape (trial, 1, 1).
     """
 
     floor: float | Tensor
@@ -123,14 +127,14 @@ class LogAbove:
 
 @dataclass(frozen=True)
 class Wiener:
-    """Weights (p / (p + level * m))^2 of image cells, minus their mean over each range cell.
+    """Weights (p / (p + level * m))^2 of image cells, minus the mean weight of their range cell.
 
-    Here p is the power, summed over three neighbouring range cells with weights 1, 2, 1 and divided
-    by 4, and m is the mean power of the image. A weight is small where a cell holds no more than
-    noise and constant where it holds much more: a Wiener filter whose prior is the local power. The
-    phase of a pulse is updated by comparing the pulse with the weighted image, to which the pulse
-    itself contributes, so that every update would be too short. Subtracting the mean removes this
-    contribution to first order.
+    Here p is the power averaged over three neighbouring range cells with the weights 1/4, 1/2 and
+    1/4, and m is the mean power of the image. The first term makes a Wiener filter whose prior is
+    the local power: it is small where a cell holds no more than noise, and near one where it holds
+    much more. The subtracted mean corrects a bias: the phase of a pulse is updated by comparing the
+    pulse with the weighted image, which contains the pulse itself, so that every update would be
+    too short. Subtracting the mean removes this contribution to first order.
 
     Args:
         level: Noise level as a multiple of the mean power.
@@ -157,30 +161,32 @@ def entropy_fixed_point(
 ) -> Estimate:
     """Estimate the phase of each pulse by a fixed-point iteration that lowers the image entropy.
 
-    Each iteration forms the image, weights its cells with ln(max(p, floor) / floor), where p is the
-    power of a cell over the mean power, transforms the weighted image back to pulses, and takes the
-    phase of each pulse relative to the result. An iteration takes two transforms and, unlike PGA,
-    needs no peaks and no windows. Differentiable.
+    Each iteration forms the image and weights its cells with ln(max(p, floor) / floor), where p is
+    the power of a cell over the mean power. It transforms the weighted image back to pulses and
+    takes the phase of each pulse relative to the result. An iteration takes two transforms and,
+    unlike PGA, needs no peaks and no windows. Differentiable.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
         start: Phase to start from in rad, shape (..., pulse); by default that of `sca`. With this
-            default, phase errors of any size are removed alike.
-        floors: Pairs (floor, largest number of iterations) that are used one after another; a
-            floor is a multiple of the mean power. A trial proceeds to the next pair once its steps
-            are below `tolerance_rad`.
+            default the size of the phase errors has no effect on the result.
+        floors: Pairs (floor, largest number of iterations), used one after another. A floor is a
+            multiple of the mean power. A trial proceeds to the next pair once its phase steps are
+            below `tolerance_rad`.
         relaxation: Factor applied to the phase step. Above 1 it helps to pass local minima; at 2 or
             more the iteration need not converge.
-        tolerance_rad: Step in rad, rms over the pulses, below which a trial ends its iterations
-            with a floor.
+        tolerance_rad: Phase step in rad, rms over the pulses, below which a trial ends its
+            iterations with a floor.
         imaging: Image formation whose image is sharpened, by default a Fourier transform along
             pulses; any object with the methods `image` and `adjoint` for profiles of shape (...,
             pulse, range), such as `torchsar.focus.PolarOperator`.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
-        unless the image is 1.5 times sharper than noise can be made, more than one range cell
-        contributes to the sharpness, and the predicted Strehl ratio exceeds 0.8.
+        unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
+        cell contributes to the sharpness, and the Strehl ratio predicted from the standard
+        deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of
+        speckle.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -190,8 +196,8 @@ def entropy_fixed_point(
     pulses = prepare(data, "entropy_fixed_point")
     if not floors or not all(floor > 0 and count >= 1 for floor, count in floors) or not 0 < relaxation < 2:
         raise ValueError(
-            "entropy_fixed_point: floors must be pairs of a floor above 0 and 1 iteration or more, and relaxation "
-            f"must lie between 0 and 2, got floors {list(floors)} and relaxation {relaxation}"
+            "entropy_fixed_point: floors must be pairs of a floor above 0 and a number of iterations of 1 or more, "
+            f"and relaxation must lie between 0 and 2, got floors {list(floors)} and relaxation {relaxation}"
         )
     operator = AlongPulses() if imaging is None else Through(imaging)
     runs = [Run(LogAbove(floor), operator, count, relaxation, tolerance_rad) for floor, count in floors]
@@ -224,7 +230,7 @@ def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, T
 def settled(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
     """Continue the estimation of a phase by four iterations of the entropy fixed point.
 
-    Autofocus methods use it to predict their accuracy: how far their result moves when it is
+    Autofocus methods use it to predict their accuracy, from the change of their result when it is
     continued on all or on half of the range cells.
 
     Args:

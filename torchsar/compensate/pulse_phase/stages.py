@@ -52,9 +52,10 @@ def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
 
 
 class CorrectPulsePhase(Stage):
-    """Removal of the phase `phase_rad` (rad, a connected value) of every pulse.
+    """Stage that removes the phase `phase_rad` (rad) of every pulse.
 
-    Every pulse is multiplied by exp(-j phase_rad), see `correct_pulse_phase`.
+    Every pulse is multiplied by exp(-j phase_rad), see `correct_pulse_phase`. The phase usually
+    comes from an earlier stage such as `Autofocus`.
     """
 
     def forward(self, signal: Signal, phase_rad: Tensor) -> Signal:
@@ -109,7 +110,7 @@ class Pga(Stage):
         windows: Window widths: "shrinking", "measured", or a list of widths in Doppler cells, see
             `windows_of`.
         iterations: Largest number of iterations.
-        patience: Number of iterations without a lower entropy after which a trial ends.
+        patience: Number of iterations without a lower image entropy after which a trial ends.
     """
 
     provides = ("phase_rad",)
@@ -154,7 +155,7 @@ class PgaSca(Pga):
         windows: Window widths: "shrinking", "measured", or a list of widths in Doppler cells, see
             `windows_of`.
         iterations: Largest number of iterations.
-        patience: Number of iterations without a lower entropy after which a trial ends.
+        patience: Number of iterations without a lower image entropy after which a trial ends.
     """
 
     def __init__(

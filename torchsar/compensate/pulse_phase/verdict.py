@@ -99,30 +99,33 @@ def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = 
     """Run an autofocus method on all trials and predict the accuracy of its phases.
 
     Trials are processed in blocks that fit into the cache, or all at once if gradients are
-    required. The standard deviation combines two measurements. One is half of the rms difference
-    between the phases from two halves of the rows (range cells): the rows are sorted by energy and
-    taken alternately, and the noise of the halves is independent. `occupied_band` corrects for rows
-    that are sampled finer than their band requires. The other is how far the phases move when the
-    method is continued on all rows.
+    required. The standard deviation is the root sum of squares of two parts:
+
+    - Half of the rms difference between the phases from two halves of the rows (range cells). The
+      rows are sorted by energy and taken alternately; the noise of the halves is independent. The
+      difference is divided by the square root of `occupied_band`, because rows that are sampled
+      finer than their band requires are not independent.
+    - The distance by which the phases move when the method is continued on all rows.
 
     Args:
         pulses: The pulses.
         start: Phase to start from in rad, one row per trial, or None.
-        find: The autofocus method: a function of (rows, present, start) that returns the phase
+        find: The autofocus method: a function of (rows, present, start). It returns the phase
             (trial, pulse), the number of iterations (trial,), and a function of (rows, present,
-            phase) that continues the method on some of the rows from that phase.
-        at_rest: True if continuing the method does not move its result; the second measurement is
-            then left out.
+            phase) that continues the method from a phase, on all or on half of the rows.
+        at_rest: True if continuing the method does not move its result; the second part of the
+            standard deviation is then left out.
 
     Returns:
-        `phase_rad` of shape (..., pulse) with its standard deviation. quality is the predicted
-        Strehl ratio times the share of the sharpness that noise does not explain. `ok` is False
-        unless the image is 1.5 times sharper than noise can be made, more than one row contributes
-        to the sharpness, and the standard deviation predicts a Strehl ratio above 0.8. info:
-        present, shape (..., pulse), False for pulses that hold only zeros; and, of shape (...,),
-        iterations, sharpness_nats (entropy below that of speckle), noise_sharpness_nats (the
-        largest that noise can reach), effective_rows (rows over which the energy is spread) and
-        telling_rows (rows over which the sharpness is spread).
+        `phase_rad` of shape (..., pulse) with its standard deviation. Sharpness is the amount by
+        which the image entropy lies below that of speckle. `quality` is the Strehl ratio predicted
+        from the standard deviation, times the share of the sharpness that noise does not explain.
+        `ok` is False unless the image is 1.5 times as sharp as autofocus can make pure noise, more
+        than one row contributes to the sharpness, and that Strehl ratio exceeds 0.8. `info` holds
+        "present", shape (..., pulse), False for pulses that hold only zeros; and, of shape (...,),
+        "iterations", "sharpness_nats", "noise_sharpness_nats" (the largest sharpness that noise can
+        reach), "effective_rows" (number of rows over which the energy is spread) and "telling_rows"
+        (number of rows over which the sharpness is spread).
     """
     rows, present = pulses.rows, pulses.present
     if not len(rows) or pulses.n < 3:

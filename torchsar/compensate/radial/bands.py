@@ -1,6 +1,7 @@
 """Filtering of the up and down sweeps of a triangular-FMCW ladar to a range window.
 
-The down sweeps are mirrored in time, and whole bins of the Doppler shift are removed.
+The down sweeps are mirrored in time, and the Doppler shift is removed in whole bins of beat
+frequency.
 """
 
 from __future__ import annotations
@@ -32,21 +33,24 @@ _FURTHEST = 14
 class Bands:
     """Both sweeps of every period, filtered to a range window, without the bulk Doppler shift.
 
-    A bin is 1 / T, where T is the length of a sweep. `up` is up(u) exp(-2j pi s u / T) and `down`
-    is the mirrored sweep down(-u) exp(+2j pi s u / T), with u the time from the middle of the sweep
-    and s the removed Doppler shift in bins. They follow the sign convention of Remote Sens. 2024,
-    16, 793 (dechirp sign "lo_conj_echo"). The beat frequency of a scatterer is then that of its
-    range plus the remaining Doppler shift in `up`, and minus it in `down`; the remaining shift is
-    about a bin or less. The residual video phase is removed unless `bands_of` was asked to keep it.
-    The samples of each trial are multiplied by a power of two that brings them to about one.
+    A bin is the frequency 1 / T, where T is the length of a sweep in seconds. Let up(u) and down(u)
+    be the sweeps, u the time from the middle of a sweep, and s the removed Doppler shift in bins.
+    Then `up` is up(u) exp(-2j pi s u / T), and `down` is the mirrored sweep
+    down(-u) exp(+2j pi s u / T). Both have the sign convention of Remote Sens. 2024, 16, 793
+    (dechirp sign "lo_conj_echo"). A scatterer has the beat frequency of its range plus the
+    remaining Doppler shift in `up`, and that of its range minus the remaining shift in `down`. The
+    remaining shift is about a bin or less. The residual video phase is removed unless `bands_of`
+    was asked to keep it. The samples of each trial are multiplied by a power of two that brings
+    them to about one.
 
     Args:
-        up: Up sweeps, shape (..., pulse, m), complex, symmetric about the middle of the sweep.
+        up: Up sweeps, shape (..., pulse, m), complex, sampled symmetrically about the middle of the
+            sweep.
         down: Mirrored down sweeps, same shape.
         time_s: Times of the samples from the middle of the sweep, shape (m,).
         shift: Removed Doppler shift s in bins, shape (..., pulse), int64.
-        lit: False where no echo was found and the shift is that of the neighbouring periods, shape
-            (..., pulse), bool.
+        lit: False for periods in which no echo was found, shape (..., pulse), bool; their shift is
+            that of the neighbouring periods.
         lines: Number of bins that the window keeps.
         first: Beat frequency of the first bin of the window, in bins.
         noise_lines: Noise bandwidth of the filter in bins.
@@ -109,10 +113,10 @@ def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str, pulse
     """Check the type and shape of sweeps.
 
     Args:
-        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
-        radar: Ladar parameters, which give N.
+        sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
+        radar: Ladar parameters, of which the number of samples per sweep N is used.
         what: Name of the calling function for the error message.
-        pulse: Axis of the periods, or None.
+        pulse: Slow-time axis of the periods of one up and one down sweep, or None.
 
     Raises:
         TypeError: If the sweeps are not a complex tensor.
@@ -139,11 +143,12 @@ def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str, pulse
 
 
 def window_lines(radar: TriangularLadar, window_m: tuple[float, float] | None) -> tuple[int, int]:
-    """Convert a window of relative ranges to beat-frequency bins.
+    """Convert a range window to bins of beat frequency; a bin is a range cell.
 
     Args:
         radar: Ladar parameters.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
 
     Returns:
         The first bin and the number of bins.
@@ -178,11 +183,12 @@ def window_lines(radar: TriangularLadar, window_m: tuple[float, float] | None) -
 def inside(
     radar: TriangularLadar, window_m: tuple[float, float] | None, bins: int, per_line: float, device: torch.device
 ) -> Tensor:
-    """Mark the bins of the Fourier transform of a sweep that lie in a window of relative ranges.
+    """Mark the bins of the Fourier transform of a sweep that lie in a range window.
 
     Args:
         radar: Ladar parameters.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
         bins: Length of the transform, zero frequency first.
         per_line: Bins of the transform per range cell (zero-padding).
         device: Device of the result.
@@ -200,7 +206,7 @@ def inside(
 
 
 def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
-    """Find the Doppler shift of every period in whole bins, from the envelopes of both sweeps.
+    """Find the Doppler shift of every period in whole bins, from the range spectra of both sweeps.
 
     The lag that aligns the range spectra of the up and the down sweep is twice the Doppler shift
     (Remote Sens. 2024, 16, 793, Eq. (13)). Lags beyond half the band, which a circular correlation
@@ -208,8 +214,9 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     shift of the neighbouring periods.
 
     Args:
-        blocks: Power spectra, zero frequency first, the down sweep as recorded, each the mean over
-            8 periods (the last over the remaining ones), shape (..., 2, block, N).
+        blocks: Power spectra of the up sweeps and of the down sweeps, which are not mirrored,
+            averaged over blocks of 8 periods (the last block may hold fewer), zero frequency first,
+            shape (..., 2, block, N).
         pulses: Number of periods.
 
     Returns:
@@ -287,22 +294,24 @@ def bands_of(
     oversampling: int = 1,
     video: bool = False,
 ) -> Bands:
-    """Filter both sweeps of every period to a window of relative ranges.
+    """Filter both sweeps of every period to a range window.
 
     The down sweeps are mirrored in time, and the bulk of the Doppler shift (whole bins, estimated
     from the data) is removed. Differentiable, except that the removed shift is held constant.
 
     Args:
-        sweeps: Sweeps as recorded, shape (..., 2, pulse, N), complex.
+        sweeps: Up and down sweeps of N samples as recorded, shape (..., 2, pulse, N), complex.
         radar: Ladar parameters.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
         taper: Share of the window that its raised-cosine edges take, 0..1. At 0 the window is cut
-            sharply, which leaves ringing at the ends of the sweep and limits the accuracy of
-            `mirror_product` at high SNR; at 1 the edges meet in the middle.
+            sharply; ringing at the ends of the sweep then limits the accuracy of `mirror_product`
+            at high SNR. At 1 the edges meet in the middle.
         oversampling: Samples per bin; the number of samples is rounded up to a power of two.
             Products of sweeps need 2.
-        video: True keeps the residual video phase. It does not affect single scatterers, and the
-            filter that removes it rings at the ends of the sweep.
+        video: True keeps the residual video phase. This suits methods that use single scatterers,
+            which that phase does not affect, because the filter that removes it rings at the ends
+            of the sweep.
 
     Returns:
         The filtered sweeps.

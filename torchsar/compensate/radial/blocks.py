@@ -24,7 +24,7 @@ def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -
 
     Args:
         estimator: Function of (sweeps, azimuth_m) that returns an estimate.
-        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
 
     Returns:

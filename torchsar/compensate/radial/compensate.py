@@ -22,20 +22,20 @@ def compensate_motion(
 
     Every sample is multiplied by exp(-j 4 pi f(u) DR(u) / c) for the dechirp sign "lo_conj_echo" of
     the radar, and by the conjugate for "echo_conj_lo". Here u is the time from the middle of the
-    sweep, DR(u) the range error (the integral of the velocity), and f(u) the optical frequency: fc
-    + K u in up sweeps and fc - K u in down sweeps, with carrier frequency fc and chirp rate K. This
-    removes the phase of the carrier, the motion of the envelope, and acceleration inside the
-    sweeps. Differentiable.
+    sweep, c the propagation speed, and DR(u) the range error, which is the integral of the
+    velocity. The optical frequency f(u) is fc + K u in up sweeps and fc - K u in down sweeps, with
+    carrier frequency fc and chirp rate K. This removes the phase of the carrier, the motion of the
+    envelope, and the effect of acceleration inside the sweeps. Differentiable.
 
     Args:
-        sweeps: Sweeps, up before down, in the dechirp sign of the radar, shape (..., 2, pulse, N),
-            complex.
-        velocity_m_s: Radial velocity at the turning points in m/s, receding positive, shape (...,
-            pulse).
+        sweeps: Sweeps of N samples, up before down, in the dechirp sign of the radar, shape
+            (..., 2, pulse, N), complex.
+        velocity_m_s: Radial velocity at the turning points (ends of the up sweeps) in m/s, receding
+            positive, shape (..., pulse).
         radar: Ladar parameters.
-        pulse: Axis of the periods.
-        carrier_only: True takes fc in place of f(u), as the paper prints it. The envelopes then
-            remain displaced by the motion.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
+        carrier_only: True takes fc in place of f(u), as the equations of the reference are printed.
+            The envelopes then remain displaced by the motion.
 
     Returns:
         The compensated sweeps, shape (..., 2, pulse, N), complex.
@@ -62,7 +62,7 @@ def refuse_other_velocity(velocity_m_s: Tensor, sweeps: Tensor, what: str) -> No
 
     Args:
         velocity_m_s: Velocities in m/s, shape (..., pulse).
-        sweeps: Sweeps, shape (..., 2, pulse, N).
+        sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N).
         what: Name of the calling function for the error message.
 
     Raises:
@@ -116,13 +116,14 @@ def carrier_turns(motion: Tensor, radar: TriangularLadar, carrier_only: bool = F
 
 
 def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) -> Tensor:
-    """Compute exp(2j pi sum_k turns[..., k] u^k) at u_i = (i - (n - 1) / 2) step_s.
+    """Compute exp(2j pi sum_k turns[..., k] u^k) at the times u_i = (i - (n - 1) / 2) step_s.
 
-    The constant and the linear term are formed from short tables in float64. The higher terms are
-    small and are formed in the precision of `dtype`; negligible terms are skipped.
+    The constant and the linear term are formed from short tables in float64. Higher terms of more
+    than two turns are formed in float64 too, smaller ones in the precision of `dtype`; negligible
+    ones are skipped.
 
     Args:
-        turns: Coefficients by power of u, in turns/s^k, shape (..., k), float64.
+        turns: Coefficients by power of u, in turns/s^k, shape (..., power), float64.
         step_s: Sample spacing in seconds.
         n: Number of samples.
         dtype: Complex type of the result.

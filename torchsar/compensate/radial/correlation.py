@@ -31,25 +31,26 @@ def spectrum_correlation(
 ) -> Estimate:
     """Estimate the radial velocity from the lag between the range envelopes of both sweeps.
 
-    The envelopes are the magnitude spectra |S+(f)| of the up sweep and |S-(-f)| of the mirrored
-    down sweep. The lag that aligns them is twice the Doppler shift. It is found on a grid with the
-    step 1 / (upsampling T), where T is the length of a sweep. However strong the signal, an rms
-    error of lambda / (4 upsampling T sqrt(12)) remains, 0.70 mm/s for the system of the paper and
-    an upsampling of 20. If the motion is slow, the estimate stays on one step of the grid. Not
-    differentiable.
+    The range envelopes are the magnitude spectra of the up sweep and of the mirrored down sweep.
+    The lag that aligns them is twice the Doppler shift. It is found on a grid with the step
+    1 / (upsampling T), where T is the length of a sweep. However strong the signal, an rms error of
+    lambda / (4 upsampling T sqrt(12)) remains: 0.70 mm/s for an upsampling of 20 and the ladar of
+    Remote Sens. 2024, 16, 793. If the motion is slow, the estimate stays on one step of the grid.
+    Not differentiable.
 
     Args:
-        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
         radar: Ladar parameters.
-        pulse: Axis of the periods.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
         upsampling: Upsampling of the spectra, 1..64.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
 
     Returns:
-        `velocity_m_s` of shape (..., pulse) at the turning points, receding positive, with its
-        standard deviation. `ok` is False where the SNR after compression is below 14 dB, or no
-        scatterer is illuminated in any period.
+        `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
+        positive, with its standard deviation. `ok` is False where the SNR after compression is
+        below 14 dB, or no scatterer is illuminated in any period.
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -78,16 +79,16 @@ def spectrum_correlation(
 def envelope_lag(bands: Bands, upsampling: int) -> Tensor:
     """Find the lag between the range envelopes of the up sweep and of the mirrored down sweep.
 
-    Only lags within 4 bins are searched, because the Doppler shift that the filtered sweeps have
-    lost is right to a bin or two.
+    The sweeps were filtered after the Doppler shift was removed to within a bin or two. Therefore
+    only lags within 4 bins are searched.
 
     Args:
         bands: Filtered sweeps.
         upsampling: Upsampling of the spectra.
 
     Returns:
-        The lag of the up envelope, twice the remaining Doppler shift, in bins of 1 / T (T is the
-        length of a sweep), shape (..., pulse), float64.
+        The lag of the envelope of the up sweep, which is twice the remaining Doppler shift, in bins
+        of 1 / T (T is the length of a sweep), shape (..., pulse), float64.
     """
     m = bands.time_s.shape[-1]
     n = upsampling * m

@@ -17,21 +17,22 @@ _PAD = 4  # zero-padding of the transform: a peak is then found to an eighth of 
 def pulse_gain(data: Tensor) -> Estimate:
     """Estimate the amplitude of every pulse from steady scatterers.
 
-    Scintillation and pointing change the amplitude of the echo, which changes the side lobes in
-    azimuth (a log-amplitude of 0.1 rms changes the first side lobe by a decibel either way). The
-    strongest scatterer of each range cell is a tone of constant amplitude. One real factor per
-    pulse is fitted to the tones of all cells, each weighted by the share of the cell's energy that
-    the tone explains. Differentiable around the detached peaks.
+    Scintillation and pointing errors change the amplitude of the echo from pulse to pulse, which
+    changes the side lobes in azimuth: a log-amplitude of 0.1 rms changes the first side lobe by a
+    decibel either way. The strongest scatterer of each range cell is taken as a tone of constant
+    amplitude, which explains a share of the energy of the cell. One real factor per pulse is fitted
+    to the tones of all cells, each weighted with the square of its share. Differentiable, except
+    for the peak search that finds the frequencies of the tones.
 
     Args:
-        data: Pulses that are focused except for their amplitudes (compensated, deramped, phases
-            corrected), shape (..., pulse, range), complex.
+        data: Range-compressed pulses after motion compensation, deramping and autofocus, of which
+            only the amplitudes have errors, shape (..., pulse, range), complex.
 
     Returns:
         `gain` of shape (..., pulse), by which each pulse is to be divided. Its mean is about one,
-        and it is never below 0.05, so that a lost pulse is not amplified. quality is the share of
-        the energy that the tones explain. `ok` is False where that share is half or less; all gains
-        of the trial are then one.
+        and it is never below 0.05, so that a lost pulse is not amplified more than 20 times.
+        `quality` is the share of the energy that the tones explain. `ok` is False where that share
+        is half or less; all gains of the trial are then one.
 
     Raises:
         TypeError: If the data are not complex.

@@ -33,35 +33,37 @@ def mirror_product(
 ) -> Estimate:
     """Estimate the radial velocity from the product of the up sweep and the mirrored down sweep.
 
-    z(u) = up(u) conj(down(-u)), with u the time from the middle of a sweep, multiplies samples of
-    equal optical frequency fc + K u (carrier frequency fc, chirp rate K). Therefore z(u) =
-    |scene(u)|^2 exp(-j 4 pi / c (fc + K u) (T - 2u) v), with the radial velocity v and the length T
-    of a sweep, whatever scatterers lie in the window. The two samples lie symmetrically about the
-    turning point, so acceleration cancels; jerk remains. Differentiable: the peak search is
-    detached, and Newton steps refine its result.
+    Let u be the time from the middle of a sweep, fc the carrier frequency and K the chirp rate. The
+    product z(u) = up(u) conj(down(-u)) combines two samples of equal optical frequency fc + K u.
+    Therefore z(u) = |scene(u)|^2 exp(-j 4 pi / c (fc + K u) (T - 2u) v), with the radial velocity
+    v, the length T of a sweep and the propagation speed c, whatever scatterers lie in the window.
+    The two samples lie symmetrically about the turning point, the end of the up sweep, so that
+    acceleration cancels; jerk remains. Differentiable, except for the peak search, whose result
+    Newton steps refine.
 
     Args:
-        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
         radar: Ladar parameters.
-        pulse: Axis of the periods.
-        window_m: Lowest and highest relative range in metres; None for the whole band. The window
-            follows the Doppler shift.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band. The window follows the Doppler shift.
         intercept: What is assumed of the phase of z at the turning point, u = T / 2. "known" takes
-            it as zero, which requires accurate trigger timing and lowers the variance by a factor
-            of four. "free" assumes nothing and uses the slope of the phase alone. "record"
-            estimates one constant phase for the whole record, for a timing error that is unknown
-            but constant.
+            it as zero; this requires accurate trigger timing and lowers the variance by a factor of
+            four. "free" assumes nothing and uses only the slope of the phase. "record" estimates
+            one constant phase for the whole record, for an unknown but constant timing error.
         taper: Share of the window that its edges take, see `bands_of`.
-        azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,). Its geometric
-            velocity, which the straight flight causes, is subtracted.
+        azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,). The radial
+            velocity that the straight flight causes there is subtracted, see
+            `geometric_velocity_m_s`.
 
     Returns:
-        `velocity_m_s` of shape (..., pulse) at the turning points, receding positive. Its standard
-        deviation is predicted from the measured SNR and includes the squaring loss. `ok` is False
-        where the SNR after compression, less the squaring loss, is below 15 dB, or no scatterer is
-        illuminated in any period. info: snr_db (after compression), shape (...,); shift (Doppler
-        shift in whole bins) and lit (periods with an echo), shape (..., pulse); and, with "record",
-        intercept_rad, the estimated phase, shape (...,).
+        `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
+        positive. Its standard deviation is predicted from the measured SNR and includes the
+        squaring loss. `ok` is False where the SNR after compression, less the squaring loss, is
+        below 15 dB, or no scatterer is illuminated in any period. `info` holds "snr_db" (after
+        compression), shape (...,); "shift" (Doppler shift in whole bins) and "lit" (True in periods
+        with an echo), shape (..., pulse); and, with intercept "record", "intercept_rad", the
+        estimated phase, shape (...,).
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -94,7 +96,7 @@ def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: 
 
     Args:
         bands: Filtered sweeps with two samples per bin.
-        pulse: Axis of the periods.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
         intercept: "known", "record" or "free", see `mirror_product`.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
 

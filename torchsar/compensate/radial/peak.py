@@ -32,25 +32,26 @@ def ml_peak(
     """Estimate the radial velocity from the periodogram peaks of both sweeps.
 
     The Doppler shift is half the difference between the beat frequencies of the up sweep and of the
-    mirrored down sweep; each is the peak of a periodogram, refined by Newton steps. For one
-    scatterer this is the maximum-likelihood estimate if the phase of each sweep is unknown. Each
-    peak is searched within two range cells of the peak of the mean over the whole record.
-    Differentiable: the search is detached, the Newton steps are not.
+    mirrored down sweep. Each beat frequency is the peak of a periodogram, refined by Newton steps.
+    For one scatterer this is the maximum-likelihood estimate if the phase of each sweep is unknown.
+    The peak is searched within two range cells of the peak of the mean periodogram of the record.
+    Differentiable, except for this search.
 
     Assumes one dominant scatterer; use `radial_motion` for extended scenes.
 
     Args:
-        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
         radar: Ladar parameters.
-        pulse: Axis of the periods.
-        window_m: Lowest and highest relative range in metres in which the peak is searched; None
-            for the whole band. The sweeps are not filtered.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
+        window_m: Lowest and highest range in metres, relative to the reference range, between which
+            the peak of the mean periodogram is searched; None for the whole band. The sweeps are
+            not filtered.
         azimuth_m: Azimuth of the scatterer in metres, a number or shape (...,).
 
     Returns:
-        `velocity_m_s` of shape (..., pulse) at the turning points, receding positive, with its
-        standard deviation. `ok` is False where the SNR after compression is below 14 dB, or no
-        scatterer is illuminated in any period.
+        `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
+        positive, with its standard deviation. `ok` is False where the SNR after compression is
+        below 14 dB, or no scatterer is illuminated in any period.
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -110,8 +111,8 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
 
     Args:
         bands: Filtered sweeps.
-        window_m: Lowest and highest relative range in metres in which the scatterer is searched;
-            None for the whole band.
+        window_m: Lowest and highest range in metres, relative to the reference range, between which
+            the scatterer is searched; None for the whole band.
 
     Returns:
         The beat frequencies in the up and in the mirrored down sweeps in Hz, shape (..., pulse)

@@ -1,7 +1,7 @@
 """Residual phase of each pulse after the motion was compensated by integrated velocities.
 
-The error of integrated velocities grows over the record; that of the phases estimated here does
-not.
+The error of integrated velocities grows over the record; the error of the phases estimated here
+does not.
 """
 
 from __future__ import annotations
@@ -29,34 +29,39 @@ def phase_polish(
 ) -> Estimate:
     """Estimate the residual phase of each pulse relative to the scene that all pulses share.
 
-    It is meant for pulses whose motion was compensated by integrated velocities. These leave a
-    random walk of the order of a radian with small phase steps, so the iterations can start from
-    zero. Beyond a radian, they may end in an image with two peaks; a start such as that of `pga`
-    prevents this. Differentiable.
+    It is meant for pulses whose motion was compensated by integrated velocities. The phase that
+    remains is a random walk of the order of a radian with small steps, so that the iterations can
+    start from zero. If it is larger, they may end in an image with two peaks; a start such as the
+    result of `pga` prevents this. Differentiable.
 
-    Every iteration forms the image, weights its cells, transforms back to pulses, and takes the
-    phase of each pulse relative to the result. The weights of the first step are the power over the
-    maximum of the range cell; this step already suffices for trials of single points. Over-relaxed
-    steps with Wiener weights follow, in which a cell counts as scene if its power is a fiftieth of
-    that of a typical bright cell. The last five steps have weights p / (p + p_max / 10), where p is
-    the power of a cell and p_max the maximum of its range cell, on twice as many Doppler cells;
-    these include scatterers that are illuminated for a part of the record only.
+    Every iteration forms the image, weights its cells, transforms it back to pulses, and takes the
+    phase of each pulse relative to the result. With the power p of a cell and the maximum p_max of
+    its range cell, three kinds of weights are used one after another:
 
-    For single points the error reaches the bound of the phase of one sweep where the SNR after
-    compression exceeds about 14 dB. A constant and a slope of the phase, which only shift the
+    - One step with the weights p / p_max, which already suffices for a trial of single points. A
+      trial of many scatterers starts with the next kind instead.
+    - Up to `iterations` over-relaxed steps with Wiener weights. The noise level of the Wiener
+      filter is a fiftieth of the power of a typical bright cell, and at least four times the mean
+      power.
+    - Up to five steps with the weights p / (p + p_max / 10), on twice as many Doppler cells. They
+      include scatterers that are illuminated for a part of the record only.
+
+    For single points the error reaches the Cramer-Rao bound of the phase of one sweep where the SNR
+    after compression exceeds about 14 dB. A constant and a slope of the phase, which only shift the
     image, stay near zero.
 
     Args:
-        data: Pulses, compensated, range-compressed and deramped in azimuth so that scatterers are
-            tones, shape (..., pulse, range), complex. If only the range cells about the scatterers
-            are given, the estimate takes less time and less noise enters.
+        data: Range-compressed pulses after motion compensation and azimuth deramping, by which
+            scatterers become tones, shape (..., pulse, range), complex. If only the range cells
+            about the scatterers are given, the estimate takes less time and less noise enters.
         start: Phase to start from in rad, shape (..., pulse); by default zero.
         iterations: Largest number of iterations with Wiener weights.
-        tolerance_rad: Step in rad, rms over the pulses, below which a trial ends.
+        tolerance_rad: Phase step in rad, rms over the pulses, below which the steps with Wiener
+            weights end; the last kind of steps ends below half of it.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed. Its standard deviation is predicted from
-        the energy of the cells above the noise. quality is the share of the energy in cells that
+        the energy of the cells above the noise. `quality` is the share of the energy in cells that
         clearly exceed the noise. `ok` is False where the standard deviation is 0.5 rad or more.
 
     Raises:

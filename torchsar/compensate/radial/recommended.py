@@ -46,30 +46,32 @@ def radial_motion(
 ) -> Estimate:
     """Estimate the radial motion from up and down sweeps; the recommended estimator.
 
-    `mirror_product` estimates the velocities. Their integral compensates the motion in the range
-    cells of the window, which are deramped in azimuth. `phase_polish` then estimates the residual
-    phase of each pulse, so that the range error does not grow with the length of the record. All
-    steps use only the few bins of the window: a window that holds the scene and little else costs
-    less and tolerates more noise. Differentiable around the detached peak search.
+    `mirror_product` estimates the velocities. The range cells of the window are compensated with
+    the integral of the velocities and deramped in azimuth. `phase_polish` then estimates the
+    residual phase of each pulse, so that the range error does not grow with the length of the
+    record. All steps use only the bins of the window: a window that holds the scene and little else
+    saves time and allows a lower SNR. Differentiable, except for the peak searches.
 
     Args:
-        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
         radar: Ladar parameters.
-        pulse: Axis of the periods.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
-        intercept: "known", "record" or "free": what is assumed of the phase of the mirror product
-            at the turning point, see `mirror_product`.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
+        intercept: What is assumed of the phase of the product of up and mirrored down sweep at the
+            turning point: "known", "record" or "free", see `mirror_product`.
         taper: Share of the window that its edges take, see `bands_of`.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
         iterations: Largest number of iterations, see `phase_polish`.
         tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.
 
     Returns:
-        `velocity_m_s` at the turning points, receding positive, and `phase_rad` at the middles of
-        the up sweeps, shape (..., pulse) each, with standard deviations. The phase is to be removed
-        after `compensate_motion` with the velocities; `range_error` combines both to a range error.
-        quality is that of the velocities. `ok` is False where `ok` of `mirror_product` is False, or
-        the phase has a standard deviation of 0.5 rad or more.
+        `velocity_m_s` at the turning points (ends of the up sweeps), receding positive, and
+        `phase_rad` at the middles of the up sweeps, shape (..., pulse) each, with standard
+        deviations. The phase is to be removed after `compensate_motion` with the velocities.
+        `range_error` combines both to a range error. `quality` is that of the velocities. `ok` is
+        False where `ok` of `mirror_product` is False, or the phase has a standard deviation of 0.5
+        rad or more.
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -94,7 +96,7 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
     Args:
         bands: Filtered sweeps from which the velocities were estimated.
         coarse: Estimate of the velocities.
-        pulse: Axis of the periods.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
         iterations: Largest number of iterations, see `phase_polish`.
         tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.
 
@@ -143,11 +145,12 @@ def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
 
     Args:
         bands: Filtered sweeps.
-        velocity_m_s: Radial velocity at the turning points in m/s, shape (..., pulse).
-        pulse: Axis of the periods.
+        velocity_m_s: Radial velocity at the turning points (ends of the up sweeps) in m/s, shape
+            (..., pulse).
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
 
     Returns:
-        Range cells of the window, shape (..., pulse, line), complex.
+        Range cells of the window of `bands`, shape (..., pulse, range), complex.
     """
     radar, m = bands.radar, bands.time_s.shape[-1]
     turns = carrier_turns(sweep_motion(velocity_m_s, radar, pulse), radar)[..., 0, :, :]
@@ -166,15 +169,15 @@ def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
 def range_error(estimate: Estimate, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:
     """Compute the range error at any slow time from an estimate of the radial motion.
 
-    The range error is the integral of the velocities, zero at the first turning point, plus lambda
-    / (4 pi) times the phases of the pulses if the estimate has phases. Both parts are interpolated
-    by cubic splines.
+    The range error is the integral of the velocities, zero at the first turning point (end of the
+    first up sweep), plus lambda / (4 pi) times the phases of the pulses if the estimate has phases.
+    Both parts are interpolated by cubic splines.
 
     Args:
         estimate: Estimate that holds `velocity_m_s`, `phase_rad` or both, such as that of
             `radial_motion`.
         radar: Ladar parameters.
-        pulse: Axis of the periods.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
         at_s: Slow times in seconds, any shape.
 
     Returns:

@@ -37,43 +37,49 @@ def segmented_interference(
 ) -> Estimate:
     """Estimate the radial velocity from the phase between the halves of both sweeps.
 
-    The phase phi = arg{U1 conj(D1) conj(U2 conj(D2))} is -2 pi T fd, with sweep length T and
-    Doppler shift fd. U1 and U2 are the spectra of the first and the second half of the up sweep, D1
-    and D2 those of the conjugated down sweep; the phase of each refers to the centre of its half.
-    Up and down sweeps are each evaluated at their own peaks. The paper prints the equations without
-    these corrections. Differentiable; peaks and whole turns are held constant.
+    Let U1 and U2 be the spectra of the first and the second half of the up sweep, and D1 and D2
+    those of the halves of the conjugated down sweep. The phase
+    phi = arg{U1 conj(D1) conj(U2 conj(D2))} is then -2 pi T fd, with sweep length T and Doppler
+    shift fd. Two conditions that the printed equations omit are met: the phase of each spectrum
+    refers to the centre of its half, and up and down sweeps are each evaluated at their own peaks.
+    Differentiable; peaks and whole turns are held constant.
 
-    For scenes with scatterers closer in range than c / B, where B is the bandwidth, use
+    For scenes with scatterers closer in range than c / B, where B is the bandwidth of a sweep, use
     `bins="sum"` or `mirror_product`.
 
     Args:
-        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
         radar: Ladar parameters.
-        pulse: Axis of the periods.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
         bins: Frequency bins in which the phase is read. "peak" takes those of the strongest
-            scatterers, which must be c / B or more apart, and averages their phase changes from
-            period to period with weights from the contrast (Eqs. (18) and (19)). "sum" adds the
-            complex products of all bins, for dense scenes.
+            scatterers, which must be c / B or more apart. The phase changes of the scatterers from
+            period to period are averaged with weights from the contrast (Eqs. (18) and (19)). "sum"
+            adds the complex products of all bins, for dense scenes.
         unwrap: How the whole turns of the phase are found. "per_pulse" takes them for every period
-            from the lag between the range envelopes of the two sweeps. "gradient", the method of
-            the paper, does so for the first period only and then adds the wrapped phase changes
-            from period to period; it slips by a turn where the velocity changes by lambda / (4 T)
-            per period, or where the SNR after compression is below 14 dB.
+            from the lag between the range envelopes of the two sweeps. "gradient", the published
+            method, does so for one period only and then adds the wrapped phase changes from period
+            to period. It slips by a turn where the velocity changes by lambda / (4 T) per period,
+            or where the SNR after compression is below 14 dB.
         scatterers: Number of scatterers with "peak". Each is used in the periods in which it is
             illuminated.
         padding: Factor of the zero-padding of the halves, 1..16.
         hann: True applies a Hann window to each half, for range windows with other scatterers.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
 
     Returns:
-        `velocity_m_s` of shape (..., pulse) at the turning points, receding positive, with its
-        standard deviation. `ok` is False where the SNR after compression is below 14 dB, or no
-        scatterer is illuminated in any period. info: phase_rad and integer (whole turns), shape
-        (..., pulse); slips, the number of period changes at which "gradient" and "per_pulse"
-        disagree by a turn, and dispersion, the standard deviation of the amplitude over the periods
-        relative to its mean, shape (...,); weights of the scatterers, averaged over the periods,
-        shape (..., scatterers).
+        `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
+        positive, with its standard deviation. `ok` is False where the SNR after compression is
+        below 14 dB, or no scatterer is illuminated in any period. `info` holds
+
+        - "phase_rad" and "integer" (whole turns), shape (..., pulse);
+        - "slips", the number of changes between periods in which "gradient" and "per_pulse" differ
+          by a turn, shape (...,);
+        - "dispersion", the standard deviation of the amplitude over the periods divided by its
+          mean, shape (...,);
+        - "weights" of the scatterers, averaged over the periods, shape (..., scatterers);
+        - "snr_db", "shift" and "lit", as for `mirror_product`.
 
     Raises:
         TypeError: If the sweeps are not complex.

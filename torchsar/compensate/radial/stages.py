@@ -47,13 +47,15 @@ class _OfSweeps(Stage):
 class MirrorProduct(_OfSweeps):
     """Radial velocity by the product of up and mirrored down sweeps; see `mirror_product`.
 
-    Provides `velocity_m_s` of shape (..., pulse) at the turning points, receding positive.
+    Provides `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps),
+    receding positive.
 
     Args:
         radar: Ladar parameters.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
-        intercept: "known", "record" or "free": what is assumed of the phase of the product at the
-            turning point, see `mirror_product`.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
+        intercept: What is assumed of the phase of the product of up and mirrored down sweep at the
+            turning point: "known", "record" or "free", see `mirror_product`.
         taper: Share of the window that its edges take, see `bands_of`.
         azimuth_m: Azimuth of the scene centre in metres.
 
@@ -74,10 +76,11 @@ class MirrorProduct(_OfSweeps):
         self.taper = taper
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the radial velocity from sweeps of axes (ramp, pulse, fast_time).
+        """Estimate the radial velocity from up and down sweeps of axes (ramp, pulse, fast_time).
 
         Returns:
-            `velocity_m_s` at the turning points, shape (..., pulse), receding positive.
+            `velocity_m_s` at the turning points (ends of the up sweeps), shape (..., pulse),
+            receding positive.
         """
         return mirror_product(
             signal.data,
@@ -93,14 +96,15 @@ class MirrorProduct(_OfSweeps):
 class RadialMotion(MirrorProduct):
     """Radial motion by the recommended estimator; see `radial_motion`.
 
-    Provides `velocity_m_s`, to be removed by `CompensateMotion`, and the residual `phase_rad`, to
-    be removed after it by `CorrectPulsePhase`.
+    Provides `velocity_m_s`, which `CompensateMotion` can compensate, and the residual `phase_rad`,
+    which `CorrectPulsePhase` can then remove.
 
     Args:
         radar: Ladar parameters.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
-        intercept: "known", "record" or "free": what is assumed of the phase of the product at the
-            turning point, see `mirror_product`.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
+        intercept: What is assumed of the phase of the product of up and mirrored down sweep at the
+            turning point: "known", "record" or "free", see `mirror_product`.
         taper: Share of the window that its edges take, see `bands_of`.
         azimuth_m: Azimuth of the scene centre in metres.
         iterations: Largest number of iterations, see `phase_polish`.
@@ -129,9 +133,9 @@ class RadialMotion(MirrorProduct):
         """Estimate the radial motion from sweeps of axes (ramp, pulse, fast_time).
 
         Returns:
-            `Estimate` by the function `radial_motion` with `velocity_m_s` at the turning points,
-            receding positive, and the residual `phase_rad` of the up sweeps, each of shape
-            (..., pulse).
+            `Estimate` by the function `radial_motion` with `velocity_m_s` at the turning points
+            (ends of the up sweeps), receding positive, and the residual `phase_rad` of the up
+            sweeps, each of shape (..., pulse).
         """
         return radial_motion(
             signal.data,
@@ -151,7 +155,8 @@ class MlPeak(_OfSweeps):
 
     Args:
         radar: Ladar parameters.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
         azimuth_m: Azimuth of the scatterer in metres.
 
     Raises:
@@ -162,10 +167,11 @@ class MlPeak(_OfSweeps):
         super().__init__(radar, window_m, azimuth_m)
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the radial velocity from sweeps of axes (ramp, pulse, fast_time).
+        """Estimate the radial velocity from up and down sweeps of axes (ramp, pulse, fast_time).
 
         Returns:
-            `velocity_m_s` at the turning points, shape (..., pulse), receding positive.
+            `velocity_m_s` at the turning points (ends of the up sweeps), shape (..., pulse),
+            receding positive.
         """
         return ml_peak(signal.data, self.radar, signal.axis("pulse"), window_m=self.window_m, azimuth_m=self.azimuth_m)
 
@@ -176,7 +182,8 @@ class SpectrumCorrelation(_OfSweeps):
     Args:
         radar: Ladar parameters.
         upsampling: Upsampling of the spectra, 1..64.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
         azimuth_m: Azimuth of the scene centre in metres.
 
     Raises:
@@ -190,10 +197,11 @@ class SpectrumCorrelation(_OfSweeps):
         self.upsampling = upsampling
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the radial velocity from sweeps of axes (ramp, pulse, fast_time).
+        """Estimate the radial velocity from up and down sweeps of axes (ramp, pulse, fast_time).
 
         Returns:
-            `velocity_m_s` at the turning points, shape (..., pulse), receding positive.
+            `velocity_m_s` at the turning points (ends of the up sweeps), shape (..., pulse),
+            receding positive.
         """
         return spectrum_correlation(
             signal.data,
@@ -217,7 +225,8 @@ class SegmentedInterference(_OfSweeps):
         scatterers: Number of scatterers with "peak".
         padding: Factor of the zero-padding of the halves, 1..16.
         hann: True applies a Hann window to each half.
-        window_m: Lowest and highest relative range in metres; None for the whole band.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
         azimuth_m: Azimuth of the scene centre in metres.
 
     Raises:
@@ -241,10 +250,11 @@ class SegmentedInterference(_OfSweeps):
         self.scatterers, self.padding, self.hann = scatterers, padding, hann
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the radial velocity from sweeps of axes (ramp, pulse, fast_time).
+        """Estimate the radial velocity from up and down sweeps of axes (ramp, pulse, fast_time).
 
         Returns:
-            `velocity_m_s` at the turning points, shape (..., pulse), receding positive.
+            `velocity_m_s` at the turning points (ends of the up sweeps), shape (..., pulse),
+            receding positive.
         """
         return segmented_interference(
             signal.data,
@@ -261,9 +271,9 @@ class SegmentedInterference(_OfSweeps):
 
 
 class CompensateMotion(Stage):
-    """Compensation of the radial motion given by `velocity_m_s`, a value to be connected.
+    """Stage that compensates the radial motion `velocity_m_s`; see `compensate_motion`.
 
-    See `compensate_motion`.
+    The velocity usually comes from an earlier stage such as `MirrorProduct`.
 
     Args:
         radar: Ladar parameters.
@@ -281,9 +291,9 @@ class CompensateMotion(Stage):
         """Remove the radial motion from sweeps of axes (ramp, pulse, fast_time).
 
         Args:
-            signal: Sweeps, shape (..., 2, pulse, N), complex.
-            velocity_m_s: Radial velocity at the turning points in m/s, receding positive, shape
-                (..., pulse).
+            signal: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
+            velocity_m_s: Radial velocity at the turning points (ends of the up sweeps) in m/s,
+                receding positive, shape (..., pulse).
 
         Returns:
             The compensated sweeps.
@@ -294,13 +304,14 @@ class CompensateMotion(Stage):
 
 
 class PhasePolish(Stage):
-    """Residual phase of each pulse after the motion was compensated; see `phase_polish`.
+    """Residual phase of each pulse after motion compensation; see `phase_polish`.
 
     Provides `phase_rad` of shape (..., pulse).
 
     Args:
         iterations: Largest number of iterations with Wiener weights.
-        tolerance_rad: Step in rad, rms over the pulses, below which a trial ends.
+        tolerance_rad: Phase step in rad, rms over the pulses, below which the iterations of a trial
+            end.
     """
 
     provides = ("phase_rad",)
@@ -333,7 +344,10 @@ class PulseGain(Stage):
 
 
 class EqualisePulses(Stage):
-    """Division of every pulse by its `gain`, a value to be connected; see `equalise_pulses`."""
+    """Stage that divides every pulse by its `gain`; see `equalise_pulses`.
+
+    The gain usually comes from an earlier stage such as `PulseGain`.
+    """
 
     def forward(self, signal: Signal, gain: Tensor) -> Signal:
         """Divide the pulses of a signal of axes (pulse, range) by their gains.

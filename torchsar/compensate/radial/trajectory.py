@@ -19,7 +19,7 @@ def turning_points(radar: TriangularLadar, pulse: Axis) -> Axis:
 
     Args:
         radar: Ladar parameters.
-        pulse: Axis of the periods.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
 
     Returns:
         Axis of the turning points in seconds.
@@ -37,13 +37,13 @@ def geometric_velocity_m_s(
     """Compute the radial velocity of a static scatterer that the straight flight causes.
 
     It is V (V t - x) / R at slow time t, with platform speed V and the azimuth x and range R of the
-    scatterer, and is computed at the turning points between up and down sweeps. A velocity
-    estimated from the echo contains it. If it were compensated as motion error, the azimuth phase
-    history would be removed.
+    scatterer. It is computed at the turning points between up and down sweeps. A velocity estimated
+    from the echo contains it. If it were compensated like a motion error, the azimuth phase history
+    would be removed.
 
     Args:
         radar: Ladar parameters.
-        pulse: Axis of the periods.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
         azimuth_m: Azimuth x of the scatterer in metres, a number or shape (...,).
         relative_range_m: Range R of the scatterer minus the reference range of the radar in metres.
         device: Device of the result.
@@ -63,9 +63,10 @@ def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, 
     first turning point. A sum of rectangles would have errors of micrometres. Differentiable.
 
     Args:
-        velocity_m_s: Radial velocity at the turning points in m/s, shape (..., pulse).
+        velocity_m_s: Radial velocity at the turning points (ends of the up sweeps) in m/s, shape
+            (..., pulse).
         radar: Ladar parameters.
-        pulse: Axis of the periods.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
         at_s: Slow times in seconds, any shape.
 
     Returns:
@@ -81,15 +82,16 @@ def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, 
 def sweep_motion(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> Tensor:
     """Compute the range error over both sweeps of every period as polynomials.
 
-    The range error is DR(u) = sum_k c_k u^k, with u the time from the middle of the sweep: the
-    integral of the cubic spline through the velocities, zero at the first turning point. The
-    polynomials are exact, because the knots of the spline are the turning points, so each sweep
+    The range error is the integral of the cubic spline through the velocities, zero at the first
+    turning point. Over a sweep it is DR(u) = sum_k c_k u^k, with u the time from the middle of the
+    sweep. The polynomials are exact: the knots of the spline are the turning points, so each sweep
     lies in one piece of the spline.
 
     Args:
-        velocity_m_s: Radial velocity at the turning points in m/s, shape (..., pulse).
+        velocity_m_s: Radial velocity at the turning points (ends of the up sweeps) in m/s, shape
+            (..., pulse).
         radar: Ladar parameters.
-        pulse: Axis of the periods.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
 
     Returns:
         Coefficients, shape (..., 2, pulse, 5), up before down, float64; c_k in m/s^k.

@@ -20,8 +20,8 @@ LEAST_SQUARED_DB = 15.0  # the same for a product of sweeps, after the squaring 
 def signal_and_noise(bands: Bands, residual_m_s: Tensor) -> tuple[Tensor, Tensor]:
     """Measure the mean power per sample of the scene and of the noise.
 
-    The power that the up sweep and the mirrored down sweep have in common, after the motion is
-    removed, is taken as scene; the rest is taken as noise.
+    After the motion is removed, the power that the up sweep and the mirrored down sweep have in
+    common is taken as scene, and the rest as noise.
 
     Args:
         bands: Filtered sweeps.
@@ -65,26 +65,30 @@ def velocity_estimate(
     T is the length of a sweep and g the energy of a sweep over the noise variance of a sample.
 
     Args:
-        velocity_m_s: Velocity at the turning points in m/s, with the geometric velocity (that of a
-            static scatterer, see `geometric_velocity_m_s`) still included, shape (..., pulse).
+        velocity_m_s: Measured velocity at the turning points (ends of the up sweeps) in m/s, shape
+            (..., pulse). It still includes the geometric velocity of a static scatterer, see
+            `geometric_velocity_m_s`.
         bands: Filtered sweeps.
-        pulse: Axis of the periods.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
         factor: Factor of the variance, which depends on the method of measurement.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
-        squared: True for a method that multiplies sweeps with each other; the squaring loss at low
-            SNR is then included.
+        squared: True for a method that multiplies sweeps with each other; the variance then
+            includes the squaring loss at low SNR.
         floor_m_s: Standard deviation in m/s that remains however strong the signal.
-        window_m: Lowest and highest relative range of the scene in metres, if `bands` holds more.
-        info: Further entries of the estimate's info.
+        window_m: Lowest and highest range of the scene in metres, relative to the reference range,
+            if `bands` holds a wider range.
+        info: Further entries for `info` of the estimate.
 
     Returns:
         `velocity_m_s` of shape (..., pulse), receding positive, without the geometric velocity,
-        with its standard deviation. quality is the share of the power in the window that both
-        sweeps have in common. `ok` is False where the SNR after compression (info["snr_db"], shape
-        (...,)) is below 14 dB (with `squared`: the SNR less the squaring loss below 15 dB), where
-        nothing is illuminated, or where a velocity is not finite. info, shape (..., pulse): shift,
-        the Doppler shift removed from `bands` in whole bins, and lit, False where no scatterer is
-        illuminated. There the velocity is interpolated between the neighbouring periods.
+        with its standard deviation. In periods in which no scatterer is illuminated, the velocity
+        is interpolated between the neighbouring periods. `quality` is the share of the power in the
+        window that both sweeps have in common. `ok` is False where the SNR after compression is
+        below 14 dB (with `squared`, where this SNR less the squaring loss is below 15 dB), where no
+        scatterer is illuminated in any period, or where a velocity is not finite. `info` holds
+        "snr_db", the SNR after compression, shape (...,); "shift", the Doppler shift removed from
+        `bands` in whole bins, and "lit", False for periods in which no scatterer is illuminated,
+        both of shape (..., pulse); and the entries given.
     """
     radar, tiny = bands.radar, torch.finfo(torch.float64).tiny
     velocity, finite = settle(filled(velocity_m_s, bands.lit), 0.0)

@@ -1,6 +1,7 @@
 """Searches for a rotation that start near the truth, to compare other estimators with.
 
-They show the best accuracy and the least time that these searches can reach.
+Starting near the truth, they show the best accuracy and the least time that such searches can
+reach.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ def descent_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **know
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range).
-        omega_rad_s: True rate at the first pulse in rad/s, shape (...,).
-        warp_k: True relative derivatives k1, k2, ... of the rotation rate in 1/s, 1/s^2, ..., shape
-            (..., coefficient).
+        omega_rad_s: True rotation rate at the first pulse in rad/s, shape (...,).
+        warp_k: True derivatives k1, k2, ... of the rotation rate at the first pulse, divided by
+            that rate, in 1/s, 1/s^2, ..., shape (..., coefficient).
         known: The arguments wavelength_m, prf_hz, range_m, yc_m and order of `uneven_rotation`.
 
     Returns:
@@ -55,9 +56,9 @@ def genetic_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **know
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range).
-        omega_rad_s: True rate at the first pulse in rad/s, shape (...,).
-        warp_k: True relative derivatives k1, k2, ... of the rotation rate in 1/s, 1/s^2, ..., shape
-            (..., coefficient).
+        omega_rad_s: True rotation rate at the first pulse in rad/s, shape (...,).
+        warp_k: True derivatives k1, k2, ... of the rotation rate at the first pulse, divided by
+            that rate, in 1/s, 1/s^2, ..., shape (..., coefficient).
         known: The arguments wavelength_m, prf_hz, range_m, yc_m and order of `uneven_rotation`.
 
     Returns:

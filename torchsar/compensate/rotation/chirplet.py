@@ -26,9 +26,10 @@ class Chirplets:
     """Chirps found in every range cell, in the order in which they were found, and their image.
 
     Args:
-        image: Image of the chirps above the floor, shape (..., lines, range), complex.
-        doppler_hz: Frequency in Hz in the middle of the aperture, positive where the phase falls,
-            as in exp(-2j pi f t), shape (..., atom, range).
+        image: Image of the chirps that are less than `floor_db` below the strongest one (see
+            `chirplet_clean`), shape (..., lines, range), complex.
+        doppler_hz: Frequency f in Hz in the middle of the aperture, shape (..., atom, range);
+            positive where the phase falls, as in exp(-2j pi f t).
         rate_hz_s: Rate in Hz/s, with the same sign convention, shape (..., atom, range).
         amplitude: Amplitude, shape (..., atom, range), complex.
         residual_share: Energy that the chirps do not explain, over the energy of the data, shape
@@ -56,14 +57,14 @@ def chirplet_clean(
 
     In each range cell the chirp a exp(-2j pi (f t + r t^2 / 2)) of most energy is found and
     removed, where a is its complex amplitude, f its frequency, r its rate, and t the time from the
-    middle of the aperture. This is repeated `atoms` times. The image is that of the tones a exp(-2j
-    pi f t), which have no rate, with lines as those of `torchsar.focus.matched_fourier`. Not
-    differentiable.
+    middle of the aperture. This is repeated `atoms` times. The image is formed by
+    `torchsar.focus.matched_fourier` from the chirps without their rates, that is from the tones
+    a exp(-2j pi f t). Not differentiable.
 
-    The method is a baseline for comparison. It needs no model of the rotation and gives none. A
-    chirp has no cubic phase: if the rotation has jerk, strong scatterers leave residuals, further
-    chirps are spent on these, and weak scatterers are missing from the image. The method takes two
-    transforms of each range cell per chirp and rate.
+    The method is a baseline for comparison. It needs no model of the rotation and does not estimate
+    the rotation. A chirp has no cubic phase: if the rotation rate has a second derivative, strong
+    scatterers leave residuals, further chirps are spent on these residuals, and weak scatterers are
+    missing from the image.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
