@@ -1,10 +1,11 @@
 """Correction of narrowband interference from external sources, by one of three methods.
 
-The methods subtract the interference (`subtract_interference`, recommended), set its frequencies to
-zero (`notch_interference`), or set whole lines to zero (`drop_interference`). Each function takes
-raw lines (..., pulse, range) and returns a `Repaired`. Each stage returns the signal and an
-Estimate that marks the lines that are missing afterwards, for a stage that fills them. Lines
-without interference are unchanged bit for bit.
+The interference is subtracted (`subtract_interference`, recommended), its frequencies are set to
+zero (`notch_interference`), or whole lines are set to zero (`drop_interference`). Each of these
+functions takes raw lines (..., pulse, range) and returns a `Repaired`. The corresponding stages of
+a processing chain (`SubtractInterference`, `NotchInterference`, `DropInterference`) return the
+corrected signal and a mask of the lines that are missing afterwards; a later stage can fill these
+lines. Lines without interference are unchanged bit for bit.
 
 Reference:
     Tsvetkov 2017, Figs. 2 and 3.
@@ -53,10 +54,12 @@ class Contamination:
     """Lines and range-frequency cells that may hold interference.
 
     Args:
-        level: Robust estimate of the power spectral density without interference.
-        excess: Power spectra divided by the level, FFT order, shape (..., pulse, range).
+        level: Robust estimate of the power spectral density without interference, one value for
+            each cell of each line.
+        excess: Power spectra divided by the level, in FFT order, shape (..., pulse, range).
         cells: Cells whose excess is above the threshold, shape (..., pulse, range), bool.
-        lines: Lines that exceed the threshold in few parts of the band, shape (..., pulse), bool.
+        lines: Lines whose spectrum has a narrow peak above the threshold (see `stands_out`), shape
+            (..., pulse), bool.
     """
 
     level: Level
@@ -91,8 +94,8 @@ def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contaminati
 def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     """Set contaminated cells of the range spectrum to zero: a notch filter, the simplest method.
 
-    It removes the clutter of those cells as well, and leaves the side lobes of a tone that are
-    below the threshold. Differentiable in the lines.
+    The clutter of those cells is removed as well. Side lobes of a tone that are below the threshold
+    remain. Differentiable in the lines.
 
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
@@ -114,7 +117,7 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 
 
 def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
-    """Set contaminated lines to zero and mark them as missing, for the stage that fills lines.
+    """Set contaminated lines to zero and mark them as missing, so that a later stage can fill them.
 
     Differentiable in the lines.
 
@@ -135,13 +138,13 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones: int = 4) -> Repaired:
     """Subtract tones by maximum likelihood, and wider interference as a narrowband random process.
 
-    A tone has its own frequency, linear drift, amplitude and phase in each line. Up to three bands
-    of wider interference are subtracted, each narrower than about 1/40 of the sampling rate fs.
-    Some clutter is removed too: with a tone, that of 1 to 2 of the n frequency cells of a line of n
-    samples; with a band of width B, that of about B n / fs cells. A line in which the remaining
-    interference is stronger than the clutter is set to zero and marked as missing. Lines without
-    interference are unchanged. Differentiable in the lines, with the frequencies and spectra of the
-    interference held fixed.
+    A tone has its own frequency, linear drift, amplitude and phase in each line. Wider interference
+    is subtracted in up to three bands, each narrower than about 1/40 of the sampling rate fs. The
+    subtraction also removes some clutter. In a line of n samples, which has n frequency cells, a
+    tone costs the clutter of 1 to 2 cells, and a band of width B that of about B n / fs cells. A
+    line in which the remaining interference is stronger than the clutter is set to zero and marked
+    as missing. Lines without interference are unchanged. Differentiable in the lines, with the
+    frequencies and spectra of the interference held fixed.
 
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
@@ -298,9 +301,9 @@ class NotchInterference(_InterferenceCorrection):
 
 
 class DropInterference(_InterferenceCorrection):
-    """Stage that sets lines with interference to zero and marks them for a stage that fills lines.
+    """Stage that sets lines with interference to zero, so that a later stage can fill them.
 
-    The marked lines are the value `missing` of its Estimate; see `drop_interference`.
+    The stage returns the mask of these lines as `missing`; see `drop_interference`.
 
     Args:
         threshold: Ratio of the power of a frequency cell to the mean power of clutter above which

@@ -1,12 +1,12 @@
 """Interference with a bandwidth: Wiener estimate of a narrowband random process, subtracted.
 
-A group of successive lines shares one spectrum of the interferer, estimated as the excess of their
-averaged range spectra. Each line is modelled as the sum of a stationary process with that spectrum
-and of white clutter, and the conditional mean of the process is subtracted. The model includes the
-finite length of a line (n samples of a process that is periodic with 2 n), so that the spectral
-leakage of a strong interferer, which no notch removes, is subtracted as well. Clutter inside the
-band is lost with the interference: about one frequency cell of width 1 / (duration of a line) for
-each such width of the band, and a few cells for its edges.
+A group of successive lines shares one spectrum of the interferer: the excess of their averaged
+range spectra over clutter. Each line is modelled as a stationary process with that spectrum plus
+white clutter, and the conditional mean of the process is subtracted. The model accounts for the
+finite length of a line: its n samples are a part of a process with the period 2 n. The spectral
+leakage of a strong interferer is therefore subtracted as well, which a notch filter cannot do.
+Clutter inside the band is lost with the interference: for lines of duration T, a band of width B
+costs about B T frequency cells, and a few more at the band edges.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ STRETCH_LINES = 32
 def lasts_the_line(lines: Tensor, cell: Tensor) -> Tensor:
     """Return whether the energy near one frequency cell is present during most of the line.
 
-    The line is demodulated to the cell and divided into short blocks. Over the blocks, the median
-    power of noise-like interference is 0.7 of its mean power, that of a tone 1, and that of a few
-    chirps that pass the frequency is near 0; the limit is 0.35.
+    The line is demodulated to the cell and divided into short blocks. The ratio of the median to
+    the mean power of the blocks is 0.7 for noise-like interference, 1 for a tone, and near 0 for a
+    few chirps that sweep through the frequency of the cell. It must exceed 0.35.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
-        cell: Cell of an n-point FFT for each line, shape (..., pulse), int64.
+        cell: Index of one FFT cell for each line, shape (..., pulse), int64.
 
     Returns:
         True where the energy lasts, shape (..., pulse), bool.
@@ -57,8 +57,8 @@ def find_band(lines: Tensor, level: Level, threshold: float = THRESHOLD) -> tupl
             the cell counts as interference.
 
     Returns:
-        Lines with interference, shape (..., pulse), bool, and their strongest cell of an n-point
-        FFT, shape (..., pulse), int64.
+        Lines with interference, shape (..., pulse), bool, and the index of the strongest FFT cell
+        of each line, shape (..., pulse), int64.
     """
     excess = level.excess(line_spectra(lines.detach()))
     strong, cell = stands_out(excess, threshold), excess.argmax(-1)
@@ -76,8 +76,8 @@ def subtract_band(lines: Tensor, touched: Tensor, level: Level) -> Tensor:
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
-        touched: Lines with interference from `find_band`, shape (..., pulse), bool; others are
-            unchanged.
+        touched: Lines with interference, as found by `find_band`, shape (..., pulse), bool; the
+            other lines are unchanged.
         level: Robust estimate of the power spectral density without interference.
 
     Returns:

@@ -1,11 +1,12 @@
 """Detection of narrowband interference: range spectra of raw lines against a robust level.
 
-The level of a frequency cell is the larger of two estimates of its power without interference. The
-first is the gain of the line times the shape of the clean spectrum, which is a median over lines
-followed by a running median over frequency. Neither an interferer on all lines nor one of constant
-frequency raises it, and the running median preserves the steep edges of the pulse band. The second
-is the median over neighbouring cells of the line's own spectrum, since the spectrum of a line
-without echo has another shape than that of a line with echo.
+The level of a frequency cell is its power without interference. The larger of two estimates is
+used. The first is the gain of the line times a clean spectrum that all lines share: a median over
+lines, followed by a running median over frequency. The median over lines rejects interferers whose
+frequency changes from line to line. The running median rejects narrowband interferers of constant
+frequency, and preserves the steep edges of the pulse band. The second estimate is the median over
+neighbouring cells of the line's own spectrum. It is needed for lines without an echo, whose
+spectrum has another shape than that of lines with an echo.
 
 Reference:
     Tsvetkov 2017, Fig. 3.
@@ -41,7 +42,7 @@ class Level:
         """Return the power spectral density without interference at one frequency cell per line.
 
         Args:
-            cell: Cell of an n-point FFT, shape (..., pulse), int64.
+            cell: Index of one FFT cell for each line, shape (..., pulse), int64.
 
         Returns:
             Density, shape (..., pulse).
@@ -60,7 +61,7 @@ class Level:
         return torch.where(self.density > 0, power / torch.where(self.density > 0, self.density, 1), 0)
 
     def lines(self, index: Tensor) -> Level:
-        """Return the level of some of the lines.
+        """Return the level of selected lines.
 
         Args:
             index: Indices of the lines, shape (..., count), int64.
@@ -93,7 +94,7 @@ def line_spectra(raw: Tensor, oversampling: int = 1) -> Tensor:
 
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
-        oversampling: Number of cells for each sample.
+        oversampling: FFT length over the number of samples of a line.
 
     Returns:
         Density in FFT order, shape (..., pulse, oversampling * range).
@@ -123,7 +124,7 @@ def running_median(x: Tensor, width: int) -> Tensor:
 
 
 def local_median(power: Tensor, width: int) -> Tensor:
-    """Return for each cell the larger median of the two windows that contain it.
+    """Return for each cell the larger of the medians of the two windows that contain it.
 
     Successive windows overlap by half, so that every cell lies in two of them.
 

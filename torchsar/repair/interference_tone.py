@@ -2,11 +2,12 @@
 
 A tone is A exp(2j pi (f t + r t^2 / 2)) over the whole line, with t in samples from the middle of
 the line. Each line has its own complex amplitude A, frequency f (cycles per sample) and linear
-drift r (cycles per sample^2). A line demodulated with f and r is expanded in Legendre polynomials
-over t. At the maximum of the likelihood the first and second coefficients are in phase with the
-zeroth; as long as they are not, their parts in quadrature give the Gauss-Newton steps of f and r.
-Every real parameter that is fitted to a line also removes half a frequency cell of its clutter. So
-f and r are averaged over lines wherever the tone drifts smoothly.
+drift r (cycles per sample^2). To refine f and r, a line is demodulated with their first estimates
+and projected on the Legendre polynomials of degree 0, 1 and 2 over t. At the maximum of the
+likelihood the coefficients of degree 1 and 2 are in phase with that of degree 0. Parts in
+quadrature give the Gauss-Newton steps of f and r. Every real parameter that is fitted to a line
+also removes half a frequency cell of its clutter. Therefore f and r are averaged over neighbouring
+lines wherever the tone drifts smoothly.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class Tone:
         return unit_phasor((self.frequency[..., None] + self.rate[..., None] * (t / 2)) * t, dtype)
 
     def cell(self, n: int) -> Tensor:
-        """Return the cell of an n-point FFT nearest to the tone, shape (..., pulse), int64."""
+        """Return the index of the FFT cell nearest to the tone, shape (..., pulse), int64."""
         return torch.round(self.frequency * n).to(torch.int64) % n
 
     def waveform(self, lines: Tensor) -> Tensor:
@@ -116,7 +117,7 @@ def block_sums(x: Tensor) -> Tensor:
 
 
 def coarse_offset(blocks: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """Search for the frequency offset and the drift that collect most energy of a tone.
+    """Search for the frequency offset and the drift that give a tone the highest spectral peak.
 
     The tone has been demodulated with a first estimate of its frequency.
 
@@ -175,11 +176,11 @@ def _to_rate(second_rad: Tensor, n: int) -> Tensor:
 
 
 def fit_tone(lines: Tensor, cell: Tensor, present: Tensor, level: Level) -> Tone:
-    """Fit the tone of maximum likelihood near a frequency cell of each line.
+    """Fit a tone by maximum likelihood to each line, near a given frequency cell.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
-        cell: Cell of an n-point FFT, shape (..., pulse), int64.
+        cell: Index of one FFT cell for each line, shape (..., pulse), int64.
         present: Lines that may hold a tone, shape (..., pulse), bool.
         level: Robust estimate of the power spectral density without interference.
 
@@ -218,9 +219,10 @@ def _refine(lines: Tensor, tone: Tone, steps: int) -> tuple[Tone, Tensor]:
 def is_steady(blocks: Tensor, energy: Tensor, density: Tensor) -> Tensor:
     """Return whether a spectral line comes from a tone that lasts the whole line.
 
-    Echoes of regularly spaced targets make spectral lines too, but a chirp passes a frequency in
-    few blocks. A tone fills all B blocks: its coherent sum holds the share z / (z + B) of the
-    energy, where z = energy / density. At least 0.35 of this share is required.
+    Echoes of regularly spaced targets make spectral lines too, but a chirp has a given frequency in
+    few blocks only, whereas a tone fills all B blocks. The coherent share of the energy is |sum of
+    blocks|^2 / (B sum |block|^2). A tone has an expected share of z / (z + B), where z = energy /
+    density; at least 0.35 times this share is required.
 
     Args:
         blocks: Sums of `block_sums`, shape (..., block), complex.
@@ -297,13 +299,15 @@ def smooth_track(value: Tensor, std: Tensor, present: Tensor, position: Tensor) 
 
 
 def window_sums(half: int) -> Callable[[Tensor], Tensor]:
-    """Return a function that sums over the lines i - half to i + half, cut at the ends.
+    """Return a function that sums over a sliding window of 2 half + 1 lines.
+
+    At the ends the window is cut.
 
     Args:
         half: Half width of the window in lines.
 
     Returns:
-        Function that maps (..., n) to sums of the same shape.
+        Function that maps values, shape (..., line), to sums of the same shape.
     """
 
     def sums(x: Tensor) -> Tensor:
@@ -336,8 +340,8 @@ def find_tones(
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
         level: Robust estimate of the power spectral density without interference.
-        position: Line numbers, shape (..., pulse), if the lines are not successive.
-        most: Largest number of tones in a line.
+        position: Line numbers, shape (..., pulse); None if the lines are successive.
+        most: Largest number of tones that are sought in a line.
         threshold: Ratio of the power of a frequency cell to the mean power of clutter above which
             the cell counts as interference.
 
@@ -406,9 +410,10 @@ def explaining(lines: Tensor, rest: Tensor, tones: list[Tone], level: Level) -> 
 
 
 def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -> list[Tone]:
-    """Fit each tone again in lines from which the others are subtracted.
+    """Fit each tone again, in lines from which the other tones are subtracted.
 
-    Then frequency and drift of each are averaged over neighbouring lines, see `pooled`.
+    Then the frequency and the drift of each tone are averaged over neighbouring lines; see
+    `pooled`.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
@@ -440,7 +445,8 @@ def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -
 def subtract_each(lines: Tensor, tones: list[Tone], rounds: int = 3) -> list[Tensor]:
     """Return the waveform of each tone, with amplitudes that fit the lines jointly.
 
-    The tones are fitted in turn, each to the lines without the others. Differentiable in the lines.
+    The tones are fitted in turn, each to the lines from which the other tones are subtracted.
+    Differentiable in the lines.
 
     Args:
         lines: Raw lines, shape (..., pulse, range), complex.
@@ -458,7 +464,7 @@ def subtract_each(lines: Tensor, tones: list[Tone], rounds: int = 3) -> list[Ten
 
 
 def subtract_tones(lines: Tensor, tones: list[Tone]) -> Tensor:
-    """Subtract tones, with amplitudes that fit the lines jointly, from the lines.
+    """Subtract tones from lines, with amplitudes that fit the lines jointly.
 
     Differentiable in the lines.
 
@@ -475,27 +481,29 @@ def subtract_tones(lines: Tensor, tones: list[Tone]) -> Tensor:
 
 
 def around(cell: Tensor, n: int) -> Tensor:
-    """Return the cells within n / 32 of one cell of each line, in circular order.
+    """Mark the n / 32 cells on each side of a given cell, with cells in circular order.
 
     Args:
-        cell: Cell of an n-point FFT, shape (..., pulse), int64.
-        n: Number of cells.
+        cell: Index of one FFT cell for each line, shape (..., pulse), int64.
+        n: Number of FFT cells of a line.
 
     Returns:
-        True for these cells, shape (..., pulse, n), bool.
+        True for the given cell and the marked ones, shape (..., pulse, n), bool.
     """
     distance = (torch.arange(n, device=cell.device) - cell[..., None]) % n
     return (distance <= n // 32) | (distance >= n - n // 32)
 
 
 def anything(mask: Tensor) -> bool:
-    """Return whether any entry is True; inside torch.vmap, where values cannot be read, True.
+    """Return whether any entry is True.
+
+    Inside torch.vmap, where values cannot be read, the result is True.
 
     Args:
         mask: Any shape, bool.
 
     Returns:
-        Whether any entry is, or may be, True.
+        Whether any entry is True, or may be True.
     """
     try:
         return bool(mask.any())

@@ -80,14 +80,16 @@ def sample_offsets(offset_samples: Tensor, n: int) -> Tensor:
 def neighbours(offset_samples: Tensor, points: int) -> tuple[Tensor, Tensor]:
     """Find the jittered samples nearest to each instant of the uniform grid.
 
+    The pattern of offsets repeats every M samples, so that M uniform instants are sufficient.
+
     Args:
         offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M).
-        points: Number of samples for each instant; an even number is centred on the interval that
-            holds the instant.
+        points: Number of jittered samples for each instant; an even number is centred on the
+            interval that holds the instant.
 
     Returns:
-        True instants of these samples relative to the uniform instant, in samples, shape (..., M,
-        points); and the index of the first of them relative to the index of the uniform instant,
+        Instants of these jittered samples relative to the uniform instant, in samples, shape (...,
+        M, points); and the index of the first of them relative to the index of the uniform instant,
         shape (..., M), int64.
     """
     m, device = offset_samples.shape[-1], offset_samples.device
@@ -98,7 +100,7 @@ def neighbours(offset_samples: Tensor, points: int) -> tuple[Tensor, Tensor]:
 
 
 def lagrange_weights(instants: Tensor) -> Tensor:
-    """Compute weights with which a polynomial through uneven samples gives the value at instant 0.
+    """Compute weights of uneven samples that give the value of their polynomial at instant 0.
 
     Args:
         instants: Instants in samples, shape (..., points).
@@ -198,10 +200,10 @@ def correct_jitter_exact(y: Tensor, offset_samples: Tensor, refinements: int | N
     """Reconstruct uniform samples exactly from periodic non-uniform ones.
 
     Each of the M interleaved converters alone samples a line M times too slowly, so that groups of
-    M frequencies alias together. They are separated by the inverse of one M x M matrix, which is
-    the same for every group except for a diagonal factor. A line whose length is
-    not a multiple of M is extended to the next multiple, and the error that this leaves at its ends
-    is removed by residual correction. Differentiable.
+    M frequencies alias. The frequencies of a group are separated by the inverse of an M x M matrix,
+    which is the same for every group except for a diagonal factor. A line whose length is not a
+    multiple of M is extended to the next multiple, and the error that this leaves at its ends is
+    removed by residual correction. Differentiable.
 
     Args:
         y: Lines, shape (..., pulse, range), complex.
@@ -254,9 +256,10 @@ def _separate(y: Tensor, offsets: Tensor) -> Tensor:
 
 
 def jittered(x: Tensor, offset_samples: Tensor) -> Tensor:
-    """Simulate the samples that a converter with timing offsets takes of uniformly sampled lines.
+    """Simulate the samples that a converter with timing offsets takes.
 
-    The lines are taken as band-limited and periodic.
+    The true signal is the interpolation of uniformly sampled lines, taken as band-limited and
+    periodic.
 
     Args:
         x: Uniform samples, lines of any length, shape (..., pulse, range), complex.
@@ -342,7 +345,7 @@ def correct_jitter(
     period: Tensor | None = None,
     method: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Tensor:
-    """Correct the periodic timing jitter of lines in trials whose jitter periods may differ.
+    """Correct the periodic timing jitter of lines, where the period may differ between trials.
 
     Trials with equal periods are processed together. If `period` is given, trials whose offsets are
     all zero are unchanged.
@@ -351,8 +354,8 @@ def correct_jitter(
         y: Lines, shape (..., pulse, range), complex.
         offset_samples: Timing offsets of the interleaved converters in samples, shape (..., P) or
             (P,).
-        period: Number of converters in each trial, shape (...,), int64: only so many of the first
-            offsets are used; None: all P.
+        period: Number of converters in each trial, shape (...,), int64; offsets beyond it are
+            ignored. None: P in all trials.
         method: Function of lines and the offsets of one period, shape (..., period), that returns
             corrected lines; by default `Exact()`.
 
@@ -386,8 +389,8 @@ def correct_jitter(
 class CorrectJitter(Stage):
     """Correction of periodic sampling jitter with known or estimated timing offsets.
 
-    In a chain, after a stage of the name "pilot" that estimates the offsets (`PilotJitter` or
-    `BlindJitter`): `use(CorrectJitter(), offset_samples="pilot", period="pilot")`.
+    In a chain, `use(CorrectJitter(), offset_samples="pilot", period="pilot")` takes the offsets
+    from an earlier stage named "pilot", which is a `PilotJitter` or a `BlindJitter`.
 
     Args:
         offset_samples: Timing offsets of the M interleaved converters in samples, shape (M,); by
@@ -416,8 +419,8 @@ class CorrectJitter(Stage):
             signal: Lines, shape (..., pulse, range).
             offset_samples: Timing offsets of the interleaved converters in samples, shape (..., P);
                 replace those of the constructor.
-            period: Number of converters in each trial, shape (...,), int64: only so many of the
-                first offsets are used; None: all P.
+            period: Number of converters in each trial, shape (...,), int64; offsets beyond it are
+                ignored. None: P in all trials.
 
         Returns:
             Signal with uniformly sampled lines.

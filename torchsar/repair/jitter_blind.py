@@ -2,14 +2,15 @@
 
 Clutter is stationary along range: its spectrum has no correlation between different frequencies.
 Jitter e[n mod M] with the Fourier coefficients E_k = (1 / M) sum_m e[m] exp(-2j pi k m / M) makes
-it cyclostationary. To first order, with the power spectrum S and frequencies wrapped to +-1/2 cycle
-per sample,
+it cyclostationary: its spectrum Y is then correlated at frequencies k / M apart. To first order,
+with the power spectrum S, the mean <> over lines and frequencies wrapped to +-1/2 cycle per sample,
 
     <Y(f) Y*(f - k/M)> = 2j pi E_k [(f - k/M) S(f - k/M) - f S(f)].
 
-Each E_k is a least-squares fit of this over the band; exact correction and a new fit remove the
-higher orders. The unequal slopes on both sides of the wrap distinguish jitter from a periodic gain.
-The mean offset (k = 0) cannot be observed.
+Each E_k is fitted to this relation over the band by least squares. Then the lines are corrected
+exactly and fitted again, which removes the terms of higher order. Where f - k/M is wrapped, the
+bracket jumps; this distinguishes jitter from a periodic gain, whose correlation does not jump. The
+mean offset (k = 0) cannot be observed.
 """
 
 from __future__ import annotations
@@ -40,11 +41,11 @@ class CyclicFit:
     def significance(self, primitive: bool = False) -> Tensor:
         """Return the chi-squared statistic of the Fourier coefficients of the jitter.
 
-        Without jitter it has as many degrees of freedom as there are coefficients.
+        Without jitter it has as many degrees of freedom as coefficients are counted.
 
         Args:
-            primitive: Whether to count only the coefficients k without a divisor in common with the
-                period; the others also belong to a shorter period.
+            primitive: Whether to count only the coefficients E_k for which k and the period have no
+                common divisor. Coefficients with a common divisor also occur for a shorter period.
 
         Returns:
             Statistic, shape (...,).
@@ -112,11 +113,11 @@ def _smooth(power: Tensor, width: int) -> Tensor:
 
 
 def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> Tensor:
-    """Find the shortest period that explains all significant components of the timing jitter.
+    """Find the shortest period that explains all significant Fourier coefficients of the jitter.
 
-    For each period M, those Fourier coefficients of the jitter are tested that no shorter period
-    has; the false-alarm rate is below 1e-5 per trial. Components more than 27 dB weaker than the
-    strongest are taken for its leakage and ignored.
+    For each period, only the coefficients are tested that do not occur for a shorter period; the
+    false-alarm rate is below 1e-5 per trial. A period whose coefficients are more than 27 dB weaker
+    than those of the strongest period is ignored, since leakage can cause them.
 
     Args:
         y: Lines, shape (..., pulse, range), complex.
@@ -147,15 +148,16 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
     Args:
         y: Raw or range-compressed lines, shape (..., pulse, range), complex, in any order.
         max_period: Longest period that is tested.
-        period: Known period, which is then not tested.
-        passes: Number of fits, each made after correction with the offsets of the fit before.
+        period: Known period in samples; None: the period is estimated.
+        passes: Number of fits; before each, lines are corrected with the offsets found so far.
 
     Returns:
-        Estimate with `offset_samples` of shape (..., P), in samples, with mean zero and standard
-        deviations, and `period` of shape (...,), int64; offsets repeat beyond the period. P is the
-        known period or `max_period`. `quality` is m / (m + v), with m the mean square of the
-        offsets and v their variance, or 1 where there is no jitter. `ok` is False, and the offsets
-        are zero, where a trial is all zero or sample instants would coincide or cross.
+        Estimate with `offset_samples` of shape (..., P), in samples, with mean zero, and their
+        standard deviations; and `period` of shape (...,), int64. P is the known period or
+        `max_period`; beyond the period of a trial its offsets repeat. `quality` is m / (m + v),
+        with the mean square m of the offsets and the variance v of their errors, or 1 where there
+        is no jitter. `ok` is False, and the offsets are zero, where a trial is all zero or sample
+        instants would coincide or cross.
 
     Raises:
         ValueError: If the period is less than 2, or lines are shorter than 8 periods.
@@ -215,12 +217,12 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[CyclicFit, Tens
 class BlindJitter(Stage):
     """Estimator of periodic sampling jitter from the clutter of the recording.
 
-    In a chain that gives this stage the name "blind", the correction follows as
+    If this stage is named "blind" in a chain, the jitter is corrected by the later stage
     `use(CorrectJitter(), offset_samples="blind", period="blind")`.
 
     Args:
         max_period: Longest period that is tested, in samples.
-        period: Known period in samples, which is then not tested.
+        period: Known period in samples; None: the period is estimated.
     """
 
     provides = ("offset_samples", "period")

@@ -1,9 +1,9 @@
 """Estimation of periodic jitter from a pilot tone recorded by the same converter.
 
 A tone of f cycles per sample, taken at n + e[n mod M], has the phase 2 pi f (n + e[n mod M]) +
-constant. After removal of the tone, the mean phase of every M-th sample is 2 pi f e[m]. The
-frequency is estimated from the record and the period by a test of significance, so that a converter
-without jitter gives offsets of exactly zero.
+constant. After removal of the tone, the samples m, m + M, m + 2 M, ... have the mean phase
+2 pi f e[m]. The frequency f is estimated from the record. The period M is found by a test of
+significance, so that a converter without jitter gives offsets of exactly zero.
 
 Reference:
     Tsvetkov 2017, Fig. 4 (estimation from pilot signals).
@@ -34,17 +34,17 @@ def estimate_jitter_pilot(
     Args:
         pilot: Record of one tone of any frequency other than zero, shape (..., n), complex.
         max_period: Longest period that is tested.
-        period: Known period, which is then not tested.
+        period: Known period in samples; None: the period is estimated.
         origin: "mean" sets the mean offset to zero, "first" the first one.
 
     Returns:
         Estimate with `offset_samples` of shape (..., P), in samples, and `period` of shape (...,),
-        int64; offsets repeat beyond the period. P is the known period or `max_period`. The standard
-        deviation is the Cramer-Rao bound at the measured noise. `quality` is the share of the
-        record's power that belongs to the tone. `ok` is False, and the offsets are zero, where the
-        record is not finite or all zero, where no tone exceeds the noise or the tone is too close
-        to zero frequency, and where sample instants would coincide or cross. `info` has the
-        frequency of the tone in cycles per sample, `frequency_cycles`.
+        int64. P is the known period or `max_period`; beyond the period of a trial its offsets
+        repeat. The standard deviation is the Cramer-Rao bound at the measured noise. `quality` is
+        the share of the record's power that belongs to the tone. `ok` is False, and the offsets are
+        zero, where the record is not finite or all zero, where no tone exceeds the noise or the
+        tone is too close to zero frequency, and where sample instants would coincide or cross.
+        `info` has the frequency of the tone in cycles per sample, `frequency_cycles`.
 
     Raises:
         ValueError: If the record is shorter than 4 periods, the period is less than one, or the
@@ -177,12 +177,12 @@ def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: st
 class PilotJitter(Stage):
     """Estimator of periodic sampling jitter from a recorded pilot tone.
 
-    In a chain, with the side data `pilot` of the recording: `use(PilotJitter(),
-    pilot="aux.pilot")`. The signal is unchanged.
+    In a chain, `use(PilotJitter(), pilot="aux.pilot")` takes the record of the tone from the side
+    data `pilot` of the recording. The signal is unchanged.
 
     Args:
         max_period: Longest period that is tested, in samples.
-        period: Known period in samples, which is then not tested.
+        period: Known period in samples; None: the period is estimated.
         origin: "mean" sets the mean offset to zero, "first" the first one.
     """
 

@@ -3,7 +3,7 @@
 Every line number is compared with those of the neighbouring lines. Since lines are lost but never
 added, the number of a correct line exceeds that of the k-th line before it by k or more. The
 difference between the number of a line and its row in the recording therefore never falls. A number
-that contradicts most of its neighbours on either side is taken for corrupted.
+that contradicts most of its neighbours on one of its two sides is taken for corrupted.
 
 Reference:
     Tsvetkov 2017 (verification of line numbers).
@@ -32,8 +32,8 @@ class LinePlan:
     Args:
         source: Row of the recording for each of the n rows of the grid, -1 where there is none,
             shape (..., n).
-        number: Verified number of each received line, shape (..., received); -1 for padding,
-            repeated lines and lines without a unique position.
+        number: Verified number of each received line, shape (..., received); -1 for padding at the
+            end of a trial, repeated lines and lines without a unique position.
         missing: Rows of the grid without a line, shape (..., n), bool.
         corrected: Lines with a corrected number, shape (..., received), bool.
         repeated: Lines that repeat the line before, shape (..., received), bool.
@@ -111,10 +111,10 @@ def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tens
     """Return the lines whose number agrees with those of the neighbouring lines.
 
     Args:
-        offset: Line number minus the row in the recording without repeated lines, shape (...,
-            line), int64.
-        candidate: Lines that are tested; padding and repeated lines are not, shape (..., line),
-            bool.
+        offset: Line number minus the row in the recording, counted without repeated lines, shape
+            (..., line), int64.
+        candidate: Lines that are tested, which are all except padding and repeated lines, shape
+            (..., line), bool.
         longest_gap: Largest number of successive lost lines that is accepted; a larger step of the
             numbers is taken for an error.
 
@@ -155,10 +155,10 @@ def line_integrity(
 
     Repeated lines (samples equal to those of the line before) are dropped. A number that
     contradicts its neighbours is corrected if the lines beside it leave only one position for it; a
-    line that fits several positions of a gap is left out and counted. Lines of zeros between other
-    lines count as missing. Rows after the last received line do not, since trials of different
-    lengths are padded there. A trial with fewer than half of its numbers accepted has `ok` False,
-    and its lines stay in the order received.
+    line that fits several positions of a gap is left out and marked as unplaced. Lines of zeros
+    between other lines count as missing. Rows after the last received line do not, since trials of
+    different lengths are padded there. A trial with fewer than half of its numbers accepted has
+    `ok` False, and its lines stay in the order received.
 
     Args:
         lines: Received lines, shape (..., line, range), complex.

@@ -2,9 +2,9 @@
 
 The response is A(u) exp(j psi(u)), where u = f / (bandwidth / 2) is the normalised range frequency,
 -1..1 over the band of the pulse. Outside the band it keeps its values at the edges. By convention
-psi has no constant and no linear part over the band, which are a phase and a shift, and ln A has
-mean zero, which is a gain. Responses are sampled at GRID = 1025 equally spaced u from -1 to 1.
-The module `response_phase` estimates the phase.
+psi has no constant part (a phase) and no linear part (a shift) over the band, and ln A has mean
+zero (no gain). Responses are sampled at GRID = 1025 equally spaced u from -1 to 1. The module
+`response_phase` estimates the phase.
 
 Reference:
     Tsvetkov 2017, Figs. 8 and 9.
@@ -104,9 +104,7 @@ def on_axis(values: Tensor, u: Tensor) -> Tensor:
 def response_filter(
     phase_rad: Tensor, amplitude: Tensor | None, n: int, band: float, dtype: torch.dtype = torch.complex128
 ) -> Tensor:
-    """Return the inverse response exp(-j psi) / A, which corrects range or reference spectra.
-
-    Spectra are multiplied by it.
+    """Return the inverse response exp(-j psi) / A, by which range spectra are to be multiplied.
 
     Args:
         phase_rad: Phase psi of the response in radians at GRID = 1025 equally spaced frequencies of
@@ -128,8 +126,7 @@ def response_filter(
 def correct_response(x: Tensor, phase_rad: Tensor, amplitude: Tensor | None, band: float) -> Tensor:
     """Remove the phase and amplitude response of the channel along range.
 
-    The middle of the pulse band must be at zero range frequency, as it is in images in beam
-    coordinates. Differentiable.
+    The middle of the pulse band must be at zero range frequency. Differentiable.
 
     Args:
         x: Raw or range-compressed lines or image, shape (..., pulse, range), complex.
@@ -147,7 +144,7 @@ def correct_response(x: Tensor, phase_rad: Tensor, amplitude: Tensor | None, ban
 
 
 def band_power(x: Tensor) -> Tensor:
-    """Return the mean power spectrum along range, for use as an expected spectrum.
+    """Return the mean power spectrum along range, such as `estimate_amplitude_response` takes.
 
     Args:
         x: Lines or image, shape (..., pulse, range), complex.
@@ -165,9 +162,9 @@ def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, or
     with Legendre polynomials, without its mean.
 
     Args:
-        power: Measured power spectrum, FFT order, shape (..., n).
-        expected: Power spectrum of data of the same kind that the response has not changed, FFT
-            order, shape (..., n') of any length; |pulse spectrum|^2 if noise and scene are white.
+        power: Measured power spectrum along range, FFT order, shape (..., n).
+        expected: Power spectrum of data of the same kind without the response, FFT order, shape
+            (..., n') of any length; |pulse spectrum|^2 if noise and scene are white.
         band: Bandwidth of the pulse over the sampling rate.
         order: Highest degree of the polynomials.
 
@@ -203,8 +200,8 @@ def _binned(power: Tensor, band: float, bins: int) -> Tensor:
     inside = u.abs() < 1
     if int(inside.sum()) < bins:
         raise ValueError(
-            f"a power spectrum must have {bins} samples or more inside the pulse band, but one of "
-            f"{power.shape[-1]} samples in all has fewer; lower the order or give longer lines"
+            f"a power spectrum must have {bins} samples or more inside the pulse band, but a spectrum of "
+            f"{power.shape[-1]} samples has fewer; lower the order or give longer lines"
         )
     index = ((u[inside] + 1) / 2 * bins).to(torch.int64).clamp(0, bins - 1)
     total = torch.zeros((*power.shape[:-1], bins), dtype=power.dtype, device=power.device).index_add(
@@ -216,13 +213,13 @@ def _binned(power: Tensor, band: float, bins: int) -> Tensor:
 class CorrectResponse(Stage):
     """Correction of the phase and amplitude response of the channel along range.
 
-    In a chain, after a stage of the name "response" that estimates the response:
-    `use(CorrectResponse(radar), phase_rad="response", amplitude="response")`.
+    In a chain, `use(CorrectResponse(radar), phase_rad="response", amplitude="response")` takes the
+    response from an earlier stage named "response" that estimates it.
 
     Args:
         radar: Radar; gives bandwidth and sampling rate.
         on: "image" if the stage receives images, "raw" if it receives raw or range-compressed
-            lines, where the correction is equivalent to one of the reference spectrum.
+            lines.
 
     Raises:
         ValueError: If `on` is neither "image" nor "raw".

@@ -1,10 +1,11 @@
 """Phase response of the channel from bright points of the focused image.
 
 Two methods use short range windows about the brightest points. The point average (the simpler one)
-assumes that each window holds a single point: the spectra of the windows, each without its own
-constant and linear phase, are averaged coherently. The sharpest fit (recommended) does not need
-single points: it determines the phase, as a sum of Legendre polynomials, whose removal gives range
-responses of least entropy. Ships, houses and close pairs of points are therefore useful as well.
+assumes that each window holds a single point: the constant and the linear phase of the spectrum of
+each window are removed, and the spectra are averaged coherently. The sharpest fit (recommended)
+does not need single points, so that ships, houses and close pairs of points are useful as well. It
+models the phase as a sum of Legendre polynomials and finds the phase whose removal gives range
+responses of least entropy.
 
 Reference:
     Tsvetkov 2017, Figs. 8 and 9 (point average).
@@ -239,7 +240,8 @@ def estimate_response_sharpest(
     differentiable.
 
     Args:
-        image: Image with centred range spectrum, shape (..., azimuth, range), complex.
+        image: Image whose pulse band is centred at zero range frequency, shape (..., azimuth,
+            range), complex.
         band: Bandwidth of the pulse over the sampling rate.
         points: Number of windows.
         width: Length of the windows in samples, many times the width of the distorted impulse
@@ -367,7 +369,8 @@ def estimate_response_points(
     points, or if the response spreads them over much of the window. Not differentiable.
 
     Args:
-        image: Image with centred range spectrum, shape (..., azimuth, range), complex.
+        image: Image whose pulse band is centred at zero range frequency, shape (..., azimuth,
+            range), complex.
         band: Bandwidth of the pulse over the sampling rate.
         points: Number of windows.
         width: Length of the windows in samples; at most half the valid columns are used.
@@ -409,16 +412,16 @@ _METHODS = {"sharpest": estimate_response_sharpest, "points": estimate_response_
 class EstimateResponse(Stage):
     """Estimator of the channel's phase and amplitude response from a focused image.
 
-    The amplitude is estimated only if an expected spectrum is given, since the spectrum of scene
-    and noise is not known.
+    The amplitude is estimated only if the range power spectrum of scene and noise is given as
+    `expected_power`.
 
     Args:
         radar: Radar; gives bandwidth, sampling rate and length of the pulse.
         method: "sharpest" for `estimate_response_sharpest` (default), "points" for
             `estimate_response_points`, or any function of (image, band, valid=columns) that returns
-            such an Estimate.
-        expected_power: Range power spectrum of an image of this kind that the response has not
-            changed (see `band_power`), FFT order, shape (n,); None: the amplitude is one.
+            such an Estimate, where `columns` is the number of fully compressed range columns.
+        expected_power: Range power spectrum of an image of this kind without the response (see
+            `band_power`), FFT order, shape (n,); None: the amplitude is one.
     """
 
     works_on = ("azimuth", "range")
@@ -459,10 +462,11 @@ class EstimateResponse(Stage):
 
 
 class EstimateFlatResponse(EstimateResponse):
-    """Estimator of the response from images that were compressed with the `flat` reference.
+    """Estimator of the response from images with a flat range spectrum.
 
-    Without an amplitude response, such an image has the same power at all frequencies of the pulse
-    band; the amplitude is therefore estimated as well as the phase.
+    The range compression must have used the reference "flat", which divides by the pulse spectrum
+    inside the pulse band. Without an amplitude response, the image then has the same mean power at
+    all frequencies of this band. The amplitude is therefore estimated as well as the phase.
 
     Args:
         radar: Radar; gives bandwidth, sampling rate and length of the pulse.
@@ -478,7 +482,8 @@ class EstimateFlatResponse(EstimateResponse):
         """Estimate the phase and amplitude response of the channel along range.
 
         Args:
-            signal: Image, shape (..., azimuth, range), compressed with the `flat` reference.
+            signal: Image, shape (..., azimuth, range), compressed in range with the reference
+                "flat".
 
         Returns:
             Estimate with `phase_rad` in radians and `amplitude`, relative to a flat spectrum, at

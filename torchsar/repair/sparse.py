@@ -1,15 +1,17 @@
 """Reconstruction of missing lines by a model of the power of the focused image.
 
-The image is split by Doppler into a few sub-looks and modelled as independent zero-mean noise of
-slowly varying power v(look, pixel). The most probable missing lines minimise sum |image|^2 / v.
-This is a linear system in the missing lines alone, solved by conjugate gradients; v is then
-estimated from the reconstructed image, and the solution repeated.
+The image is split by Doppler into a few sub-looks. Every pixel of every sub-look is modelled as
+independent zero-mean noise, whose power v varies slowly over the image. The most probable missing
+lines minimise the sum of |pixel|^2 / v over all pixels of all sub-looks. This is a linear system in
+the missing lines alone, solved by conjugate gradients. Then v is estimated anew from the
+reconstructed image, and the system is solved again.
 
-The first estimate keeps only the bright part of the image (`bright_fill`), which finds points but
-no texture. Three properties of the model lower the error on recorded data further. A local power
-estimate, instead of a threshold, follows texture. Conjugate gradients converge faster than plain
-iteration. Sub-looks include properties of the azimuth spectrum, such as band edges, noise floor,
-drift of the Doppler centroid over the scene, and apertures cut by the ends of the recording.
+The first estimate (`bright_fill`) keeps only the bright part of the image; it finds points but no
+texture. The model is better on recorded data for three reasons. A local power estimate follows
+texture, which a threshold does not. Conjugate gradients converge faster than plain iteration. As v
+differs between sub-looks, the model accounts for properties of the azimuth spectrum such as band
+edges, noise floor, drift of the Doppler centroid over the scene, and apertures cut by the ends of
+the recording.
 """
 
 from __future__ import annotations
@@ -52,14 +54,14 @@ def power_of(x: Tensor) -> Tensor:
 
 
 def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, mask: Tensor, steps: int) -> Tensor:
-    """Find the lines under a mask for which <lines, quadratic(lines)> is least.
+    """Minimise the quadratic form <lines, quadratic(lines)> over the lines inside a mask.
 
-    The method is conjugate gradients; lines outside the mask are kept.
+    The method is conjugate gradients. Lines outside the mask are kept.
 
     Args:
         quadratic: Hermitian positive operator on lines (..., pulse, range).
         lines: Lines to begin with, shape (..., pulse, range), complex.
-        mask: Lines that may change, broadcasts against the lines, bool.
+        mask: True for lines that may change, broadcasts against the lines, bool.
         steps: Number of steps; their lengths are chosen per trial.
 
     Returns:
@@ -133,12 +135,12 @@ class SubLooks:
     """Covariance model of lines from the focused scene, divided by Doppler into sub-looks.
 
     Every pixel of every sub-look is modelled as independent zero-mean noise with a slowly varying
-    power. Powers and weights of the sub-looks have azimuth last, (look, ..., range, pulse), where
-    azimuth FFTs take half the time.
+    power. Powers and weights of the sub-looks have the shape (look, ..., range, pulse): azimuth is
+    last, which halves the time of the azimuth FFTs.
 
     Args:
         operator: Invertible focusing of the lines.
-        windows: Amplitude weights over Doppler, shape (look, ..., n).
+        windows: Amplitude weights over the n Doppler cells, shape (look, ..., n).
     """
 
     def __init__(self, operator: InvertibleOmegaK, windows: Tensor) -> None:
@@ -147,15 +149,16 @@ class SubLooks:
         self.share = windows.square().mean(-1)[..., None, None]
 
     def power(self, lines: Tensor, unexplained: Tensor) -> Tensor:
-        """Estimate the local power of every sub-look of the image that lines form.
+        """Estimate the local power of every sub-look of the focused lines.
 
-        It is the geometric mean of two estimates: the locally averaged power of the sub-look, and
-        its mean power times the relative local power of the image of all looks.
+        The local power is the geometric mean of two estimates: the locally averaged power of the
+        sub-look; and the mean power of the sub-look times the local power of the whole image
+        relative to its mean.
 
         Args:
             lines: Lines, shape (..., pulse, range), complex.
-            unexplained: Power that errors of the reconstructed lines may have in every pixel; it is
-                added, and broadcasts against (..., range, pulse).
+            unexplained: Power in every pixel due to errors of the reconstructed lines, which is
+                added to the local power; broadcasts against (..., range, pulse).
 
         Returns:
             Local power, shape (look, ..., range, pulse).
@@ -175,8 +178,8 @@ class SubLooks:
     def precision(self, lines: Tensor, weight: Tensor) -> Tensor:
         """Multiply lines by the inverse covariance matrix of the scene model.
 
-        The product is the gradient, with respect to the lines, of the sum of weight |pixel|^2 over
-        all pixels of all sub-looks.
+        The product is the derivative, with respect to the conjugate lines, of the sum of weight
+        |pixel|^2 over all pixels of all sub-looks.
 
         Args:
             lines: Lines, shape (..., pulse, range), complex.
@@ -204,11 +207,11 @@ def bright_fill(
     """Reconstruct missing lines from the bright part of the image, by iteration.
 
     Each step focuses the lines, sets pixels below a threshold to zero, defocuses the rest, and
-    takes the missing lines from the result. Finds isolated bright points across gaps of any length,
-    but no texture.
+    takes the missing lines from the result. This finds isolated bright points across gaps of any
+    length, but no texture.
 
     Args:
-        lines: Lines, zero under the mask, shape (..., pulse, range), complex.
+        lines: Lines, zero where they are missing, shape (..., pulse, range), complex.
         mask: Missing lines, shape (..., pulse, 1), bool.
         operator: Invertible focusing of the lines.
         steps: Number of steps.
@@ -250,9 +253,9 @@ def sparse_fill(
     The image is split by Doppler into sub-looks, whose pixels are modelled as independent noise of
     slowly varying local power. The first estimate is that of `bright_fill`. Two looks are enough
     for scenes of points; four or more are useful for speckle that fills the PRF band. More than two
-    rounds or four steps are useful only in long gaps. By default the computation takes as long as
-    about 110 two-dimensional FFTs. Received lines are kept bit for bit. Differentiable in the
-    lines, with thresholds and local powers held fixed.
+    rounds or four steps are useful only in long gaps. With the default values the computation takes
+    as long as about 110 two-dimensional FFTs. Received lines are kept bit for bit. Differentiable
+    in the lines, with thresholds and local powers held fixed.
 
     Args:
         lines: Lines, shape (..., pulse, range), complex.

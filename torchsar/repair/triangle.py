@@ -1,27 +1,29 @@
 """Separation of a continuous triangular beat record into sweeps, and blanking of turning points.
 
 Each period of the laser's frequency is a triangle: an up sweep, then a down sweep of the same
-duration T. A record (..., pulse, time) holds one block of samples for each recorded period; the
-triangle starts `trigger_s` after the start of its block. Sweeps are (..., ramp, pulse, fast_time),
-ramp 0 up and 1 down, both in natural time order, on the grid of `TriangularLadar.fast_time_axis`,
-which is symmetric about the middle of the sweep. With range beat frequency f+ and Doppler shift fd,
-up sweeps have the beat fd + f+ and down sweeps fd - f+.
+duration T. A record (..., pulse, time) holds one block of samples for each recorded period. The
+triangle starts at the time `trigger_s` in its block (the trigger). Separated sweeps have the shape
+(..., ramp, pulse, fast_time), with ramp 0 for up and 1 for down sweeps. Time rises along both.
+Their time grid, `TriangularLadar.fast_time_axis`, is symmetric about the middle of the sweep. With
+the range beat frequency f+ and the Doppler shift fd, up sweeps have the beat frequency fd + f+ and
+down sweeps fd - f+.
 
-A trigger between two samples is matched by a delay of the whole record (linear phase of its
-spectrum), never by a shifted grid: if the grid is off by dt, velocities that are estimated from the
-product of the up sweep and the mirrored down sweep are biased by 0.76 f+ dt lambda / T. A record
-whose first sample is AT the trigger has this error too, since the first sample of a symmetric grid
-is half a sample later.
+The first sample of a sweep lies half a sampling interval after the trigger. Where the record has no
+sample there, the whole record is delayed by a fraction of a sample (linear phase of its spectrum).
+The time grid of the sweeps is never shifted instead: if the grid is off by dt, velocities that are
+estimated from the product of the up sweep and the mirrored down sweep are biased by
+0.76 f+ dt lambda / T. A record with a sample exactly at the trigger must be delayed as well.
 
-A detector with one real channel gives |f| only. Its analytic signal has the beat f+ + fd in the up
-sweep and f+ - fd in the down sweep; the conjugate of the latter is the sweep of a complex detector.
-The analytic signal is formed from the record BEFORE it is cut, since the record continues through
-turning points, where a cut sweep ends with a jump. For one scatterer, the relative rms error of the
-analytic signal is 1.3 % at 350 cycles per sweep and 2.1 % at 50, without the transient after the
-turning point and 2 samples at either end. If the record is cut first, it is 1.6 and 2.3 %. Most of
-the error lies near the ends: without 40 samples there it is 0.6 and 0.8 % (0.65 % if cut first). A
-delay by half a sample adds an error of 0.1 % to a complex record, and 0.04 % without 40 samples at
-the ends.
+A detector with one real channel does not give the sign of a beat frequency. Its analytic signal has
+the beat frequency f+ + fd in the up sweep and f+ - fd in the down sweep; the conjugate of the down
+sweep is that of a complex detector. The analytic signal is formed from the record BEFORE it is cut,
+since the record continues through turning points, whereas a cut sweep ends with a jump.
+
+The relative rms error of the analytic signal was measured for one scatterer, without the transient
+after the turning point and 2 samples at either end. It is 1.3 % at 350 cycles per sweep and 2.1 %
+at 50 cycles; if the record is cut first, 1.6 % and 2.3 %. Most of the error lies near the ends:
+without 40 samples at either end it is 0.6 % and 0.8 %. A delay by half a sample causes an error of
+0.1 % in a complex record, and of 0.04 % without 40 samples at either end.
 
 Reference:
     Remote Sens. 2024, 16, 793, Fig. 15.
@@ -53,21 +55,22 @@ def split_record(
 ) -> Tensor:
     """Separate a record of triangular sweeps into up and down sweeps.
 
-    The record has K blocks, one for each recorded period. A contiguous record, whose blocks follow
-    each other without a gap, is cut into periods from the trigger on, modulo the period. The period
-    that its end leaves incomplete is dropped, so that K' = K - 1 periods remain (K if one trigger
-    is given for all trials and is less than half a sample). Other blocks are cut individually, and
-    K' = K. The first sample of a sweep is half a sample after its start. With real detection the
-    Doppler shift must be smaller than the beat frequency of the range. Differentiable in record and
-    trigger.
+    The record has K blocks, one for each recorded period. In a contiguous record the blocks follow
+    each other without a gap. It is cut into periods from the first start of an up sweep on, and the
+    incomplete period at its end is dropped, so that K' = K - 1 periods remain. (K' = K if one
+    trigger is given for all trials and the first sample of the record is, to half a sample, the
+    first sample of an up sweep.) Blocks with gaps between them are cut one by one, and K' = K. The
+    first sample of a sweep lies half a sampling interval after the start of the sweep. With real
+    detection the Doppler shift must be smaller than the beat frequency of the range. Differentiable
+    in record and trigger.
 
     Args:
         record: Record, shape (..., pulse, time), real or complex.
         radar: Ladar.
-        trigger_s: Start of the triangle after the start of a block in seconds, a number or shape
-            (...,).
-        contiguous: Whether the record is contiguous; None: it is if blocks are one period long and
-            every period is recorded.
+        trigger_s: Start of the up sweep in seconds, on a time axis on which the first sample of a
+            block lies at `first_s`; a number or shape (...,).
+        contiguous: Whether the record is contiguous; None: contiguous if blocks are one period long
+            and every period is recorded.
         nearer: With real detection, whether the scene is nearer than the reference range, so that
             beats in up sweeps are negative.
         first_s: Time of the first sample of a block in seconds, on the time axis of `trigger_s`.
@@ -147,12 +150,13 @@ def is_contiguous(block_samples: int, radar: TriangularLadar) -> bool:
 
 
 def start_sample(trigger_s: Tensor, radar: TriangularLadar, joined: bool) -> tuple[Tensor, Tensor]:
-    """Return the first sample of the up sweep, which is half a sample after the trigger.
+    """Return the index of the first sample of the up sweep, half a sample after the trigger.
 
     Args:
-        trigger_s: Trigger after the first sample of a block in seconds, shape (...,), float64.
+        trigger_s: Start of the up sweep (trigger) in seconds after the first sample of a block,
+            shape (...,), float64.
         radar: Ladar.
-        joined: Whether the record is contiguous; the sample is then taken modulo the period.
+        joined: Whether the record is contiguous; the index is then taken modulo the period.
 
     Returns:
         Index of the nearest sample, shape (...,), int64, and the remaining fraction of a sample,
@@ -168,8 +172,8 @@ def start_sample(trigger_s: Tensor, radar: TriangularLadar, joined: bool) -> tup
 def canonical_ramps(sweeps: Tensor, radar: TriangularLadar, nearer: bool) -> Tensor:
     """Convert sweeps of a real detector's analytic signal to those of a complex detector.
 
-    An analytic signal has positive beat frequencies only. The sweeps in which a complex detector
-    has negative ones, up or down, are conjugated.
+    An analytic signal has positive beat frequencies only. With a complex detector, either the up or
+    the down sweeps have negative beat frequencies; these sweeps are conjugated.
 
     Args:
         sweeps: Sweeps of the analytic signal, up before down, shape (..., 2, K, N), complex.
@@ -236,7 +240,7 @@ def _any(condition: Tensor) -> bool:
 
 
 def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Tensor:
-    """Shift the samples of each period circularly, as in the Reference, to show the errors of this.
+    """Shift the samples of each period circularly, as published; for comparisons only.
 
     Samples that are one period apart become neighbours, which makes a phase step of 2 pi fd period
     (with the Doppler shift fd) inside a sweep. No estimator of the velocity tolerates this step,
@@ -260,7 +264,7 @@ def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Te
 def blank_turning_points(
     sweeps: Tensor, radar: TriangularLadar, farthest_m: float, nearest_m: float = 0.0, margin: int = 0
 ) -> Tensor:
-    """Set the samples to zero in which local oscillator and echo sweep in opposite directions.
+    """Set the samples to zero at which local oscillator and echo sweep in opposite directions.
 
     The echo of a scatterer at a range RD beyond the reference range turns 2 RD / c after the local
     oscillator, so that the first ceil(2 RD fs / c) samples of each sweep are set to zero (fs: the
@@ -309,18 +313,18 @@ def blank_turning_points(
 class SplitSweeps(Stage):
     """Separation of a record with the axes (pulse, time) into sweeps (ramp, pulse, fast_time).
 
-    A trigger that is common to all trials is added to the slow time of the sweeps. Triggers that
-    differ between trials are not, since all trials share one pulse axis: the slow time is then too
-    early by the trigger, which is less than one period. The real samples of a one-channel detector
-    become complex ones.
+    The trigger is the start of the triangle. A trigger that is common to all trials is added to the
+    slow time of the sweeps. Triggers that differ between trials are not added, since all trials
+    share one pulse axis: the slow time is then too early by the trigger, which is less than one
+    period. The real samples of a one-channel detector become complex ones.
 
-    In a chain, with the side data `trigger_s` of the recording: `use(SplitSweeps(radar,
-    "recorded"), trigger_s="aux.trigger_s")`.
+    In a chain, `use(SplitSweeps(radar, "recorded"), trigger_s="aux.trigger_s")` takes the trigger
+    from the side data `trigger_s` of the recording.
 
     Args:
         radar: Ladar.
         trigger: Start of the triangle in seconds on the time axis of the record; "recorded" if
-            `forward` receives it; or "search" to estimate it by `find_trigger`.
+            `forward` receives the trigger; or "search" to estimate it by `find_trigger`.
         nearer: Whether the scene is nearer than the reference range.
 
     Raises:
@@ -435,10 +439,10 @@ class BlankTurningPoints(Stage):
 
 
 class CircularShift(Stage):
-    """Circular shift of the samples inside each period, to show its errors; see `circular_shift`.
+    """Stage that shifts the samples of each period circularly; see `circular_shift`.
 
-    It aligns the start of the triangles with the start of the blocks, and is to be followed by
-    `SplitSweeps(radar, 0.0)`.
+    For comparisons only. The shift aligns the start of the triangles with the start of the blocks;
+    `SplitSweeps(radar, 0.0)` then separates the sweeps.
 
     Args:
         radar: Ladar.

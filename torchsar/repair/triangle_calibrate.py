@@ -8,9 +8,10 @@ channel mixes the transmitted signal with itself delayed by tc:
     channel phase / 2 pi = fc tc +- K u tc + e(u) - e(u - tc) + constant.
 
 Let w(u) = u +- e'(u) / K be the time at which a linear sweep has the frequency of the real one.
-Since e(u) - e(u - t) = t e'(u - t / 2) except for t^3 e''' / 24, the channel gives w - u at u - tc
-/ 2, and the beat of ANY range is a pure tone in w. The constant of e' is a change of the carrier,
-which the channel cannot determine; the mean of w - u over the sweep is set to zero.
+Since e(u) - e(u - t) = t e'(u - t / 2) except for t^3 e''' / 24, the channel gives w - u at the
+time u - tc / 2, and the beat of ANY range is a pure tone as a function of w. A constant part of e'
+is a change of the carrier, which the channel cannot determine; the mean of w - u over the sweep is
+therefore set to zero.
 
 Reference:
     Remote Sens. 2024, 16, 793, section 2.1 (internal calibration module).
@@ -135,21 +136,21 @@ def calibrate_sweeps(
 
     The calibration channel gives the time w(u) at which a linear sweep has the frequency that the
     real sweep has at the time u. The method "resample" interpolates every sweep at instants of
-    uniform w and is valid for all ranges at once. It keeps constant carrier phases; a Doppler shift
-    fd, which does not follow w, leaves the phase error 2 pi fd (w - u). The method "phase"
-    multiplies by the conjugate phase error of one relative range; a scatterer at a distance d from
-    it keeps the phase error 4 pi K d (w - u) / c, with the chirp rate K. Differentiable in the
-    sweeps.
+    uniform w and is valid for all ranges at once. Constant phases are kept. The phase of a Doppler
+    shift fd is linear in u, not in w, which leaves the phase error 2 pi fd (w - u). The method
+    "phase" multiplies by the conjugate phase error of one relative range; a scatterer at a distance
+    d from it keeps the phase error 4 pi K d (w - u) / c, with the chirp rate K. Differentiable in
+    the sweeps.
 
     Residual phase rms for w - u of up to 9 ns (0.11 % of the sweep), measured for one scatterer at
     the relative range RD:
 
     - RD 1.5 m, at rest: 0.16 rad before the correction; 0.0002 rad after "phase" (0.054 rad if
-      `range_m` is wrong by half a metre); 0.0025 rad after "resample", 0.0012 rad if this is given
-      `range_m` (also if it is wrong by half a metre).
+      `range_m` is wrong by half a metre); 0.0025 rad after "resample" without `range_m`, 0.0012 rad
+      with it (even if it is wrong by half a metre).
     - RD 1.5 m, 0.5 m/s: 0.016 rad after "resample".
-    - RD 10.5 m, at rest: 0.56 rad before the correction, 1e-6 rad after "phase", 0.027 rad after
-      "resample", 0.002 rad if this is given `range_m`.
+    - RD 10.5 m, at rest: 0.56 rad before the correction; 1e-6 rad after "phase"; 0.027 rad after
+      "resample" without `range_m`, 0.002 rad with it.
 
     Args:
         sweeps: Sweeps, up before down, shape (..., 2, K, N), complex.
@@ -158,8 +159,8 @@ def calibrate_sweeps(
         delay_s: Delay in seconds with which the channel mixes the transmitted signal.
         method: "resample" or "phase".
         range_m: Range RD in metres relative to the reference range: for "phase" that of the
-            scatterer; for "resample" the middle of the range gate, with which the delay of the echo
-            is taken into account.
+            scatterer; for "resample" the middle of the range gate, so that the delay of the echo is
+            taken into account; None neglects this delay.
         points: Number of neighbouring samples that are combined in the interpolation.
         band: Bandwidth over the sampling rate for which the interpolation error is least.
 
@@ -238,9 +239,9 @@ def _resampled(x: Tensor, instant: Tensor, points: int, band: float) -> Tensor:
 class CalibrateSweeps(Stage):
     """Correction of non-linear sweeps by the calibration channel; see `calibrate_sweeps`.
 
-    In a chain, with the side data `calibration` of the recording: `use(CalibrateSweeps(radar,
-    delay_s), calibration="aux.calibration")`; if the delay is recorded too, without the argument
-    delay_s of the constructor and with `delay_s="aux.calibration_delay_s"`.
+    In a chain, `use(CalibrateSweeps(radar, delay_s), calibration="aux.calibration")` takes the
+    channel from the side data `calibration` of the recording. If the delay is recorded too, leave
+    it out of the constructor and give `use` the source `delay_s="aux.calibration_delay_s"`.
 
     Args:
         radar: Ladar.

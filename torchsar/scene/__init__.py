@@ -1,7 +1,7 @@
 """Scenes, motions and worlds: the true state that a simulation starts from.
 
 A world collects everything that is true about an acquisition; `torchsar.echo` turns it into a
-recording and a truth. All objects are frozen.
+recording and the true parameters of this recording. All objects are immutable (frozen dataclasses).
 
 A parameter annotated `Tensor | float` is a number, equal in all trials, or a tensor of shape
 (trials,) with one value per trial. Parameters annotated with a plain type are fixed for all trials,

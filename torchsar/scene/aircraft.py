@@ -1,7 +1,8 @@
 """Targets of inverse synthetic aperture ladar: an aircraft model, and rows of scatterers.
 
-Cross range is `azimuth_m` of the scatterers. It is positive on the side that recedes from the radar
-first: the echo phase is exp(-4j pi x sin(theta) / lambda).
+The cross range x of a scatterer is its `azimuth_m`. A scatterer with positive x recedes from the
+radar as the rotation angle theta grows from zero: its echo phase is
+exp(-4j pi x sin(theta) / lambda).
 """
 
 from __future__ import annotations
@@ -116,7 +117,7 @@ class Aircraft:
         """Draw displaced scatterers with circular Gaussian amplitudes.
 
         Args:
-            draws: Random draws.
+            draws: Source of random numbers.
 
         Returns:
             Scatterers of shape (..., target).
@@ -169,7 +170,7 @@ class SpreadRows:
         """Draw phases and cross ranges.
 
         Args:
-            draws: Random draws.
+            draws: Source of random numbers.
 
         Returns:
             Scatterers of shape (..., rows * per_row).

@@ -42,7 +42,8 @@ class BandLimited:
     zero and v the along-track speed of the receiver relative to the target.
 
     Args:
-        duration_s: Length of the interval in seconds. A sea needs one value for all trials.
+        duration_s: Length of the interval in seconds. It must be equal in all trials if the world
+            has a sea.
 
     Raises:
         ValueError: If the duration is not positive.
@@ -82,8 +83,8 @@ class Pattern:
     along-track position of channel m and R_m its range to the target.
 
     Args:
-        element_m: Length of the element in metres, None for that of the radar. A sea needs one
-            value for all trials.
+        element_m: Length of the element in metres, None for that of the radar. It must be equal in
+            all trials if the world has a sea.
 
     Raises:
         ValueError: If the length is not positive.
@@ -187,9 +188,9 @@ class OrbitTransmit:
 
     Args:
         orbit: Orbit of the satellite.
-        point_m: Point at the epoch in the inertial frame in metres, three coordinates, as from
-            `radar.seen_point`.
-        epoch_s: Time of the orbit at slow time zero in seconds.
+        point_m: Position of the point at the time `epoch_s`: three coordinates in the inertial
+            frame in metres, such as `torchsar.radar.seen_point` gives.
+        epoch_s: Time on the time axis of the orbit at which the slow time is zero, in seconds.
 
     Raises:
         ValueError: If there are not three finite coordinates, or the epoch is not finite.

@@ -32,11 +32,11 @@ class RandomMotion(Protocol):
         """Draw the motion of each trial.
 
         Args:
-            draws: Random draws.
+            draws: Source of random numbers.
             span_s: Length of the recording in seconds.
 
         Returns:
-            The drawn motion, with one course for each trial of the draws.
+            The drawn motion, a different one in each trial.
         """
         ...
 
@@ -46,8 +46,8 @@ def drawn_motion(motion: Sequence[Motion | RandomMotion], draws: Draws, span_s: 
 
     Args:
         motion: Fixed and random motions.
-        draws: Random draws; each motion draws its own random numbers, addressed by its position in
-            the list.
+        draws: Source of random numbers; the numbers of each motion depend on its position in the
+            list.
         span_s: Length of the recording in seconds.
 
     Returns:
@@ -121,7 +121,7 @@ class VibrationSpectrum:
         rms_m: Root mean square of the displacement within the band in metres.
         lowest_hz: Lower end of the band in hertz, None for one cycle in the recording.
         highest_hz: Upper end of the band in hertz.
-        slope: Exponent of the frequency in the power spectral density.
+        slope: Exponent p of the power spectral density, which is proportional to f^p.
         count: Number of sinusoids, fixed for all trials.
 
     Raises:
@@ -142,14 +142,15 @@ class VibrationSpectrum:
         """Draw the phases of the sinusoids.
 
         Args:
-            draws: Random draws.
+            draws: Source of random numbers.
             span_s: Length of the recording in seconds.
 
         Returns:
             The sinusoids, amplitudes in metres.
 
         Raises:
-            ValueError: If the band lies below one cycle in the recording.
+            ValueError: If the band is empty, because its upper end is below one cycle in the
+                recording.
         """
         return random_tones(draws, self.rms_m, *_band(self.lowest_hz, self.highest_hz, span_s), self.slope, self.count)
 
@@ -159,15 +160,15 @@ class PathFluctuation(VibrationSpectrum):
     """Fluctuation of the optical path by turbulent air.
 
     By default the power spectral density follows f^(-8/3), as for a point receiver in Kolmogorov
-    turbulence. The displacement is added to the range; the caller decides how the paths to and from
-    the target contribute to it. The sinusoids are those of `VibrationSpectrum`.
+    turbulence. The displacement is added to the range, that is, to the mean of the paths to and
+    from the target. The motion is a sum of sinusoids as in `VibrationSpectrum`.
 
     Args:
         rms_m: Root mean square of the displacement within the band in metres.
         lowest_hz: Lower end of the band in hertz, None for one cycle in the recording.
-        highest_hz: Upper end of the band in hertz; None for 2 kHz, or ten cycles in a short
-            recording.
-        slope: Exponent of the frequency in the power spectral density.
+        highest_hz: Upper end of the band in hertz; None for 2 kHz or ten times the lower end,
+            whichever is higher.
+        slope: Exponent p of the power spectral density, which is proportional to f^p.
         count: Number of sinusoids, fixed for all trials.
 
     Raises:
@@ -190,9 +191,9 @@ class LogAmplitude:
     Args:
         rms: Root mean square of chi within the band.
         lowest_hz: Lower end of the band in hertz, None for one cycle in the recording.
-        highest_hz: Upper end of the band in hertz; None for 2 kHz, or ten cycles in a short
-            recording.
-        slope: Exponent of the frequency in the power spectral density.
+        highest_hz: Upper end of the band in hertz; None for 2 kHz or ten times the lower end,
+            whichever is higher.
+        slope: Exponent p of the power spectral density, which is proportional to f^p.
         count: Number of sinusoids, fixed for all trials.
 
     Raises:
@@ -213,14 +214,15 @@ class LogAmplitude:
         """Draw the phases of the sinusoids.
 
         Args:
-            draws: Random draws.
+            draws: Source of random numbers.
             span_s: Length of the recording in seconds.
 
         Returns:
             chi as a sum of sinusoids.
 
         Raises:
-            ValueError: If the band lies below one cycle in the recording.
+            ValueError: If the band is empty, because its upper end is below one cycle in the
+                recording.
         """
         return random_tones(draws, self.rms, *_band(self.lowest_hz, self.highest_hz, span_s), self.slope, self.count)
 
@@ -252,7 +254,7 @@ def random_tones(
         rms: Root mean square of the sum, in the unit of its amplitudes.
         lowest_hz: Lower end of the band in hertz.
         highest_hz: Upper end of the band in hertz.
-        slope: Exponent of the frequency in the power spectral density.
+        slope: Exponent p of the power spectral density, which is proportional to f^p.
         count: Number of sinusoids.
 
     Returns:

@@ -28,10 +28,11 @@ _SHORT_S = 1e-6
 class Extremes:
     """Largest ranges and motions of a scene, from which neglected phases are predicted.
 
-    They describe a whole batch and are therefore plain numbers.
+    The values are plain numbers, common to all trials.
 
     Args:
-        range_m: Smallest and largest relative range in metres.
+        range_m: Smallest and largest range of the scatterers relative to the reference range in
+            metres.
         across_m: Largest along-track distance of the ladar from a scatterer in metres.
         velocity_m_s: Largest magnitude of the radial velocity in metres per second.
         velocity_change_m_s: Largest change of the radial velocity over the recording in metres per
@@ -58,13 +59,14 @@ class Extremes:
         range_m: tuple[float, float],
         azimuth_m: float,
     ) -> Extremes:
-        """Determine the extremes of a scene, those of the motion by differences of displacements.
+        """Determine the extremes of a scene; the motion is differentiated numerically.
 
         Args:
             radar: Ladar.
             motion: Motions along the line of sight; only the first trial is used.
             n_period: Number of recorded periods.
-            range_m: Smallest and largest relative range in metres.
+            range_m: Smallest and largest range of the scatterers relative to the reference range in
+                metres.
             azimuth_m: Largest magnitude of the azimuth of the scatterers in metres.
 
         Returns:
@@ -92,14 +94,17 @@ class Extremes:
 def omitted_phase_rad(without: Sequence[Effect], radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
     """Predict the phase error that the omission of each physical effect causes.
 
-    Without the residual video phase the error is pi K (dtau1^2 - dtau2^2), with the chirp rate K
-    and the delays dtau1 and dtau2, relative to the reference range, of the scatterers with the
-    largest and the smallest magnitude of relative range; its sign is opposite in up-sweeps and
-    down-sweeps. A parabola instead of the hyperbola gives pi X^4 / (2 lambda R^3), with the largest
-    along-track distance X between ladar and scatterer and the smallest range R. Without the flight
-    time, ranges are taken at a time that is wrong by R / c: the error is 4 pi / lambda dv R / c,
-    with the change dv of the radial velocity over the recording. A constant velocity would give
-    only a constant phase.
+    Without the residual video phase ("residual_video") the error is pi K (dtau1^2 - dtau2^2), with
+    the chirp rate K and the delays dtau1 and dtau2 of the farthest and the nearest scatterer from
+    the reference range, relative to the delay of this range. The sign of the error is opposite in
+    up-sweeps and down-sweeps.
+
+    With a parabola instead of the hyperbola ("hyperbola") the error is pi X^4 / (2 lambda R^3),
+    with the largest along-track distance X between ladar and scatterer and the smallest range R.
+
+    Without the flight time ("flight") ranges are taken at a time that is wrong by Rref / c, with
+    the reference range Rref. The error is 4 pi / lambda dv Rref / c, with the change dv of the
+    radial velocity over the recording; a constant velocity would cause only a constant phase.
 
     Args:
         without: Omitted effects, of "residual_video", "hyperbola" and "flight".
@@ -126,13 +131,15 @@ def omitted_phase_rad(without: Sequence[Effect], radar: TriangularLadar, extreme
 class RangeHistory:
     """Range of scatterers relative to the reference range as a function of slow time.
 
-    At slow time t the range of a scatterer is
-    sqrt((Rref + RD)^2 + (V t - x)^2) - Rref + d(t - start_s), with the reference range Rref, the
-    relative range RD and the azimuth x of the scatterer, the speed V of the ladar and the
-    displacement d by the motions. The difference is formed without loss of digits. With
-    "flight" omitted it is the range at the time t of reception; otherwise it is the range at the
-    time of reflection, R(t - R / c), in which the delay Rref / c is exact and the rest of R / c is
-    accounted for to first order. With "hyperbola" omitted a parabola replaces the square root.
+    At slow time t the range of a scatterer relative to the reference range Rref is
+    sqrt((Rref + RD)^2 + (V t - x)^2) - Rref + d(t - start_s), with the relative range RD and the
+    azimuth x of the scatterer, the speed V of the ladar and the displacement d by the motions. The
+    difference is formed without loss of digits. If "hyperbola" is omitted, a parabola replaces the
+    square root.
+
+    The wave that is received at the time t was reflected at about t - R / c, with the range R. If
+    "flight" is omitted, the range is taken at t, otherwise at t - R / c: the part Rref / c of this
+    delay is exact, the rest is accounted for to first order.
 
     Args:
         scatterers: Scatterers, shape (..., target).
@@ -198,8 +205,8 @@ def refuse_unseen_ranges(radar: TriangularLadar, near_m: float, far_m: float) ->
 
     Args:
         radar: Ladar.
-        near_m: Smallest relative range in metres.
-        far_m: Largest relative range in metres.
+        near_m: Smallest range of the scatterers relative to the reference range in metres.
+        far_m: Largest range of the scatterers relative to the reference range in metres.
 
     Raises:
         ValueError: If a scatterer lies behind the ladar, or its beat frequency aliases.
@@ -247,7 +254,7 @@ class Fidelity(Protocol):
 
         Returns:
             Phase in radians by name of the effect: `level` for the approximation of the range
-            history, and the effects in `without`.
+            within a sweep, and one value for each omitted effect.
         """
         ...
 
@@ -274,7 +281,7 @@ class EverySample(_Level):
     """
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
-        """Return range and slope at the middle of each sweep, for the check of beat frequencies.
+        """Return range and slope at the middle of each sweep, to check beat frequencies.
 
         Args:
             history: Range of the scatterers.
@@ -300,7 +307,7 @@ class EverySample(_Level):
 
 @dataclass(frozen=True)
 class QuadraticInSweep(_Level):
-    """Linear phase of each scatterer in each sweep, with one curvature for all scatterers.
+    """Quadratic phase of each scatterer in each sweep, with one curvature for all scatterers.
 
     The curvature accounts for the acceleration and for the change of the Doppler shift across the
     band. For many scatterers the model takes little longer than `LinearInSweep`. It neglects the
@@ -424,8 +431,8 @@ class OnePerSweep(_Level):
             extremes: Largest ranges and motions of the scene.
 
         Returns:
-            Phase in radians by name of the effect. `level` is due to the velocity, at the ends of a
-            sweep and the upper edge of the band.
+            Phase in radians by name of the effect. `level` is the phase due to the velocity at the
+            ends of a sweep, at the upper edge of the band.
         """
         upper = radar.carrier_hz + radar.bandwidth_hz / 2
         return {
@@ -468,8 +475,8 @@ class OnePerPeriod(_Level):
             extremes: Largest ranges and motions of the scene.
 
         Returns:
-            Phase in radians by name of the effect. `level` is due to the velocity, at the ends of
-            the period and the upper edge of the band.
+            Phase in radians by name of the effect. `level` is the phase due to the velocity at the
+            ends of the period, at the upper edge of the band.
         """
         upper = radar.carrier_hz + radar.bandwidth_hz / 2
         return {
@@ -529,7 +536,7 @@ class CalibrationFibre:
 class LadarWorld:
     """Scene, motion, propagation, laser errors and noise of a ladar acquisition.
 
-    Effects that are None or absent from a list do not exist.
+    An effect that is None is not simulated.
 
     Args:
         scene: Scatterers.
@@ -539,8 +546,8 @@ class LadarWorld:
         snr_db: Power of a scatterer of amplitude 1 over the noise variance in decibels, PER SAMPLE
             before any compression; None for no noise.
         fidelity: Model of the range within a sweep.
-        gate_m: Lower and upper limit of the relative range in metres; scatterers outside are not
-            recorded.
+        gate_m: Lower and upper limit of the range relative to the reference range in metres;
+            scatterers outside are not recorded. None for no limits.
         sweep_error: Phase error of the sweeps of the laser.
         calibration: Internal fibre, which records the sweep error.
 

@@ -24,7 +24,8 @@ class LetterE:
     here.
 
     Args:
-        first_range_m: Relative range of the first point of the spine in metres.
+        first_range_m: Range of the first point of the spine relative to the reference range in
+            metres.
         spine_azimuth_m: Azimuth of the spine in metres.
         random_phase: Whether each trial draws phases; otherwise all phases are zero. Equal phases
             mislead autofocus by minimum entropy: a wrong image, whose rows have collapsed, has a
@@ -49,7 +50,7 @@ class LetterE:
         """Draw the phases of the points.
 
         Args:
-            draws: Random draws.
+            draws: Source of random numbers.
 
         Returns:
             Scatterers of shape (..., 62).
@@ -77,7 +78,7 @@ class RetroAndBrokenLine:
     of three points.
 
     Args:
-        range_m: Relative range of the retro-reflector in metres.
+        range_m: Range of the retro-reflector relative to the reference range in metres.
         azimuth_m: Azimuth of the retro-reflector in metres.
         retro_db: Power of the retro-reflector relative to a scatterer of amplitude 1 in decibels.
         line_db: Power of each point of the line relative to the retro-reflector in decibels.
@@ -112,7 +113,7 @@ class RetroAndBrokenLine:
         """Draw the phases of the line.
 
         Args:
-            draws: Random draws.
+            draws: Source of random numbers.
 
         Returns:
             Scatterers of shape (..., 10), the retro-reflector first.

@@ -1,4 +1,4 @@
-"""Errors of point responses due to approximate range histories, predicted without echoes."""
+"""Errors of point responses due to approximate range histories, predicted without simulation."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ class LitPoints:
         gate: Illumination of the points.
         radar: Receiver.
         n_pulse: Number of pulses.
-        processed_hz: Doppler band that is focused; None for all that is illuminated.
+        processed_hz: Width of the Doppler band that is focused in hertz; None for the whole band in
+            which points are illuminated.
     """
 
     movers: Movers

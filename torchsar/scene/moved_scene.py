@@ -51,11 +51,12 @@ class Moved:
         """Find the strongest scatterers and the bounds of the first trial of a scene.
 
         Args:
-            radar: Instrument.
+            radar: Ladar.
             scene: Scatterers.
             motion: Drawn motions.
             periods: Number of sweep periods.
-            gate_m: Least and largest relative range that is seen in metres; None for all.
+            gate_m: Smallest and largest range that is seen, relative to the reference range in
+                metres; None for all ranges.
 
         Returns:
             Strongest scatterers within the gate, motions and bounds.

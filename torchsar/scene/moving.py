@@ -21,9 +21,10 @@ Numbers = Sequence[Tensor | float] | Tensor
 class Bend:
     """Deviation of a real motion from uniform motion in the slant plane.
 
-    By the slow time t the range to the transmitter shrinks by s t + a t^2 / 2. The squared range to
-    the receiver grows by b2 t^2 + b3 t^3 + b4 t^4 over that of uniform motion in the slant plane.
-    All tensors have the shape (..., target) and the dtype float64.
+    At the slow time t the range to the transmitter is shorter by s t + a t^2 / 2 than that of a
+    point at rest. The squared range to the receiver exceeds that of uniform motion in the slant
+    plane by b2 t^2 + b3 t^3 + b4 t^4. All tensors have the shape (..., target) and the dtype
+    float64.
 
     Args:
         transmit_m_s: Closing speed s towards the transmitter in m/s.
@@ -92,16 +93,17 @@ class Bend:
 
 @dataclass(frozen=True)
 class Movers:
-    """Point targets and their motion at slow time zero, the middle pulse.
+    """Point targets and their motion.
 
-    All tensors have the shape (..., target), the leading dimensions being trials, and may require
-    gradients.
+    Positions and speeds are those at slow time zero, the middle pulse. All tensors have the shape
+    (..., target), the leading dimensions being trials, and may require gradients.
 
     Args:
         u_r_m_s: Slant-range speed in m/s, closing positive, float64.
         u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, float64.
         y0_m: Along-track position in metres, float64.
-        range_m: Closest range R0 beyond the reference range of the radar in metres, float64.
+        range_m: Closest range R0 (distance from the track at slow time zero) minus the reference
+            range of the radar, in metres, float64.
         amplitude: Amplitude, complex128.
         bend: Deviation from uniform motion in the slant plane, None for none.
 
@@ -212,7 +214,7 @@ class MovingScene(Protocol):
 
         Args:
             radar: Receiver.
-            draws: Random draws.
+            draws: Source of random numbers.
 
         Returns:
             Targets, shape (..., target).
@@ -243,7 +245,7 @@ def _phases(turns: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class MovingPoints:
-    """Given points in uniform motion.
+    """Points with given positions, in uniform motion.
 
     Each parameter is a list with one entry per target (numbers, or one value per trial) or a tensor
     of shape (..., target), which may require gradients.
@@ -252,7 +254,8 @@ class MovingPoints:
         u_r_m_s: Slant-range speeds in m/s, closing positive.
         u_a_m_s: Along-track speeds in m/s, positive in the direction of the receiver.
         azimuth_m: Along-track positions at slow time zero in metres.
-        range_m: Closest ranges beyond the reference range in metres.
+        range_m: Closest ranges (distances from the track at slow time zero) minus the reference
+            range of the radar, in metres.
         amplitude: Amplitudes, one by default; they may be complex.
         random_phase: Whether each trial draws phases.
 
@@ -283,7 +286,7 @@ class MovingPoints:
 
         Args:
             radar: Receiver.
-            draws: Random draws.
+            draws: Source of random numbers.
 
         Returns:
             Targets, shape (..., target).
@@ -299,18 +302,19 @@ class MovingPoints:
 class Ship:
     """Extended target: scatterers of common motion at random positions along track.
 
-    The scatterers are distributed in turn to several range cells. Their levels are equal; each
-    trial draws positions and phases.
+    The scatterers are dealt out to several range cells in turn. All scatterers have the same
+    amplitude; each trial draws their along-track positions and phases.
 
     Args:
         u_r_m_s: Slant-range speed in m/s, closing positive.
         u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver.
-        azimuth_m: Along-track position of the middle in metres.
-        range_m: Closest range of the middle beyond the reference range in metres.
+        azimuth_m: Along-track position of the middle of the ship at slow time zero in metres.
+        range_m: Closest range of the middle of the ship minus the reference range of the radar in
+            metres.
         length_m: Length along track in metres.
         range_cells: Number of range cells, fixed for all trials.
         count: Number of scatterers, fixed for all trials.
-        cell_m: Distance of the range cells in metres.
+        cell_m: Distance between neighbouring range cells in metres.
         level_db: Mean power of a sample in one range cell of the ship relative to that of a point
             of amplitude 1 in decibels.
 
@@ -345,7 +349,7 @@ class Ship:
 
         Args:
             radar: Receiver.
-            draws: Random draws.
+            draws: Source of random numbers.
 
         Returns:
             Targets, shape (..., count).
@@ -366,20 +370,24 @@ class Ship:
 class GroundMovers:
     """Points that move on flat ground, followed exactly in three dimensions.
 
-    The ground lies the height h = radar.height_m below the track of the receiver. A point with the
-    ground range g, the outward speed w and the outward acceleration a has the squared range
-    (g + w t + a t^2 / 2)^2 + h^2 + y^2 to the receiver, with the along-track distance y. This is
-    the squared range of uniform motion in the slant plane, with the closest range R0,
-    R0^2 = g^2 + h^2, and the closing speed u_r = -g w / R0, plus b2 t^2 + b3 t^3 + b4 t^4 with
-    b2 = w^2 + g a - u_r^2, b3 = w a and b4 = a^2 / 4. Each parameter is a list with one entry per
-    target (numbers, or one value per trial) or a tensor of shape (..., target). All values are
-    those at slow time zero.
+    The ground lies the height h = radar.height_m below the track of the receiver. At slow time t, a
+    point with the ground range g, the outward speed w and the outward acceleration a (all at t = 0)
+    has the squared range (g + w t + a t^2 / 2)^2 + h^2 + y^2 to the receiver, where y is their
+    along-track distance.
+
+    For uniform motion in the slant plane, with the closest range R0, R0^2 = g^2 + h^2, and the
+    closing speed u_r = -g w / R0, the squared range is (R0 - u_r t)^2 + y^2. The true squared range
+    is larger by b2 t^2 + b3 t^3 + b4 t^4 with b2 = w^2 + g a - u_r^2, b3 = w a and b4 = a^2 / 4;
+    these terms are added.
+
+    Each parameter is a list with one entry per target (numbers, or one value per trial) or a tensor
+    of shape (..., target). All values are those at slow time zero.
 
     Args:
         outward_m_s: Speeds across the track in m/s, positive away from it.
         along_m_s: Speeds along track in m/s, positive in the direction of the receiver.
         azimuth_m: Along-track positions in metres.
-        ground_range_m: Distances from the ground track in metres.
+        ground_range_m: Distances from the ground track of the receiver in metres.
         amplitude: Amplitudes, one by default; they may be complex.
         outward_m_s2: Constant accelerations across the track in m/s^2, zero by default.
         along_m_s2: Constant accelerations along track in m/s^2, zero by default.
@@ -418,7 +426,7 @@ class GroundMovers:
 
         Args:
             radar: Receiver.
-            draws: Random draws.
+            draws: Source of random numbers.
 
         Returns:
             Targets, shape (..., target).
@@ -447,7 +455,7 @@ class Fleet:
     """Several moving scenes in one.
 
     Args:
-        parts: Scenes by name; each draws its own random numbers, addressed by its name.
+        parts: Scenes by name; the random numbers of each scene depend on its name.
     """
 
     parts: Mapping[str, MovingScene]
@@ -457,7 +465,7 @@ class Fleet:
 
         Args:
             radar: Receiver.
-            draws: Random draws.
+            draws: Source of random numbers.
 
         Returns:
             Targets of all parts in order, shape (..., target).

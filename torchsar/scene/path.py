@@ -47,8 +47,8 @@ class Path(Protocol):
 class Hyperbola:
     """Exact range history of a straight path, r(t) = sqrt(r0^2 + v^2 t^2), constant during a pulse.
 
-    The history neglects the motion within the pulse: the Doppler shift 2 v_r / lambda displaces an
-    up-chirp by a constant delay and adds a phase.
+    The history neglects the motion within the pulse. The Doppler shift, which this motion causes,
+    would displace the echo of a chirp in range and change its phase.
     """
 
     def range_m(self, since_s: Tensor, closest_m: Tensor, velocity_m_s: Tensor) -> Tensor:
