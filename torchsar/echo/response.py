@@ -20,16 +20,17 @@ _POINTS = 1025
 class ChannelResponse:
     """Impairment: every range spectrum is multiplied by amplitude(u) exp(j phase(u)).
 
-    u is the range frequency divided by half the pulse bandwidth. The functions are evaluated within
-    -1..1 only; outside the band their values at its edges are used. Constant and linear parts of
-    the phase are applied as well, although no processor can distinguish them from a phase and a
-    shift of the scene. The truth holds `phase_rad` and `amplitude` at 1025 points of -1..1.
+    u is the range frequency divided by half the pulse bandwidth, so that the band is -1..1. Outside
+    the band the response has its value at the nearer band edge. Constant and linear parts of the
+    phase are applied as well, although no processor can distinguish them from a phase and a shift
+    of the scene. The true values are `phase_rad` and `amplitude` at 1025 equally spaced points of
+    -1..1.
 
     Args:
-        phase_rad: Function of u, shape (n,), float64, that returns the phase in radians, shape (n,)
-            or (..., n); None for zero.
-        amplitude: Function of u that returns the positive amplitude, in the same form; None for
-            one.
+        phase_rad: Function that takes u, shape (n,), float64, and returns the phase in radians,
+            shape (n,) or (..., n); None for a phase of 0.
+        amplitude: Function that takes u, shape (n,), float64, and returns the positive amplitude,
+            shape (n,) or (..., n); None for an amplitude of 1.
 
     Raises:
         ValueError: When applied, if the amplitude is not positive.

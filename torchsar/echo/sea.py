@@ -1,15 +1,18 @@
 """Echo of a stationary surface in all channels of a bistatic receiver.
 
-The echo is formed from its two-dimensional spectrum. A scatterer at the closest range R0 and the
-along-track position y has the spectrum (stationary phase, one way; F is the carrier plus the range
-frequency f_r, f the Doppler frequency, V the speed of the receiver)
+The echo is formed from its two-dimensional spectrum. By the principle of stationary phase, a
+scatterer at the closest range R0 and the along-track position y has the one-way spectrum
 
     exp(-j 2 pi [ f y / V + sqrt(F^2 - (c f / V)^2) R0 / c ]),    sin(look) = -c f / (F V).
 
-This is the phase from which omega-K focusing starts. The channel with the along-track offset dx
-receives at the time t what the reference channel received at t - dx / V, which is the exact factor
-exp(-j 2 pi f dx / V). One sum over range per bin of the full Doppler band therefore serves all
-channels: for each channel it is multiplied by that factor and then folded to the PRF.
+Here f is the Doppler frequency, F the carrier plus the range frequency, V the speed of the
+receiver, c the propagation speed, and look the angle of the line of sight from broadside.
+
+The channel with the along-track offset dx receives at the time t what the reference channel
+received at t - dx / V. Its spectrum is therefore exactly that of the reference channel times
+exp(-j 2 pi f dx / V). The spectrum of the reference channel, a sum over range in every bin of the
+full Doppler band, is computed once. For each channel it is multiplied by the factor of the channel
+and folded to the PRF.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Eqs. (1), (4), with zero target velocity.
@@ -53,24 +56,28 @@ def sea_echo(
 ) -> Tensor:
     """Return the range-compressed echo of a sea without noise.
 
-    The phase of a cell is -2 pi / lambda (R_m - reference range), with the range R_m from the cell
-    to the receiver, and the range response is that of the rectangular band of the pulse. The
-    caller applies the transmit range and, where needed, a pulse of another shape. A cell keeps its
-    amplitude while it is illuminated. The amplitude falls with the closest range R0 as
-    1 / sqrt(R0), since the number of cells in the beam grows with R0: the mean power is
-    10^(power_db / 10) in every sample, for every gate and frame. The principle of stationary phase
-    is the only approximation; it blurs the edges of a band-limited gate by Fresnel ripple. The echo
-    is differentiable in power_db and, for a sea made from an image, in the image.
+    The sea consists of cells. A cell has the phase -2 pi / lambda (R_m - reference range), where
+    R_m is its range to channel m of the receiver. Its range response is that of a pulse with a
+    rectangular spectrum. The transmit path and other pulse shapes are left to the caller.
+
+    A cell keeps its amplitude while it is illuminated. The amplitude falls with the closest range
+    R0 as 1 / sqrt(R0), because the number of cells in the beam grows with R0. The mean power of
+    every sample is therefore 10^(power_db / 10), for every gate and every size of the record. The
+    principle of stationary phase is the only approximation; it blurs the edges of a `BandLimited`
+    gate by Fresnel ripple. Differentiable in `sea.power_db` and, for a sea made from an image, in
+    the image.
 
     Args:
-        sea: Surface.
+        sea: Sea surface.
         radar: Receiver.
         n_pulse: Number of pulses.
-        n_range: Number of range samples, None for one line at the reference range.
-        gate: `BandLimited` of duration T illuminates the Doppler band |f| < V^2 T / (2 lambda R0)
-            of the reference range at every range, as a beam of fixed width does. `Pattern` weights
-            with sinc(element_m sin(look) / lambda) up to null number sea.lobes to either side.
-            duration_s and element_m must each be one number for all trials.
+        n_range: Number of range samples; None for azimuth data at the reference range only.
+        gate: Illumination. `BandLimited` of duration T illuminates the Doppler band
+            |f| < V^2 T / (2 lambda R0) at every range, as a beam of fixed width does; here V is the
+            speed of the receiver and R0 the reference range. `Pattern` weights with
+            sinc(element_m sin(look) / lambda) up to null number `sea.lobes` on either side, with
+            the look angle from broadside. duration_s or element_m must be one number for all
+            trials.
         draws: Random draws.
         dtype: Complex dtype of the result.
         device: Device of the result.
@@ -81,8 +88,9 @@ def sea_echo(
 
     Raises:
         TypeError: If the gate is neither `BandLimited` nor `Pattern`, or the dtype is not complex.
-        ValueError: If the frame begins behind the receiver, the gate reaches a look angle above
-            53 degrees or differs between trials, or power_db has another length than the trials.
+        ValueError: If the first range sample does not lie at a positive range, the gate reaches a
+            look angle above 53 degrees or differs between trials, or `sea.power_db` has another
+            length than the number of trials.
     """
     real_dtype(dtype)
     refuse_other_trials(sea, draws)

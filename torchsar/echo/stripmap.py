@@ -93,14 +93,13 @@ def stripmap_echo(
 ) -> Tensor:
     """Return the raw echo without noise.
 
-    The echo is formed in range frequency from the spectrum of the sampled pulse, by blocks of
-    pulses and of the targets that they illuminate. Slow time starts at zero. Echoes partly outside
-    the record are cut and never wrap. Differentiable in positions, amplitudes, velocity and Doppler
-    frequency.
+    The echo is formed in range frequency from the spectrum of the sampled pulse. Slow time is zero
+    at the first pulse. Echoes partly outside the record are cut off and never wrap around.
+    Differentiable in positions, amplitudes, velocity and Doppler frequency.
 
     Args:
-        placed: Scatterers, shape (..., target).
-        world: World.
+        placed: Scatterers, shape (..., target), as from `path_geometry`.
+        world: Simulated world: its beam, path, velocity and Doppler frequency are used.
         radar: Radar.
         n_pulse: Number of pulses.
         n_range: Number of range samples.
@@ -255,12 +254,12 @@ def _target_blocks(placed: Placed, height: int, n_fft: int) -> Iterator[slice]:
 def target_energy(truth: Truth, world: StripmapWorld, radar: StripmapRadar, n_pulse: int) -> Tensor:
     """Return the energy of the raw echo of each target over all lines of the record.
 
-    Divided by the noise variance (`noise_std` squared) it is the peak signal-to-noise ratio after
-    two-dimensional compression.
+    The energy divided by the noise variance (`noise_std` squared) is the peak signal-to-noise ratio
+    after two-dimensional compression.
 
     Args:
-        truth: Truth of `simulate`.
-        world: World.
+        truth: True values returned by `simulate`.
+        world: Simulated world; its beam weights the pulses.
         radar: Radar.
         n_pulse: Number of pulses.
 
@@ -283,7 +282,8 @@ def lit_power(echo: Tensor) -> Tensor:
         echo: Raw echo, shape (..., pulse, range), complex.
 
     Returns:
-        Mean power of the samples above 1e-4 of the largest power of their trial, shape (...,).
+        Mean power of the samples whose power exceeds 1e-4 of the largest power in their trial,
+        shape (...,).
     """
     power = echo.real.square() + echo.imag.square()
     lit = power > 1e-4 * power.amax((-2, -1), keepdim=True)
@@ -300,11 +300,11 @@ def simulate(
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
-    """Simulate a raw stripmap recording, batched over the trials of the draws.
+    """Simulate raw stripmap recordings, one per trial of `draws`.
 
     Args:
         radar: Radar.
-        world: World.
+        world: Scene, beam, path, true velocity and Doppler frequency, and signal-to-noise ratio.
         n_pulse: Number of pulses.
         n_range: Number of range samples.
         draws: Random draws.
@@ -313,17 +313,22 @@ def simulate(
         device: Device of the recording.
 
     Returns:
-        The recording, shape (..., pulse, range), and the truth. The truth holds the targets, shape
-        (..., target): `crossing_s` (beam centre) and `zero_doppler_s` in seconds, `closest_range_m`
-        and `amplitude`; `velocity_m_s` and `doppler_hz`, shape (...,) or (); `noise_std`, the
-        standard deviation of the noise of a sample, shape (...,); and the values of each impairment
-        under "<impairment>.<name>". `clean` is the recording without impairments, with the same
-        noise.
+        The recording, shape (..., pulse, range), and the truth. The values of the truth are:
+
+        - of the targets, shape (..., target): `crossing_s`, the time at which the beam centre
+          crosses the target, and `zero_doppler_s`, both in seconds; `closest_range_m` in metres;
+          `amplitude`, complex;
+        - shape (...,) or (): the effective velocity `velocity_m_s`; the Doppler frequency
+          `doppler_hz` of the beam centre; the standard deviation `noise_std` of the complex noise
+          of a sample;
+        - the true values of each impairment, as "<impairment>.<name>".
+
+        The recording `clean` of the truth has the same noise, but no impairments.
 
     Raises:
         ValueError: If there is no scatterer, the squint exceeds 90 degrees, a target lies behind
-            the radar, a line does not hold the pulse, or a parameter per trial has another length
-            than the trials.
+            the radar, a line is shorter than the pulse, or a parameter given per trial has another
+            length than the number of trials.
     """
     refuse_other_trials(world, draws)
     velocity = radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s
@@ -382,7 +387,8 @@ def apply_impairments(
 ) -> tuple[Recording, dict[str, Tensor]]:
     """Apply impairments to a recording, simulated or recorded.
 
-    A recording without aux `line_number` gets line numbers 0, 1, ... in the order of its pulses.
+    A recording without the side data `line_number` (in `aux`) gets the line numbers 0, 1, ... in
+    the order of its pulses.
 
     Args:
         recording: Recording.

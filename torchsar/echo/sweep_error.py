@@ -112,13 +112,14 @@ class SinusoidSweepError:
 def wound_turns(error: SweepError, radar: TriangularLadar, position_s: Tensor) -> Tensor:
     """Return the phase error of the laser, continued without jumps from sweep to sweep.
 
-    The phase error is zero at the start of the triangle. Each sweep starts with the phase error at
-    which the sweep before it ends, and the same up-sweep and down-sweep repeat in every period.
+    The phase error is zero at time 0, the start of an up-sweep. Each sweep starts with the phase
+    error at which the sweep before it ends. The same up-sweep and down-sweep repeat in every
+    period.
 
     Args:
         error: Phase error of one up-sweep and one down-sweep.
         radar: Ladar.
-        position_s: Time since the start of a triangle in seconds, negative before it, shape (n,) or
+        position_s: Time since the start of a period in seconds, negative before it, shape (n,) or
             (..., pulse, n), float64.
 
     Returns:
@@ -147,8 +148,9 @@ def calibration_channel(
 
     At the time u from the middle of an up-sweep the phase in cycles is
     fc tc + K u tc - K tc^2 / 2 + e(u) - e(u - tc), with the carrier fc, the chirp rate K, the delay
-    tc of the fibre and the phase error e of the laser. In a down-sweep -K stands for K, and e is
-    the error of the down-sweep. The signal is conjugated if radar.dechirp_sign is "echo_conj_lo".
+    tc of the fibre and the phase error e of the laser. In a down-sweep, K is replaced by -K, and e
+    is the error of the down-sweep. The signal is conjugated if radar.dechirp_sign is
+    "echo_conj_lo".
 
     Args:
         radar: Ladar.
@@ -160,7 +162,8 @@ def calibration_channel(
         device: Device of the result.
 
     Returns:
-        Beat, shape (*trials, 2, n_period or 1, fast_time).
+        Beat signal, shape (*trials, 2, n, fast_time): the up-sweep, then the down-sweep, of
+        n = n_period periods if `fibre.every_period` is set, otherwise of n = 1 period.
 
     Reference:
         Remote Sens. 2024, 16, 793, section 2.1 (internal calibration module).

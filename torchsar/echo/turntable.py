@@ -59,7 +59,7 @@ def rotation_angle(radar: InverseRadar, n_pulse: int, rotation: Rotation, like: 
 
 @dataclass(frozen=True)
 class PulseTurn:
-    """Angle and rotation rate of the target at the middle of each pulse.
+    """Angle, rotation rate and angular acceleration of the target at the middle of each pulse.
 
     Args:
         angle_rad: Angle in radians, shape (*trials, pulse), float64.
@@ -195,8 +195,8 @@ class PulseRange:
             half_s: Half the pulse length in seconds.
 
         Returns:
-            Motion minus track at the middle of each pulse, and the slope of the motion within the
-            pulse with the deviation from that slope.
+            The range of the target. `middle_m` is motion minus track; `speed_m_s` and `bend_m`
+            follow from the motion alone, since the reference is fixed within a pulse.
         """
         start, middle, end = (displacement_m(motion, pulse_s + shift) for shift in (-half_s, 0.0, half_s))
         speed = (end - start) / (2 * half_s)
@@ -217,22 +217,25 @@ def dechirped_echo(
 ) -> Tensor:
     """Return dechirped pulses with the range evaluated at every sample, without noise.
 
-    At the time t' from the middle of a pulse the phase of a scatterer is
-    -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2), with the carrier f0, the chirp rate gamma
-    and the delay dtau relative to the reference of the receiver. For a scatterer at the cross range
-    x and range y and the rotation angle theta, dtau = 2 (x sin theta + y cos theta + d) / c, where
-    d is the motion minus the value of the track at the middle of the pulse. With a centre of
-    rotation at the range -yc the first two terms are x sin theta + (y + yc) cos theta - yc. The
-    constant phase of the carrier at the range y is omitted: the phase of an amplitude is that of
-    the echo at theta = 0. Within a pulse the rotation rate changes linearly, with its value and
-    slope at the middle.
+    At the time t' from the middle of a pulse, the phase of a scatterer is
 
-    Within a pulse the phases of scatterers are linear in t' except for about 1e-4 rad. The linear
-    parts are summed by a matrix product of short tables, the rest by a power series. The result is
-    exact to 1e-6 rad, and to 1e-10 rad for the ladar of Ruan et al. 2013. The receiver is ideal: a
-    beat frequency outside the range window wraps, for example where a radial speed v shifts the
-    echo by v f0 / gamma in range; `focus.compress_dechirped` unwraps it. Differentiable in
-    positions, amplitudes, yc and the parameters of the rotation.
+        -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2),
+
+    with the carrier f0, the chirp rate gamma and the delay dtau relative to the reference of the
+    receiver. For a scatterer at the cross range x and the range y,
+
+        dtau = 2 / c (x sin theta + (y + yc) cos theta - yc + d),
+
+    with the rotation angle theta about a centre at the range -yc. d is the motion at the time of
+    the sample minus the track at the middle of the pulse. The constant carrier phase of the range y
+    is left out, so that the phase of an amplitude is that of the echo at theta = 0. Within a pulse
+    the rotation rate is taken as linear in time.
+
+    The result is exact to 1e-6 rad, and to 1e-10 rad for the ladar of Ruan et al. 2013. The
+    receiver is ideal: a beat frequency outside the range window wraps around. A radial speed v, for
+    example, shifts the echo by v f0 / gamma in range. `focus.compress_dechirped`, given v, corrects
+    this shift, also where it wraps. Differentiable in positions, amplitudes, yc and the parameters
+    of the rotation.
 
     Args:
         scatterers: Scatterers, shape (..., target).
@@ -252,8 +255,8 @@ def dechirped_echo(
         Pulses, shape (*trials, pulse, fast_time).
 
     Raises:
-        ValueError: If the phase that the model neglects of rotation or motion within a pulse
-            exceeds 1e-6 rad, the pulse length is not known, or the rate of a PolynomialRotation
+        ValueError: If rotation or motion within a pulse is so fast that the model would neglect a
+            phase above 1e-6 rad, the pulse length is not known, or the rate of a PolynomialRotation
             falls to zero within the record.
     """
     x, y, amplitude = _rows_of(scatterers)
@@ -303,14 +306,14 @@ class ScattererLines:
     ) -> ScattererLines:
         """Form the phases from the range of each scatterer to second order in fast time.
 
-        At the time t' from the middle of a pulse, where the rotation angle is theta, the range by
-        the rotation is
+        At the time t' from the middle of a pulse, the rotation moves a scatterer to the range
 
             r + (x cos theta - y' sin theta) (rate t' + acceleration t'^2 / 2)
-              - (x sin theta + y' cos theta) (rate t')^2 / 2,
+              - (x sin theta + y' cos theta) (rate t')^2 / 2.
 
-        with its value r at the middle of the pulse, the cross range x and the range y' from the
-        centre of rotation.
+        r is its range at the middle of the pulse, x its cross range and y' its range from the
+        centre of rotation. theta, rate and acceleration are the rotation angle and its derivatives
+        at the middle of the pulse.
 
         Args:
             radar: Radar.
@@ -511,16 +514,16 @@ def _pulse_blocks(n_pulse: int, per_pulse: int) -> Iterator[slice]:
 class LostPulses:
     """Impairment: whole pulses at random positions that were not received; their samples are zero.
 
-    The other pulses keep their positions, since pulses are counted by the trigger; with `LostLines`
-    they would move up. The truth holds `present`, shape (..., pulse), bool, true for the pulses
-    that were received.
+    All other pulses keep their positions, as where a trigger counts the pulses. (`LostLines` is the
+    impairment in which later lines move up instead.) The true value `present`, shape (..., pulse),
+    bool, is true for the pulses that were received.
 
     Args:
         count: Number of lost pulses, fixed for all trials; None if a fraction is given.
         fraction: Fraction of all pulses, at least 0 and below 1; None if a count is given.
 
     Raises:
-        ValueError: If both count and fraction are given or neither is, or one is out of range; when
+        ValueError: Unless exactly one of count and fraction is given, and within its range. When
             applied, if no pulse would be left or the trials of draws and recording differ.
     """
 
@@ -567,17 +570,17 @@ def simulate_turntable(
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
-    """Simulate a recording of a rotating target, batched over the trials of the draws.
+    """Simulate recordings of a rotating target, one per trial of `draws`.
 
-    With world.fidelity `PhaseOnly` the recording before impairments is EXACTLY the clean recording,
-    noise included, with each pulse multiplied by exp(j psi), where psi is the phase error of the
-    pulse: circular Gaussian noise keeps its distribution under a phase, and tests of equivariance
-    are exact. With `Dechirped` the noise is added to the echo after its phase errors. The
-    signal-to-noise ratio world.snr_db is the same before and after range compression.
+    `world.fidelity` is the model of the echo. With `PhaseOnly`, the recording before impairments is
+    EXACTLY the clean recording, noise included, with each pulse multiplied by exp(j psi), where psi
+    is the phase error of the pulse. Circular Gaussian noise keeps its distribution under this
+    factor. With `Dechirped`, the noise is added to the echo after its phase errors. The
+    signal-to-noise ratio `world.snr_db` is the same before and after range compression.
 
     Args:
         radar: Radar.
-        world: World.
+        world: Scene, rotation, motion, start phases, model of the echo and signal-to-noise ratio.
         n_pulse: Number of pulses.
         n_range: Number of range samples, or of samples of a dechirped pulse.
         draws: Random draws.
@@ -587,22 +590,30 @@ def simulate_turntable(
 
     Returns:
         The recording and the truth. With `PhaseOnly` the recording is range-compressed, shape (...,
-        pulse, range); with `Dechirped` it is raw, shape (..., pulse, fast_time), and has aux
-        `reference_m`, the displacement of the reference, shape (..., pulse). The truth holds
-        `phase_rad`, shape (..., pulse), psi = delta - 4 pi d / lambda with the start phase delta
-        and the displacement d relative to the reference at the middle of the pulse;
-        `displacement_m`, the whole displacement, shape (..., pulse); `noise_std`, the standard
-        deviation of the noise of a sample, shape (...,); `cross_range_m`, `range_m` and `amplitude`
-        of the scatterers, shape (..., target); `rotation_rad_s`, shape (...,) or (); and the values
-        of each impairment under "<impairment>.<name>". With a polynomial rotation it also holds
-        `omega_rad_s` and `yc_m`, shape (...,), and `warp_k`, shape (..., order - 1), and
-        `rotation_rad_s` is the mean rate over the record. `clean` is the recording without motion,
-        start phases and impairments, with the same noise.
+        pulse, range). With `Dechirped` it is raw, shape (..., pulse, fast_time), and its side data
+        `aux` hold `reference_m`, the displacement of the reference, shape (..., pulse).
+
+        The values of the truth are:
+
+        - `phase_rad`, shape (..., pulse): the phase error psi = delta - 4 pi d / lambda, with the
+          start phase delta and the displacement d relative to the reference at the middle of the
+          pulse;
+        - `displacement_m`, shape (..., pulse): the whole displacement of the target;
+        - `noise_std`, shape (...,) or (): the standard deviation of the complex noise of a sample;
+        - `cross_range_m`, `range_m` and `amplitude` of the scatterers, shape (..., target);
+        - `rotation_rad_s`, shape (...,) or (): the rate of a uniform rotation, or the mean rate of
+          a polynomial rotation over the record;
+        - with a polynomial rotation only: its rate `omega_rad_s` at the first pulse and the centre
+          deviation `yc_m`, shape (...,); its coefficients `warp_k`, shape (..., order - 1);
+        - the true values of each impairment, as "<impairment>.<name>".
+
+        The recording `clean` of the truth has the same noise, but no motion, start phases or
+        impairments.
 
     Raises:
         ValueError: If the target leaves the range window, the scene is empty, there is no rotation
-            rate, the rate falls to zero, the pulse length of a dechirped pulse is not known, or a
-            parameter per trial has another length than the trials.
+            rate, the rate falls to zero, the length of a dechirped pulse is not known, or a
+            parameter given per trial has another length than the number of trials.
     """
     refuse_other_trials(world, draws)
     course = _Course.of(radar, world, n_pulse, n_range, draws, device)

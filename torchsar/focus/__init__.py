@@ -1,4 +1,4 @@
-"""Range compression, image formation, and the requirements of each scene on its processor."""
+"""Range compression, image formation, and predictions of the errors of simplified processing."""
 
 from torchsar.focus.backprojection import Backproject, DopplerBand, EveryPulse, Integration, backproject
 from torchsar.focus.chirp_z import chirp_z, keystone

@@ -22,7 +22,8 @@ class Aperture(Protocol):
         """Return the weight of each pulse at each pixel, in the shape of the arguments.
 
         Args:
-            since_s: Slow time since the beam centre crossed the pixel, in seconds.
+            since_s: Slow time in seconds since the line of sight that defines the image
+                coordinates, by default that of the beam centre, crossed the pixel.
             doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
         """
         ...
@@ -36,7 +37,8 @@ class EveryPulse:
         """Return the weight 1 for each pulse, in the shape of `since_s`.
 
         Args:
-            since_s: Slow time since the beam centre crossed the pixel, in seconds.
+            since_s: Slow time in seconds since the line of sight that defines the image
+                coordinates, by default that of the beam centre, crossed the pixel.
             doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
         """
         return torch.ones_like(since_s)
@@ -44,7 +46,10 @@ class EveryPulse:
 
 @dataclass(frozen=True)
 class Integration:
-    """Aperture of the pulses within an integration time about the crossing of the beam centre.
+    """Aperture of the pulses within an integration time about the crossing of the pixel.
+
+    At the crossing, the line of sight that defines the image coordinates, by default that of the
+    beam centre, points to the pixel.
 
     Args:
         integration_s: Integration time in seconds.
@@ -56,7 +61,8 @@ class Integration:
         """Return the weight of each pulse: 1 within the integration time and 0 elsewhere.
 
         Args:
-            since_s: Slow time since the beam centre crossed the pixel, in seconds.
+            since_s: Slow time in seconds since the line of sight that defines the image
+                coordinates, by default that of the beam centre, crossed the pixel.
             doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
         """
         return (since_s.abs() <= self.integration_s / 2).to(since_s.dtype)
@@ -78,7 +84,8 @@ class DopplerBand:
         """Return the weight of each pulse: 1 where the Doppler lies in the band and 0 elsewhere.
 
         Args:
-            since_s: Slow time since the beam centre crossed the pixel, in seconds.
+            since_s: Slow time in seconds since the line of sight that defines the image
+                coordinates, by default that of the beam centre, crossed the pixel.
             doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
         """
         return (doppler_offset_hz.abs() <= self.width_hz / 2).to(since_s.dtype)
@@ -101,12 +108,12 @@ def backproject(
 ) -> Tensor:
     """Sum the compressed echo coherently over the pulses at the range of each pixel.
 
-    The range history is the exact hyperbola, computed as difference from the range at which the
-    beam centre crosses the pixel. The echo between range samples is interpolated from its range
-    spectrum by a non-uniform FFT. A focused target at slant range R has the phase -4 pi R / lambda;
-    its amplitude is the sum over its pulses. Echoes outside the record count as zero. The sum takes
-    pulses x pixels x 50 operations: use it for patches. Differentiable in the raw data, the
-    velocity, the frame Doppler and the pixel positions.
+    The range history is the exact hyperbola, computed as the difference from the range at which the
+    line of sight of `frame_hz` crosses the pixel. Between range samples the echo is interpolated
+    from its range spectrum by a non-uniform FFT. A focused target at slant range R has the phase
+    -4 pi R / lambda; its amplitude is the sum over its pulses. Echoes outside the record count as
+    zero. The sum takes about 50 operations per pulse and pixel, so use it for small patches.
+    Differentiable in the raw data, the velocity, `frame_hz` and the pixel positions.
 
     Args:
         raw: Raw or range-compressed data, shape (..., pulse, range), complex.
@@ -117,8 +124,9 @@ def backproject(
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
-            None for the nominal pointing of the radar, or the centroid where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
+            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
+            centroid where the radar has none.
         reference: Spectrum of the range compression filter, shape (range,); None for
             range-compressed data.
         aperture: Pulses that contribute to a pixel, such as `Integration` or `DopplerBand`; None
@@ -132,9 +140,9 @@ def backproject(
         coordinates.
 
     Raises:
-        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
-            dims of the data, the velocity is not positive, or a Doppler exceeds 2 velocity /
-            wavelength.
+        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
+            of the leading dims of the data, the velocity is not positive, or the magnitude of
+            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength.
     """
     at = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
     x, r = torch.broadcast_tensors(
@@ -169,8 +177,8 @@ def _slices(n: int, step: int) -> Iterator[slice]:
 
 @dataclass(frozen=True)
 class _PixelGeometry:
-    """Range of pixels relative to the crossing of the beam centre, and the weights of the
-    pulses.
+    """Range of pixels relative to that at the crossing of the line of sight `frame_hz`, and the
+    weights of the pulses.
     """
 
     radar: StripmapRadar
@@ -225,18 +233,20 @@ class _EchoBetweenSamples:
 
 
 class Backproject(Focuser):
-    """Stage that focuses a patch by backprojection, on the image axes of the faster focusers.
+    """Stage that focuses a patch by backprojection, on the image axes of focusers such as `OmegaK`.
 
     Args:
         radar: Radar of the recording.
         reference: Filter that compresses the pulses in range: "matched", "flat" or "phase"; None
             for range-compressed data.
         velocity_m_s: Effective velocity in m/s; None for that of the radar.
-        doppler_hz: Absolute Doppler centroid in Hz; None for the nominal pointing of the radar.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
-            None for the nominal pointing of the radar, or the centroid where it has none.
-        lines: First and last raw line of the patch; None for all.
-        cells: First and last range cell of the patch; None for all.
+        doppler_hz: Absolute Doppler centroid in Hz; None for the nominal pointing of the radar, or
+            0 where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
+            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
+            centroid where the radar has none.
+        lines: First raw line of the patch and the line after its last; None for all lines.
+        cells: First range cell of the patch and the cell after its last; None for all cells.
         oversampling: Pixels per raw sample along either axis.
         aperture: Pulses that contribute to a pixel, such as `Integration` or `DopplerBand`; None
             for all.

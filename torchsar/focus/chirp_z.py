@@ -1,7 +1,9 @@
 """Chirp-z transform onto any uniform grid of frequencies, and the keystone transform.
 
-Both compute the spectrum X_i = sum_j x_j exp(-2j pi (start + i step) (j - centre)) of samples x_j
-exactly, by one convolution with a chirp instead of interpolation.
+The chirp-z transform X_i = sum_j x_j exp(-2j pi (start + i step) (j - centre)) is the spectrum of
+samples x_j at the frequencies start + i step, in cycles per sample. It is computed exactly, by one
+convolution with a chirp instead of interpolation. The keystone transform uses it to resample slow
+time.
 
 Reference:
     Bluestein 1970 (chirp-z); Perry, DiPietro and Fante 1999, IEEE Trans. AES 35(1) (keystone).
@@ -62,28 +64,29 @@ def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: T
     """Rescale slow time per range frequency, which removes the linear range walk of all targets.
 
     Data s(t, f) over slow time t and range frequency f become s(t carrier / (carrier + f), f). The
-    phase of a target of constant velocity grows with (carrier + f) t before and with carrier t
-    afterwards, so that its range is constant. Slow time is zero at pulse `n // 2` of n, where the
-    data do not change.
+    phase of a target of constant velocity is proportional to (carrier + f) t before the transform
+    and to carrier t after it, so that its range becomes constant. Slow time is zero at pulse
+    `n // 2` of n pulses, which does not change.
 
-    At every f the true Doppler must lie within half a pulse rate of `ambiguity` pulse rates. Pulses
-    are resampled exactly as a periodic, band-limited signal. For f < 0, where the scale exceeds
-    one, the outermost pulses come from beyond the aperture and wrap around. Differentiable in the
-    data.
+    The pulses are resampled exactly, as a periodic, band-limited signal. At every f, the true
+    Doppler must differ from `ambiguity` times the pulse rate by less than half the pulse rate. For
+    f < 0, the outermost pulses are taken from beyond the aperture, where the periodic signal wraps
+    around. Differentiable in the data.
 
     Args:
         data: Pulses, shape (..., pulse, range frequency), complex.
         frequency_hz: Range frequencies f relative to the carrier in Hz, shape (range frequency,).
         carrier_hz: Carrier frequency in Hz.
         ambiguity: Number of pulse rates by which the true Doppler exceeds the sampled one, a number
-            or shape (...,). An error of this number leaves the range walk that belongs to it.
+            or shape (...,). If it is wrong by one, the range walk due to a Doppler of one pulse
+            rate remains.
 
     Returns:
         Pulses of the same shape.
 
     Raises:
-        ValueError: If the number of frequencies does not fit the data, or a frequency reaches minus
-            the carrier.
+        ValueError: If the number of frequencies does not fit the data, the carrier is not positive,
+            or a frequency is at or below minus the carrier.
 
     Reference:
         Perry, DiPietro and Fante 1999, IEEE Trans. AES 35(1).
@@ -96,7 +99,7 @@ def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: T
         )
     if not (carrier_hz > 0 and bool((frequency_hz > -carrier_hz).all())):
         raise ValueError(
-            "frequency_hz, relative to a positive carrier_hz, must lie above minus the carrier, got down to "
+            "carrier_hz must be positive and every frequency_hz above minus the carrier, got frequencies down to "
             f"{float(frequency_hz.min()):g} Hz with a carrier of {carrier_hz:g} Hz"
         )
     scale = carrier_hz / (carrier_hz + frequency_hz)

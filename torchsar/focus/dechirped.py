@@ -64,10 +64,12 @@ def compress_dechirped(
 def azimuth_transform(pulses: Tensor, window: str = "none", oversampling: int = 1) -> Tensor:
     """Form the image of phase-corrected pulses by a centred transform with exp(+j) over the pulses.
 
-    Of n = oversampling * pulse lines, line q is
-    sum_k w_k s[k] exp(2j pi (q - n // 2) (k - pulse // 2) / n) / sqrt(n) with the pulses s[k] and
-    the window w_k, so that without a window the energy of the pulses is preserved. Rounding errors
-    do not depend on the number of trials. Differentiable.
+    With P pulses s[k], the window w_k and n = oversampling * P lines, line q of the image is
+
+        sum_k w_k s[k] exp(2j pi (q - n // 2) (k - P // 2) / n) / sqrt(n).
+
+    Without a window the energy of the pulses is preserved. Rounding errors do not depend on the
+    number of trials. Differentiable.
 
     Args:
         pulses: Range-compressed pulses, shape (..., pulse, range), complex.
@@ -112,8 +114,8 @@ class CompressDechirped(Stage):
     Args:
         radar: Radar of the recording, with its pulse length.
         residual_video: Remove the residual video phase.
-        velocity_m_s: Range rate within pulses in m/s, receding positive; a connected value takes
-            precedence.
+        velocity_m_s: Range rate within pulses in m/s, receding positive; None for no correction. A
+            value passed to `forward` takes precedence, such as an estimate that a chain connects.
 
     Raises:
         ValueError: If the radar has no pulse length.

@@ -1,8 +1,9 @@
 """Omega-K without Stolt interpolation as an invertible operator between raw lines and image.
 
-Every filter of `omega_k` has unit modulus, except the filter of range compression. Where that also
-has unit modulus (all-pass), the operator is unitary: its inverse is its adjoint, which applies the
-conjugate filters in reverse order. Methods that compute the echoes of a modelled image use it.
+For the whole PRF, every filter of `omega_k` has unit modulus, except the filter of range
+compression. If this filter also has unit modulus (`all_pass`), the operator is unitary: its inverse
+is its adjoint, which applies the conjugate filters in reverse order. The operator serves methods
+that compute the echoes of a modelled image.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ def all_pass(reference: Tensor) -> Tensor:
 
 
 class InvertibleOmegaK:
-    """Omega-K without Stolt interpolation and its adjoint, with stored filters, for one geometry.
+    """Omega-K without Stolt interpolation and its adjoint, with filters stored for repeated use.
 
-    It makes the same approximation as `omega_k`. The adjoint maps an image to raw lines, and is the
-    exact inverse where |reference| = 1 or `reference` is None. `to_doppler` and `from_doppler` give
-    access to the focused azimuth spectra, in the domain (Doppler, range). The filters take one
-    complex number per sample. The geometry may differ between trials.
+    The approximation is that of `omega_k`. The adjoint maps an image to raw lines; it is the exact
+    inverse where |reference| = 1 or `reference` is None. `to_doppler` and `from_doppler` transform
+    between raw lines and focused azimuth spectra in the domain (Doppler, range). The stored filters
+    take one complex number per sample. Doppler and velocity may differ between trials.
 
     Args:
         radar: Radar of the recording.
@@ -42,15 +43,16 @@ class InvertibleOmegaK:
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
-            None for the nominal pointing of the radar, or the centroid where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
+            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
+            centroid where the radar has none.
         reference: Spectrum of the range compression filter, shape (range,); None for
             range-compressed data.
 
     Raises:
-        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
-            dims of the data, the velocity is not positive, or a Doppler exceeds 2 velocity /
-            wavelength.
+        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
+            of the leading dims of the data, the velocity is not positive, or the magnitude of
+            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength.
     """
 
     def __init__(
@@ -134,7 +136,7 @@ def defocus_omega_k(
 ) -> Tensor:
     """Compute the raw lines of an image by the adjoint of `omega_k`.
 
-    It is the exact inverse where `reference` has unit modulus or is None.
+    The adjoint is the exact inverse where `reference` has unit modulus or is None.
 
     Args:
         image: Image, shape (..., azimuth, range), complex.
@@ -142,8 +144,9 @@ def defocus_omega_k(
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
-            None for the nominal pointing of the radar, or the centroid where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
+            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
+            centroid where the radar has none.
         reference: Spectrum of the range compression filter, shape (range,); None for
             range-compressed data.
 
@@ -151,9 +154,9 @@ def defocus_omega_k(
         Raw lines, same shape.
 
     Raises:
-        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
-            dims of the image, the velocity is not positive, or a Doppler exceeds 2 velocity /
-            wavelength.
+        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
+            of the leading dims of the image, the velocity is not positive, or the magnitude of
+            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength.
     """
     operator = InvertibleOmegaK(
         radar, image, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, frame_hz=frame_hz, reference=reference

@@ -1,12 +1,15 @@
 """Non-uniform FFT along pulses, with the same points for all range cells.
 
-A point is the frequency at which a pulse is evaluated. Spreading pulses onto a uniform grid,
-interpolating the grid at the points, and the derivative of both in the kernel weights are the three
-partial derivatives of one sum over point m, tap and column,
-weights[m, tap] * values[m, column] * grid[first[m] + tap, column]. Each operation is therefore the
-gradient of the others, to any order. Each is computed as a sum of weighted rows (`embedding_bag`),
-which on a CPU core takes a tenth of the time of adding complex rows by index. Range remains
-contiguous in memory.
+A point is the frequency at which a pulse is evaluated. The transform needs three operations:
+`spread_rows` spreads pulses onto a uniform grid, `interpolate_rows` interpolates the grid at the
+points, and `correlate_rows` gives the derivative of the other two with respect to the kernel
+weights. They are the partial derivatives of the sum, over point m, tap and column, of
+
+    weights[m, tap] * values[m, column] * grid[first[m] + tap, column]
+
+with respect to grid, values and weights. The gradients of one operation are therefore given by the
+other two, to any order. Each operation is computed as a sum of weighted rows (`embedding_bag`),
+which on a CPU core takes a tenth of the time of adding complex rows by index.
 
 Reference:
     Fessler and Sutton 2003 (gridding); Barnett et al. 2019 (kernel, error against width and
@@ -50,7 +53,7 @@ def spread_rows(weights: Tensor, values: Tensor, first: Tensor, length: int) -> 
 def interpolate_rows(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
     """Interpolate grid rows at points: sum weights[m, tap] * grid[first[m] + tap] over the taps.
 
-    It is the adjoint of `spread_rows` as a map of its values.
+    For fixed weights this is the adjoint of `spread_rows` as a map from values to the grid.
 
     Args:
         weights: Tap weights, shape (b, m, tap), real.
@@ -66,7 +69,7 @@ def interpolate_rows(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
 def correlate_rows(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor:
     """Correlate values with grid rows: sum values[m] * grid[first[m] + tap] over the columns.
 
-    It is the adjoint of `spread_rows` as a map of its weights.
+    For fixed values this is the adjoint of `spread_rows` as a map from weights to the grid.
 
     Args:
         values: Rows of values, shape (b, m, column), real.
@@ -190,9 +193,9 @@ class PulsePoints:
     """Positions of the pulses on the grid of a `PulseNufft`.
 
     Args:
-        first: Index of the first grid row, shape (..., m), int64.
-        weights: Tap weights, shape (..., m, tap).
-        rows: Number of grid rows that the points reach.
+        first: Index of the first grid row onto which each pulse is spread, shape (..., m), int64.
+        weights: Kernel weights of each pulse at its grid rows, shape (..., m, tap).
+        rows: Number of grid rows, up to the last one onto which a pulse is spread.
     """
 
     first: Tensor

@@ -1,8 +1,9 @@
 """Azimuth lines of an image formed by the matched Fourier transform, in Doppler or in metres.
 
 The rotation angle of the target is Om phi(t), with the rotation rate Om at the first pulse and the
-warp phi(t) of `core.warp.warp`. T = pulses / PRF is the aperture time. The step between image lines
-is given in Doppler cells of 1 / T, where Doppler is that at the mean rotation rate Om phi(T) / T.
+warp phi(t) = t + k1 t^2 / 2! + k2 t^3 / 3! + ... With the aperture time T = pulses / PRF, the mean
+rotation rate is Om phi(T) / T. Doppler frequencies of the image are those at this mean rate. The
+step between image lines is given in Doppler cells of 1 / T.
 
 Reference:
     Remote Sens. 2025, 17, 3447, Eqs. (9)-(10).
@@ -174,7 +175,8 @@ class CrossRangeLines:
     def cells_per_line(self, k: Tensor, duration_s: float) -> Tensor:
         """Return the step between image lines in Doppler cells of 1 / T, shape (...,), float64.
 
-        The step in metres is fixed, so that it depends on the mean rotation rate of each trial.
+        The step in metres is fixed, so that the step in Doppler cells depends on the mean rotation
+        rate of each trial.
 
         Args:
             k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,

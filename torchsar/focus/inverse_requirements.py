@@ -1,9 +1,9 @@
 """Phase that each simplification of inverse SAR processing neglects for a rotating target.
 
-All values follow from the radar and from bounds of the motion, before any simulation.
+All values are computed from the radar and from bounds of the motion, without a simulation.
 
 Reference:
-    Ruan et al. 2013, for the effects that it names.
+    Ruan et al. 2013 (some of the effects).
 """
 
 from __future__ import annotations
@@ -41,11 +41,16 @@ def inverse_requirements(
 ) -> tuple[Requirement, ...]:
     """List the largest phase and range shift that each simplification neglects, with its tolerance.
 
-    A range shift is also expressed as its phase at the ends of the band, pi per range cell. The
-    tolerances are 0.05 cell rms for shifts that change over the aperture, 0.4 cell for the whole
-    migration by rotation (between 0.4 and 1 cell it raises the entropy of the image by up to
-    0.1 nat), pi for phase steps between neighbouring samples, and `tolerance_rad` for all other
-    phases. Motion within a pulse is listed only where `radar.pulse_s` is set.
+    A range shift is also given as its phase at the ends of the range band, pi per range cell. The
+    tolerances are:
+
+    - 0.05 range cell rms for shifts that change over the aperture;
+    - 0.4 range cell for the whole migration by rotation. A migration between 0.4 and 1 cell raises
+      the entropy of the image by up to 0.1 nat;
+    - pi for phase steps between neighbouring samples;
+    - `tolerance_rad` for all other phases.
+
+    Motion within a pulse is listed only where `radar.pulse_s` is set.
 
     Args:
         radar: Radar of the recording.
@@ -54,9 +59,9 @@ def inverse_requirements(
         cross_range_extent_m: Extent of the target in cross range, in metres.
         range_extent_m: Extent of the target in range, in metres.
         velocity_m_s: Radial velocity in m/s that remains after the range window has followed the
-            target and compression has removed the known part. The full velocity gives the error
-            without any such removal.
-        acceleration_m_s2: Radial acceleration in m/s^2 that remains in the same sense.
+            target and range compression has corrected a known velocity. Where neither is done, give
+            the full velocity.
+        acceleration_m_s2: Radial acceleration in m/s^2 that remains after these corrections.
         vibrations: Amplitude in metres and frequency in Hz of each vibration; their effects add up.
         rotation_rad_s: Rotation rate in rad/s; None for that of the radar.
         tolerance_rad: Tolerated phase in rad.
@@ -65,11 +70,11 @@ def inverse_requirements(
         One `Requirement` per simplification: what it neglects, the error and the remedy.
 
     Raises:
-        ValueError: If the rotation rate is not known, or an extent or motion is not finite, or an
-            extent or number of samples is not positive.
+        ValueError: If the rotation rate is not known, a number is not finite, an extent or a number
+            of pulses or samples is not positive, or the frequency of a vibration is negative.
 
     Reference:
-        Ruan et al. 2013, for the effects that it names.
+        Ruan et al. 2013 (some of the effects).
     """
     omega = radar.rotation_rad_s if rotation_rad_s is None else rotation_rad_s
     if omega is None:
@@ -175,8 +180,8 @@ class TurningTarget:
     def between_samples(self, n_range: int) -> tuple[Requirement, ...]:
         """List the largest phase steps between neighbouring pulses and range frequencies.
 
-        They are those of the echoes of the outermost scatterers and of the motion. Steps beyond pi
-        alias.
+        The steps are due to vibration, to the rotation of the outermost scatterers in cross range,
+        and to the extent of the target in range. Steps beyond pi alias.
 
         Args:
             n_range: Number of range samples.

@@ -1,8 +1,8 @@
 """Limits of velocity estimators and errors of simplified echo models for a triangular ladar.
 
-`ladar_limits` lists where the estimators fail, `ladar_requirements` the phase that each
-simplification of the model neglects. Both follow from the radar and from bounds of the motion,
-before any simulation.
+`ladar_limits` lists where the estimators fail. `ladar_requirements` lists the phase that each
+simplification of the model neglects. The two functions need the radar and bounds of the motion, but
+no simulation.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Limit:
         name: Name of the quantity.
         value: Value of the quantity in the scene, in `unit`.
         limit: Limit of the method, in `unit`.
-        unit: Unit of both, empty for pure numbers.
-        beyond: Verdict where the limit is not met, "warn" or "refuse".
+        unit: Unit of `value` and `limit`, empty for pure numbers.
+        beyond: Verdict where the limit is not met: "warn", or "refuse" if the method then fails.
         consequence: Consequence where the limit is not met.
         remedy: Remedy where the limit is not met.
         at_least: True if the value must be at least the limit, False if it must be below.
@@ -83,9 +83,10 @@ def ladar_limits(
 ) -> tuple[Limit, ...]:
     """List the limits of the velocity estimators of a triangular ladar for motion within bounds.
 
-    Limits that need `snr_db` or `spacing_m` are left out where these are None. One row compares the
-    velocity bias by jerk, which is jerk x period^2 / 27: a vibration of 10 um at 5 kHz gives 2 mm/s
-    rms.
+    Limits that need `snr_db` or `spacing_m` are left out where these are None. The bias of each
+    velocity estimate due to jerk, jerk x period^2 / 27, is compared with the standard deviation of
+    the estimate due to noise, or with 1 mm/s where `snr_db` is None. With a period of 16 us, a
+    vibration of 10 um at 5 kHz gives a bias of 2 mm/s rms.
 
     Args:
         radar: Radar of the recording.
@@ -103,7 +104,8 @@ def ladar_limits(
         One row per limit.
 
     Raises:
-        ValueError: If a number is not finite or negative, or `ranges_m` are out of order.
+        ValueError: If a number is not finite, a number other than a range is negative, or
+            `ranges_m` are out of order.
 
     Reference:
         Remote Sens. 2024, 16, 793, for the estimators.
@@ -307,9 +309,9 @@ def ladar_requirements(
 ) -> tuple[Requirement, ...]:
     """List the largest phase that each simplification neglects for a triangular ladar.
 
-    The simplifications are those of the echo model, such as one range per sweep, and of the motion
-    compensation. Ignoring the flight time, and compensating the whole band with the phase of the
-    carrier, are assessed over the whole record.
+    The simplifications are those of the echo model, such as one range per sweep, and those of the
+    motion compensation. Two errors are given for the whole record: that of ignoring the flight
+    time, and that of compensating the whole band with the phase of the carrier.
 
     Args:
         radar: Radar of the recording.
@@ -325,7 +327,8 @@ def ladar_requirements(
         One `Requirement` per simplification: what it neglects, the error and the remedy.
 
     Raises:
-        ValueError: If a number is not finite or negative.
+        ValueError: If `n_period`, the speed, the acceleration or the tolerance is negative or not
+            finite.
     """
     near, far = ranges_m
     _check_finite(

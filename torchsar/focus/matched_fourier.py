@@ -1,19 +1,22 @@
 """Matched Fourier transform: azimuth focusing of a target with non-uniform rotation.
 
-The rotation angle is Om phi(t), with the rotation rate Om at the first pulse (t = 0) and the warped
-time phi(t) of `core.warp.warp`. A scatterer at cross range x in range sample n contributes
+The rotation angle is Om phi(t), with the rotation rate Om at the first pulse (t = 0) and the warp
+phi(t) = t + k1 t^2 / 2! + k2 t^3 / 3! + ... A scatterer at cross range x in range sample n
+contributes
 
     exp(-j c4 x Om phi(t)) exp(+j (c4/2) (y_n + yc) Om^2 phi(t)^2),    c4 = 4 pi / wavelength,
 
-where y_n + yc is its range from the rotation centre. `range_phase` removes the second factor,
+where y_n + yc is its range from the rotation centre. `range_phase` removes the second factor, and
 `matched_fourier` focuses the first by a Fourier transform over phi. From the pulses s(m, n) with
 weights w_m, line q of the image is
 
-    I(q, n) = sum_m w_m s(m, n) exp(+2j pi c_q u_m) / sqrt(pulses),
+    I(q, n) = sum_m w_m s(m, n) exp(+2j pi c_q u_m) / sqrt(pulses).
 
-with u_m = phi(t_m) / phi(T) in [0, 1), T = pulses / PRF and c_q = (q - lines // 2) / oversampling.
-The image axis c_q / T is Doppler at the mean rotation rate; the cross range of line q is
-wavelength c_q / (2 Om phi(T)). The data show only Om^2, so that images may be mirrored in x.
+Here u_m = phi(t_m) / phi(T) is the relative angle of pulse m, from 0 to below 1, T = pulses / PRF
+the aperture time, and c_q = (q - lines // 2) / oversampling the position of line q in Doppler cells
+of 1 / T. The image axis c_q / T is Doppler at the mean rotation rate; the cross range of line q is
+wavelength c_q / (2 Om phi(T)). The data do not show the sign of Om, so that images may be mirrored
+in x.
 
 Reference:
     Remote Sens. 2025, 17, 3447, Eqs. (7)-(10), with the warp of `core.warp`; Greengard and Lee 2004
@@ -94,10 +97,10 @@ def matched_fourier(
 ) -> Tensor:
     """Form the image of a target with non-uniform rotation by a Fourier transform over its angle.
 
-    The rotation angle follows the warp, up to a constant factor. Where the target is deeper in
-    range than the depth of focus, 2 (cross-range resolution)^2 / wavelength, first remove the phase
-    of the range with `range_phase`. Differentiable twice in data, warp and rotation rate, with
-    `CompiledNufft` once.
+    The rotation angle is proportional to the warp. Where the target is deeper in range than the
+    depth of focus, 2 (cross-range resolution)^2 / wavelength, first remove the phase of the range
+    with `range_phase`. Differentiable in the data, the warp and the rotation rate of
+    `CrossRangeLines`: twice, or once with `CompiledNufft`.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
@@ -136,8 +139,7 @@ def matched_fourier(
 class MatchedFourierOperator:
     """Linear map of `matched_fourier` for one warp per trial, with its exact adjoint.
 
-    `compensate.pulse_phase.Through` uses it as image formation. The tables of the transform, which
-    depend on the warp only, are computed once, at construction.
+    The tables of the transform do not depend on the data. They are computed once, at construction.
 
     Args:
         warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
@@ -232,7 +234,8 @@ class RangePhase(Stage):
     """Stage that removes the phase that the range of scatterers adds during the rotation.
 
     Use it before `MatchedFourier`. It applies `range_phase` with the range axis of the signal.
-    Values that a chain connects take precedence over those given here.
+    Values passed to `forward`, such as estimates that a chain connects, take precedence over those
+    given here.
 
     Args:
         radar: Radar of the recording.
@@ -313,8 +316,8 @@ class MatchedFourier(Stage):
     """Stage that forms the image (azimuth, range) of a target with non-uniform rotation.
 
     It applies `matched_fourier`. The azimuth axis is Doppler in Hz at the mean rotation rate, the
-    same for all trials, or cross range in metres where `cross_range_m` is given. Values of `warp_k`
-    and `omega_rad_s` that a chain connects take precedence over those given here.
+    same for all trials, or cross range in metres where `cross_range_m` is given. Values passed to
+    `forward`, such as estimates that a chain connects, take precedence over those given here.
 
     Args:
         radar: Radar of the recording.
@@ -332,7 +335,8 @@ class MatchedFourier(Stage):
         ValueError: If `oversampling` is not positive, `lines` is below 1, or `weight` is not known.
             On use: if the rotation angle does not increase throughout the aperture, if
             `cross_range_m` is given without a rotation rate, or if the outermost line in metres has
-            a Doppler above the pulse rate. From 0.95 of half the pulse rate on, the stage warns.
+            a Doppler above the pulse rate. The stage warns if this Doppler exceeds 0.95 times half
+            the pulse rate.
     """
 
     omega_rad_s: Tensor | None

@@ -1,9 +1,10 @@
 """One-dimensional non-uniform FFT with separate points in every row, and its interpolation kernel.
 
-Type 2 evaluates the spectrum of uniform samples at arbitrary frequencies; type 1, its adjoint, sums
-samples at arbitrary points into uniform frequencies. Both use a twice oversampled FFT grid and a
-Kaiser-Bessel kernel whose width follows from the accuracy `eps`; the kernel is evaluated as one
-small matrix product of polynomials. Differentiable in samples and points.
+Type 2 evaluates the spectrum of uniform samples at arbitrary frequencies, the points. Type 1 is its
+adjoint: it sums values at arbitrary points into uniform samples. Either type uses a twice
+oversampled FFT grid and a Kaiser-Bessel kernel whose width follows from the relative error `eps`.
+The kernel is evaluated as a piecewise polynomial, by one small matrix product. Differentiable in
+samples and points.
 
 Reference:
     Fessler and Sutton 2003 (gridding); Barnett et al. 2019 (kernel as piecewise polynomial).
@@ -170,8 +171,8 @@ class Points:
                 for all trials or (..., m).
             length: Length of the grid.
             dtype: Real type of the weights.
-            shift: Further positions in grid steps, shape (..., m), small enough for the precision
-                of its own dtype.
+            shift: Offsets added to `start`, in grid steps, shape (..., m). They may be float32 if
+                they are small enough for its precision.
 
         Returns:
             Points for `interpolate` and `spread`.
@@ -187,7 +188,7 @@ class Points:
 
 
 def interpolate(grid: Tensor, points: Points) -> Tensor:
-    """Interpolate a periodic grid at points: sum weight * grid[first + tap] over their taps.
+    """Interpolate a periodic grid at points: sum over the taps of weight * grid[first + tap].
 
     Args:
         grid: Grid, shape (..., length), complex.
@@ -244,8 +245,8 @@ class Nufft:
 
     Args:
         n: Number of samples.
-        eps: Relative error, as the root mean square over the points against the direct sum, for
-            white samples; complex64 data reach about 1e-6.
+        eps: Relative error against the direct sum for white samples, as the root mean square over
+            the points. With complex64 data it cannot fall below about 1e-6.
         dtype: Complex type of the data.
         device: Device of the data.
 
@@ -335,13 +336,14 @@ def nufft_type2(x: Tensor, points: Tensor, eps: float = 1e-6) -> Tensor:
 
 
 def nufft_type1(y: Tensor, points: Tensor, n: int, eps: float = 1e-6) -> Tensor:
-    """Sum samples at any points into uniform frequencies, the adjoint of `nufft_type2`.
+    """Sum values at arbitrary points into uniform samples, the adjoint of `nufft_type2`.
 
-    x_j = sum_k y_k exp(+2j pi p_k (j - n//2)), j = 0..n-1. Differentiable in samples and points.
+    The samples are x_j = sum_k y_k exp(+2j pi p_k (j - n//2)), j = 0..n-1. Differentiable in values
+    and points.
 
     Args:
-        y: Values at the points, shape (..., m), complex.
-        points: Points p in cycles per sample, float64 (..., m).
+        y: Values y_k at the points p_k, shape (..., m), complex.
+        points: Points p_k in cycles per sample, float64 (..., m).
         n: Number of uniform samples.
         eps: Relative error.
 

@@ -1,17 +1,17 @@
 """Wavenumber (omega-K) focusing of stripmap data.
 
 The image shows a target at the slow time t and the slant range R at which a chosen line of sight
-crosses it. The line of sight is given by its Doppler frequency, the frame Doppler f_frame: usually
-that of the beam centre, or 0 Hz for the classical zero-Doppler image. At range frequency f,
-relative to the carrier f0, and Doppler frequency f_a the echo has the spectrum (stationary phase)
+crosses it. The line of sight is given by its Doppler frequency f_frame (`frame_hz`): usually that
+of the beam centre, or 0 Hz for the classical zero-Doppler image. At the Doppler frequency f_a and
+the range frequency f, relative to the carrier f0, the echo has the spectrum (stationary phase)
 
     exp(-j 2 pi [2 R G(f, X) / c + f_a t]),    X = c f_a / (2 v),
     G = cos(s) sqrt((f0 + f)^2 - X^2) + sin(s) X,
 
 where v is the effective velocity and s the squint of the line of sight, sin(s) = lambda f_frame /
-(2 v). The mapping to G rotates the plane of wave numbers by s: at the frame Doppler and the carrier
-G = f0, with the slope 1 over f and 0 over f_a. Images therefore keep the range and azimuth axes of
-the raw matrix, and their spectra stay centred at any squint.
+(2 v). For f_frame = 0, G is the usual square root; otherwise the plane of wave numbers is rotated
+by s. At f = 0 and f_a = f_frame this gives G = f0, dG/df = 1 and dG/df_a = 0. Images therefore keep
+the range and azimuth axes of the raw matrix, and their spectra stay centred at any squint.
 
 Reference:
     Tsvetkov 2017, focusing steps 1 to 6 after Eq. (2).
@@ -163,8 +163,8 @@ class FrameGeometry:
             velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
                 radar.
             frame_hz: Doppler frequency in Hz of the line of sight that defines the image
-                coordinates; None for the nominal pointing of the radar, or the centroid where it
-                has none.
+                coordinates, 0 for a zero-Doppler image; None for the nominal pointing of the radar,
+                or for the centroid where the radar has none.
             device: Device of the result; None for that of the data.
             band_hz: Processed Doppler bandwidth in Hz; None for the whole PRF.
 
@@ -172,9 +172,10 @@ class FrameGeometry:
             Geometry of all Doppler rows.
 
         Raises:
-            ValueError: If the Doppler or the velocity is neither a number nor a tensor of the
-                leading dims of the data, the velocity is not positive, or a Doppler exceeds 2
-                velocity / wavelength.
+            ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the
+                shape of the leading dims of the data, the velocity is not positive, the magnitude
+                of `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, or `band_hz` is
+                not positive.
         """
         device = raw.device if device is None else device
         centroid = torch.as_tensor(doppler_hz, dtype=torch.float64, device=device)
@@ -222,7 +223,7 @@ class FrameGeometry:
 
     @property
     def requires_grad(self) -> bool:
-        """True if Doppler, velocity or frame Doppler require gradients."""
+        """True if `doppler_hz`, `velocity_m_s` or `frame_hz` requires gradients."""
         return any(value.requires_grad for value in (self.doppler_hz, self.velocity_m_s, self.frame_hz))
 
     def mapped(self, frequency_hz: Tensor) -> Tensor:
@@ -258,11 +259,11 @@ def _check_squint(radar: StripmapRadar, velocity_m_s: Tensor, *doppler_hz: Tenso
 
 
 def residual_frequency(at: FrameGeometry, offset_hz: Tensor) -> Tensor:
-    """Compute the frequency shift of Stolt mapping that remains after bulk filter and refocusing.
+    """Compute the part of the Stolt frequency shift that `bulk_filter` and `refocus` leave.
 
     The range frequency h of the image belongs to the range frequency f of the raw data at which
-    G(f) = G(0) + h, with the mapping G of `wavenumber`. Bulk filter and refocusing act as if f were
-    h, so that the shift f - h remains.
+    G(f) = G(0) + h, with the mapping G of `wavenumber`. `bulk_filter` and `refocus` treat f and h
+    as equal, so that the shift f - h remains.
 
     Args:
         at: Geometry of the Doppler rows.
@@ -407,8 +408,9 @@ def omega_k(
     The bulk filter is exact in the middle of the swath; refocusing corrects the azimuth phase at
     all other ranges. The change of range migration over the swath is neglected: `requirements`
     predicts the error, and `omega_k_stolt` avoids it. A focused target at slant range R has the
-    phase -4 pi R / lambda. Differentiable in the raw data, the velocity and the frame Doppler.
-    Where no gradients are needed, Doppler rows are processed in blocks inside one copy of the data.
+    phase -4 pi R / lambda. Differentiable in the raw data, the velocity and `frame_hz`. Where no
+    gradients are required, memory is saved: Doppler rows are processed in blocks that overwrite one
+    copy of the data.
 
     Args:
         raw: Raw or range-compressed data, shape (..., pulse, range), complex.
@@ -417,8 +419,9 @@ def omega_k(
             a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
-            None for the nominal pointing of the radar, or the centroid where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
+            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
+            centroid where the radar has none.
         reference: Spectrum of the range compression filter, shape (range,); None for
             range-compressed data.
         band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF.
@@ -427,9 +430,10 @@ def omega_k(
         Image, shape (..., azimuth, range), complex.
 
     Raises:
-        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
-            dims of the data, the velocity is not positive, a Doppler exceeds 2 velocity /
-            wavelength, or `band_hz` is not positive.
+        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
+            of the leading dims of the data, the velocity is not positive, the magnitude of
+            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, or `band_hz` is not
+            positive.
 
     Reference:
         Tsvetkov 2017, focusing steps 1 to 5 after Eq. (2).
@@ -452,15 +456,15 @@ def through_doppler(
 ) -> Tensor:
     """Apply a function to the rows of the two-dimensional spectrum, then an inverse azimuth FFT.
 
-    Where gradients are required all rows are processed at once; otherwise blocks of rows are
-    processed inside one copy of the data.
+    Where gradients are required, all rows are processed at once. Otherwise memory is saved: rows
+    are processed in blocks that overwrite one copy of the data.
 
     Args:
         raw: Raw data, shape (..., pulse, range), complex.
         focus_rows: Maps rows (..., d, range frequency) and their slice of the Doppler axis to (...,
             d, range).
         differentiable: Whether gradients are required.
-        block_bytes: Size of a block in bytes; None for the cache of the device.
+        block_bytes: Size of a block in bytes; None for a size that suits the device.
 
     Returns:
         Image, same shape as the data.
@@ -483,7 +487,7 @@ class Focuser(Stage):
 
     The image shows a target where a chosen line of sight crosses it: azimuth follows from the slow
     time of the crossing, range is the slant range there. `frame_hz` is the Doppler frequency of
-    that line of sight. Values of `velocity_m_s` and `doppler_hz` that a chain connects take
+    that line of sight. Values passed to `forward`, such as estimates that a chain connects, take
     precedence over those given here. A subclass sets `form`, the function that focuses.
 
     Args:
@@ -495,7 +499,7 @@ class Focuser(Stage):
         doppler_hz: Absolute Doppler centroid in Hz: a number, a tensor per trial, or an
             nn.Parameter; None for the nominal pointing of the radar, or 0 where it has none.
         frame_hz: Doppler frequency of that line of sight in Hz, 0 for a zero-Doppler image; None
-            for the nominal pointing of the radar, or the centroid where it has none.
+            for the nominal pointing of the radar, or for the centroid where the radar has none.
         band_hz: Processed Doppler bandwidth in Hz; None for the whole PRF.
 
     Raises:
@@ -553,8 +557,8 @@ class Focuser(Stage):
             Image with axes (azimuth, range).
 
         Raises:
-            ValueError: If the function that focuses refuses the Doppler, the velocity or the
-                processed band, see `omega_k`.
+            ValueError: If a Doppler frequency, the velocity or the processed band is not valid, see
+                `omega_k`.
         """
         data = type(self).form(
             signal.data,

@@ -35,7 +35,8 @@ class SmoothBand:
         """Return the weight of each pulse at each pixel, in the shape of `doppler_offset_hz`.
 
         Args:
-            since_s: Slow time since the beam centre crossed the pixel, in seconds; not used.
+            since_s: Slow time in seconds since the line of sight that defines the image
+                coordinates crossed the pixel; not used.
             doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
         """
         outer = ((doppler_offset_hz.abs() - 3 * self.width_hz / 8) / (self.width_hz / 8)).clamp(0, 1)
@@ -63,14 +64,17 @@ class PointPatches:
         doppler_hz: Tensor,
         velocity_m_s: Tensor,
     ) -> PointPatches:
-        """Place a patch where a focused image shows each of some point targets.
+        """Place one patch about each point target, at its position in a focused image.
+
+        A patch that would extend beyond the first or last line is moved inside the image.
 
         Args:
             radar: Radar of the recording.
             size: Lines and samples of the recording.
             zero_doppler_s: Times of closest approach in seconds, shape (point,).
             closest_range_m: Closest ranges in metres, shape (point,).
-            doppler_hz: Doppler centroid in Hz.
+            doppler_hz: Doppler centroid in Hz; it defines the image coordinates where the radar has
+                no nominal pointing.
             velocity_m_s: Effective velocity in m/s.
 
         Returns:

@@ -246,13 +246,13 @@ class PolarOperator:
 
         Raises:
             TypeError: If the dtype is not that of the operator.
-            ValueError: If the size is not that of the image.
+            ValueError: If the image does not have the size of the axes of the operator.
         """
         self._check_dtype(image)
         if tuple(image.shape[-2:]) != (self.azimuth.n, self.range.n):
             raise ValueError(
                 f"image of shape {tuple(image.shape)} does not end in the (azimuth, range) = "
-                f"({self.azimuth.n}, {self.range.n}) of the operator"
+                f"({self.azimuth.n}, {self.range.n}) sizes of the operator"
             )
         return self._by_trials(self._adjoint, image)
 

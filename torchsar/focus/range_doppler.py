@@ -55,8 +55,9 @@ def range_doppler(
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
-            None for the nominal pointing of the radar, or the centroid where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
+            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
+            centroid where the radar has none.
         reference: Spectrum of the range compression filter, shape (range,); None for
             range-compressed data.
         band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF.
@@ -66,9 +67,10 @@ def range_doppler(
         Image, shape (..., azimuth, range), complex, with coordinates and phases as in `omega_k`.
 
     Raises:
-        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
-            dims of the data, the velocity is not positive, a Doppler exceeds 2 velocity /
-            wavelength, or `band_hz` is not positive.
+        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
+            of the leading dims of the data, the velocity is not positive, the magnitude of
+            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, or `band_hz` is not
+            positive.
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre, real = raw.shape[-1], raw.shape[-1] // 2, real_dtype(raw.dtype)

@@ -28,9 +28,9 @@ class Requirement:
         range_cells: Neglected shift in range cells; nan where no shift is neglected.
         tolerance_rad: Tolerated phase in rad.
         remedy: Remedy where the simplification is not permissible.
-        error_db: Error in dB of the response of a point where the neglected phase is largest: its
-            relative error, see `phase_error_db`, or the loss of its peak; nan where neither is
-            predicted.
+        error_db: Predicted error in dB of the image of a point for which the neglected phase is
+            largest: the relative error of `phase_error_db`, or the loss of the peak; nan where no
+            error is predicted.
         tolerance_db: Largest permissible `error_db` in dB.
     """
 
@@ -47,7 +47,8 @@ class Requirement:
     def ok(self) -> bool:
         """True where the simplification is permissible.
 
-        The error `error_db` of the response decides where it is predicted, otherwise the phase.
+        If `error_db` is predicted, it must not exceed `tolerance_db`. Otherwise `phase_rad` must
+        not exceed `tolerance_rad`.
         """
         if math.isnan(self.error_db):
             return self.phase_rad <= self.tolerance_rad
@@ -62,7 +63,7 @@ class Requirement:
 def phase_error_db(phase_rad: Tensor) -> float:
     """Relative error of a response with a neglected phase: mean |exp(j phi) - 1|^2 in dB.
 
-    A quadratic phase that reaches pi / 4 at the ends of an aperture gives -11 dB, or -12.6 dB if
+    A quadratic phase that reaches pi / 4 at the ends of an aperture gives -9.2 dB, or -12.7 dB if
     its mean is removed.
 
     Args:
@@ -194,23 +195,25 @@ def requirements(
 ) -> tuple[Requirement, ...]:
     """List the largest phase that each simplification of a focuser neglects in a stripmap scene.
 
-    A shift by a quarter of a range resolution cell is a phase of pi/4 at the ends of the range
-    band, so that tolerances in cells and in phase agree. Warns where the PRF is below the Doppler
-    band of a target.
+    A range shift is also given as its phase at the ends of the range band; a quarter of a range
+    resolution cell is a phase of pi/4. Warns where the PRF is below the Doppler band of a target.
 
     Args:
         radar: Radar of the recording.
         axes: Axes of the raw matrix, (pulse, range).
-        doppler_hz: Absolute Doppler centroid in Hz; None for the nominal pointing or 0.
+        doppler_hz: Absolute Doppler centroid in Hz; None for the nominal pointing of the radar, or
+            0 where it has none.
         velocity_m_s: Effective velocity in m/s; None for that of the radar.
         integration_s: Integration time of a target in seconds; None for that of the radar, or where
             it has none, the time in which the Doppler of a target sweeps one PRF.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
-            None for the nominal pointing of the radar, or the centroid where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
+            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
+            centroid where the radar has none.
         tolerance_rad: Tolerated phase in rad.
         velocity_error_m_s: Error of the effective velocity in m/s that the row "velocity wrong by"
             assumes.
-        tolerance_db: Tolerated relative error of a response, for rows that predict one.
+        tolerance_db: Tolerated relative error in dB of the image of a point, for simplifications
+            whose error is predicted.
 
     Returns:
         One `Requirement` per simplification: what it neglects, the error and the remedy.

@@ -1,6 +1,7 @@
 """Limits of estimating a non-uniform rotation, and the phase that simplified processing neglects.
 
-Both are computed from radar, rotation and scatterers of a target, before any simulation.
+Limits and phases are computed from the radar, the rotation and the scatterers of a target, without
+a simulation.
 """
 
 from __future__ import annotations
@@ -213,14 +214,17 @@ def rotation_requirements(
     The rotation angle is omega_rad_s phi(t), with the warp phi(t) = t + k1 t^2 / 2! + ... The
     simplifications are:
 
-    - a warp cut to order 1, 2, 3 or 4, which neglects its Legendre terms of higher order. It is
-      permissible where the relative error of the response is small;
-    - azimuth only, which neglects the phase of the range y from the rotation centre,
-      2 pi y (omega_rad_s phi)^2 / wavelength, apart from a line in phi. It is permissible up to
-      `tolerance_rad`; pi/4 is reached at y = 2 (cross-range resolution)^2 / wavelength;
-    - fixed envelopes, which neglect migration through range cells, a phase at the ends of the range
-      band. It is permissible where the relative error of the response is small;
-    - small angles and ranges in float32, permissible up to `tolerance_rad`.
+    - "warp of order" 1 to 4: the Legendre terms of the warp above this order in time are neglected;
+    - "azimuth only": the phase due to the range y from the rotation centre is neglected,
+      2 pi y (omega_rad_s phi)^2 / wavelength. Its part linear in phi only shifts the image and is
+      not counted. The rest reaches pi/4 at y = 2 (cross-range resolution)^2 / wavelength;
+    - "fixed envelopes": migration through range cells is neglected, given as its phase at the ends
+      of the range band;
+    - "small angles": sine and cosine are replaced by their first terms;
+    - "range in float32": absolute ranges are rounded to float32.
+
+    A warp of some order and fixed envelopes are permissible where the predicted error of the image
+    of a point is at most -20 dB, the other simplifications up to the phase `tolerance_rad`.
 
     Args:
         radar: Radar of the recording.
@@ -332,8 +336,8 @@ def order_loss_db(
 ) -> float:
     """Compute the loss of the peak of a scatterer by a rotation model of too low an order.
 
-    The rotation angle is omega_rad_s (t + k1 t^2 / 2! + ...). The model keeps its Legendre terms up
-    to an order; the phase of the other terms defocuses the scatterer.
+    The rotation angle is omega_rad_s (t + k1 t^2 / 2! + ...). The model keeps the Legendre terms of
+    this angle up to `order`; the phase of the other terms defocuses the scatterer.
 
     Args:
         k: Coefficients k1, k2, ... in 1/s, 1/s^2, ..., shape (coefficient,).
@@ -344,7 +348,7 @@ def order_loss_db(
         wavelength_m: Wavelength in metres.
 
     Returns:
-        Loss in dB; 0 where the rotation has no higher orders.
+        Loss in dB; 0 where the angle has no terms above `order`.
     """
     across = 4 * math.pi / wavelength_m * cross_range_m * omega_rad_s
     return peak_loss_db(across * _legendre_left(k, duration_s)[order - 1])

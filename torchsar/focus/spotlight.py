@@ -68,7 +68,7 @@ def refuse_other_size(profiles: Tensor, geometry: FarField | Spotlight) -> None:
     if tuple(profiles.shape[-2:]) != expected:
         raise ValueError(
             f"profiles of shape {tuple(profiles.shape)} do not end in the (pulse, frequency) = "
-            f"{expected} of the geometry; crop both to the same samples"
+            f"{expected} sizes of the geometry; crop profiles and geometry to the same samples"
         )
 
 
@@ -208,7 +208,7 @@ class GroundImager(Stage):
     """Base class of the stages that form an image of the ground plane from range profiles.
 
     The image has the axes ("azimuth", "range"). One geometry is used for all trials. Where the
-    geometry is not known in advance, connect recorded side data:
+    geometry is not known in advance, a chain connects the side data of the recording:
 
         use(PolarFormat(100.0, 0.25), frequency_hz="aux.frequency_hz",
             position_m="aux.position_m", reference_m="aux.reference_m")

@@ -74,8 +74,8 @@ def omega_k_stolt(
     """Focus by omega-K with Stolt interpolation.
 
     The image of a target is exact at every range. Coordinates and phases are those of `omega_k`,
-    and for narrow swaths both images agree. The computation takes two to three times as long as
-    `omega_k`. Differentiable in the raw data, the velocity and the frame Doppler.
+    and for narrow swaths the two functions give the same image. The computation takes two to three
+    times as long as `omega_k`. Differentiable in the raw data, the velocity and `frame_hz`.
 
     Args:
         raw: Raw or range-compressed data, shape (..., pulse, range), complex.
@@ -83,8 +83,9 @@ def omega_k_stolt(
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
-            None for the nominal pointing of the radar, or the centroid where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
+            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
+            centroid where the radar has none.
         reference: Spectrum of the range compression filter, shape (range,); None for
             range-compressed data.
         band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF.
@@ -95,9 +96,10 @@ def omega_k_stolt(
         Image, shape (..., azimuth, range), complex.
 
     Raises:
-        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
-            dims of the data, the velocity is not positive, a Doppler exceeds 2 velocity /
-            wavelength, or `band_hz` is not positive.
+        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
+            of the leading dims of the data, the velocity is not positive, the magnitude of
+            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, or `band_hz` is not
+            positive.
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2

@@ -1,10 +1,11 @@
 """Focusing of strips longer than memory, by overlapping azimuth blocks.
 
-A focused line is a convolution of raw lines with the azimuth filter, which occupies (processed
-band) / (Doppler rate) seconds and has tails beyond. Blocks overlap by that length and by a guard
-that keeps the energy of the cut tails below a tolerance; except for those tails the blocks equal
-one transform of the whole strip. Focusers with a processed band (`band_hz`) have short tails. Those
-that use the whole PRF have long ones, because their filter is discontinuous where the band wraps.
+A focused line is a convolution of raw lines with the azimuth filter. The filter occupies (processed
+band) / (Doppler rate) seconds and has tails beyond. Blocks overlap by this length and by a guard.
+The guard is so long that the energy of the tails beyond it, which are cut off, is below a
+tolerance. Apart from these tails, the blocks equal one transform of the whole strip. The filter of
+a focuser with a processed band (`band_hz`) has short tails. A filter for the whole PRF has long
+tails, because it is discontinuous where the PRF band wraps.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class StripPlan:
         n_lines: Number of lines of the strip.
         height: Raw lines read per block.
         reach: First and last raw line that contribute to an image line, relative to it.
-        bytes: Memory of the samples of a block in bytes.
+        bytes: Memory in bytes for the samples of the three arrays that `plan_strip` describes.
     """
 
     n_lines: int
@@ -72,9 +73,9 @@ class StripPlan:
 def filter_tail(guard_lines: float) -> float:
     """Compute the part of the energy of an azimuth filter beyond its aperture and a guard.
 
-    The filter uses the whole PRF, and its phase jumps where the PRF band wraps. At g lines from the
-    ends of the aperture, a jump that changes the filter by 2 gives a tail |h| = 1 / (pi g); over
-    all jumps the mean energy is half of that.
+    The filter uses the whole PRF, and its phase jumps where the PRF band wraps. The largest jump,
+    by pi, gives a tail of magnitude 1 / (pi g) at g lines from the ends of the aperture. The mean
+    energy over jumps of all phases, which is returned, is half of that of the largest.
 
     Args:
         guard_lines: Distance g from the ends of the aperture in lines.
@@ -163,7 +164,7 @@ def plan_strip(shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int
         Plan of the blocks.
 
     Raises:
-        ValueError: If the memory does not hold blocks of 9/8 of the lines by which blocks overlap;
+        ValueError: If the memory holds fewer lines per block than 9/8 of the overlap of the blocks;
             the message names the least memory.
     """
     n_lines = shape[-2]
@@ -176,8 +177,8 @@ def plan_strip(shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int
     if height < least:
         raise ValueError(
             f"memory_bytes must hold blocks of at least {least} lines, since blocks overlap by {overlap} lines, got "
-            f"{memory_bytes / 1e9:.3g} GB for {height} lines; allow at least {least * line_bytes / 1e9:.3g} GB, or "
-            "process a narrower Doppler band"
+            f"{memory_bytes / 1e9:.3g} GB, which hold {height} lines; allow at least {least * line_bytes / 1e9:.3g} "
+            "GB, or process a narrower Doppler band"
         )
     height = max((h for h in range(max(least, height // 2), height + 1) if smooth_length(h) == h), default=height)
     return StripPlan(n_lines, height, reach, height * line_bytes)
@@ -200,18 +201,19 @@ def focus_strip(
 
     Args:
         source: Raw lines, shape (..., line, sample), read by blocks.
-        focus: Focusing stage or chain that keeps the size of the matrix, called as focus(signal,
-            **values(lines)).
+        focus: Focusing stage or chain that keeps the size of the matrix. It is called for each
+            block as focus(signal, **values(lines)), where `lines` is the slice of its raw lines.
         radar: Radar of the recording.
         plan: Division of the strip into blocks, from `plan_strip`.
         axes: Axes of the raw matrix; None for those of the radar.
-        values: Values that change along the strip, such as {"doppler_hz": ..., "velocity_m_s":
-            ...}, for the raw lines of a block. The radar should then have a nominal pointing, which
-            gives all blocks the same frame.
+        values: Function of a slice of raw lines that returns the values that change along the
+            strip, such as {"doppler_hz": ..., "velocity_m_s": ...}; None where there are none. If
+            the Doppler changes, the radar should have a nominal pointing, so that all blocks have
+            the same image coordinates.
         device: Device for the computation.
 
     Yields:
-        Image lines and their image; the images tile the strip.
+        The slice of image lines of each block and their image; the images tile the strip.
 
     Raises:
         ValueError: If the source has another number of lines than the plan.

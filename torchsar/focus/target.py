@@ -85,7 +85,7 @@ class TargetImage(Stage):
         if profiles.shape[-2:] != want:
             raise ValueError(
                 f"profiles of shape {tuple(profiles.shape)} do not end in the (pulse, frequency) = "
-                f"{want} of the geometry; crop both to the same samples"
+                f"{want} sizes of the geometry; crop profiles and geometry to the same samples"
             )
 
     def _axes(self, waves: FarField, profiles: Tensor) -> tuple[Axis, Axis]:

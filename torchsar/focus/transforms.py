@@ -1,7 +1,7 @@
 """Ways in which the matched Fourier transform can compute its sum over pulses.
 
-Each is a frozen object that holds its accuracy settings and builds the corresponding sum of
-`focus.warped_sums` for given pulses and image lines.
+Each way is an object that holds its settings. Its method `build` makes the linear map from given
+pulses to image lines.
 
 Reference:
     Fessler and Sutton 2003 (gridding); Remote Sens. 2025, 17, 3447, Eqs. (9)-(10).
