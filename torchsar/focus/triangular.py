@@ -25,8 +25,9 @@ _EPOCH = {"up": 0.25, "down": 0.75}
 def video_filter(frequency_hz: Tensor, radar: TriangularLadar, ramp: Ramp = "up") -> Tensor:
     """Compute the filter that removes the residual video phase.
 
-    It is exp(+j pi f^2 / K) over beat frequency f for the up-sweep, with the chirp rate K, and its
-    conjugate for the down-sweep.
+    For the up-sweep it is exp(+j pi f^2 / K) over beat frequency f, with the chirp rate K. For the
+    down-sweep it is the conjugate. The sign is that for sweeps dechirped as local oscillator times
+    conjugate echo.
 
     Args:
         frequency_hz: Beat frequencies f in Hz.
@@ -37,7 +38,8 @@ def video_filter(frequency_hz: Tensor, radar: TriangularLadar, ramp: Ramp = "up"
         Filter, same shape, complex128.
 
     Reference:
-        Remote Sens. 2024, 16, 793, Eq. (5), whose printed sign belongs to the conjugate convention.
+        Remote Sens. 2024, 16, 793, Eq. (5). Its printed sign holds for the conjugate signal, echo
+        times conjugate local oscillator.
     """
     turns = frequency_hz.square() / (2 * radar.chirp_rate_hz_s)
     return unit_phasor(turns if ramp == "up" else -turns, torch.complex128)
@@ -47,20 +49,21 @@ def compress_sweeps(sweeps: Tensor, radar: TriangularLadar, ramp: Ramp = "up", v
     """Compress the up-sweeps or the down-sweeps into range profiles.
 
     A scatterer of amplitude a, RD metres beyond the reference range of the radar in the middle of
-    the sweep, has a peak of modulus a and phase +4 pi RD / lambda. This is the sign of the
-    Reference, for either dechirp sign of the radar. Compensate motion in the sweeps before the
-    residual video phase is removed. Differentiable.
+    the sweep, has a peak of modulus a and phase +4 pi RD / lambda. The phase has this sign whatever
+    `radar.dechirp_sign` is: sweeps with the sign "echo_conj_lo" are conjugated first. Motion within
+    a sweep must be compensated before the residual video phase is removed. Differentiable.
 
     Args:
         sweeps: Dechirped sweeps with N samples each, shape (..., 2, pulse, N), up before down,
-            complex, in the sign `radar.dechirp_sign`.
+            complex. The sign of their phase is `radar.dechirp_sign`.
         radar: Radar of the recording.
         ramp: "up" or "down".
-        video: Remove the residual video phase, for the up-sweep -pi K dtau^2 with the chirp rate K
-            and the delay dtau of the scatterer relative to the reference range.
+        video: Whether to remove the residual video phase. For the up-sweep it is -pi K dtau^2, with
+            the chirp rate K and the delay dtau of the scatterer relative to the reference range.
 
     Returns:
-        Range profiles, shape (..., pulse, N), with relative range rising from -(N // 2) cells.
+        Range profiles, shape (..., pulse, N). Relative range rises from -(N // 2) cells; it is zero
+        at cell N // 2.
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -200,11 +203,12 @@ def azimuth_matched_filter(
         radar: Radar of the recording.
         pulse: Slow time of the samples, zero at broadside.
         range_: Range relative to the reference range of the radar.
-        beam_rad: Angle of the aperture in rad: it is beam_rad * R long about every x. None for the
-            beam of the radar, or the whole record where the radar has no beam.
+        beam_rad: Angle in rad that sets the length of the aperture, beam_rad * R, centred on every
+            azimuth x. None for `radar.beam_rad`; if that is None too, the whole record is used for
+            every x.
         weighting: Coefficient a of the weights 1 - a + a cos(2 pi y / L) at the distance y from the
-            middle of an aperture of length L. They lower the first side lobes (0: -13.27 dB; 0.03:
-            -13.9 dB and 1 % wider; 0.46: Hamming).
+            middle of an aperture of length L. They lower the first side lobes (a = 0: -13.27 dB;
+            0.03: -13.9 dB, main lobe 1 % wider; 0.46: Hamming weights).
 
     Returns:
         Image, shape (..., azimuth, range), complex.
@@ -271,7 +275,7 @@ class CompressSweeps(Stage):
     Args:
         radar: Radar of the recording.
         ramp: "up" or "down".
-        video: Remove the residual video phase.
+        video: Whether to remove the residual video phase.
         window_m: Least and greatest range to keep in metres, relative to the reference range of the
             radar; None for all ranges.
 

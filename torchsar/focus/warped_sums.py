@@ -1,7 +1,13 @@
-"""The sum over pulses of the matched Fourier transform, computed in four ways, and its adjoint.
+"""Four ways to compute the sum over pulses of the matched Fourier transform, and its adjoint.
 
-The sum maps pulses to image lines. It is computed by gridding, directly, by resampling, or by a
-compiled library, as chosen by an object of `focus.transforms`.
+The transform images a target that rotates non-uniformly. From pulses s_p it forms the image lines
+
+    I_l = scale * sum_p s_p exp(+j 2 pi l x_p),    l = -(lines // 2), -(lines // 2) + 1, ...
+
+where x_p is the phase step of pulse p from one line to the next in cycles. It is proportional to
+the rotation angle at pulse p. `Explicit` evaluates the sum directly. `Gridded` and `Compiled` use a
+non-uniform FFT. `Resampled` interpolates the pulses to equal steps of rotation angle and uses an
+FFT. The settings of these methods are held by the classes of `focus.transforms`.
 
 Reference:
     Remote Sens. 2025, 17, 3447, Eq. (9); Greengard and Lee 2004 (non-uniform FFT), see
@@ -42,8 +48,9 @@ def slow_times(n_pulse: int, prf_hz: float, device: torch.device | str | None = 
 def normalised_warp(k: Tensor, n_pulse: int, prf_hz: float) -> tuple[Tensor, Tensor]:
     """Compute the normalised warp u = phi(t) / phi(T) and its rate du/d(t/T) at the pulses.
 
-    The warp phi(t) is the rotation angle over the rotation rate at the first pulse, T the aperture
-    time. The rate is 1 for uniform rotation. Differentiable.
+    The warp phi(t) is the rotation angle divided by the rotation rate at the first pulse, and T is
+    the aperture time n_pulse / prf_hz. The rate du/d(t/T) is 1 for uniform rotation.
+    Differentiable.
 
     Args:
         k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
@@ -61,7 +68,9 @@ def normalised_warp(k: Tensor, n_pulse: int, prf_hz: float) -> tuple[Tensor, Ten
 
 
 def whole_warp(k: Tensor, duration_s: float) -> Tensor:
-    """Compute phi(T): the rotation angle of the whole aperture over the rate at the first pulse.
+    """Compute the warped time phi(T) at the end of an aperture of duration T.
+
+    It is the rotation angle of the whole aperture divided by the rotation rate at the first pulse.
 
     Args:
         k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
@@ -75,7 +84,7 @@ def whole_warp(k: Tensor, duration_s: float) -> Tensor:
 
 
 class Sum(Protocol):
-    """Linear map from pulses to image lines with its adjoint: the sum of a Fourier transform."""
+    """Linear map from pulses to image lines by a Fourier sum over pulses, with its adjoint."""
 
     def forward(self, pulses: Tensor) -> Tensor:
         """Transform pulses into image lines.
@@ -101,13 +110,15 @@ class Sum(Protocol):
 
 
 class Gridded:
-    """Sum over pulses by a non-uniform FFT with gridding, see `focus.gridding`.
+    """Image lines as Fourier sums over pulses, by a non-uniform FFT with gridding.
+
+    See `focus.gridding`.
 
     Args:
         points: Phase step of each pulse from one image line to the next in cycles, shape (...,
             pulse), float64.
         lines: Number of image lines.
-        kernel: Interpolation kernel.
+        kernel: Gridding kernel.
         dtype: Complex type of the data.
         scale: Factor on the sum.
     """
@@ -140,7 +151,7 @@ class Gridded:
 
 
 class Explicit:
-    """Sum over pulses by direct evaluation, in blocks of image lines.
+    """Image lines as Fourier sums over pulses, evaluated directly in blocks of lines.
 
     Args:
         points: Phase step of each pulse from one image line to the next in cycles, shape (...,
@@ -187,17 +198,19 @@ class Explicit:
 
 
 class Resampled:
-    """Sum over pulses by interpolation to equal steps of rotation angle, followed by an FFT.
+    """Image lines as Fourier sums over pulses, by interpolation of the pulses and an FFT.
 
-    The FFT weights equal steps of angle equally, the sum over pulses equal steps of time. Pulses
-    are therefore divided by the relative rotation rate.
+    The pulses are interpolated to equal steps of rotation angle. An FFT of them gives equal weight
+    to equal steps of angle, but the sum over pulses gives equal weight to equal steps of time. The
+    interpolated pulses are therefore divided by the rotation rate relative to its mean.
 
     Args:
         k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
             ..., shape (..., order - 1), float64.
         n_pulse: Number of pulses.
         prf_hz: Pulse rate in Hz.
-        step: Step between image lines in Doppler cells, 1 / aperture time, shape (...,), float64.
+        step: Step between image lines in Doppler cells, shape (...,), float64. A Doppler cell is
+            the inverse of the aperture time.
         lines: Number of image lines.
         interpolation: "linear" or "spline".
         scale: Factor on the sum.
@@ -251,9 +264,9 @@ class Resampled:
 def times_of_even_angle(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
     """Compute the times at which the rotation angle has grown by equal steps.
 
-    At time j the warp, which is the angle over the rate at the first pulse, is j / n_pulse of its
-    value over the whole aperture, j = 0..n_pulse - 1. Differentiable twice: the last two Newton
-    steps carry gradients.
+    From the first pulse to time j the target turns by j / n_pulse of the rotation angle of the
+    whole aperture, j = 0..n_pulse - 1. The times are found by Newton steps. Differentiable twice,
+    since the last two steps carry gradients.
 
     Args:
         k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
@@ -316,15 +329,16 @@ def _pulses_at(pulses: Tensor, index: Tensor) -> Tensor:
 
 
 class Compiled:
-    """Sum over pulses by the compiled library finufft, in float64 for data of any precision.
+    """Image lines as Fourier sums over pulses, by the compiled library finufft in float64.
 
-    In single precision the library rounds points far from zero by a thousandth of a Doppler cell.
+    Data of any precision are transformed in float64. In single precision the library would round
+    points far from zero by a thousandth of a Doppler cell.
 
     Args:
         points: Phase step of each pulse from one image line to the next in cycles, shape (...,
             pulse), float64.
         lines: Number of image lines.
-        eps: Relative error.
+        eps: Relative error of the image lines.
         scale: Factor on the sum.
 
     Raises:

@@ -48,12 +48,15 @@ def read_inverse(path: str | Path, dtype: torch.dtype = torch.complex64) -> Reco
 
     Returns:
         Recording of range profiles with the axes (pulse, range) and an InverseRadar. Range is zero
-        at cell n // 2, the scene centre. For turntable and spotlight data the profiles are the
-        centred unitary transform of the frequency samples, which `radar.frequency_samples` inverts,
-        and `aux` holds, in float64, `frequency_hz` (range,) in Hz with `angle_rad` (pulse,), or
-        with `position_m` (pulse, 3) and `reference_m` (pulse,): the inputs of `PolarFormat` and
-        `SpotlightBackprojection`. `radar.rotation_rad_s` is the mean rotation rate of the line of
-        sight, None for a target in flight.
+        at cell n // 2, the scene centre. The field `rotation_rad_s` of the radar is the mean
+        rotation rate of the line of sight in rad/s. It is None for a target in flight, or if the
+        line of sight does not turn.
+
+        Profiles of turntable and spotlight data are the centred unitary inverse FFT of the
+        frequency samples; the function `torchsar.radar.frequency_samples` restores the samples.
+        `aux` then holds float64 tensors, the inputs of `PolarFormat` and `SpotlightBackprojection`.
+        For a turntable they are `frequency_hz` (range,) and `angle_rad` (pulse,); for spotlight
+        data `frequency_hz`, `position_m` (pulse, 3) and `reference_m` (pulse,).
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -144,7 +147,7 @@ def _spotlight_radar(
     if not bool((reference > 0).all() and (torch.linalg.vector_norm(position, dim=-1) > 0).all()):
         raise ValueError(
             f"{path}: r0_m must be positive and the antenna must not be at the scene centre, "
-            f"got r0_m down to {float(reference.min()):g}"
+            f"got a least r0_m of {float(reference.min()):g}"
         )
     aux = {"frequency_hz": frequency, "position_m": position, "reference_m": reference}
     return _radar(arrays, frequency, shape, _turn_rad(position), float(reference.mean()), path), aux

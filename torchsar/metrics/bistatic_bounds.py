@@ -70,12 +70,14 @@ def bistatic_bounds(
 ) -> dict[str, Tensor]:
     """Compute the least standard deviations of the velocities and the position of a moving point.
 
-    The samples are a w exp(-j 2 pi / lambda R_m(t)) over `n_pulse` pulses and all channels, with
-    the transmit range removed. R_m is the range from the point to channel m, and w the antenna
-    pattern or a rectangular gate. The complex amplitude a is unknown; the slant range at t = 0 and
-    the noise are known. The Fisher information is 2 snr Re(D^H C^-1 D), where D holds the
-    derivatives of the samples with respect to the unknowns, made orthogonal to the samples since a
-    is unknown, and C is the covariance of noise and clutter.
+    The samples are a w exp(-j 2 pi / lambda R_m(t)) over `n_pulse` pulses and all channels. R_m is
+    the range from the point to channel m, and w the antenna pattern or a rectangular gate; the
+    transmit range has been removed from the phase. The complex amplitude a is unknown. The range of
+    the point across the track and the noise are known.
+
+    The Fisher information is 2 snr Re(D^H C^-1 D). The columns of D are the derivatives of the
+    samples with respect to the unknowns. Their components along the samples themselves are removed,
+    because a is unknown. C is the covariance of noise and clutter.
 
     At 0 dB, PRF 180 Hz, 4.5 s and three channels 0.8 m apart the bound of u_r is 0.251 m/s; with
     u_a known 0.148 m/s; with y0 known too 0.00042 m/s. In the last case u_r follows from the
@@ -89,7 +91,8 @@ def bistatic_bounds(
         u_r_m_s: Slant-range speed u_r of the point in m/s, closing positive.
         u_a_m_s: Along-track speed u_a of the point in m/s.
         y0_m: Along-track position y0 of the point at t = 0 in metres.
-        range_m: Slant range at t = 0 in metres; None for the reference range of the radar.
+        range_m: Range from the track to the position of the point at t = 0, across the track, in
+            metres; None for the reference range of the radar.
         integration_s: Length T in seconds of a rectangular gate |t - y0/v| < T/2 in which the point
             is illuminated, a number or shape (...,); None for the one-way pattern of the radar's
             elements.
@@ -97,8 +100,8 @@ def bistatic_bounds(
         gate_tells: Whether to include what the slopes of the antenna pattern reveal about the
             position; by default only phases are used.
         covariance: Covariance of noise and clutter across the channels, shape (..., n_pulse,
-            channel, channel), for each bin of the unitary FFT over the pulses in FFT order; None
-            for white noise of unit variance.
+            channel, channel), for each bin of the unitary FFT over the pulses in FFT order, in
+            units of the noise power of `snr`; None for white noise.
 
     Returns:
         Bounds of the unknowns by name in m/s and m, shape (...,) each, float64; infinite for

@@ -66,10 +66,10 @@ def beam_centre_bound_hz(gain: Tensor, q: Value, rate_hz_s: Value, prf_hz: float
     beam centre. The bound is Ka / sqrt(2 q G), where G is the integral of g'^2 divided by that of
     g^2. For a cosine-shaped gain of length T this is about 0.2 Ka T / sqrt(q), larger than the
     bound of a tone by about half the time-bandwidth product Ka T^2. A rectangular gain has no bound
-    of this kind; its edges can be located to one line, or Ka / PRF in Doppler.
+    of this kind: its edges can be located to one pulse, which is Ka / PRF in Doppler.
 
     Args:
-        gain: Amplitude of the point over the lines of its aperture, shape (..., pulse).
+        gain: Amplitude of the point over the pulses of its aperture, shape (..., pulse).
         q: Peak signal-to-noise power ratio after two-dimensional compression (not in dB).
         rate_hz_s: Doppler rate Ka in Hz/s.
         prf_hz: Pulse rate in Hz.
@@ -165,10 +165,10 @@ def turntable_responses(
     The rotation changes only the phases of the echoes: every scatterer stays in its range cell.
 
     Args:
-        radar: Instrument; its wavelength and range step are used.
+        radar: Instrument; its wavelength, range step and pulse rate are used.
         rotation_rad_s: Constant rotation rate in rad/s.
-        azimuth_m: Cross-range positions, shape (target,), m.
-        range_m: Range positions, shape (target,), m.
+        azimuth_m: Cross-range positions in metres, shape (target,).
+        range_m: Range positions in metres, shape (target,).
         pulses: Number of pulses, centred on time zero.
         samples: Number of range samples, centred on range zero.
 

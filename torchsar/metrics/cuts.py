@@ -23,9 +23,9 @@ _WIDTH = 0.886
 def impulse_cuts(image: Signal, at_m: tuple[float, float]) -> dict[str, tuple[Tensor, Tensor]]:
     """Cut through the point response nearest to a position, along both axes of an image.
 
-    The cuts have 16 points per sample of the image, interpolated within the band about the centre
-    of the local spectrum. To either side of the peak they reach over ten side lobes of a
-    rectangular band, and over at least 24 samples; less at the edges of the image.
+    The cuts have 16 points per sample of the image. They are interpolated by sinc kernels modulated
+    to the centre of the local spectrum. To either side of the peak they extend over ten side lobes
+    of a sinc, at least 24 samples, unless the image ends before.
 
     Args:
         image: Image of one trial, (first, second).

@@ -99,8 +99,8 @@ def entropy(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None =
 
     p = |I|^2 / sum |I|^2 for the intensity and |I| / sum |I| for the amplitude. The entropy is
     invariant to scale, 0 for an all-zero image, and ln(number of pixels) for a flat one.
-    Differentiable, also where pixels are zero; there the slope of the amplitude is infinite and its
-    gradient is set to 0.
+    Differentiable. With respect to a pixel of value zero, the entropy of the amplitude has no
+    finite derivative; the gradient there is set to 0.
 
     Args:
         image: Image, shape (..., azimuth, range), real or complex, or a Signal.
@@ -244,8 +244,8 @@ def rolled_to(image: Signal, reference: Signal) -> Signal:
         reference: Image on the same axes.
 
     Returns:
-        The image, rolled by the whole numbers of samples by which the centres of energy, computed
-        on a circle, differ.
+        The shifted image. Along each axis the shift in whole samples is the difference between the
+        circular means of the energy of the two images.
     """
     shifts = [
         round((_circular_centre(reference, dim) - _circular_centre(image, dim)) * image.axes[dim].n) for dim in (0, 1)

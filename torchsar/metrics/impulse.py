@@ -26,9 +26,9 @@ def impulse_response(
 ) -> dict[str, Tensor]:
     """Measure width, side lobes and position of the point responses nearest to given positions.
 
-    Each response is cut along both axes. The cuts are interpolated within the band about the centre
-    of their own spectrum and padded with zeros to twice their length before, so that full-band
-    images and squinted spectra are measured correctly.
+    Each response is cut along both axes. Every cut is padded with zeros to twice its length and
+    then interpolated within the sampled band about the centre of its own spectrum. Images that fill
+    the sampled band and images with a squinted spectrum are therefore measured correctly.
 
     Args:
         signal: Image with two axes, (..., first, second).
@@ -36,7 +36,7 @@ def impulse_response(
             or (..., target). The response measured is that of the strongest sample within
             `search_m`.
         sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
-            of a rectangular band; 10 give an ISLR of -10.17 dB for a sinc.
+            of a sinc of the same -3 dB width. With 10, a sinc has an ISLR of -10.17 dB.
         search_m: Half width of the search in metres; None for 8 samples.
         centre_turns: Centre of the spectrum along each axis in turns per sample. With None it is
             estimated from the neighbourhood, where other scatterers may bias it. The value must be
@@ -44,9 +44,9 @@ def impulse_response(
 
     Returns:
         For each axis A of the image `irw_A_m` (-3 dB width), `pslr_A_db` (strongest side lobe
-        within the extent), `islr_A_db` (side-lobe over main-lobe energy, null to null) and
-        `position_A_m`; and `peak`, the complex interpolated peak. The shapes are those of `at_m`
-        broadcast with the trials.
+        within `sidelobe_nulls`), `islr_A_db` (energy of the side lobes divided by that of the main
+        lobe, null to null) and `position_A_m`; and `peak`, the complex interpolated peak. The
+        shapes are those of `at_m` broadcast with the trials.
 
     Raises:
         ValueError: If the signal does not have two axes, is not finite, or a position lies outside
@@ -228,7 +228,7 @@ def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[
         tone: Centre of the spectrum in turns per sample, shape (...,).
         offset: Position of the maximum relative to sample n // 2 in samples, shape (...,).
         nulls: Distance from the peak up to which side lobes are measured, in null spacings of a
-            rectangular band.
+            sinc of the same -3 dB width.
 
     Returns:
         A dict with `irw` (-3 dB width in samples), `pslr` and `islr` in dB, and the complex peak,

@@ -1,4 +1,4 @@
-"""Statistics of a figure over Monte Carlo trials, each with its confidence interval.
+"""Statistics of a quantity over Monte Carlo trials, with confidence intervals.
 
 Arrays have the shape (..., trial); missing trials are NaN.
 """
@@ -25,12 +25,14 @@ def trial_statistics(values: np.ndarray, seed: int, level: float = LEVEL) -> dic
     """Compute statistics over trials: mean, median, rms and standard deviation, with intervals.
 
     Values that are not finite are left out. The confidence intervals of mean and rms are
-    percentiles of a bootstrap, which are too narrow for few trials. At a nominal 95 %, the interval
-    contains the true rms of Gaussian errors in 81 % of cases for n = 10 trials, 92 % for 50 and 95
-    % for 200. Rare outliers that did not occur in the trials make it worse: for log-normal errors
-    it contains the true rms in 69 % (n = 50) and 80 % (n = 200) of cases; if one error in a hundred
-    is 100 times as large as the others, in 28 % and 62 %. In the same cases the interval of the
-    median contains the true median in 95 % or more, that of the mean the true mean in 89 % or more.
+    percentiles of a bootstrap, which are too narrow for few trials.
+
+    The following shares of nominal 95 % intervals contain the true rms. For Gaussian errors: 81 %
+    with n = 10 trials, 92 % with 50, 95 % with 200. For log-normal errors: 69 % with n = 50, 80 %
+    with 200. If one error in a hundred is 100 times as large as the others: 28 % with n = 50, 62 %
+    with 200. In all these cases at least 95 % of the intervals of the median contain the true
+    median, and at least 89 % of those of the mean contain the true mean.
+
     The random draws of the bootstrap depend only on the seed and the number of trials, so that the
     interval of one row of trials does not depend on the other rows.
 
@@ -59,7 +61,7 @@ def trial_statistics(values: np.ndarray, seed: int, level: float = LEVEL) -> dic
 def half_width_ratio(values: np.ndarray, statistic: str, seed: int, level: float = LEVEL) -> np.ndarray:
     """Compute the half width of the confidence interval of a statistic, relative to the statistic.
 
-    It indicates by how much more trials may still change the statistic.
+    It indicates how much the statistic may still change if trials are added.
 
     Args:
         values: Values of the trials, shape (..., trial).

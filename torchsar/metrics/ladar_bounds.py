@@ -49,9 +49,9 @@ def velocity_segmented_bound_m_s(snr: Value, samples_per_sweep: Value, wavelengt
     """Compute the velocity bound of estimates from the phases of half sweeps.
 
     Each sweep is split into two halves, and the velocity follows from the phase between their
-    spectra (segmented interference).
-    The bound is (lambda / 2) sqrt(4 / g) / (2 pi T) with g = samples_per_sweep * snr and the
-    duration T of one sweep, 1.25 dB above `velocity_free_offset_bound_m_s`.
+    spectra (segmented interference). The bound is (lambda / 2) sqrt(4 / g) / (2 pi T) with g =
+    samples_per_sweep * snr and the duration T of one sweep, 1.25 dB above
+    `velocity_free_offset_bound_m_s`.
 
     Args:
         snr: Signal-to-noise power ratio per sample before compression.
@@ -71,11 +71,11 @@ def velocity_segmented_bound_m_s(snr: Value, samples_per_sweep: Value, wavelengt
 def velocity_known_offset_bound_m_s(
     snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value
 ) -> Tensor:
-    """Compute the velocity bound of one period if both sweeps have one phase at the turning point.
+    """Compute the velocity bound of one period if both sweeps join in phase at the turning point.
 
-    Up sweep and down sweep have equal phases there if the trigger is exact. The bound is (lambda /
-    2) sqrt(0.75 / g) / (2 pi T) with g = samples_per_sweep * snr and the duration T of one sweep,
-    7.3 dB below `velocity_segmented_bound_m_s`.
+    They do so if the sampling of the sweeps is triggered exactly at the turning point. The bound is
+    (lambda / 2) sqrt(0.75 / g) / (2 pi T) with g = samples_per_sweep * snr and the duration T of
+    one sweep, 7.3 dB below `velocity_segmented_bound_m_s`.
 
     Args:
         snr: Signal-to-noise power ratio per sample before compression.

@@ -213,7 +213,8 @@ def point_responses(
             `y0_m` at slow time zero and closest range `range_m` of the points, (row,) each.
         integration_s: Time in seconds for which the points are illuminated, a number or (row,);
             None if only the antenna pattern of the array elements limits the illumination.
-        orders: Largest Doppler distance, in pulse rates, at which replicas are sought.
+        orders: Largest Doppler distance in pulse rates at which false targets (replicas) are
+            sought.
 
     Returns:
         Widths in metres, side-lobe and false-target levels in dB and position errors in metres by

@@ -58,8 +58,10 @@ class Course:
 
     @property
     def coarse_slope_m_s(self) -> Tensor:
-        """Slope in m/s, (...,), of the range error if only velocities are compensated, which alone
-        move the range envelope; phases of single pulses do not.
+        """Slope in m/s, (...,), of the range error that remains if only velocities are compensated.
+
+        Targets are displaced in range by this slope: compensation of a velocity changes the beat
+        frequency, while that of a phase per pulse does not.
         """
         return self._line(self.coarse_m)[1] / self.pulse.step
 
@@ -117,13 +119,13 @@ class Course:
 
 
 def lit_periods(radar: TriangularLadar, pulse: Axis, azimuth_m: Tensor, range_m: Tensor) -> Tensor:
-    """Find the sweep periods at whose turning point the beam illuminates any of some scatterers.
+    """Find the sweep periods at whose turning point the beam illuminates a scatterer.
 
     Args:
         radar: The instrument.
         pulse: Slow-time axis: starts of the periods.
         azimuth_m: Positions of the scatterers along track in metres, (..., target).
-        range_m: Their ranges relative to the reference range in metres, (..., target).
+        range_m: Ranges of the scatterers relative to the reference range in metres, (..., target).
 
     Returns:
         True for illuminated periods, bool (..., pulse).
@@ -179,10 +181,11 @@ def target_responses(
 ) -> dict[str, dict[str, Tensor]]:
     """Measure the point responses of named targets in an image with residual motion.
 
-    A residual motion shifts the targets: a range error (estimated minus true) with the slope s in
-    m/s shifts them by s R / V in azimuth, with the range R and the along-track speed V. The slope
-    that remains after compensation of the velocities alone shifts them by -s fc / K in range, with
-    the carrier fc and the chirp rate K. The responses are sought at the shifted positions.
+    The slope over time of the range error (estimated minus true) displaces the targets. In azimuth
+    they are displaced by s R / V, with the slope s in m/s, the range R and the along-track speed V.
+    In range they are displaced by -s' fc / K, with the carrier fc, the chirp rate K and the slope
+    s' that remains if only velocities are compensated. The responses are sought at the displaced
+    positions.
 
     Args:
         image: Image (azimuth, range).
@@ -191,12 +194,12 @@ def target_responses(
         course: Residual motion.
         radar: The instrument.
         sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
-            of a rectangular band.
+            of a sinc of the same -3 dB width.
         search_m: Half width in metres of the search about the predicted position.
 
     Returns:
-        Figures of `impulse_response` by the name of the target; targets outside the image are left
-        out.
+        Widths, side-lobe levels and positions as returned by `impulse_response`, by the name of the
+        target; targets outside the image are left out.
     """
     found, finer = {}, finer_in_range(image)
     for name, (azimuth, range_) in positions_m.items():

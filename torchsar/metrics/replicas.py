@@ -1,9 +1,10 @@
-"""Azimuth response of moving points rebuilt from several channels, and their false targets.
+"""Azimuth response and false targets of moving points in images from several channels.
 
-If the reconstruction does not separate the Doppler bands, part of the spectrum of a point appears k
-pulse rates from its true Doppler frequency, with k = +-1, +-2, ... It focuses as a false target
-(replica) about k PRF lambda R0 v / V^2 away in azimuth, where R0 is the slant range, v the
-along-track speed of the receiver relative to the point, and V their total relative speed.
+Each channel is aliased in azimuth, and its Doppler bands are separated by combining the channels.
+If this reconstruction is not exact, part of the spectrum of a point appears k pulse rates from its
+true Doppler frequency, with k = +-1, +-2, ... It focuses as a false target (replica) about k PRF
+lambda R0 v / V^2 away in azimuth, where R0 is the slant range, v the along-track speed of the
+receiver relative to the point, and V the modulus of their relative velocity.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Table 4 and Figure 17 (maximum false target amplitude, MFTA).
@@ -52,8 +53,8 @@ def azimuth_response(
             Doppler centre, as in this package. With None it is estimated, which is not possible if
             the spectrum fills the whole sampled band.
         sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
-            of a rectangular band. A sinc has an ISLR of -10.17 dB with 10, -9.92 dB with 20 and
-            -9.68 dB with all side lobes; its PSLR is always -13.26 dB.
+            of a sinc of the same -3 dB width. A sinc has an ISLR of -10.17 dB with 10, -9.92 dB
+            with 20 and -9.68 dB with all side lobes; its PSLR is always -13.26 dB.
 
     Returns:
         A dict with `irw_m` (-3 dB width), `pslr_db`, `islr_db`, `position_m` and the complex
@@ -103,8 +104,8 @@ def replica_level(profile: Tensor, step_m: float, zones_m: Tensor, *, centre_tur
     `replica_zones`. Profiles are interpolated by eight, which misses at most 0.06 dB of a peak.
     Where side lobes of the point are higher than a replica, their level is measured instead; those
     of a sinc fall to -68 dB at 800 resolution cells. Zones outside the profile are left out. A
-    record of 4 PRF lambda R0 / v^2 seconds or more (R0: range, v: along-track speed) contains two
-    replicas on either side.
+    record of 4 PRF lambda R0 / v^2 seconds or more (R0: range, v: along-track speed of the receiver
+    relative to the point) contains two replicas on either side.
 
     Args:
         profile: Azimuth profiles, shape (..., azimuth), complex.
@@ -214,10 +215,10 @@ def replica_zones(
     """Compute the azimuth offsets from the peak at which replicas of a moving point can appear.
 
     A replica of order k is the part of the point's spectrum that appears k pulse rates from its
-    true Doppler frequency. The zone of an order covers the positions to which the frequencies of
-    this part are focused, computed from the exact range hyperbola: a few metres for the parameters
-    of the Reference. Ten resolution cells are added on either side, beyond which the side lobes of
-    a replica lie below -30 dB relative to the replica.
+    true Doppler frequency. The zone of an order covers the positions at which the frequencies of
+    this part are focused. It is computed from the exact range hyperbola, and is a few metres wide
+    for the parameters of the Reference. Ten resolution cells are added on either side; beyond them
+    the side lobes of a replica lie below -30 dB relative to the replica.
 
     Args:
         radar: Radar with pulse rate, wavelength and speed.
@@ -225,12 +226,13 @@ def replica_zones(
         u_r_m_s: Slant-range speed of the point in m/s, closing positive.
         u_a_m_s: Along-track speed of the point in m/s.
         y0_m: Along-track position of the point at t = 0 in metres.
-        range_m: Slant range at t = 0 in metres; None for the reference range of the radar.
+        range_m: Range from the track to the position of the point at t = 0, across the track, in
+            metres; None for the reference range of the radar.
         integration_s: Length in seconds of a rectangular gate in which the point is illuminated, a
             number or shape (...,); None for the main lobe of the pattern of the elements.
         focused_at: Speeds (slant-range, along-track) in m/s for which the image was reconstructed
-            and focused; None for those of the point. Where they differ, peak and replicas blur and
-            zones widen accordingly.
+            and focused; None for the speeds of the point. With other speeds than those of the
+            point, peak and replicas blur, and the zones are wider.
         orders: Orders k of the replicas to either side, 1 or more.
         axis_speed_m_s: Speed in m/s that converts slow time into position on the image axis; None
             for the speed of the receiver.

@@ -86,10 +86,12 @@ class FoundRotation:
             assumed_rad_s: Mean rate in rad/s that is assumed where the chain estimates none.
 
         Returns:
-            Errors by name, (...,) each, in % of the true value; those of yc in metres. The error of
-            a derivative k whose true value is zero is given in its own unit instead, as
-            `k1_error_per_s`, `k2_error_per_s2`, ... If a k is zero in only some of the trials, both
-            forms are returned, with NaN in the trials to which they do not apply.
+            Errors by name, (...,) each, in % of the true value; the error of yc is in metres. If
+            the true value of a derivative k is zero, its error is in the unit of k instead, as
+            `k1_error_per_s`, `k2_error_per_s2`, ... If it is zero in only some of the trials, both
+            errors are returned, each with NaN in the trials to which it does not apply. Predicted
+            standard deviations have the same names with "std" in place of "error"; those in % refer
+            to the estimated value.
         """
         found: dict[str, Tensor] = {}
         if self.omega_rad_s is not None:

@@ -48,15 +48,14 @@ def rotation_bounds(
     pulses, and P removes a constant and a multiple of phi, which the unknown amplitude and cross
     range absorb.
 
-    Overlapping scatterers raise the true bound above this one. If all scatterers have one range,
-    the bounds of Om and yc are infinite and those of k finite. The bounds are proportional to
-    10^(-SNR / 20) with the SNR in dB. Differentiable.
+    Overlapping scatterers raise the true bound above this one. If all scatterers have the same
+    range, the bounds of Om and yc are infinite and those of k1, k2, ... finite. The bounds are
+    proportional to 10^(-SNR / 20) with the SNR in dB. Differentiable.
 
     Args:
         cross_range_m: Cross range of the resolved scatterers in metres, shape (..., target).
         range_m: Range of the scatterers in metres from the centre that the processor assumes, shape
-            (..., target); range_m + yc_m is the distance from the rotation centre (`lever` of
-            `echo.turntable_echo`).
+            (..., target); range_m + yc_m is the distance from the rotation centre.
         amplitude: Amplitude of a range-compressed sample at the peak of the range response, shape
             (..., target).
         noise_std: Square root of the variance of the complex noise per sample, shape (...,).

@@ -1,4 +1,4 @@
-"""Images of a sea with moving ships, and the estimated motions of the ships, against the truth."""
+"""Errors of the images of a sea with moving ships, and of the estimated motions of the ships."""
 
 from __future__ import annotations
 
@@ -100,10 +100,11 @@ class Ship:
     """True motion and noise-free echo of a simulated ship.
 
     Args:
-        motion: Motion of the middle of the ship, () each.
+        motion: Motion of the middle of the ship; its tensors have the shape ().
         scatterers_m: Along-track position and closest range in metres of the scatterers' mean,
             weighted by their powers.
-        echo: Echo of the ship alone (channel, pulse, range), with the transmit range removed.
+        echo: Echo of the ship alone (channel, pulse, range), with the transmit range removed from
+            the phase.
     """
 
     motion: PointMotion
@@ -123,14 +124,15 @@ class ShownShip:
 
     Args:
         ship: The ship.
-        centre: True velocities of the ship, and position of the intensity centroid of the image
-            that is focused with them.
+        centre: True velocities of the ship, with the position of the intensity centroid of the ship
+            in the image that is focused with these velocities.
         image: Position in the image focused for a stationary scene.
-        replica: Position of the strongest replica, one or two pulse rates away in Doppler, in that
-            image.
-        away_m: Distance in metres of the replica one pulse rate away: measured in that image, whose
-            azimuth axis is receiver speed times slow time; and predicted, on an axis with the speed
-            of the receiver relative to the ship.
+        replica: Position of the strongest replica of the ship in the image focused for a stationary
+            scene. A replica is a false target, here one or two pulse rates away in Doppler.
+        away_m: Measured and predicted azimuth distance in metres between the ship and its replica
+            one pulse rate away. The measured one is slow time multiplied by the speed of the
+            receiver, the predicted one slow time multiplied by the speed of the receiver relative
+            to the ship.
     """
 
     ship: Ship
@@ -146,8 +148,9 @@ class ShownShip:
         Args:
             radar: The instrument.
             ship: The ship.
-            data: The whole recording (channel, pulse, range), with the transmit range removed; the
-                covariance of its sea sets the weights with which the ship is focused.
+            data: The whole recording (channel, pulse, range), with the transmit range removed from
+                the phase. The covariance of the sea in it sets the weights with which the channels
+                are combined to focus the ship.
             extraction: Extent of a ship in the data.
 
         Returns:
@@ -194,7 +197,7 @@ class FoundTarget:
     """A moving target that an imaging method detected.
 
     Args:
-        motion: Estimated motion of the target, () each.
+        motion: Estimated motion of the target; its tensors have the shape ().
         u_r_std_m_s: Predicted standard deviation of the slant-range speed; 0 where there is none.
         ok: Whether the estimate is reliable.
     """
@@ -290,7 +293,7 @@ def ship_metrics(shown: ShownShip, found: FoundTarget | None, made: MadeScene, s
         shown: True motion and positions of the ship.
         found: Detected target that belongs to the ship; None if there is none.
         made: Images of the scene by the method.
-        still: Image of the same method of what does not move alone.
+        still: Image that the same method forms of the data without moving ships.
 
     Returns:
         Errors, levels and distances by name, in m/s, m and dB.

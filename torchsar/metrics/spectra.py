@@ -14,12 +14,11 @@ _LINES = 256
 def azimuth_spectrum(signal: Signal, bins: int = 256) -> tuple[Tensor, Tensor]:
     """Estimate the azimuth power spectrum of a recording, averaged over range.
 
-    The spectrum is also averaged over segments of `bins` lines, each weighted by a raised-cosine
-    window.
+    The spectrum is also averaged over segments of `bins` pulses, each weighted by a Hann window.
 
     Args:
         signal: Signal of one trial with the axes (pulse, range).
-        bins: Lines of a segment, and Doppler bins of the result.
+        bins: Number of pulses of a segment, and of Doppler bins of the result.
 
     Returns:
         Baseband Doppler frequency in Hz and power relative to its maximum, (bins,) each, float64.
@@ -35,7 +34,7 @@ def azimuth_spectrum(signal: Signal, bins: int = 256) -> tuple[Tensor, Tensor]:
 
 
 def range_spectrum(signal: Signal) -> Tensor:
-    """Compute the range power spectrum, summed over all lines.
+    """Compute the range power spectrum of a recording, summed over all pulses.
 
     Args:
         signal: Signal of one trial with the axes (pulse, range).
@@ -50,11 +49,11 @@ def range_spectrum(signal: Signal) -> Tensor:
 
 
 def phase_increments(signal: Signal, blocks: int = 64) -> tuple[Tensor, Tensor]:
-    """Compute the mean phase increment from line to line in successive blocks of a recording.
+    """Compute the mean phase increment from pulse to pulse in successive blocks of a recording.
 
     Args:
         signal: Signal of one trial with the axes (pulse, range).
-        blocks: Number of blocks; increments are averaged over the lines of each.
+        blocks: Number of blocks; increments are averaged over the pulses and range cells of each.
 
     Returns:
         Slow time of the blocks in seconds and phase increments in radians, (block,) each, float64.

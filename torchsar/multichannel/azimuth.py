@@ -77,11 +77,11 @@ class FocusAzimuth(Stage):
     """Stage that focuses one target per trial in azimuth, with its velocities.
 
     The input is a spectrum (doppler[, range]) of `Reconstruct`, the output an image (azimuth[,
-    range]). Azimuth is x = V_R t in metres, with the speed V_R of the receiver and slow time t. For
-    widths along the track as seen by a target of along-track speed u_a, multiply the widths on this
-    axis by (V_R - u_a) / V_R. All range lines are focused for a single range, since a separate
-    range for each line would curve the range side lobes of the target. Use `StationaryImage` for a
-    whole stationary scene.
+    range]). Azimuth is x = V_R t in metres, with the speed V_R of the receiver and slow time t. A
+    width w on this axis is a width w (V_R - u_a) / V_R along a target that moves at the along-track
+    speed u_a. All range lines are focused for a single range, since a separate range for each line
+    would curve the range side lobes of the target. Use `StationaryImage` for a whole stationary
+    scene.
 
     Args:
         radar: Instrument.

@@ -1,11 +1,12 @@
 """Estimation and correction of phase, gain and delay differences between channels.
 
-Stationary clutter is a Gaussian process whose covariance over the channels is known at every
-Doppler frequency up to these differences: each band has the response of the array and the power
-that the antenna pattern gives it. The differences are estimated by maximum likelihood. If the
-clutter fills fewer bands than there are channels, this amounts to fitting the balanced data into
-the subspace that the responses to these bands span (a noise-subspace method); otherwise the
-estimate relies on the expected power over Doppler.
+Stationary clutter is modelled as a Gaussian process. Its covariance over the channels without
+differences is known at every Doppler frequency: each Doppler band contributes with the response of
+the array to this band, and with the power that the antenna pattern gives the band. The differences
+are fitted to the data with this model by maximum likelihood. If the clutter fills fewer bands than
+there are channels, this amounts to fitting the balanced data into the subspace that the responses
+to these bands span (a noise-subspace method). Otherwise the estimate relies on the expected power
+over Doppler.
 
 Reference:
     Remote Sens. 2020, 12, 1703, section 4.3, which requires the correction without a method; Weiss
@@ -114,8 +115,8 @@ def estimate_balance(
     channels.
 
     Args:
-        data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
-            range), complex, mostly stationary clutter.
+        data: Range-compressed channels with the transmit range removed from the phase, shape (...,
+            channel, pulse, range), complex, mostly stationary clutter.
         radar: Instrument.
         prior: Expected power of the clutter over Doppler, `ElementPattern()` by default.
         bands: Number of Doppler bands that the clutter fills, each one PRF wide.
@@ -125,8 +126,8 @@ def estimate_balance(
             16 blocks by a tenth of a cycle.
 
     Returns:
-        `phase_rad`, `gain_db` and `delay_s`, float64 (..., channel), relative to the channel
-        nearest to the reference point of the track, with standard deviations from the likelihood.
+        `phase_rad`, `gain_db` and `delay_s`, float64 (..., channel), relative to the channel whose
+        along-track position is nearest to zero, with standard deviations from the likelihood.
         `info` holds `snr_db` (...,), the ratio of the clutter power at the peak of the prior to the
         noise power. `ok` is False, and the values are zero, where a channel has no power or a phase
         has a standard deviation above 0.1 rad.
@@ -389,8 +390,8 @@ class EstimateBalance(Stage):
         """Estimate phase, gain and delay of each channel from stationary clutter.
 
         Args:
-            signal: Range-compressed channels with the axes (channel, pulse, range), without the
-                transmit range.
+            signal: Range-compressed channels with the axes (channel, pulse, range) and the transmit
+                range removed from the phase.
 
         Returns:
             `phase_rad`, `gain_db` and `delay_s` of shape (..., channel), see `estimate_balance`.

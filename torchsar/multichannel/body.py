@@ -1,10 +1,11 @@
-"""Extended moving targets ("bodies"): one velocity for all scatterers, image, and echo to subtract.
+"""Velocity, image and echo of extended moving targets ("bodies").
 
-Range lines around the body are shifted by the range history of its middle and deramped channel by
-channel. Each scatterer then is one tone in all channels, even if aliased. The frequency F of the
-tone gives the along-track position y = y0 + F lambda R0 / v of the scatterer, with the position y0
-and the closest range R0 of the middle and the along-track speed v of the receiver relative to the
-body. Position and velocity determine the phases of the tone across the channels.
+All scatterers of a body have one velocity. Range lines around the body are shifted by the range
+history of its middle and deramped channel by channel. Each scatterer then is one tone in all
+channels, even if aliased. The frequency F of the tone gives the along-track position y = y0 + F
+lambda R0 / v of the scatterer, with the position y0 and the closest range R0 of the middle and the
+along-track speed v of the receiver relative to the body. Position and velocity determine the phases
+of the tone across the channels.
 
 In a short segment of slow time, the sea clutter at the frequency of a tone comes from only a few
 look angles, one for each Doppler band. Its covariance across the channels is estimated from range
@@ -246,8 +247,8 @@ class Chip:
             cells: Short-time spectra of range lines, complex128 (line, channel, segment, tone).
 
         Returns:
-            Echo as received at the reference point of the track, complex128 (line, pulse), zero in
-            pulses in which no part of the body is illuminated.
+            Echo as received by a channel at the along-track position 0, complex128 (line, pulse),
+            zero in pulses in which no part of the body is illuminated.
         """
         weight, gain = self._weights(self.motion)
         return self.segments.back(torch.einsum("lmsf,sfm->lsf", cells, weight.conj()) / gain) * self.lit
@@ -308,10 +309,10 @@ class Body:
         u_r_std_m_s: Predicted standard deviation of the slant-range speed u_r in m/s.
         chip: Data of the body, deramped by its motion.
         picture: Image of the body.
-        level: Ratio of the mean intensity of the bright pixels to that of the residual sea and
-            noise.
+        level: Mean intensity of the pixels of the body (`picture.bright`) divided by that of the
+            residual sea and noise in `picture`.
         ok: False if `level` is below 40 (16 dB), u_r lies at an end of its search interval, or the
-            body left the frame during the search.
+            motion found during the search left the range lines or the pulses of the data.
     """
 
     motion: PointMotion
@@ -326,9 +327,10 @@ def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
     """Extract the range cells of a body, deramped with its motion, as short-time spectra.
 
     Args:
-        data: Range-compressed channels without the transmit range, shape (channel, pulse, range),
-            complex, including range cells outside the body.
-        frame: Geometry of the data.
+        data: Range-compressed channels with the transmit range removed from the phase, shape
+            (channel, pulse, range), complex, with the range cells of the body and at least 12
+            beside it.
+        frame: Radar, slow time and ranges of the data.
         motion: Motion of the body.
         extraction: Extent of the body.
 
@@ -336,7 +338,7 @@ def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
         Short-time spectra of the range cells, with the inverse covariance of sea and noise.
 
     Raises:
-        ValueError: If the data have no range cell of the body, or fewer than 12 outside it.
+        ValueError: If the data have no range cell of the body, or fewer than 12 beside it.
     """
     off = (frame.range_m - motion.range_m).abs()
     body, beside = off <= extraction.range_m, off > extraction.range_m + _GUARD_CELLS * frame.radar.range_step_m
@@ -418,9 +420,10 @@ def find_body(
     slant-range speed u_r, the along-track speed u_a and the middle of the body again.
 
     Args:
-        data: Range-compressed channels without the transmit range, shape (channel, pulse, range),
-            complex, with the range cells of the body and at least 12 beside it.
-        frame: Geometry of the data.
+        data: Range-compressed channels with the transmit range removed from the phase, shape
+            (channel, pulse, range), complex, with the range cells of the body and at least 12
+            beside it.
+        frame: Radar, slow time and ranges of the data.
         image_s: Slow time in seconds at which the image shows the body.
         image_m: Range in metres at which the image shows the body.
         extraction: Extent of the body.
@@ -590,9 +593,10 @@ def known_body(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
     """Extract a body of known velocity from the data and measure the position of its middle.
 
     Args:
-        data: Range-compressed channels without the transmit range, shape (channel, pulse, range),
-            complex, with the range cells of the body and at least 12 beside it.
-        frame: Geometry of the data.
+        data: Range-compressed channels with the transmit range removed from the phase, shape
+            (channel, pulse, range), complex, with the range cells of the body and at least 12
+            beside it.
+        frame: Radar, slow time and ranges of the data.
         motion: Known motion of the body.
         extraction: Extent of the body.
 
@@ -608,13 +612,13 @@ def known_body(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
 
 
 def body_echo(body: Body, frame: Frame, everything: bool = False) -> Tensor:
-    """Return the echo of a body, to subtract from the data of the frame in which it was found.
+    """Return the echo of a body, to be subtracted from the data in which the body was found.
 
     The echo consists of the pixels of more than twice the intensity of the residual sea and noise.
 
     Args:
         body: Body that was found in these data.
-        frame: Geometry of the data.
+        frame: Radar, slow time and ranges of the data.
         everything: True to return all data in the range lines and Doppler bins of the body instead,
             including the sea.
 

@@ -20,8 +20,8 @@ class CompressChannels(Stage):
     Args:
         radar: Instrument.
         reference: Reference spectrum "matched", "flat" or "phase", see `focus.RangeCompress`.
-            "flat" gives an exactly rectangular band, the same response as in data that are
-            simulated range compressed.
+            "flat" gives an exactly rectangular band and thus the response of data that are
+            simulated directly in range-compressed form.
 
     Raises:
         ValueError: If `reference` is unknown.
@@ -40,5 +40,5 @@ class CompressChannels(Stage):
         return REFERENCES[self.reference](self.radar.pulse, n, self.radar.sampling_hz, device)
 
     def forward(self, signal: Signal) -> Signal:
-        """Compress full chirps with the axes (channel, pulse, range) in range, on the same axes."""
+        """Compress full chirps (channel, pulse, range) in range; the axes stay the same."""
         return signal.with_data(range_compress(signal.data, self.spectrum(signal.data.shape[-1], signal.data.device)))

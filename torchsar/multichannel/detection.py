@@ -72,9 +72,9 @@ def detect(
 
     The image is divided into rectangles of pixels (neighbourhoods) that overlap by half. Their
     contrast is the mean intensity relative to the median over all of them. Any two detections are
-    at least `apart_m` apart along one of the axes. The position of a detection is the intensity
-    centre of the neighbourhoods within `apart_m` of its brightest one whose contrast exceeds a
-    quarter of the largest.
+    at least `apart_m` apart along one of the axes. The position of a detection is the
+    contrast-weighted mean position of all neighbourhoods that lie within `apart_m` of the brightest
+    one and have more than a quarter of its contrast.
 
     Args:
         image: Image (azimuth, range) without trials, complex.

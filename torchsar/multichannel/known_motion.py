@@ -34,7 +34,7 @@ def known_motion_chain(
         bandwidth_hz: Width of the Doppler band that is focused in Hz; None for the whole
             reconstructed band.
         migration: Correction of range migration; None for azimuth-only data.
-        order: Number of coefficients (orders in time) of the transmit range that are removed; None
+        order: Highest power of slow time in the transmit range that is removed from the phase; None
             for all.
         full: Whether the data are full chirps, which are then compressed in range first.
         follow: Whether the migration is corrected with the known motion, instead of that of a point

@@ -42,7 +42,7 @@ class Frame:
     Args:
         radar: Instrument.
         time_s: Slow time in seconds, float64 (pulse,).
-        range_m: Closest ranges of the range axis in metres, float64 (range,).
+        range_m: Range axis in metres, float64 (range,). It holds the closest range of points.
     """
 
     radar: BistaticRadar
@@ -70,11 +70,12 @@ class Frame:
         return self._history(reference, reference.range_m[..., None, None, None]).path_m[..., 0]
 
     def residual_m(self, reference: PointMotion, walks: float) -> Tensor:
-        """Return the displacement of envelopes after the reference range history is removed.
+        """Return the envelope displacement left after removal of the reference range history.
 
-        Let e(t) be the range history of a point at the range of the cell minus that of the
-        reference point. The displacement is e(t) - walks * t de/dt: a keystone transform (walks =
-        1) removes what is linear in t and displaces the rest by -t de/dt.
+        It is computed in each range cell for a point that moves as the reference, but has the
+        closest range of the cell. Without a keystone transform it is e(t), the range history of
+        this point minus that of the reference point. A keystone transform removes the part that is
+        linear in t and leaves e(t) - t de/dt.
 
         Args:
             reference: Motion of the reference point, shape (...,).
@@ -141,7 +142,7 @@ class Migration(Protocol):
 
         Args:
             data: Range-compressed channels, shape (..., channel, pulse, range), complex.
-            frame: Geometry of the data.
+            frame: Radar, slow time and ranges of the data.
             reference: Motion of the reference point, whose range history is removed, shape (...,).
             ambiguity: PRF ambiguity number of the targets relative to the reference, shape (...,),
                 see `ambiguity_number`.
@@ -152,7 +153,7 @@ class Migration(Protocol):
         ...
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the range migration that remains for a point unlike the reference point.
+        """Return the migration that remains for a point that does not move as the reference point.
 
         It is the largest displacement of the envelope within the integration time, which is centred
         on t = 0. Below a quarter of a range cell, c / (4 B) with the bandwidth B, the loss is
@@ -215,11 +216,10 @@ class Keystone:
     """Migration correction that removes the range walk of all targets by a keystone transform.
 
     The range history of the reference is removed before the transform (deramp) and restored in the
-    carrier phase after it (reramp). The ambiguity number must be that of the target: the frequency
-    (u_r + v y0 / R0) / lambda of the target, minus that of the reference, must lie within half a
-    PRF of the ambiguity number times the PRF. Here u_r is the slant-range speed, v the along-track
-    speed of the receiver relative to the point, y0 the along-track position and R0 the closest
-    range.
+    carrier phase after it (reramp). The ambiguity number q must be that of the target: |F - F_ref -
+    q PRF| must be at most PRF / 2, with F = (u_r + v y0 / R0) / lambda for the target and F_ref for
+    the reference. Here u_r is the slant-range speed, v the along-track speed of the receiver
+    relative to the point, y0 the along-track position and R0 the closest range.
 
     Args:
         whole_swath: True to correct the curvature for the closest range of every range cell. False
@@ -333,9 +333,9 @@ def correct_migration(
     `whole_swath` False, in the reference.
 
     Args:
-        data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
-            range), complex.
-        frame: Geometry of the data.
+        data: Range-compressed channels with the transmit range removed from the phase, shape (...,
+            channel, pulse, range), complex.
+        frame: Radar, slow time and ranges of the data.
         reference: Motion of the reference point, whose range history is removed, shape (...,).
         migration: Method, `Keystone()` by default.
         ambiguity: PRF ambiguity number of the targets relative to the reference, shape (...,) or a
@@ -351,7 +351,7 @@ def correct_migration(
         expected = (frame.radar.channels, frame.time_s.shape[0], frame.range_m.shape[0])
         raise ValueError(
             f"correct_migration works on data (..., {', '.join(map(str, expected))}), the numbers of channels, pulses "
-            f"and range cells of its frame, got shape {tuple(data.shape)}; give the frame of these data"
+            f"and range cells of `frame`, got shape {tuple(data.shape)}; build the frame from these data"
         )
     return (Keystone() if migration is None else migration).apply(data, frame, reference, per_trial(ambiguity, 0, data))
 

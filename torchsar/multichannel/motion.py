@@ -96,10 +96,13 @@ class PointMotion:
 
     @property
     def effective_m_s(self) -> Tensor:
-        """Relative sensor velocity v_e = V^2 / v in m/s, Eq. (25).
+        """Relative sensor velocity v_e = V^2 / v in m/s.
 
         v is the along-track speed of the receiver relative to the point, and V^2 = v^2 + u_r^2 with
         the slant-range speed u_r.
+
+        Reference:
+            Remote Sens. 2020, 12, 1703, Eq. (25).
         """
         return self.square_m2_s2 / self.along_m_s
 
@@ -134,14 +137,16 @@ class PointMotion:
 
         This corrects the azimuth displacement of a moving target: a closing target (slant-range
         speed u_r > 0) appears displaced by +V_R u_r R0 / V^2 in azimuth x = V_R t, with the speed
-        V_R of the receiver, the closest range R0 and the relative speed V. Eq. (30) of the paper is
-        printed with the opposite sign.
+        V_R of the receiver, the closest range R0 and the relative speed V.
 
         Args:
             image_s: Slow time in seconds at which the image shows the point, shape (...,).
 
         Returns:
             Along-track position in metres, shape (...,).
+
+        Reference:
+            Remote Sens. 2020, 12, 1703, Eq. (30), which is printed with the opposite sign.
         """
         return (self.square_m2_s2 * image_s - self.u_r_m_s * self.range_m) / self.along_m_s
 

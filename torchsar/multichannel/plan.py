@@ -1,10 +1,10 @@
 """Reconstruction and focusing for one motion as a precomputed plan.
 
 All that does not depend on the data is computed once, so that an image costs little more than its
-transforms. At each alias frequency the chain of `reconstruct` and `focus_azimuth` is one small
-matrix from channels to Doppler bands, with the exact filter included. Use a plan for Monte Carlo
-trials or range lines that share one motion; use the stages `Reconstruct` and `FocusAzimuth` where
-each trial has its own velocities.
+FFTs. In each Doppler bin of the aliased channels, `reconstruct` followed by `focus_azimuth` is the
+product with one small matrix from channels to Doppler bands, which contains the exact azimuth
+filter. Use a plan for Monte Carlo trials or range lines that share one motion; use the stages
+`Reconstruct` and `FocusAzimuth` where each trial has its own velocities.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class AzimuthPlan:
             raise ValueError(why)
         if motion.u_r_m_s.ndim or motion.u_a_m_s.ndim or motion.y0_m.ndim or motion.range_m.ndim:
             raise ValueError(
-                "a plan serves one motion, got a motion with trials; use Reconstruct and FocusAzimuth "
+                "a plan serves one motion, got a motion with trial dimensions; use Reconstruct and FocusAzimuth "
                 "where each trial has its own velocities"
             )
         self.bands, self.n_pulse = rebuild.bands, n_pulse

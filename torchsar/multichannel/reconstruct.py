@@ -40,11 +40,13 @@ def reconstruct(
 
     Args:
         data: Channels with slow time zero at pulse n // 2, shape (..., channel, pulse), complex.
-            The transmit range has been removed, except for a linear term of rate `left_k1_m_s`.
+            The transmit range has been removed from the phase, except for a linear term where
+            `left_k1_m_s` is given.
         radar: Instrument.
         motion: Motion of the points, shape (...,).
         rebuild: Reconstruction method.
-        left_k1_m_s: Rate k1 of the transmit range that remains in the data in m/s.
+        left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
+            still in the phase; 0 if it was removed.
 
     Returns:
         Spectrum about the Doppler centre of the motion, shape (..., bands * pulse), complex. Bins
@@ -63,15 +65,17 @@ def reconstruct_lines(
 ) -> Tensor:
     """Reconstruct the full-band Doppler spectra of range lines that share one motion.
 
-    As `reconstruct`, for data with a range axis.
+    This is `reconstruct` for data with a range axis.
 
     Args:
         data: Channels with slow time zero at pulse n // 2, shape (..., channel, pulse, range),
-            complex.
+            complex. The transmit range has been removed from the phase, except for a linear term
+            where `left_k1_m_s` is given.
         radar: Instrument.
         motion: Motion of the points, shape (...,).
         rebuild: Reconstruction method.
-        left_k1_m_s: Rate k1 of the transmit range that remains in the data in m/s.
+        left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
+            still in the phase; 0 if it was removed.
 
     Returns:
         Spectra about the Doppler centre of the motion, shape (..., bands * pulse, range), complex.
@@ -153,7 +157,8 @@ class Reconstruct(Stage):
         A warning is given where the reconstruction is ill-conditioned.
 
         Args:
-            signal: Channels with the axes (channel, pulse[, range]), transmit range removed.
+            signal: Channels with the axes (channel, pulse[, range]) and the transmit range removed
+                from the phase.
             u_r_m_s: Slant-range speed in m/s, closing positive, shape (...,) or a number.
             u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, same
                 shape.

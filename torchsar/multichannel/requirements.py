@@ -1,9 +1,9 @@
 """Limits of a multichannel receiver, and the phase that each model simplification neglects.
 
-Both are predicted from the radar, the reconstruction and bounds of the motion before anything is
-computed. Other checks are made elsewhere: `BistaticRadar` rejects empty lists of channels and
-values that are not positive, every stage rejects samples that are not finite, and estimators mark
-an estimate at the end of its search interval.
+Limits and phases are predicted from the radar, the reconstruction and bounds of the motion, before
+any data are processed. Other checks are made elsewhere: `BistaticRadar` rejects empty lists of
+channels and values that are not positive, every stage rejects samples that are not finite, and
+estimators mark an estimate at the end of its search interval.
 
 Reference:
     Remote Sens. 2020, 12, 1703, sections 2 to 4.
@@ -64,7 +64,7 @@ class MultichannelUse:
         pattern: True if targets fade by the element pattern, False if their echoes end at +-T / 2.
         u_r_m_s: Least and largest slant-range speed searched in m/s, closing positive.
         u_a_m_s: Least and largest along-track speed searched in m/s.
-        y0_m: Largest |y0| in metres.
+        y0_m: Largest magnitude of the along-track position y0 of a target at t = 0 in metres.
         acceleration_m_s2: Largest radial acceleration in m/s^2.
         swath_m: Range swath to either side of the reference range in metres.
         snr_db: SNR of a range-compressed sample of one channel in dB, None where unknown.
@@ -407,20 +407,23 @@ def multichannel_requirements(
 ) -> tuple[Requirement, ...]:
     """Return the largest phase that each simplification neglects, with its tolerance.
 
-    A row with a predicted relative error of the response of a point is judged by that error:
-    transmit range, parabolic receive range and range migration. Any other row is judged by its
-    phase. Range migration is stated as the phase at the ends of the range band, where a shift of a
-    quarter of a resolution cell c / B is pi / 4. Quadratic phases are stated at the ends of the
-    aperture. Terms "absorbed by u_a" are focused by another value of the along-track speed u_a.
+    For a truncated transmit range, a parabolic receive range and range migration, the relative
+    error of the response of a point is predicted too; it decides whether the simplification is
+    permissible. For all other simplifications the phase decides.
+
+    Range migration is stated as the phase at the ends of the range band: a shift by a quarter of a
+    resolution cell c / B is pi / 4 there. Quadratic phases are stated at the ends of the aperture.
+    A term "absorbed by u_a" is focused by another value of the along-track speed u_a.
 
     The tolerance is 0.3 rad for the transmit range and for an along-track position y0 that is left
-    out of the azimuth filter. For errors of the reconstruction it is the phase that makes a false
-    target of `use.replica_db`.
+    out of the azimuth filter, and pi / 4 for range migration. For errors of the reconstruction it
+    is the phase that causes a false target at the level `use.replica_db`. For the others it is
+    `tolerance_rad`.
 
     Args:
         radar: Instrument.
         use: Record, reconstruction and bounds of the motion.
-        tolerance_rad: Tolerance in radians of the rows that have none of their own.
+        tolerance_rad: Tolerance in radians of the other simplifications.
 
     Returns:
         One `Requirement` per simplification: what it neglects, the error and the remedy.

@@ -67,10 +67,11 @@ def doppler_offsets(n_pulse: int, bands: int, prf_hz: float, device: torch.devic
 
 
 def band_matrix(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
-    """Return the part of the channel response of Eq. (34) that differs between Doppler bands.
+    """Return the part of the channel response that differs between Doppler bands.
 
     It is exp(-j 2 pi b PRF dx_m / v_e) in band b for the channel at the along-track position dx_m,
-    with the relative sensor velocity v_e of Eq. (25).
+    with the relative sensor velocity v_e = V^2 / v. Here v is the along-track speed of the receiver
+    relative to the point, and V^2 = v^2 + u_r^2 with the slant-range speed u_r of the point.
 
     Args:
         radar: Instrument.
@@ -79,6 +80,9 @@ def band_matrix(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor
 
     Returns:
         The matrix, complex128 (..., channel, band).
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (25), (34).
     """
     band = torch.arange(bands, dtype=torch.float64, device=motion.u_r_m_s.device)
     delay = radar.channels_at(band.device)[:, None] / motion.effective_m_s[..., None, None]
@@ -88,14 +92,13 @@ def band_matrix(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor
 def shared_response(
     radar: BistaticRadar, motion: PointMotion, n_pulse: int, bands: int, dtype: torch.dtype, left_k1_m_s: float = 0.0
 ) -> Tensor:
-    """Return the part of the channel response of Eq. (34) that all bands share.
+    """Return the part of the channel response that all Doppler bands share.
 
-    It is exp(-j 2 pi (f dx / v_e + C / (2 R0 lambda))) for the channel at the along-track position
-    dx, with C = dx^2 - (v dx^2 + 2 R0 u_r dx) / v_e + 2 y0 dx u_r^2 / V^2, Eq. (7) extended by y0.
-    f is the absolute Doppler: that of the bin in the lowest band plus the Doppler centre, by which
-    the data were demodulated. v is the along-track speed of the receiver relative to the point, u_r
-    the slant-range speed, V^2 = v^2 + u_r^2, v_e = V^2 / v, y0 the along-track position at t = 0
-    and R0 the closest range.
+    For the channel at the along-track position dx it is exp(-j 2 pi (f dx / v_e + C / (2 R0
+    lambda))) with C = dx^2 - (v dx^2 + 2 R0 u_r dx) / v_e + 2 y0 dx u_r^2 / V^2. Here f is u_r /
+    lambda plus the Doppler of the bin in the lowest band relative to the Doppler centre, v is the
+    along-track speed of the receiver relative to the point, u_r the slant-range speed of the point,
+    V^2 = v^2 + u_r^2, v_e = V^2 / v, y0 the along-track position at t = 0 and R0 the closest range.
 
     Args:
         radar: Instrument.
@@ -103,11 +106,14 @@ def shared_response(
         n_pulse: Number of pulses.
         bands: Number of bands.
         dtype: Complex dtype of the result.
-        left_k1_m_s: Rate k1 of the transmit range that remains in the data in m/s, zero once the
-            transmit range is removed.
+        left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
+            still in the phase; 0 if it was removed. The response does not depend on it.
 
     Returns:
         The response, shape (..., channel, n_pulse), complex.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (7), (34); C is extended by the along-track position y0.
     """
     dx = radar.channels_at(motion.u_r_m_s.device)
     m = motion.each(lambda value: value[..., None])
@@ -132,11 +138,14 @@ def doppler_centre_hz(radar: BistaticRadar, motion: PointMotion, left_k1_m_s: fl
     Args:
         radar: Instrument.
         motion: Motion of the point, shape (...,).
-        left_k1_m_s: Rate k1 of the transmit range that remains in the data in m/s. It is zero once
-            the transmit range is removed, the case of Eq. (39).
+        left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
+            still in the phase; 0 if it was removed.
 
     Returns:
         Doppler in Hz, shape (...,).
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eq. (39), for k1 = 0.
     """
     return (motion.u_r_m_s - left_k1_m_s) / radar.wavelength_m
 
@@ -148,12 +157,13 @@ class Prior(Protocol):
         """Return the expected power relative to its peak.
 
         Args:
-            offset_hz: Doppler relative to the centre in Hz, any shape (bins).
+            offset_hz: Doppler relative to the Doppler centre in Hz, any shape.
             radar: Instrument.
             motion: Motion of the point, shape (...,).
 
         Returns:
-            Power ratio, shape (..., bins) or (bins).
+            Power ratio. Its shape is (...,) followed by the shape of `offset_hz`, or only the
+            latter if the power does not depend on the motion.
         """
         ...
 
@@ -370,10 +380,10 @@ def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> T
 def noise_gain_db(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, n_pulse: int = 64) -> Tensor:
     """Return the noise gain of a reconstruction relative to ideal uniform sampling.
 
-    The gain is the noise power of a reconstructed bin over that of uniform sampling with as many
-    channels, as a mean over bins: M / N trace(W W^H) for the weights W from M channels to N bands.
-    It is infinite where a least-squares matrix is singular: the damped weights are finite there,
-    but they lose bands.
+    It is the mean noise power of the reconstructed Doppler bins divided by the noise power that
+    uniform sampling with the same number of channels would give: M / N trace(W W^H) for the weights
+    W from M channels to N bands. It is infinite where the matrix of a least-squares reconstruction
+    is singular: the weights are damped and finite there, but do not separate the bands.
 
     Args:
         radar: Instrument.

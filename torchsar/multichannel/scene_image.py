@@ -56,8 +56,8 @@ class Detector:
         extent_m: Extent of a neighbourhood in azimuth and range in metres.
         apart_m: Least separation of detections in azimuth and range in metres.
         most: Largest number of targets.
-        suppressed_m_s: Slant-range speeds in m/s for which an image with suppressed sea is matched,
-            to detect weaker targets in it; empty to omit this image.
+        suppressed_m_s: Slant-range speeds in m/s, closing positive, to which an image with
+            suppressed sea is matched. Weaker targets are detected in this image. Empty to omit it.
 
     Raises:
         ValueError: If the threshold, an extent or a separation is not positive, or `most` is below
@@ -91,9 +91,10 @@ class SceneImage:
         rest: Image of the data without the moving targets.
         fused: Image `rest` with every moving target at its true position.
         bodies: All targets, strongest first.
-        estimate: `u_r_m_s`, `u_a_m_s`, `y0_m`, `range_m` of shape (target,), padded to the setting
-            `most` of the detector; entries without a target are zero, and `ok` is False there.
-        data: Channels without the moving targets.
+        estimate: `u_r_m_s`, `u_a_m_s`, `y0_m`, `range_m` of the targets. Each has as many entries
+            as the detector may find targets (`Detector.most`); entries without a target are zero,
+            and `ok` is False there.
+        data: Channels from which the moving targets were removed.
     """
 
     conventional: Signal
@@ -107,8 +108,9 @@ class SceneImage:
 class ImageMovers(Stage):
     """Stage that images a scene and its moving targets, from channels to a `SceneImage`.
 
-    The channels (channel, pulse, range) are range compressed and without the transmit range. One
-    frame is processed at a time, since the number of targets differs between frames.
+    The channels (channel, pulse, range) are range compressed, and the transmit range has been
+    removed from their phase. One recording is processed at a time, since the number of targets
+    differs between recordings.
 
     Args:
         radar: Instrument.
@@ -116,7 +118,8 @@ class ImageMovers(Stage):
         detector: Settings of the detection.
         rebuild: Reconstruction method for the stationary scene, `LeastSquares()` by default.
         removal: "subtract" removes the echo fitted to a moving target. "zero" removes all data in
-            its lines and extent, including the sea, as in the paper.
+            the range lines and Doppler bins of the target, including the sea, as in Remote Sens.
+            2020, 12, 1703.
         slowest_m_s: Least slant-range and least along-track speed in m/s. A target that exceeds one
             of them counts as moving; other targets stay in the image as stationary ones.
         u_a_half_m_s: Half width of the search in the along-track speed u_a in m/s.
@@ -145,14 +148,14 @@ class ImageMovers(Stage):
         self.slowest_m_s, self.u_a_half_m_s = slowest_m_s, u_a_half_m_s
 
     def forward(self, signal: Signal, known: Sequence[PointMotion] | None = None) -> SceneImage:
-        """Image one frame of data with its moving targets.
+        """Image one recording with its moving targets.
 
         A warning is given if the swath is too narrow for any target to be detected.
 
         Args:
             signal: Channels with the axes (channel, pulse, range), without trials.
-            known: Motions of all targets by their middles, strongest first, if known a priori; no
-                targets are then detected. None to detect the targets in the images.
+            known: Motions of the middles of all targets, strongest first, if they are known a
+                priori. No targets are then detected. None to detect the targets in the images.
 
         Returns:
             The images and the targets.
@@ -343,8 +346,8 @@ class ImageMovers(Stage):
 class MoversImage(Stage):
     """Stage for chains that images the scene and the moving targets of every trial.
 
-    See `ImageMovers`; it gives the image with every target at its true position, and an estimate of
-    the motions.
+    It applies `ImageMovers` to each trial. Its outputs are the image with every moving target at
+    its true position, and an estimate of the motions.
 
     Args:
         radar: Instrument.
@@ -381,16 +384,17 @@ class MoversImage(Stage):
         """Image the scene and the moving targets of every trial.
 
         Args:
-            signal: Channels (..., channel, pulse, range), without the transmit range.
+            signal: Range-compressed channels (..., channel, pulse, range) with the transmit range
+                removed from the phase.
             u_r_m_s, u_a_m_s, y0_m, range_m: Motions of all targets, (..., target) each, strongest
                 first, if known a priori: all four, or none.
 
         Returns:
             The images with every moving target at its true position, (..., azimuth, range), and the
-            estimate of the motions with values of shape (..., target), padded to the setting `most`
-            of the detector. Its info holds `level`, the ratio of the mean intensity of each target
-            to the residual sea and noise (0 where there is no target), and the images `rest` and
-            `conventional`, see `SceneImage`.
+            estimate of the motions with values of shape (..., target), padded with zeros to
+            `Detector.most` targets. The `info` of the estimate holds `level`, the ratio of the mean
+            intensity of each target to the residual sea and noise (0 where there is no target), and
+            the images `rest` and `conventional`, see `SceneImage`.
 
         Raises:
             ValueError: If some of the four values are missing, or as in `ImageMovers`.
@@ -437,7 +441,7 @@ def suppressed_image(
 
     In every Doppler bin the channels are weighted by the inverse of their covariance, which is
     estimated from all range lines and neighbouring bins, and then by the channel response to a
-    point of each speed. This is the Doppler filter of the paper extended to several channels. The
+    point of each speed. This extends the Doppler filter of the Reference to several channels. The
     intensity image of each speed is divided by its median, and the maximum over the speeds is taken
     in each pixel.
 
@@ -493,8 +497,8 @@ def _matched(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int
 def placed(image: Signal, body: Body, extraction: Extraction) -> Signal:
     """Add a moving body, focused with its velocity, to an image at its true position.
 
-    This is the along-track position at t = 0 and the closest range of each of its range lines. The
-    amplitude is scaled as that of stationary points.
+    In azimuth the image of the body is placed at its along-track position at t = 0, in range at the
+    closest range of each of its range lines. Its amplitude is scaled as that of stationary points.
 
     Args:
         image: Image (azimuth, range).
