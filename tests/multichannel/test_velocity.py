@@ -96,6 +96,16 @@ def test_recommended_reaches_the_bound(snr_db, worst, move):
         assert float(estimate.std[name].median()) == pytest.approx(least[name], rel=0.3)
 
 
+def test_ranges_other_than_the_reference_range_of_the_radar():
+    """One range per trial; the bank of filters once took all points to be at the reference range."""
+    radar, near = published_radar(reference_range_m=5700.0), torch.tensor([6490.0, 4860.0], dtype=F64)
+    echo = torch.stack([azimuth_echo(radar, N, 2.0, 3.0, 80.0, r0=float(r0)) for r0 in near])
+    estimate = moving_point_velocity(10 * echo + noise(2, 1), radar, GATE, NEAR, range_m=near)
+    assert bool(estimate.ok.all())
+    for name, truth in (("u_r_m_s", 2.0), ("u_a_m_s", 3.0), ("y0_m", 80.0)):
+        assert bool(((estimate.value[name] - truth).abs() < 5 * estimate.std[name]).all()), name
+
+
 def test_with_a_known_along_track_speed():
     estimate = MovingPointVelocity(RADAR, GATE, search=NEAR, u_a_m_s=5.0)(noisy(0.0, 32, u_r=10.0, u_a=5.0))
     assert set(estimate.std) == {"u_r_m_s", "y0_m"} and bool((estimate.value["u_a_m_s"] == 5).all())

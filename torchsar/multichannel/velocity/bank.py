@@ -188,13 +188,14 @@ def _best_tone(
     model = aperture.weight(radar, motion, time_s)[..., None, :].to(prepared.dtype) * point_phasor(
         radar, motion, time_s, prepared.dtype
     )
-    slowest = float(motion.along_m_s.max()) * reach_m / (radar.wavelength_m * radar.reference_range_m)
+    scale = radar.wavelength_m * motion.range_m[..., None]
+    slowest = float((motion.along_m_s[..., None] / scale).max()) * reach_m
     tones, rate_hz = _decimated(model.conj() * prepared[..., None, :, :], radar.prf_hz, slowest)
     length = smooth_length(2 * tones.shape[-1])
     spectrum = torch.fft.fftshift(torch.fft.fft(tones, length), dim=-1)
     tone_hz = (torch.arange(length, dtype=torch.float64, device=prepared.device) - length // 2) * (rate_hz / length)
-    shift = tone_hz * radar.wavelength_m * radar.reference_range_m / motion.along_m_s[..., None]
-    aligned = _aligned(spectrum, radar, shift)
+    shift = tone_hz * scale / motion.along_m_s[..., None]
+    aligned = _aligned(spectrum, radar, shift / scale)
     power = (
         aligned.abs().square().to(torch.float64) / _norm(model, whitening).to(torch.float64).clamp_min(_TINY)[..., None]
     )
@@ -224,9 +225,10 @@ def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor,
     return tones[..., :whole].unflatten(-1, (-1, factor)).sum(-1), prf_hz / factor
 
 
-def _aligned(spectrum: Tensor, radar: BistaticRadar, position: Tensor) -> Tensor:
-    """Add channels (..., channel, bin) with the phases of a point at `position` (..., bin)."""
-    slope = position / (radar.wavelength_m * radar.reference_range_m)
+def _aligned(spectrum: Tensor, radar: BistaticRadar, slope: Tensor) -> Tensor:
+    """Add channels (..., channel, bin) with the phases of a point; slope (..., bin) is its position
+    over wavelength and range, in turns per metre of channel position.
+    """
     total = torch.zeros_like(spectrum[..., 0, :])
     for i, dx in enumerate(radar.channel_m):
         total = total + spectrum[..., i, :] * unit_phasor(slope * dx, spectrum.dtype)
