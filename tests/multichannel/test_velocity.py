@@ -97,7 +97,7 @@ def test_recommended_reaches_the_bound(snr_db, worst, move):
 
 
 def test_ranges_other_than_the_reference_range_of_the_radar():
-    """One range per trial; the bank of filters once took all points to be at the reference range."""
+    """One range per trial; the bank of filters used the reference range for all points once."""
     radar, near = published_radar(reference_range_m=5700.0), torch.tensor([6490.0, 4860.0], dtype=F64)
     echo = torch.stack([azimuth_echo(radar, N, 2.0, 3.0, 80.0, r0=float(r0)) for r0 in near])
     estimate = moving_point_velocity(10 * echo + noise(2, 1), radar, GATE, NEAR, range_m=near)

@@ -125,7 +125,7 @@ class Parabola:
             Error in dB.
         """
         sine = radar.sin_squint(doppler_hz, velocity_m_s)
-        closest, velocity = range_m * torch.sqrt(1 - sine**2), torch.tensor(velocity_m_s)
+        closest, velocity = range_m * torch.sqrt(1 - sine**2), torch.tensor(velocity_m_s, dtype=torch.float64)
         since = range_m * sine / velocity_m_s + dwell_s * torch.linspace(-0.5, 0.5, 65, dtype=torch.float64)
         wrong = self.range_m(since, closest, velocity) - Hyperbola().range_m(since, closest, velocity)
         error = float((2 - 2 * torch.cos(4 * math.pi / radar.wavelength_m * wrong)).mean())
