@@ -242,7 +242,12 @@ def with_wavelength(radar: type) -> Callable[..., Any]:
     signature, optional = inspect.signature(radar), inspect.Parameter.KEYWORD_ONLY
     rest = [p.replace(kind=optional) for p in signature.parameters.values() if p.name != "carrier_hz"]
     first = [inspect.Parameter(name, optional, default=None) for name in ("carrier_hz", "wavelength_m")]
-    made.__signature__ = signature.replace(parameters=[*first, *rest])  # pyright: ignore[reportAttributeAccessIssue]
+    made.__signature__, made.__doc__ = (  # pyright: ignore[reportAttributeAccessIssue]
+        signature.replace(parameters=[*first, *rest]),
+        (radar.__doc__ or "").replace(
+            "carrier_hz:", "wavelength_m: Wavelength in metres, in place of `carrier_hz`.\n        carrier_hz:", 1
+        ),
+    )
     hints = typing.get_type_hints(radar.__init__)
     made.__annotations__ = {**hints, "carrier_hz": float | None, "wavelength_m": float | None}
     return made
