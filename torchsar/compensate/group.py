@@ -25,14 +25,15 @@ BLOCK_COLUMNS = 32
 
 
 def aperture_s(radar: StripmapRadar, n_range: int) -> float:
-    """Return the time that a target stays in the recorded band.
+    """Return the time that the beam illuminates a target in the middle of the swath.
 
     Args:
         radar: Radar parameters.
         n_range: Number of range samples.
 
     Returns:
-        The nominal dwell in seconds, or the time to sweep one PRF if no dwell is known.
+        The nominal dwell in seconds; if the radar has none, the time in which the Doppler frequency
+        of the target changes by one PRF.
     """
     middle = radar.near_range_m + n_range / 2 * radar.range_step_m
     return radar.aperture_s(middle)

@@ -130,11 +130,12 @@ class LadarCourse:
                 (...,); None for zero.
 
         Returns:
-            Tensors by name: the velocity `velocity_m_s` and the displacement `range_error_m` at the
-            turning points between up-sweep and down-sweep, the displacements `range_error_up_m` and
-            `range_error_down_m` at the middles of the sweeps, `azimuth_m`, `range_m` and
-            `amplitude` of the scatterers, `noise_std`, and `log_amplitude` at the turning points if
-            it is modelled.
+            Tensors by name: the radial velocity of the target `velocity_m_s` and its deviation from
+            the nominal range `range_error_m` at the turning points between up-sweep and down-sweep,
+            the same deviation at the middles of the sweeps (`range_error_up_m`,
+            `range_error_down_m`), `azimuth_m`, `range_m` and `amplitude` of the scatterers,
+            `noise_std`, and, if turbulence changes the amplitude of the echo, the logarithm
+            `log_amplitude` of this change at the turning points.
         """
         then = (
             middle_s

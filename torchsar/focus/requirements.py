@@ -1,6 +1,7 @@
 """Phase that each simplification of a stripmap focuser neglects in a given scene.
 
-All values follow from the radar and the axes, before any simulation.
+All values follow from the radar and from the slow-time and range axes of the data, before any
+simulation.
 """
 
 from __future__ import annotations

@@ -337,7 +337,7 @@ def plane_wave_loss(
         elevation_rad: Elevation of the line of sight in radians.
 
     Returns:
-        Upper bounds of the phase, displacement and defocus.
+        Upper bounds of the phase of the neglected range, of the displacement and of the defocus.
 
     Raises:
         ValueError: If an argument is out of range.

@@ -72,7 +72,8 @@ def sharpest_phase(
             azimuth, range), not necessarily of all trials, and returns one cost per image, shape
             (trial,).
         mask: Weights of the pixels, shape (azimuth, range) or (..., azimuth, range).
-        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
+        start: Phase to start from in rad, shape (..., pulse); by default that of the spatial
+            correlation algorithm (function `sca`).
         basis: Real functions of slow time, shape (coefficient, pulse) or (..., coefficient, pulse),
             such as `torchsar.core.legendre(u, 5).mT[2:]`. The phase is then a weighted sum of these
             functions, and the descent starts from their least-squares fit to the start.

@@ -52,7 +52,8 @@ def autofocus(
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
-        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`. With this
+        start: Phase to start from in rad, shape (..., pulse); by default that of the spatial
+            correlation algorithm (function `sca`). With this
             default the size of the phase errors has no effect on the result.
         search: Largest number of iterations of the second step, approximately; only hard cases of
             low SNR need them all.

@@ -216,7 +216,8 @@ class EntropyFixedPoint(Stage):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
+            start: Phase to start from in rad, shape (..., pulse); by default that of the
+                spatial correlation algorithm (function `sca`).
 
         Returns:
             `Estimate` by the function `entropy_fixed_point` with `phase_rad` of shape (...,
@@ -249,7 +250,8 @@ class Autofocus(Stage):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
+            start: Phase to start from in rad, shape (..., pulse); by default that of the
+                spatial correlation algorithm (function `sca`).
 
         Returns:
             `Estimate` by the function `autofocus` with `phase_rad` of shape (..., pulse), to be
@@ -283,7 +285,8 @@ class TargetAutofocus(Autofocus):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
+            start: Phase to start from in rad, shape (..., pulse); by default that of the
+                spatial correlation algorithm (function `sca`).
 
         Returns:
             `Estimate` by the function `autofocus` with `phase_rad` of shape (..., pulse), to be
@@ -320,7 +323,8 @@ class SharpestPhase(Stage):
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
+            start: Phase to start from in rad, shape (..., pulse); by default that of the
+                spatial correlation algorithm (function `sca`).
 
         Returns:
             `Estimate` by the function `sharpest_phase` with `phase_rad` of shape (..., pulse), to

@@ -255,7 +255,8 @@ def rotating_autofocus(
         prf_hz: Pulse repetition frequency in Hz.
         warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
             1/s^2, ..., shape (trial, order - 1), with all trial dimensions of the data as one.
-        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`: the phases
+        start: Phase to start from in rad, shape (..., pulse); by default that of the spatial
+            correlation algorithm (function `sca`): the phases
             between adjacent pulses, added up.
         search: Largest number of fixed-point iterations that minimise the image entropy.
         polish: Largest number of further iterations, which compare each pulse with a Wiener

@@ -185,23 +185,21 @@ def _best_tone(
     whitening: Whitening | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the greatest normalised correlation per trial, its position y0 and its u_a."""
-    model = aperture.weight(radar, motion, time_s)[..., None, :].to(prepared.dtype) * point_phasor(
-        radar, motion, time_s, prepared.dtype
-    )
+    weight = aperture.weight(radar, motion, time_s)
+    model = weight[..., None, :].to(prepared.dtype) * point_phasor(radar, motion, time_s, prepared.dtype)
     scale = radar.wavelength_m * motion.range_m[..., None]
-    slowest = float((motion.along_m_s[..., None] / scale).max()) * reach_m
-    tones, rate_hz = _decimated(model.conj() * prepared[..., None, :, :], radar.prf_hz, slowest)
+    fastest = float((motion.along_m_s[..., None] / scale).max()) * reach_m
+    tones, rate_hz = _decimated(model.conj() * prepared[..., None, :, :], radar.prf_hz, fastest)
     length = smooth_length(2 * tones.shape[-1])
-    spectrum = torch.fft.fftshift(torch.fft.fft(tones, length), dim=-1)
-    tone_hz = (torch.arange(length, dtype=torch.float64, device=prepared.device) - length // 2) * (rate_hz / length)
-    shift = tone_hz * scale / motion.along_m_s[..., None]
+    bins = _bins_within(fastest * length / rate_hz, length, prepared.device)
+    spectrum = torch.fft.fft(tones, length)[..., bins]
+    shift = bins.to(torch.float64) * (rate_hz / length) * scale / motion.along_m_s[..., None]
     aligned = _aligned(spectrum, radar, shift / scale)
-    power = (
-        aligned.abs().square().to(torch.float64) / _norm(model, whitening).to(torch.float64).clamp_min(_TINY)[..., None]
-    )
+    energy = weight.square().sum(-1) * radar.channels if whitening is None else _whitened_energy(model, whitening)
+    power = aligned.abs().square().to(torch.float64) / energy.clamp_min(_TINY)[..., None]
     power = torch.where(shift.abs() <= reach_m, power, -torch.inf).flatten(-2)
     at = power.argmax(-1, keepdim=True)
-    wide = torch.broadcast_to(motion.y0_m[..., None] + shift, (*aligned.shape[:-1], length)).flatten(-2)
+    wide = torch.broadcast_to(motion.y0_m[..., None] + shift, aligned.shape).flatten(-2)
     along = torch.broadcast_to(motion.u_a_m_s[..., None], aligned.shape).flatten(-2)
     return (
         power.gather(-1, at)[..., 0],
@@ -225,6 +223,12 @@ def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor,
     return tones[..., :whole].unflatten(-1, (-1, factor)).sum(-1), prf_hz / factor
 
 
+def _bins_within(reach: float, length: int, device: torch.device) -> Tensor:
+    """Return the bins of an FFT, negative ones first, that lie within `reach` bins of zero."""
+    half = min(length // 2, int(reach) + 1)
+    return torch.arange(-half, min(half + 1, length - half), device=device)
+
+
 def _aligned(spectrum: Tensor, radar: BistaticRadar, slope: Tensor) -> Tensor:
     """Add channels (..., channel, bin) with the phases of a point; slope (..., bin) is its position
     over wavelength and range, in turns per metre of channel position.
@@ -235,14 +239,11 @@ def _aligned(spectrum: Tensor, radar: BistaticRadar, slope: Tensor) -> Tensor:
     return total
 
 
-def _norm(model: Tensor, whitening: Whitening | None) -> Tensor:
-    """Return the energy of the models in the metric of the data, (..., hypothesis or 1).
+def _whitened_energy(model: Tensor, whitening: Whitening) -> Tensor:
+    """Return the energy of the middle model in the metric of the clutter, shape (..., 1).
 
-    It is exact for white noise. In clutter that of the middle hypothesis is used for all, since it
-    hardly depends on the along-track speed.
+    It serves for all hypotheses, since it hardly depends on the along-track speed.
     """
-    if whitening is None:
-        return model.abs().square().sum((-2, -1))
     middle = model[..., model.shape[-3] // 2, :, :].to(torch.complex128)
     return (
         whitening.applied(middle.expand(*whitening.factor.shape[:-3], *middle.shape[-2:]))
