@@ -77,10 +77,11 @@ class Draws:
         """Return an independent source of random numbers for a named part of a scene.
 
         Two parts of one kind, such as two areas of speckle, draw the same numbers unless their
-        sources have different names.
+        sources have different names. The name joins the case, which is part of the address of every
+        random number.
 
         Args:
-            name: Name of the part, added to the case.
+            name: Name of the part.
         """
         return replace(
             self,

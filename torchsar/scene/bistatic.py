@@ -1,4 +1,5 @@
-"""World of a scene illuminated by a distant satellite and recorded by an airborne receiver."""
+"""Targets, clutter and noise of a scene that a distant satellite illuminates and an airborne
+receiver records."""
 
 from __future__ import annotations
 

@@ -104,7 +104,9 @@ class Save(Strict):
 
 
 class Sweep(Strict):
-    """A Monte Carlo sweep. Keys other than those below are axes of the grid.
+    """Section `sweep` of a config: a Monte Carlo sweep. A dotted key of the config, such as
+    `world.noise.snr_db: [0, 10]`, may stand in this section directly or below `grid`; it is an axis
+    of the grid of swept values.
 
     Fields:
         grid: Values of each axis, a list or a mapping of labels to values, by dotted key.

@@ -145,15 +145,16 @@ class Bench:
             draws: Random numbers of the trials of the batch.
             given: Tensors (trial,) that replace numbers of the world, by dotted key below `world`.
             keep: Methods whose traces are kept.
-            detail: Whether metrics of single targets are computed as well, and a method whose chain
-                does not end with an image is an error, as for `torchsar run`.
+            detail: True, as for `torchsar run`, to compute metrics of single targets too, and to
+                report a method whose chain does not end with an image as failed.
             methods: Methods that are run; all if empty.
 
         Returns:
             The trials and the outcomes.
 
         Raises:
-            ConfigError: If the simulation or the recommended method fails.
+            ConfigError: If the simulation fails, or the method with the name `recommended`. The
+                failure of another method is part of its outcome.
         """
         self.announce("", "recording" if self.recording is not None else "simulation")
         with self._named("world"):

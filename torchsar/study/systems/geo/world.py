@@ -48,7 +48,8 @@ class Level:
     Args:
         snr_db: Power of a target over noise in a sample of one channel after range compression.
         raw_scnr_db: Power of a target over noise in a sample of one channel before range
-            compression. Compression raises it by 10 log10(B tau_p) dB, with the bandwidth B and the
+            compression; "raw SCNR" in the literature, although it does not include the clutter.
+            Compression raises it by 10 log10(B tau_p) dB, with the bandwidth B and the
             length tau_p of a pulse.
         scr_db: Power of a target over that of the sea in a sample after range compression.
     """
