@@ -21,20 +21,24 @@ LEAST_CHARACTERS = 60
 
 def readme() -> Iterator[tuple[str, str]]:
     """(where, text) of every paragraph of the README that is prose."""
-    code = False
+    code, section = False, ""
     for part in (ROOT / "README.md").read_text(encoding="utf-8").split("\n\n"):
         opens = part.count("```") % 2 == 1
-        if not (code or opens or part.startswith(("#", "|", "    ", "![", "```"))):
-            yield "README.md", part
+        if part.startswith("#") and not code:
+            section = part.splitlines()[0].lstrip("# ")
+        elif not (code or opens or part.startswith(("|", "    ", "![", "```"))):
+            yield f"README.md, section {section!r}", part
         code = code ^ opens
 
 
 def docstrings(path: Path, tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """(where, text) of the docstrings of a module and of its public classes and functions."""
+    """(where, text) of the docstrings of a module and of its public classes and functions; a
+    function has its signature in front, as in `help`.
+    """
     for name, node in [("module", tree), *public(tree)]:
         text = ast.get_docstring(node)
         if text:
-            yield f"{path.relative_to(ROOT)}: {name}", text
+            yield f"{path.relative_to(ROOT)}: {name}", f"{signature(node)}{text}"
 
 
 def public(
@@ -46,6 +50,14 @@ def public(
             yield f"{above}{node.name}", node
             if isinstance(node, ast.ClassDef):
                 yield from public(node, f"{above}{node.name}.")
+
+
+def signature(node: ast.AST) -> str:
+    """The line `name(arguments) -> result` of a function, and nothing for others."""
+    if not isinstance(node, ast.FunctionDef):
+        return ""
+    result = f" -> {ast.unparse(node.returns)}" if node.returns else ""
+    return f"{node.name}({ast.unparse(node.args)}){result}\n\n"
 
 
 def errors(path: Path, tree: ast.Module) -> Iterator[tuple[str, str]]:

@@ -531,7 +531,7 @@ REFUSED = {
         "spacing_m of an aircraft must be a positive number of metres, got 0",
     ),
     "heading": (lambda: Aircraft(heading_deg=math.nan), "heading_deg of an aircraft must be a finite number"),
-    "rows": (lambda: SpreadRows(300, 1, 0.5, 0.3, 1e-3), "spread rows need 1 to range_cells=256 rows"),
+    "rows": (lambda: SpreadRows(300, 1, 0.5, 0.3, 1e-3), "rows must lie in 1..256, the number of range cells"),
     "width": (lambda: SpreadRows(3, 1, 1.5, 0.3, 1e-3), "width of spread rows must be in 0..1"),
     "spin": (
         lambda: dechirped_echo(SMALL.scatterers(Draws(0)), QUICK, 4, 16, 50.0),

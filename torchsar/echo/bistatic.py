@@ -52,7 +52,7 @@ def bistatic_echo(
 
     Args:
         movers: Targets, shape (..., target).
-        radar: Receiver.
+        radar: Radar parameters.
         n_pulse: Number of pulses.
         n_range: Number of range samples; None for one sample per pulse, in which every target
             contributes the peak of its range response.
@@ -183,7 +183,7 @@ def simulate_bistatic(
     recording does not contain them.
 
     Args:
-        radar: Receiver.
+        radar: Radar parameters.
         world: Targets, receive gain, sea, range models and noise.
         n_pulse: Number of pulses.
         n_range: Number of range samples, None for azimuth-only data, in which every target lies on

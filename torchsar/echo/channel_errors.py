@@ -25,7 +25,7 @@ def delayed(signal: Signal, delay_s: Tensor, radar: BistaticRadar) -> Signal:
     Args:
         signal: Data of shape (..., channel, pulse, range), complex.
         delay_s: Delay in seconds, later positive, broadcastable to (..., channel, pulse), float64.
-        radar: Receiver.
+        radar: Radar parameters.
 
     Returns:
         Delayed data.

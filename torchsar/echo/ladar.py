@@ -55,7 +55,7 @@ def ladar_echo(
 
     Args:
         scatterers: Scatterers, shape (..., target).
-        radar: Ladar.
+        radar: Ladar parameters.
         n_period: Number of periods.
         motion: Motions along the line of sight; draw random ones first with `drawn_motion`.
         fidelity: Model of the range within a sweep.
@@ -102,7 +102,7 @@ def range_model_error_db(
 
     Args:
         scatterers: One scatterer without trial dimensions, shape (1,).
-        radar: Ladar.
+        radar: Ladar parameters.
         n_period: Number of recorded periods.
         motion: Motions along the line of sight; draw random ones first with `drawn_motion`.
         fidelity: Model of the range within a sweep.
@@ -140,7 +140,7 @@ def lit_by(s: Scatterers, radar: TriangularLadar, time_s: Tensor) -> Tensor:
 
     Args:
         s: Scatterers, shape (..., target).
-        radar: Ladar.
+        radar: Ladar parameters.
         time_s: Slow time in seconds, any shape, float64.
 
     Returns:
@@ -160,7 +160,7 @@ def refuse_beats(beat_hz: Tensor, shines: Tensor, radar: TriangularLadar) -> Non
     Args:
         beat_hz: Beat frequencies in hertz, shape (..., target).
         shines: Whether a scatterer contributes to the echo, broadcastable to beat_hz, bool.
-        radar: Ladar.
+        radar: Ladar parameters.
 
     Raises:
         ValueError: If a contributing scatterer has too high a beat frequency.
@@ -330,7 +330,7 @@ def simulate_ladar(
     receiver into sweeps; `simulate_ladar_record` simulates that record itself.
 
     Args:
-        radar: Ladar.
+        radar: Ladar parameters.
         world: Scene, motion, propagation, laser errors and noise.
         n_period: Number of periods.
         draws: Random draws.

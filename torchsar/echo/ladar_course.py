@@ -45,7 +45,7 @@ class LadarCourse:
         """Draw the scatterers, motions and scintillation of a simulation.
 
         Args:
-            radar: Ladar.
+            radar: Ladar parameters.
             world: Scene, motion, propagation, laser errors and noise.
             n_period: Number of periods.
             draws: Random draws.
@@ -123,7 +123,7 @@ class LadarCourse:
         light.
 
         Args:
-            radar: Ladar.
+            radar: Ladar parameters.
             world: Scene, motion, propagation, laser errors and noise.
             middle_s: Slow times of the sweep middles in seconds, shape (2, pulse).
             later_s: Time in seconds by which all sweeps come later than middle_s, a number or shape
@@ -227,7 +227,7 @@ def calibration_aux(
     """Return the side data of the calibration fibre.
 
     Args:
-        radar: Ladar.
+        radar: Ladar parameters.
         world: Scene, motion, propagation, laser errors and noise.
         n_period: Number of periods.
         draws: Random draws.
@@ -265,7 +265,7 @@ def hand_over(
         data: Samples, shape (..., *axes).
         clean: Samples without motion, same shape.
         axes: Axes of the samples.
-        radar: Ladar.
+        radar: Ladar parameters.
         aux: Recorded side data.
         values: True values by name.
         impairments: Impairments by name, applied in order.

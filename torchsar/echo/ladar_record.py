@@ -63,7 +63,7 @@ def ladar_record(
 
     Args:
         scatterers: Scatterers, shape (..., target).
-        radar: Ladar.
+        radar: Ladar parameters.
         n_period: Number of recorded periods, one block each.
         n_sample: Number of samples of a block.
         motion: Motions along the line of sight; draw random ones first with `drawn_motion`.
@@ -186,7 +186,7 @@ class BlockPaths:
 
         Args:
             scatterers: Scatterers, shape (..., target).
-            radar: Ladar.
+            radar: Ladar parameters.
             start_s: Start times of the blocks in seconds, shape (pulse,), float64.
             n_sample: Number of samples in a block.
             motion: Motions along the line of sight; draw random ones first with `drawn_motion`.
@@ -343,7 +343,7 @@ def simulate_ladar_record(
     complex samples.
 
     Args:
-        radar: Ladar.
+        radar: Ladar parameters.
         world: Scene, motion, propagation, laser errors and noise.
         n_period: Number of recorded periods.
         draws: Random draws.

@@ -22,7 +22,7 @@ class SimulatedPairs:
     Recording and its Truth.
 
     Args:
-        radar: Radar.
+        radar: Radar parameters.
         world: World whose parameters are numbers that hold for all trials, not tensors with one
             value per trial.
         n_pulse: Number of pulses.

@@ -69,7 +69,7 @@ def sea_echo(
 
     Args:
         sea: Sea surface.
-        radar: Receiver.
+        radar: Radar parameters.
         n_pulse: Number of pulses.
         n_range: Number of range samples; None for azimuth data at the reference range only.
         gate: Illumination. `BandLimited` of duration T illuminates the Doppler band

@@ -63,7 +63,7 @@ def path_geometry(
 
     Args:
         scatterers: Scatterers, shape (..., target).
-        radar: Radar.
+        radar: Radar parameters.
         n_pulse: Number of pulses.
         n_range: Number of range samples.
         doppler_hz: Doppler frequency of the beam centre in hertz, a number or one value per trial.
@@ -100,7 +100,7 @@ def stripmap_echo(
     Args:
         placed: Scatterers, shape (..., target), as from `path_geometry`.
         world: Simulated world: its beam, path, velocity and Doppler frequency are used.
-        radar: Radar.
+        radar: Radar parameters.
         n_pulse: Number of pulses.
         n_range: Number of range samples.
         dtype: Complex dtype of the result.
@@ -260,7 +260,7 @@ def target_energy(truth: Truth, world: StripmapWorld, radar: StripmapRadar, n_pu
     Args:
         truth: True values returned by `simulate`.
         world: Simulated world; its beam weights the pulses.
-        radar: Radar.
+        radar: Radar parameters.
         n_pulse: Number of pulses.
 
     Returns:
@@ -303,7 +303,7 @@ def simulate(
     """Simulate raw stripmap recordings, one per trial of `draws`.
 
     Args:
-        radar: Radar.
+        radar: Radar parameters.
         world: Scene, beam, path, true velocity and Doppler frequency, and signal-to-noise ratio.
         n_pulse: Number of pulses.
         n_range: Number of range samples.

@@ -118,7 +118,7 @@ def wound_turns(error: SweepError, radar: TriangularLadar, position_s: Tensor) -
 
     Args:
         error: Phase error of one up-sweep and one down-sweep.
-        radar: Ladar.
+        radar: Ladar parameters.
         position_s: Time since the start of a period in seconds, negative before it, shape (n,) or
             (..., pulse, n), float64.
 
@@ -153,7 +153,7 @@ def calibration_channel(
     "echo_conj_lo".
 
     Args:
-        radar: Ladar.
+        radar: Ladar parameters.
         fibre: Calibration fibre.
         error: Phase error of the laser, None for none.
         n_period: Number of periods.

@@ -41,7 +41,7 @@ def rotation_angle(radar: InverseRadar, n_pulse: int, rotation: Rotation, like: 
     """Return the rotation angle at the middle of each pulse.
 
     Args:
-        radar: Radar.
+        radar: Radar parameters.
         n_pulse: Number of pulses.
         rotation: Rate in rad/s of a uniform rotation, a number or one value per trial, with the
             angle zero at pulse n_pulse // 2; or a PolynomialRotation, with the angle zero at the
@@ -78,7 +78,7 @@ class PulseTurn:
         Args:
             rotation: Rate in rad/s of a uniform rotation, with the angle zero at pulse
                 n_pulse // 2; or a PolynomialRotation, with the angle zero at the first pulse.
-            radar: Radar.
+            radar: Radar parameters.
             n_pulse: Number of pulses.
             like: Tensor that gives the device.
 
@@ -127,7 +127,7 @@ def turntable_echo(
 
     Args:
         scatterers: Scatterers, shape (..., target).
-        radar: Radar.
+        radar: Radar parameters.
         n_pulse: Number of pulses.
         n_range: Number of range samples.
         rotation_rad_s: Rotation rate in rad/s of a uniform rotation, a number or one value per
@@ -316,7 +316,7 @@ class ScattererLines:
         at the middle of the pulse.
 
         Args:
-            radar: Radar.
+            radar: Radar parameters.
             x: Cross ranges in metres, shape (..., target), float64.
             y: Ranges from the middle of the window in metres, same shape.
             lever: Ranges from the centre of rotation in metres, same shape.
@@ -432,7 +432,7 @@ class TurnInPulse:
         Args:
             turn: Angle, rate and acceleration at the middle of each pulse.
             rotation: Rate in rad/s of a uniform rotation, or a PolynomialRotation.
-            radar: Radar.
+            radar: Radar parameters.
             half_s: Half the pulse length in seconds.
 
         Returns:
@@ -579,7 +579,7 @@ def simulate_turntable(
     signal-to-noise ratio `world.snr_db` is the same before and after range compression.
 
     Args:
-        radar: Radar.
+        radar: Radar parameters.
         world: Scene, rotation, motion, start phases, model of the echo and signal-to-noise ratio.
         n_pulse: Number of pulses.
         n_range: Number of range samples, or of samples of a dechirped pulse.

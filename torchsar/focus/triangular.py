@@ -316,7 +316,8 @@ class CompressSweeps(Stage):
             return out
         if len(self.window_m) != 2 or not self.window_m[0] < self.window_m[1]:
             raise ValueError(
-                f"window_m must be two relative ranges (low, high) in metres with low < high, got {list(self.window_m)}"
+                "window_m must be two ranges (low, high) in metres relative to the reference range"
+                f" with low < high, got {list(self.window_m)}"
             )
         low, high = (round(float(axes[1].index_of(edge))) for edge in self.window_m)
         if not 0 <= low < high < axes[1].n:

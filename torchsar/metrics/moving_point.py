@@ -113,7 +113,7 @@ class FocusedPoint:
         Args:
             chain: The chain.
             trace: Signals and values of a run of the chain.
-            radar: The instrument.
+            radar: Radar parameters.
 
         Returns:
             The last reconstruction and focusing; None if the chain lacks one of the two.
@@ -298,11 +298,11 @@ def ideal_responses(
     The point responses are then sinc functions over the processed bands.
 
     Args:
-        radar: The instrument.
+        radar: Radar parameters.
         u_r_m_s: Slant-range speed of the point in m/s.
         u_a_m_s: Along-track speed of the point in m/s.
-        integration_s: Time in seconds for which the point is illuminated; None for the antenna
-            pattern of the elements.
+        integration_s: Time in seconds for which the point is illuminated with constant amplitude;
+            None if the amplitude follows the antenna pattern of a channel.
         processed_hz: Width of the processed Doppler band in Hz.
         ranges: Whether images have a range axis.
 

@@ -122,7 +122,7 @@ def lit_periods(radar: TriangularLadar, pulse: Axis, azimuth_m: Tensor, range_m:
     """Find the sweep periods at whose turning point the beam illuminates a scatterer.
 
     Args:
-        radar: The instrument.
+        radar: Radar parameters.
         pulse: Slow-time axis: starts of the periods.
         azimuth_m: Positions of the scatterers along track in metres, (..., target).
         range_m: Ranges of the scatterers relative to the reference range in metres, (..., target).
@@ -143,7 +143,7 @@ def course_of(chain: Chain, trace: Trace, truth: Mapping[str, Tensor], radar: Tr
         chain: The chain.
         trace: Its intermediate signals and estimates for a recording.
         truth: True values of that recording, as the simulation gives them.
-        radar: The instrument.
+        radar: Radar parameters.
         clean: Whether the chain ran on the recording without motion.
 
     Returns:
@@ -192,7 +192,7 @@ def target_responses(
         positions_m: True azimuth and relative range in metres, (...,) each, by the name of the
             target.
         course: Residual motion.
-        radar: The instrument.
+        radar: Radar parameters.
         sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
             of a sinc of the same -3 dB width.
         search_m: Half width in metres of the search about the predicted position.

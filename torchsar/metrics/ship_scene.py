@@ -146,7 +146,7 @@ class ShownShip:
         """Image the echo of a ship alone and find the positions of the ship and its replicas.
 
         Args:
-            radar: The instrument.
+            radar: Radar parameters.
             ship: The ship.
             data: The whole recording (channel, pulse, range), with the transmit range removed from
                 the phase. The covariance of the sea in it sets the weights with which the channels

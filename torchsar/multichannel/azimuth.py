@@ -28,7 +28,7 @@ def azimuth_filter(
 
     Args:
         offset_hz: Doppler relative to the centre in Hz, float64 (bin,).
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         dtype: Complex dtype of the result.
         centre_hz: Doppler centre in Hz, shape (...,), by default that of the motion.
@@ -58,7 +58,7 @@ def focus_azimuth(
         spectrum: Reconstructed spectra about the Doppler centre of the motion, shape (..., bin),
             complex.
         offset_hz: Doppler relative to the centre in Hz, float64 (bin,).
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         bandwidth_hz: Processed Doppler bandwidth about the centre in Hz, None for the whole
             spectrum.
@@ -84,7 +84,7 @@ class FocusAzimuth(Stage):
     scene.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         bandwidth_hz: Processed Doppler bandwidth about the centre in Hz, None for the whole
             spectrum.
 
@@ -114,8 +114,8 @@ class FocusAzimuth(Stage):
         Args:
             signal: Spectrum with the axes (doppler[, range]).
             u_r_m_s: Slant-range speed in m/s, closing positive, shape (...,) or a number.
-            u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, same
-                shape.
+            u_a_m_s: Along-track speed in m/s, positive in the flight direction of the receiver,
+                same shape.
             y0_m: Along-track position at t = 0 in metres, same shape.
             range_m: Closest range R0 in metres, same shape. By default that of the strongest range
                 line, or the reference range of the radar where there is no range axis.
@@ -145,7 +145,7 @@ def image_axis(radar: BistaticRadar, doppler: Axis) -> Axis:
     V_R is the speed of the receiver and t the slow time.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         doppler: Doppler axis of the spectrum.
 
     Returns:

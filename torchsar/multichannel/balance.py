@@ -58,7 +58,7 @@ def correct_balance(
     Args:
         data: Channels, shape (..., channel, pulse, range), or (..., channel, pulse) if `with_range`
             is False, complex.
-        radar: Instrument.
+        radar: Radar parameters.
         phase_rad: Phases in radians, float64 (..., channel).
         gain_db: Gains in dB, float64 (..., channel).
         delay_s: Delays in seconds, float64 (..., channel), or None.
@@ -117,7 +117,7 @@ def estimate_balance(
     Args:
         data: Range-compressed channels with the transmit range removed from the phase, shape (...,
             channel, pulse, range), complex, mostly stationary clutter.
-        radar: Instrument.
+        radar: Radar parameters.
         prior: Expected power of the clutter over Doppler, `ElementPattern()` by default.
         bands: Number of Doppler bands that the clutter fills, each one PRF wide.
         delays: False to assume zero delays.
@@ -369,7 +369,7 @@ class EstimateBalance(Stage):
     The values connect to `CorrectBalance`.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         prior: Expected power of the clutter over Doppler, `ElementPattern()` by default.
         bands: Number of Doppler bands that the clutter fills, each one PRF wide.
         delays: False to assume zero delays.
@@ -406,7 +406,7 @@ class CorrectBalance(Stage):
     `use(CorrectBalance(radar), phase_rad="balance", gain_db="balance", delay_s="balance")`.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
     """
 
     works_on = ("channel", "pulse")

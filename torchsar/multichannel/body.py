@@ -156,7 +156,7 @@ class Chip:
     """Short-time spectra of the range lines around a body, deramped by the motion of its middle.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the middle of the body.
         segments: Short-time Fourier transform of slow time.
         cells: Spectra of the range lines of the body, complex128 (line, channel, segment, tone).

@@ -18,7 +18,7 @@ class CompressChannels(Stage):
     remain.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         reference: Reference spectrum "matched", "flat" or "phase", see `focus.RangeCompress`.
             "flat" gives an exactly rectangular band and thus the response of data that are
             simulated directly in range-compressed form.

@@ -29,7 +29,7 @@ def known_motion_chain(
     along-track speed in m/s, along-track position and closest range in metres.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         rebuild: Reconstruction of the Doppler bands.
         bandwidth_hz: Width of the Doppler band that is focused in Hz; None for the whole
             reconstructed band.

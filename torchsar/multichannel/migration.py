@@ -40,7 +40,7 @@ class Frame:
     """Radar and axes of data (..., channel, pulse, range), from which range histories follow.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         time_s: Slow time in seconds, float64 (pulse,).
         range_m: Range axis in metres, float64 (range,). It holds the closest range of points.
     """
@@ -271,7 +271,7 @@ def ambiguity_number(radar: BistaticRadar, motion: PointMotion, reference: Point
     along-track position and R0 the closest range.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         reference: Motion of the reference point, shape (...,).
 
@@ -362,7 +362,7 @@ class CorrectMigration(Stage):
     Azimuth-only data (channel, pulse), which do not migrate, pass unchanged.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         migration: Method, `Keystone()` by default.
         range_m: Closest range of the reference point in metres, None for the reference range of the
             radar.

@@ -23,7 +23,7 @@ class PointMotion:
 
     Args:
         u_r_m_s: Slant-range speed u_r in m/s, closing positive.
-        u_a_m_s: Along-track speed u_a in m/s, positive in the direction of the receiver.
+        u_a_m_s: Along-track speed u_a in m/s, positive in the flight direction of the receiver.
         y0_m: Along-track position y0 at t = 0 in metres.
         range_m: Closest range R0 between the track and the point at rest in metres.
         speed_m_s: Speed V_R of the receiver in m/s.
@@ -50,10 +50,10 @@ class PointMotion:
         """Build a motion from numbers or tensors (...,) on the device of `like`.
 
         Args:
-            radar: Instrument.
+            radar: Radar parameters.
             like: Tensor whose device is used.
             u_r_m_s: Slant-range speed in m/s, closing positive.
-            u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver.
+            u_a_m_s: Along-track speed in m/s, positive in the flight direction of the receiver.
             y0_m: Along-track position at t = 0 in metres.
             range_m: Closest range in metres, None for the reference range of the radar.
 

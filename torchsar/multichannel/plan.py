@@ -27,7 +27,7 @@ class AzimuthPlan:
     where f is the Doppler centre, rounded to the nearest bin, and t slow time.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the points; its tensors have the shape ().
         n_pulse: Number of pulses.
         rebuild: Reconstruction method, `LeastSquares()` by default.
@@ -138,12 +138,12 @@ class FocusPlan(Stage):
     the data changes. A warning is given where the reconstruction is ill-conditioned.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         rebuild: Reconstruction method, `LeastSquares()` by default.
         bandwidth_hz: Processed Doppler bandwidth about the centre in Hz, None for the whole
             spectrum.
         u_r_m_s: Slant-range speed in m/s, closing positive.
-        u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver.
+        u_a_m_s: Along-track speed in m/s, positive in the flight direction of the receiver.
         y0_m: Along-track position at t = 0 in metres.
         range_m: Closest range in metres, None for the reference range of the radar.
 

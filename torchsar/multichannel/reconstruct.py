@@ -42,7 +42,7 @@ def reconstruct(
         data: Channels with slow time zero at pulse n // 2, shape (..., channel, pulse), complex.
             The transmit range has been removed from the phase, except for a linear term where
             `left_k1_m_s` is given.
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the points, shape (...,).
         rebuild: Reconstruction method.
         left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
@@ -71,7 +71,7 @@ def reconstruct_lines(
         data: Channels with slow time zero at pulse n // 2, shape (..., channel, pulse, range),
             complex. The transmit range has been removed from the phase, except for a linear term
             where `left_k1_m_s` is given.
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the points, shape (...,).
         rebuild: Reconstruction method.
         left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
@@ -128,7 +128,7 @@ class Reconstruct(Stage):
     Doppler in Hz relative to the Doppler centre of the points.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         rebuild: `LeastSquares(bands)` (default) or `MinimumMeanSquare(...)`.
         range_m: Closest range of the points in metres, None for the reference range of the radar.
 
@@ -160,8 +160,8 @@ class Reconstruct(Stage):
             signal: Channels with the axes (channel, pulse[, range]) and the transmit range removed
                 from the phase.
             u_r_m_s: Slant-range speed in m/s, closing positive, shape (...,) or a number.
-            u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, same
-                shape.
+            u_a_m_s: Along-track speed in m/s, positive in the flight direction of the receiver,
+                same shape.
             y0_m: Along-track position at t = 0 in metres, same shape.
 
         Returns:
@@ -189,7 +189,7 @@ def refuse_shifted(radar: BistaticRadar, pulse: Axis) -> None:
     Reconstruction and focusing count phases from slow time zero.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         pulse: Slow-time axis of the data.
     """
     expected = radar.pulse_axis(pulse.n)
@@ -209,7 +209,7 @@ def doppler_axis(radar: BistaticRadar, n_pulse: int, bands: int) -> Axis:
     """Return the Doppler axis of a reconstructed spectrum in Hz relative to the Doppler centre.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         n_pulse: Number of pulses.
         bands: Number of reconstructed bands.
 
@@ -233,7 +233,7 @@ def check_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild,
     A warning is given where it exceeds 5 in some trials. `MinimumMeanSquare` has no such limit.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the points, shape (...,).
         rebuild: Reconstruction method.
         dtype: Dtype of the data.

@@ -137,7 +137,7 @@ def multichannel_limits(radar: BistaticRadar, use: MultichannelUse) -> tuple[Lim
     """Return the limits of reconstruction, estimation and imaging for a use of the radar.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         use: Record, reconstruction and bounds of the motion.
 
     Returns:
@@ -294,7 +294,7 @@ def singular_speeds_m_s(radar: BistaticRadar, bands: int, u_a_m_s: tuple[float, 
     v = D PRF / q with a positive whole number q; targets without slant-range speed are assumed.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         bands: Number of Doppler bands.
         u_a_m_s: Bounds of the along-track speed in m/s.
 
@@ -421,7 +421,7 @@ def multichannel_requirements(
     `tolerance_rad`.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         use: Record, reconstruction and bounds of the motion.
         tolerance_rad: Tolerance in radians of the other simplifications.
 

@@ -74,7 +74,7 @@ def band_matrix(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor
     relative to the point, and V^2 = v^2 + u_r^2 with the slant-range speed u_r of the point.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         bands: Number of bands; b is counted from the lowest one.
 
@@ -101,7 +101,7 @@ def shared_response(
     V^2 = v^2 + u_r^2, v_e = V^2 / v, y0 the along-track position at t = 0 and R0 the closest range.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         n_pulse: Number of pulses.
         bands: Number of bands.
@@ -136,7 +136,7 @@ def doppler_centre_hz(radar: BistaticRadar, motion: PointMotion, left_k1_m_s: fl
     It is the Doppler frequency while the point is at broadside.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
             still in the phase; 0 if it was removed.
@@ -158,7 +158,7 @@ class Prior(Protocol):
 
         Args:
             offset_hz: Doppler relative to the Doppler centre in Hz, any shape.
-            radar: Instrument.
+            radar: Radar parameters.
             motion: Motion of the point, shape (...,).
 
         Returns:
@@ -217,7 +217,7 @@ class Rebuild(Protocol):
         """Return the weights that combine the spectra of the channels to Doppler bands.
 
         Args:
-            radar: Instrument.
+            radar: Radar parameters.
             motion: Motion of the points, shape (...,).
             n_pulse: Number of pulses.
 
@@ -336,7 +336,7 @@ def clutter_covariance(
     """Return the covariance across channels of stationary clutter, per Doppler bin.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         prior: Expected power over Doppler, such as `ElementPattern()`.
         n_pulse: Number of pulses.
         bands: Number of Doppler bands that hold the clutter.
@@ -361,7 +361,7 @@ def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> T
     matrix is singular or has more bands than channels. Not differentiable.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         bands: Number of bands.
 
@@ -386,7 +386,7 @@ def noise_gain_db(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, n
     is singular: the weights are damped and finite there, but do not separate the bands.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         rebuild: Reconstruction method.
         n_pulse: Number of pulses, for weights that differ between bins.

@@ -113,7 +113,7 @@ class ImageMovers(Stage):
     differs between recordings.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         extraction: Extent of a target in the data.
         detector: Settings of the detection.
         rebuild: Reconstruction method for the stationary scene, `LeastSquares()` by default.
@@ -350,7 +350,7 @@ class MoversImage(Stage):
     its true position, and an estimate of the motions.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         rebuild: Reconstruction method for the stationary scene.
         removal: "subtract" or "zero", see `ImageMovers`.
         extraction: Extent of a target in the data.
@@ -447,7 +447,7 @@ def suppressed_image(
 
     Args:
         signal: Channels with the axes (channel, pulse, range), without trials.
-        radar: Instrument.
+        radar: Radar parameters.
         image: Stage that forms the conventional image.
         speeds_m_s: Slant-range speeds in m/s, closing positive.
 

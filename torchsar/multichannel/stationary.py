@@ -38,7 +38,7 @@ def two_way_radar(radar: BistaticRadar, bands: int, near_range_m: float) -> Stri
     Its waves travel the path twice, at twice the wave speed.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         bands: Number of reconstructed Doppler bands; the PRF of the result is bands * PRF.
         near_range_m: Range of the first sample in metres.
 
@@ -77,7 +77,7 @@ def stationary_image(
     Args:
         data: Range-compressed channels with the transmit range removed, shape (..., channel, pulse,
             range), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         near_range_m: Range of the first sample in metres.
         rebuild: Reconstruction method, `LeastSquares(2)` by default.
         form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
@@ -113,7 +113,7 @@ def focus_stationary(
     Args:
         spectrum: Spectra of range lines in rising order of Doppler, zero Doppler at bin n // 2 of
             n = bands * pulse, shape (..., bands * pulse, range), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         near_range_m: Range of the first sample in metres.
         bands: Number of reconstructed Doppler bands.
         form: "stolt" or "bulk", see `stationary_image`.
@@ -139,7 +139,7 @@ class StationaryImage(Stage):
     The input has the axes (channel, pulse, range), the output the axes (azimuth, range) in metres.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         rebuild: Reconstruction method, `LeastSquares(2)` by default.
         form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
             ranges.
@@ -200,7 +200,7 @@ def stationary_axis(radar: BistaticRadar, pulse: Axis, bands: int) -> Axis:
     V_R is the speed of the receiver and t the slow time.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         pulse: Slow-time axis of the data.
         bands: Number of reconstructed Doppler bands; the image has bands * pulse samples.
 
@@ -218,7 +218,7 @@ def bulk_error_db(radar: BistaticRadar, bands: int, half_swath_m: float, integra
     The form "bulk" of `stationary_image` corrects the migration of mid-swath at all ranges.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         bands: Number of reconstructed Doppler bands.
         half_swath_m: Half width of the swath in metres.
         integration_s: Integration time in seconds.
@@ -245,7 +245,7 @@ def swath_limit(
     and its range walk at a slant-range speed of up to lambda PRF / 2.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         half_swath_m: Half width of the swath in metres.
         positions_m: Along-track position of each ship, and its range from the middle of the swath,
             in metres.

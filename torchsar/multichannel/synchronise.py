@@ -37,7 +37,7 @@ def estimate_synchronisation(direct: Tensor, radar: BistaticRadar) -> Estimate:
         direct: Direct path, range compressed at the sampling rate of the echoes, shape (..., pulse,
             sample), complex. Its spectrum is flat over the bandwidth of the pulse. Its peak lies at
             sample n // 2 of n when the clocks agree.
-        radar: Instrument.
+        radar: Radar parameters.
 
     Returns:
         `phase_rad` in -pi..pi and `delay_s` in seconds, shape (..., pulse) each, with their
@@ -115,7 +115,7 @@ def remove_synchronisation(
     Args:
         data: Channels, shape (..., channel, pulse, range), or (..., channel, pulse) if `with_range`
             is False, complex.
-        radar: Instrument.
+        radar: Radar parameters.
         phase_rad: Phase in radians, float64 (..., pulse).
         delay_s: Delay in seconds, float64 (..., pulse), or None.
         with_range: Whether the data have a range axis.
@@ -157,7 +157,7 @@ class EstimateSynchronisation(Stage):
     changed.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
     """
 
     works_on = ("channel", "pulse")
@@ -196,7 +196,7 @@ class RemoveSynchronisation(Stage):
     See `remove_synchronisation`.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
     """
 
     works_on = ("channel", "pulse")

@@ -91,7 +91,7 @@ def scale_azimuth(
 
     Args:
         data: Channels as in `remove_transmit_range`.
-        radar: Instrument.
+        radar: Radar parameters.
         time_s: Slow time in seconds, float64 (pulse,).
         motion: Motion of the points, shape (...,).
         order: Highest power of slow time in the transmit range that is removed.
@@ -116,7 +116,7 @@ def neglected_transmit_phase_rad(radar: BistaticRadar, order: int, integration_s
     The bound is the sum of the magnitudes of these terms at the ends of the integration time.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         order: Highest power that is removed.
         integration_s: Integration time centred on t = 0 in seconds.
 
@@ -146,7 +146,7 @@ class RemoveTransmitRange(Stage):
     others contribute less than 0.03 rad.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         order: Number of coefficients to use, None for all.
 
     Raises:
@@ -193,7 +193,7 @@ class AzimuthScaling(Stage):
     k1 t as well.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         order: Highest power of slow time in the transmit range that is removed, 2 to 4.
 
     Raises:
@@ -221,8 +221,8 @@ class AzimuthScaling(Stage):
         Args:
             signal: Channels with the axes (channel, pulse[, range]).
             u_r_m_s: Slant-range speed in m/s, closing positive, shape (...,) or a number.
-            u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, same
-                shape.
+            u_a_m_s: Along-track speed in m/s, positive in the flight direction of the receiver,
+                same shape.
 
         Returns:
             Channels on the same axes.

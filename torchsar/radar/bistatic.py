@@ -209,7 +209,7 @@ def receive_range(
     Args:
         time_s: Slow time t in seconds.
         u_r_m_s: Slant-range speed u_r in m/s, closing positive.
-        u_a_m_s: Along-track speed u_a in m/s, positive in the direction of the receiver.
+        u_a_m_s: Along-track speed u_a in m/s, positive in the flight direction of the receiver.
         y0_m: Along-track position y0 of the point at t = 0 in metres.
         range_m: Range R0 in metres from the track to the position of the point at t = 0, across the
             track.

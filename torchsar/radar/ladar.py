@@ -206,7 +206,7 @@ def sweep_middles(radar: TriangularLadar, pulse: Axis, device: torch.device | st
     """Return the slow times of the middles of the up and down sweeps.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         pulse: Axis with the start of each period in seconds.
         device: Device of the result.
 

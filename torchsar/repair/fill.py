@@ -238,7 +238,7 @@ class SparseFill(Stage):
     The Doppler centroid must be absolute (ambiguity resolved) if range migration exceeds a cell.
 
     Args:
-        radar: Radar.
+        radar: Radar parameters.
         reference: Name of the range reference with which raw lines are compressed inside the model,
             such as "matched"; None for lines that are range-compressed already.
         velocity_m_s: Effective velocity in m/s; by default that of the radar.

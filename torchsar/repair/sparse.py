@@ -260,7 +260,7 @@ def sparse_fill(
     Args:
         lines: Lines, shape (..., pulse, range), complex.
         missing: Missing lines, shape (..., pulse), bool.
-        radar: Radar.
+        radar: Radar parameters.
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,); errors of a few Hz
             have little effect.
         velocity_m_s: Effective velocity in m/s, a number or shape (...,), by default that of the

@@ -66,7 +66,7 @@ def split_record(
 
     Args:
         record: Record, shape (..., pulse, time), real or complex.
-        radar: Ladar.
+        radar: Ladar parameters.
         trigger_s: Start of the up sweep in seconds, on a time axis on which the first sample of a
             block lies at `first_s`; a number or shape (...,).
         contiguous: Whether the record is contiguous; None: contiguous if blocks are one period long
@@ -141,7 +141,7 @@ def is_contiguous(block_samples: int, radar: TriangularLadar) -> bool:
 
     Args:
         block_samples: Number of samples of a block; the record has one block per recorded period.
-        radar: Ladar.
+        radar: Ladar parameters.
 
     Returns:
         True if every period is kept and a block is as long as a period.
@@ -155,7 +155,7 @@ def start_sample(trigger_s: Tensor, radar: TriangularLadar, joined: bool) -> tup
     Args:
         trigger_s: Start of the up sweep (trigger) in seconds after the first sample of a block,
             shape (...,), float64.
-        radar: Ladar.
+        radar: Ladar parameters.
         joined: Whether the record is contiguous; the index is then taken modulo the period.
 
     Returns:
@@ -177,7 +177,7 @@ def canonical_ramps(sweeps: Tensor, radar: TriangularLadar, nearer: bool) -> Ten
 
     Args:
         sweeps: Sweeps of the analytic signal, up before down, shape (..., 2, K, N), complex.
-        radar: Ladar.
+        radar: Ladar parameters.
         nearer: Whether the scene is nearer than the reference range.
 
     Returns:
@@ -250,7 +250,7 @@ def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Te
     Args:
         record: Record, shape (..., pulse, time), real or complex.
         shift_s: Shift to earlier times in seconds, rounded to whole samples.
-        radar: Ladar.
+        radar: Ladar parameters.
 
     Returns:
         Record of the same shape.
@@ -273,7 +273,7 @@ def blank_turning_points(
 
     Args:
         sweeps: Sweeps, up before down, shape (..., 2, K, N), complex.
-        radar: Ladar.
+        radar: Ladar parameters.
         farthest_m: Largest range relative to the reference range in metres.
         nearest_m: Smallest range relative to the reference range in metres.
         margin: Number of further samples that are set to zero at either end.
@@ -322,7 +322,7 @@ class SplitSweeps(Stage):
     from the side data `trigger_s` of the recording.
 
     Args:
-        radar: Ladar.
+        radar: Ladar parameters.
         trigger: Start of the triangle in seconds on the time axis of the record; "recorded" if
             `forward` receives the trigger; or "search" to estimate it by `find_trigger`.
         nearer: Whether the scene is nearer than the reference range.
@@ -407,7 +407,7 @@ class BlankTurningPoints(Stage):
     """Stage that sets the transients at turning points to zero; see `blank_turning_points`.
 
     Args:
-        radar: Ladar.
+        radar: Ladar parameters.
         farthest_m: Largest range relative to the reference range in metres.
         nearest_m: Smallest range relative to the reference range in metres.
         margin: Number of further samples that are set to zero at either end of a sweep.
@@ -445,7 +445,7 @@ class CircularShift(Stage):
     `SplitSweeps(radar, 0.0)` then separates the sweeps.
 
     Args:
-        radar: Ladar.
+        radar: Ladar parameters.
         shift_s: Shift to earlier times in seconds, rounded to whole samples.
 
     Reference:

@@ -45,7 +45,7 @@ def sweep_error_s(calibration: Tensor, radar: TriangularLadar, delay_s: float) -
     Args:
         calibration: Beat signal of the channel, up before down, shape (..., 2, K, N), complex, with
             K periods or one.
-        radar: Ladar.
+        radar: Ladar parameters.
         delay_s: Delay in seconds with which the channel mixes the transmitted signal.
 
     Returns:
@@ -155,7 +155,7 @@ def calibrate_sweeps(
     Args:
         sweeps: Sweeps, up before down, shape (..., 2, K, N), complex.
         calibration: Beat signal of the calibration channel, shape (..., 2, K or 1, N), complex.
-        radar: Ladar.
+        radar: Ladar parameters.
         delay_s: Delay in seconds with which the channel mixes the transmitted signal.
         method: "resample" or "phase".
         range_m: Range RD in metres relative to the reference range: for "phase" that of the
@@ -244,7 +244,7 @@ class CalibrateSweeps(Stage):
     it out of the constructor and give `use` the source `delay_s="aux.calibration_delay_s"`.
 
     Args:
-        radar: Ladar.
+        radar: Ladar parameters.
         delay_s: Delay in seconds with which the channel mixes the transmitted signal; None if
             `forward` receives it.
         method: "resample", valid for all ranges, or "phase", for one range.

@@ -117,7 +117,7 @@ def find_trigger(
 
     Args:
         record: Record, shape (..., pulse, time), real or complex.
-        radar: Ladar.
+        radar: Ladar parameters.
         contiguous: Whether blocks follow each other without a gap; None: without a gap if blocks
             are one period long and every period is recorded. Blocks with gaps need at least 1.7
             periods of samples.

@@ -159,8 +159,8 @@ class SpreadRows:
     def __post_init__(self) -> None:
         if not (1 <= self.rows <= self.range_cells and self.per_row >= 1):
             raise ValueError(
-                f"spread rows need 1 to range_cells={self.range_cells} rows with at least one "
-                f"scatterer each, got rows={self.rows}, per_row={self.per_row}"
+                f"rows must lie in 1..{self.range_cells}, the number of range cells, and per_row, the scatterers of "
+                f"a row, must be at least 1, got rows={self.rows}, per_row={self.per_row}"
             )
         refuse_unless("width of spread rows must be in 0..1", self.width, lambda x: (x >= 0) & (x <= 1))
         for name in ("extent_m", "range_step_m"):

@@ -26,7 +26,7 @@ class Gate(Protocol):
         Args:
             movers: Targets.
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             Gain of shape (..., 1 or channel, pulse, target), float64.
@@ -64,7 +64,7 @@ class BandLimited:
         Args:
             movers: Targets.
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             Shape (..., 1, pulse, target), float64.
@@ -104,7 +104,7 @@ class Pattern:
         Args:
             movers: Targets.
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             Shape (..., channel, pulse, target), float64.
@@ -150,8 +150,8 @@ class PolynomialTransmit:
             refuse_unless_finite(f"coefficient {degree} of a transmit range", value)
         if self.order is not None and not 0 <= self.order <= len(self.coefficients):
             raise ValueError(
-                f"order of a transmit range must lie in 0..{len(self.coefficients)}, the number of "
-                f"its coefficients, got {self.order}"
+                f"order, the number of coefficients of the transmit range that are used, must lie in "
+                f"0..{len(self.coefficients)}, got {self.order}"
             )
 
     def range_m(self, time_s: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ class PolynomialTransmit:
         """Return the largest phase of the polynomial terms beyond the chosen order.
 
         Args:
-            radar: Receiver.
+            radar: Radar parameters.
             duration_s: Length in seconds of the interval, centred on slow time zero, in which the
                 phase is considered.
 

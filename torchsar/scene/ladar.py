@@ -62,7 +62,7 @@ class Extremes:
         """Determine the extremes of a scene; the motion is differentiated numerically.
 
         Args:
-            radar: Ladar.
+            radar: Ladar parameters.
             motion: Motions along the line of sight; only the first trial is used.
             n_period: Number of recorded periods.
             range_m: Smallest and largest range of the scatterers relative to the reference range in
@@ -108,7 +108,7 @@ def omitted_phase_rad(without: Sequence[Effect], radar: TriangularLadar, extreme
 
     Args:
         without: Omitted effects, of "residual_video", "hyperbola" and "flight".
-        radar: Ladar.
+        radar: Ladar parameters.
         extremes: Largest ranges and motions of the scene.
 
     Returns:
@@ -143,7 +143,7 @@ class RangeHistory:
 
     Args:
         scatterers: Scatterers, shape (..., target).
-        radar: Ladar.
+        radar: Ladar parameters.
         motion: Motions along the line of sight.
         start_s: Slow time in seconds at which the time of the motions is zero, fixed for all
             trials.
@@ -204,7 +204,7 @@ def refuse_unseen_ranges(radar: TriangularLadar, near_m: float, far_m: float) ->
     """Raise ValueError for scatterers that no sweep can show, even at rest.
 
     Args:
-        radar: Ladar.
+        radar: Ladar parameters.
         near_m: Smallest range of the scatterers relative to the reference range in metres.
         far_m: Largest range of the scatterers relative to the reference range in metres.
 
@@ -249,7 +249,7 @@ class Fidelity(Protocol):
         """Predict the largest phases that the range model neglects.
 
         Args:
-            radar: Ladar.
+            radar: Ladar parameters.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
@@ -296,7 +296,7 @@ class EverySample(_Level):
         """Predict the phase errors that the omitted effects cause.
 
         Args:
-            radar: Ladar.
+            radar: Ladar parameters.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
@@ -337,7 +337,7 @@ class QuadraticInSweep(_Level):
         """Predict the largest phases that the range model neglects.
 
         Args:
-            radar: Ladar.
+            radar: Ladar parameters.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
@@ -382,7 +382,7 @@ class LinearInSweep(_Level):
         """Predict the largest phases that the range model neglects.
 
         Args:
-            radar: Ladar.
+            radar: Ladar parameters.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
@@ -427,7 +427,7 @@ class OnePerSweep(_Level):
         """Predict the largest phases that the range model neglects.
 
         Args:
-            radar: Ladar.
+            radar: Ladar parameters.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
@@ -471,7 +471,7 @@ class OnePerPeriod(_Level):
         """Predict the largest phases that the range model neglects.
 
         Args:
-            radar: Ladar.
+            radar: Ladar parameters.
             extremes: Largest ranges and motions of the scene.
 
         Returns:

@@ -27,7 +27,7 @@ class LitPoints:
     Args:
         movers: Points, shape (row, 1).
         gate: Illumination of the points.
-        radar: Receiver.
+        radar: Radar parameters.
         n_pulse: Number of pulses.
         processed_hz: Width of the Doppler band that is focused in hertz; None for the whole band in
             which points are illuminated.

@@ -51,7 +51,7 @@ class Moved:
         """Find the strongest scatterers and the bounds of the first trial of a scene.
 
         Args:
-            radar: Ladar.
+            radar: Ladar parameters.
             scene: Scatterers.
             motion: Drawn motions.
             periods: Number of sweep periods.

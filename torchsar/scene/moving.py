@@ -100,7 +100,8 @@ class Movers:
 
     Args:
         u_r_m_s: Slant-range speed in m/s, closing positive, float64.
-        u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, float64.
+        u_a_m_s: Along-track speed in m/s, positive in the flight direction of the receiver,
+            float64.
         y0_m: Along-track position in metres, float64.
         range_m: Closest range R0 (distance from the track at slow time zero) minus the reference
             range of the radar, in metres, float64.
@@ -151,7 +152,7 @@ class Movers:
         """Return the closest range R0.
 
         Args:
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             Range in metres, shape (..., target).
@@ -176,7 +177,7 @@ class Movers:
 
         Args:
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             v t - y0 - dx_m in metres, shape (..., channel, pulse, target): v is the along-track
@@ -191,7 +192,7 @@ class Movers:
 
         Args:
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             R_m(t) - R0 in metres for the range R_m of channel m and the closest range R0, shape
@@ -213,7 +214,7 @@ class MovingScene(Protocol):
         """Draw the targets.
 
         Args:
-            radar: Receiver.
+            radar: Radar parameters.
             draws: Source of random numbers.
 
         Returns:
@@ -252,7 +253,7 @@ class MovingPoints:
 
     Args:
         u_r_m_s: Slant-range speeds in m/s, closing positive.
-        u_a_m_s: Along-track speeds in m/s, positive in the direction of the receiver.
+        u_a_m_s: Along-track speeds in m/s, positive in the flight direction of the receiver.
         azimuth_m: Along-track positions at slow time zero in metres.
         range_m: Closest ranges (distances from the track at slow time zero) minus the reference
             range of the radar, in metres.
@@ -285,7 +286,7 @@ class MovingPoints:
         """Draw the phases of the points.
 
         Args:
-            radar: Receiver.
+            radar: Radar parameters.
             draws: Source of random numbers.
 
         Returns:
@@ -307,7 +308,7 @@ class Ship:
 
     Args:
         u_r_m_s: Slant-range speed in m/s, closing positive.
-        u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver.
+        u_a_m_s: Along-track speed in m/s, positive in the flight direction of the receiver.
         azimuth_m: Along-track position of the middle of the ship at slow time zero in metres.
         range_m: Closest range of the middle of the ship minus the reference range of the radar in
             metres.
@@ -348,7 +349,7 @@ class Ship:
         """Draw positions and phases of the scatterers.
 
         Args:
-            radar: Receiver.
+            radar: Radar parameters.
             draws: Source of random numbers.
 
         Returns:
@@ -385,7 +386,7 @@ class GroundMovers:
 
     Args:
         outward_m_s: Speeds across the track in m/s, positive away from it.
-        along_m_s: Speeds along track in m/s, positive in the direction of the receiver.
+        along_m_s: Speeds along track in m/s, positive in the flight direction of the receiver.
         azimuth_m: Along-track positions in metres.
         ground_range_m: Distances from the ground track of the receiver in metres.
         amplitude: Amplitudes, one by default; they may be complex.
@@ -425,7 +426,7 @@ class GroundMovers:
         """Return the targets with their deviation from motion in the slant plane.
 
         Args:
-            radar: Receiver.
+            radar: Radar parameters.
             draws: Source of random numbers.
 
         Returns:
@@ -464,7 +465,7 @@ class Fleet:
         """Draw the targets of all parts.
 
         Args:
-            radar: Receiver.
+            radar: Radar parameters.
             draws: Source of random numbers.
 
         Returns:
@@ -501,7 +502,7 @@ class ReceiveRange(Protocol):
         Args:
             movers: Targets.
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             Range in metres, shape (..., channel, pulse, target), float64.
@@ -514,7 +515,7 @@ class ReceiveRange(Protocol):
         Args:
             movers: Targets.
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             Phase in radians, shape (...,).
@@ -532,7 +533,7 @@ class ExactRange:
         Args:
             movers: Targets.
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             Range in metres, shape (..., channel, pulse, target), float64.
@@ -545,7 +546,7 @@ class ExactRange:
         Args:
             movers: Targets.
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             Zeros, shape (...,).
@@ -586,7 +587,7 @@ class TaylorRange:
         Args:
             movers: Targets.
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             Range relative to the reference range in metres, shape (..., channel, pulse, target),
@@ -606,7 +607,7 @@ class TaylorRange:
         Args:
             movers: Targets.
             time_s: Slow time in seconds, shape (pulse,), float64.
-            radar: Receiver.
+            radar: Radar parameters.
 
         Returns:
             Phase in radians, shape (...,).

@@ -33,7 +33,7 @@ class Path(Protocol):
         """Return the largest phase that this range history neglects within an aperture.
 
         Args:
-            radar: Radar.
+            radar: Radar parameters.
             range_m: Closest range in metres.
             since_s: Slow time of the aperture end since closest approach in seconds.
 
@@ -72,7 +72,7 @@ class Hyperbola:
         that at closest approach, and the length T of the pulse.
 
         Args:
-            radar: Radar.
+            radar: Radar parameters.
             range_m: Closest range in metres.
             since_s: Slow time of the aperture end since closest approach in seconds.
 
@@ -115,7 +115,7 @@ class Parabola:
         the mean is over the time for which the target is illuminated.
 
         Args:
-            radar: Radar.
+            radar: Radar parameters.
             doppler_hz: Doppler of the beam centre in Hz.
             velocity_m_s: Effective velocity in m/s.
             range_m: Slant range of the target at the beam centre in metres.
@@ -138,7 +138,7 @@ class Parabola:
         distance x of the end of the aperture from closest approach.
 
         Args:
-            radar: Radar.
+            radar: Radar parameters.
             range_m: Closest range in metres.
             since_s: Slow time of the aperture end since closest approach in seconds.
 

@@ -163,7 +163,8 @@ def window_lines(radar: TriangularLadar, window_m: tuple[float, float] | None) -
     low, high = (float(edge) for edge in window_m)
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ValueError(
-            f"window_m must be two relative ranges (low, high) in metres with low < high, got {tuple(window_m)}"
+            "window_m must be two ranges (low, high) in metres relative to the reference range"
+            f" with low < high, got {tuple(window_m)}"
         )
     first, last = round(low / radar.range_step_m), round(high / radar.range_step_m)
     limit = n // 2

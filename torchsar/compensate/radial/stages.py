@@ -27,7 +27,9 @@ def _window(window_m: Window) -> tuple[float, float] | None:
     if window_m is None:
         return None
     if len(window_m) != 2:
-        raise ValueError(f"window_m must be two relative ranges (low, high) in metres, got {list(window_m)}")
+        raise ValueError(
+            f"window_m must be two ranges (low, high) in metres relative to the reference range, got {list(window_m)}"
+        )
     return float(window_m[0]), float(window_m[1])
 
 

@@ -49,7 +49,7 @@ def along_track_velocity(
 
     Args:
         data: Channels with the transmit range removed, shape (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         start: Motion about which u_a is searched, shape (...,). Its slant-range speed and
             along-track position are kept.
         aperture: Expected amplitude over slow time.
@@ -58,10 +58,10 @@ def along_track_velocity(
         fine: Number of finer grids.
 
     Returns:
-        `u_a_m_s` of shape (...,), positive in the direction of the receiver, with its standard
-        deviation from the curvature of the likelihood. `info` holds `snr_db`, the SNR over all
-        samples, and `at_the_end`, True where the maximum lies at an end of the search. `ok` is
-        False where this SNR is below 19 dB, or where `at_the_end` is True.
+        `u_a_m_s` of shape (...,), positive in the flight direction of the receiver, with its
+        standard deviation, which follows from the curvature of the likelihood. `info` holds
+        `snr_db`, the SNR over all samples, and `at_the_end`, True where the maximum lies at an end
+        of the search. `ok` is False where this SNR is below 19 dB, or where `at_the_end` is True.
 
     Raises:
         ValueError: If `half_m_s` is not positive, or the search reaches the speed of the receiver.
@@ -126,7 +126,7 @@ def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         aperture: Expected amplitude over slow time.
 
@@ -170,7 +170,7 @@ def motion_from(
     """Return the motion of the point in each trial of the data from velocities and positions.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         data: Channels, shape (..., channel, pulse).
         u_r_m_s: Slant-range speed in m/s, closing positive.
         u_a_m_s: Along-track speed in m/s.

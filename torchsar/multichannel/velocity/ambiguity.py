@@ -40,7 +40,7 @@ def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, a
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Fitted motion, shape (...,).
         aperture: Expected amplitude over slow time.
 
@@ -79,7 +79,7 @@ def warned_of_ambiguity(
     Args:
         estimate: Estimate of the velocity.
         data: Channels, shape (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Fitted motion, shape (...,).
         aperture: Expected amplitude over slow time.
 

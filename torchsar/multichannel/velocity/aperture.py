@@ -22,7 +22,7 @@ class Aperture(Protocol):
         """Return the expected amplitude of the echo of a point in each pulse.
 
         Args:
-            radar: Instrument.
+            radar: Radar parameters.
             motion: Motion of the point, shape (...,).
             time_s: Slow time in seconds, float64 (pulse,).
 

@@ -80,7 +80,7 @@ def bank_search(
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         aperture: Expected amplitude over slow time.
         search: Extent and steps of the search.
         u_a_m_s: Middle of the search along track in m/s, shape (...,) or a number.
@@ -128,7 +128,7 @@ def tone_energy(data: Tensor, radar: BistaticRadar, motions: PointMotion, apertu
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         motions: Hypotheses, shape (..., hypothesis).
         aperture: Expected amplitude over slow time.
         reach_m: Largest along-track distance in metres from the position of a hypothesis.

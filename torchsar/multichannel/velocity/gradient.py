@@ -24,7 +24,7 @@ def explained_energy(data: Tensor, radar: BistaticRadar, motion: PointMotion, we
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         weight: Expected amplitude, shape (..., pulse). In a search, compute it once for the
             starting motion with `aperture.weight(...)` and keep it. Otherwise the search fits the
@@ -55,7 +55,7 @@ def gradient_likelihood(
 
     Args:
         data: Channels with the transmit range removed, shape (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         start: Starting motion, shape (...,). Its residual Doppler must lie within half a Doppler
             cell, as for `maximum_likelihood`.
         aperture: Expected amplitude over slow time.

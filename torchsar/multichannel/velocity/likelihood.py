@@ -74,7 +74,7 @@ def maximum_likelihood(
     Args:
         data: Channels with the transmit range removed and slow time zero at pulse n // 2, shape
             (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         start: Starting motion, shape (...,).
         aperture: Expected amplitude over slow time.
         unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`; the others
@@ -105,7 +105,7 @@ class PointLikelihood:
     Args:
         data: Channels, shape (..., channel, pulse), complex128. With a clutter covariance, their
             whitened Doppler spectra, shape (..., channel, bin).
-        radar: Instrument.
+        radar: Radar parameters.
         weight: Expected amplitude, shape (..., 1, pulse).
         time_s: Slow time in seconds, float64 (pulse,).
         unknowns: Names of the parameters to estimate.

@@ -20,7 +20,7 @@ class MigratingLines(Stage):
     go to the estimator directly.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         estimator: Estimator of the velocity, a stage on (channel, pulse, range) or, with
             `one_line`, on (channel, pulse).
         one_line: Whether the estimator gets only the strongest range line.

@@ -21,7 +21,7 @@ def point_phasor(radar: BistaticRadar, motion: PointMotion, time_s: Tensor, dtyp
     R_m(t) is the range between the point and channel m, and R_ref the reference range of the radar.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         time_s: Slow time in seconds, float64 (pulse,).
         dtype: Complex dtype of the result.
@@ -44,7 +44,7 @@ def phase_slopes(
     """Return the derivatives of the phase of `point_phasor` by the unknowns.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion of the point, shape (...,).
         time_s: Slow time in seconds, float64 (pulse,).
         unknowns: Names among `u_r_m_s`, `u_a_m_s`, `y0_m`.

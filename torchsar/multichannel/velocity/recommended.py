@@ -48,7 +48,7 @@ def moving_point_velocity(
     Args:
         data: Channels with the transmit range removed and slow time zero at pulse n // 2, shape
             (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         aperture: Expected amplitude over slow time.
         search: Extent of the search, by default +-1.5 lambda PRF in slant-range speed. The
             ambiguity modulo lambda PRF is resolved by the cubic phase of the range history.

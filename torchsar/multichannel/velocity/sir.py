@@ -107,7 +107,7 @@ def signal_intensity(
     Args:
         data: Range lines of one target with the transmit range removed, shape (..., channel, pulse,
             range), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         motion: Motion assumed, shape (...,).
         rebuild: Reconstruction method.
         bandwidth_hz: Processed Doppler bandwidth in Hz.
@@ -141,7 +141,7 @@ def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float
     """Raise ValueError unless part of the reconstructed band lies outside the processed band.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         rebuild: Reconstruction of the Doppler bands.
         bandwidth_hz: Processed Doppler band in Hz.
     """
@@ -167,7 +167,7 @@ class SignalIntensityRatio(Stage):
     alias into them. The record must contain the whole dwell of the target.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         bandwidth_hz: Processed Doppler bandwidth in Hz, V^2 T / (lambda R0) for the relative speed
             V, the integration time T and the closest range R0.
         rebuild: Reconstruction method, `LeastSquares(3)` by default, since two bands leave little

@@ -87,7 +87,7 @@ class Interferometry(_Velocity):
     The along-track speed is given; see `interferometry`.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         aperture: Expected amplitude over slow time.
         range_m: Closest range in metres, None for that of the strongest range line, or for the
             reference range of the radar if there is no range axis.
@@ -131,7 +131,7 @@ class AlongTrackAutofocus(_Velocity):
     See `along_track_velocity`.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         aperture: Expected amplitude over slow time.
         range_m: Closest range in metres, None for that of the strongest range line, or for the
             reference range of the radar if there is no range axis.
@@ -171,7 +171,7 @@ class LikelihoodVelocity(_Velocity):
     See `maximum_likelihood`.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         aperture: Expected amplitude over slow time.
         range_m: Closest range in metres, None for that of the strongest range line, or for the
             reference range of the radar if there is no range axis.
@@ -219,7 +219,7 @@ class GradientVelocity(_Velocity):
     See `gradient_likelihood`.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         aperture: Expected amplitude over slow time.
         range_m: Closest range in metres, None for that of the strongest range line, or for the
             reference range of the radar if there is no range axis.
@@ -266,7 +266,7 @@ class MovingPointVelocity(_Velocity):
     lambda PRF, a warning is given where the velocity seems to lie beyond it.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         aperture: Expected amplitude over slow time.
         range_m: Closest range in metres, None for that of the strongest range line, or for the
             reference range of the radar if there is no range axis.

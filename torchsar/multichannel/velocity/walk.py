@@ -72,7 +72,7 @@ class WalkAmbiguity(Stage):
     See `walk_ambiguity`. `CorrectMigration` accepts the estimate as its input `ambiguity`.
 
     Args:
-        radar: Instrument.
+        radar: Radar parameters.
         most: Largest magnitude of the ambiguity numbers that are tried.
         range_m: Closest range of the reference point in metres, None for the reference range of the
             radar.

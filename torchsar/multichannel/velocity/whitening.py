@@ -97,7 +97,7 @@ def sample_whitening(data: Tensor, radar: BistaticRadar, samples: int = _SAMPLES
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         samples: Number of neighbouring bins averaged.
 
     Returns:
@@ -117,7 +117,7 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES)
 
     Args:
         lines: Range lines, shape (..., line, channel, pulse), complex.
-        radar: Instrument.
+        radar: Radar parameters.
         samples: Number of samples averaged: range lines times neighbouring bins.
 
     Returns:

@@ -168,7 +168,8 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any
 
     Args:
         loaded: The config.
-        results: Results by case. The entry `metrics` of a method is that of the first case.
+        results: Results by case. In the returned content, the entry `metrics` of a method has those
+            of the first case, and the entry `cases` those of every case.
     """
     first = next(iter(results.values()))
     methods = {name: _method_tree(method.title, name, results) for name, method in loaded.config.processor.items()}

@@ -74,12 +74,12 @@ def _embedded(path: Path) -> str:
 
 
 def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown) -> dict[str, Any]:
-    """Return the values of the template of a run.
+    """Return the values that are filled into the report page of a run.
 
     Args:
         metrics: Content of metrics.json.
-        columns: Presentation of the metrics.
-        target_columns: Presentation of the metrics of targets.
+        columns: Label and unit of each metric.
+        target_columns: Label and unit of each metric of targets.
     """
     methods = metrics["methods"]
     best, cases = methods["recommended"], list(methods["recommended"]["cases"])

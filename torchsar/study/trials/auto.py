@@ -48,11 +48,13 @@ def choices_of(bench: Any) -> Sequence[Choice]:
 
 
 def resolved(loaded: Loaded, bench_of: Callable[[Loaded], Any]) -> tuple[Loaded, tuple[str, ...]]:
-    """Replace every `auto` of a config by an alternative.
+    """Replace every `auto` of a config by the cheapest alternative with a predicted loss within the
+    tolerance.
 
     Args:
         loaded: The config.
-        bench_of: Function that builds the bench of a config without `auto`.
+        bench_of: Function that prepares a config without `auto` for simulation and processing, see
+            `Bench`.
 
     Returns:
         The config without `auto`, and a sentence about each replacement with its reason.

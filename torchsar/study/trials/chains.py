@@ -39,7 +39,8 @@ def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
             unknown = next((value for value in method.rerun.given if value not in offered), None)
             if unknown is not None:
                 raise ConfigError(
-                    f"{where}.rerun.given.{unknown} is no estimate of the method {method.rerun.method!r}"
+                    f"{where}.rerun.given.{unknown} does not name an estimate (STAGE.NAME) that the method "
+                    f"{method.rerun.method!r} makes"
                     f"{did_you_mean(unknown, offered)}"
                 )
     return chains

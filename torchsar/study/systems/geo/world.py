@@ -30,7 +30,7 @@ class Target:
 
     Args:
         u_r_m_s: Speed along the slant range in m/s, closing positive.
-        u_a_m_s: Speed along the track in m/s, positive in the direction of the receiver.
+        u_a_m_s: Speed along the track in m/s, positive in the flight direction of the receiver.
         azimuth_m: Position along the track in metres at t = 0, the middle pulse.
         range_m: Closest range in metres beyond the reference range.
     """

@@ -31,7 +31,7 @@ class Vessel:
 
     Args:
         u_r_m_s: Speed along the slant range in m/s, closing positive.
-        u_a_m_s: Speed along the track in m/s, positive in the direction of the receiver.
+        u_a_m_s: Speed along the track in m/s, positive in the flight direction of the receiver.
         azimuth_m: Position of its middle along the track in metres at t = 0, the middle pulse.
         range_m: Closest range of its middle in metres beyond the reference range.
         scr_db: Signal-to-clutter ratio in dB: mean power of the ship over that of the sea, in a
@@ -117,7 +117,7 @@ class Ocean(World):
         """Simulate recordings of the whole scene, and the true values of every ship.
 
         Args:
-            radar: The instrument.
+            radar: Radar parameters.
             draws: Random numbers; those of a ship depend on its name.
             extraction: Extent of a ship in the data, for the reference image of this ship alone.
             dtype: Complex type of the recording.

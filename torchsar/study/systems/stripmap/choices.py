@@ -34,7 +34,7 @@ class StripProbe:
     """Point targets at both edges and in the middle of the swath, without noise or impairments.
 
     Args:
-        radar: The instrument.
+        radar: Radar parameters.
         world: The points, seen with the true Doppler and velocity.
         size: Number of lines and number of samples in a line.
         edges_m: Ranges of the points in metres, relative to the middle of the fully compressed part
