@@ -95,7 +95,8 @@ def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: 
     """Estimate the radial velocity as `mirror_product` does, from sweeps that are already filtered.
 
     Args:
-        bands: Filtered sweeps with two samples per bin.
+        bands: Sweeps filtered to the range window and resampled to two samples per frequency bin of
+            the window.
         pulse: Slow-time axis; each entry is a period of one up and one down sweep.
         intercept: "known", "record" or "free", see `mirror_product`.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).

@@ -130,7 +130,9 @@ class Motion:
 
     @property
     def offset(self) -> Tensor:
-        """Squared rotation rate times range centre deviation in m rad^2/s^2, shape (trial,)."""
+        """Squared rotation rate times yc in m rad^2/s^2, shape (trial,); a cell at range y lies at
+        y + yc from the centre of rotation.
+        """
         return self.w * self.centre_m + self.v
 
     @property

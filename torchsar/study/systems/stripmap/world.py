@@ -83,7 +83,11 @@ class Strip(World):
 
     @property
     def named_points(self) -> dict[str, int]:
-        """Names of the point targets, `part.number`, and their indices among all scatterers."""
+        """Names of the point targets and their indices among all scatterers.
+
+        A name is the key of the scene part in the config and the number of the target in this part,
+        such as `points.0`.
+        """
         names: dict[str, int] = {}
         first = 0
         for part, scene in self.scene.items():
