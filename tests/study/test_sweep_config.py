@@ -15,7 +15,7 @@ import yaml
 
 from tests.study.tiny import TINY, write_tiny
 from torchsar.cli import main
-from torchsar.study.commands.sweep import SweepTrial, sweep_grid
+from torchsar.study.commands.sweep import SweepTrial, identity, sweep_grid
 from torchsar.study.montecarlo import Record, differences, read_sweep
 from torchsar.study.montecarlo.engines import InProcess
 from torchsar.study.montecarlo.loop import Plan, run_plan
@@ -176,6 +176,14 @@ def test_a_recording_cannot_be_swept(load_tree, tmp_path: Path) -> None:
     recorded = load_tree({**rest, "data": {"file": str(tmp_path / "raw.npz")}, "sweep": SWEEP})
     with pytest.raises(ConfigError, match="data.file cannot be used in a sweep"):
         sweep_grid(recorded, SweepTrial(recorded))
+
+
+def test_titles_and_trials_do_not_stop_a_resume() -> None:
+    """Keys that change no result are not part of the identity of a sweep."""
+    config = load("isal_snr")
+    same = config.changed({"title": "another", "processor.sca.title": "another", "sweep.trials": 3})
+    assert identity(config) == identity(same)
+    assert identity(config) != identity(config.changed({"world.pulses": 77}))
 
 
 def test_squint_is_the_doppler_of_the_true_velocity(load_tree) -> None:

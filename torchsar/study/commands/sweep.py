@@ -30,7 +30,9 @@ from torchsar.study.trials.bench import Bench
 
 log = logging.getLogger("torchsar")
 # keys that change only how much is computed or shown are not part of the identity of results
-_NOT_IDENTITY = ("sweep", "trade", "title", "seed", "cases", "beyond_limits")
+_NOT_IDENTITY: Any = dict.fromkeys(("sweep", "trade", "title", "seed", "cases", "beyond_limits"), True) | {
+    "processor": {"__all__": {"title"}}
+}
 # results that the same trial does not give again
 _NOT_RESULTS = ("seconds",)
 _FIXED = ("sweep", "seed", "data", "title", "trade", "system", "cases")
@@ -201,8 +203,7 @@ def identity(loaded: Loaded) -> dict[str, Any]:
     """Return what the results depend on besides the grid: the seed, and all other keys of the
     config that change results.
     """
-    kept = {key: value for key, value in loaded.config.model_dump().items() if key not in _NOT_IDENTITY}
-    return {"seed": loaded.config.seed, "config": kept}
+    return {"seed": loaded.config.seed, "config": loaded.config.model_dump(exclude=_NOT_IDENTITY)}
 
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> None:
