@@ -4,6 +4,7 @@ cases give, and cost what trials of one value cost.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,7 +15,9 @@ import pytest
 import torch
 import yaml
 
+from tests.program import Program
 from torchsar.core import Draws
+from torchsar.optim import gradient_minimum
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo.engines import engine
 from torchsar.study.montecarlo.loop import Plan, run_plan
@@ -250,6 +253,22 @@ def loaded(
         yaml.safe_dump({**tree, "processor": processor, "sweep": sweep or {}}, sort_keys=False), encoding="utf-8"
     )
     return load(path)
+
+
+def batch_of_every_system(folder: Path) -> int:
+    """Run a small batch of each system, and return how many costly modules that has imported."""
+    for system in CONFIGS:
+        Bench(loaded(system, folder)).batch(Draws(3, "a", [0]))
+    gradient_minimum(torch.square, torch.ones(2), 1.0, 1e-3)
+    costly = {"sympy", "torch._dynamo"} & set(sys.modules)
+    print(*costly)
+    return len(costly)
+
+
+def test_a_batch_does_not_import_the_compiler_of_torch(tmp_path: Path) -> None:
+    """It takes seconds in each process; torch.broadcast_shapes and torch.func.grad import it."""
+    program = Program(batch_of_every_system, tmp_path, folder=tmp_path, said=tmp_path / "said.txt")
+    assert program.wait() == 0, program.said
 
 
 class Watched(SweepTrial):

@@ -56,7 +56,7 @@ def warp_rate(time_s: Tensor, k: Tensor) -> Tensor:
 
 def _horner(time_s: Tensor, k: Tensor, first: int) -> Tensor:
     """Sum over i of k_i t^i (first - 1)! / (first - 1 + i)!, with k_0 = 1."""
-    trials = torch.broadcast_shapes(k.shape[:-1], time_s.shape[:-1])
+    trials = np.broadcast_shapes(k.shape[:-1], time_s.shape[:-1])
     total, power = (
         torch.ones((*trials, time_s.shape[-1]), dtype=time_s.dtype, device=time_s.device),
         torch.ones_like(time_s),

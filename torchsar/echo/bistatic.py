@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -237,7 +238,7 @@ def simulate_bistatic(
             if n_range is None
             else _received(sea, transmit_m, radar, kind)
         )
-    trials = torch.broadcast_shapes(echo.shape[: -len(axes)], () if draws.trials is None else (len(draws.trials),))
+    trials = np.broadcast_shapes(echo.shape[: -len(axes)], () if draws.trials is None else (len(draws.trials),))
     echo = echo.expand(*trials, *echo.shape[-len(axes) :])
     std = _noise_std(radar, world, kind, echo)
     values = _truths(movers, radar, transmit_m, std)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -275,7 +276,7 @@ def hand_over(
         Recording and truth.
     """
     tail = len(axes)
-    trials = torch.broadcast_shapes(
+    trials = np.broadcast_shapes(
         data.shape[:-tail], clean.shape[:-tail], () if draws.trials is None else (len(draws.trials),)
     )
     data, clean = (v.expand(*trials, *v.shape[v.ndim - tail :]) for v in (data, clean))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -92,9 +93,9 @@ def ladar_record(
     )
     _refuse_record(scatterers, radar, n_period, motion, without)
     parts = []
-    trials = torch.broadcast_shapes(
-        paths.start_m.shape[:-2], paths.knots.shape[:-2], scatterers.amplitude.shape[:-1]
-    ).numel()
+    trials = math.prod(
+        np.broadcast_shapes(paths.start_m.shape[:-2], paths.knots.shape[:-2], scatterers.amplitude.shape[:-1])
+    )
     height = max(1, _BLOCK_BYTES // (8 * n_sample * trials))
     for first in range(0, n_period, height):
         beat = _blocks(paths.part(first, first + height), ramps, scatterers.amplitude, sweep_error, dtype)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -350,7 +351,7 @@ def simulate(
         echo = echo + noise * std.to(echo.real.dtype)[..., None, None]
     trials = () if draws.trials is None else (len(draws.trials),)
     # without random numbers the echo has no trials yet
-    echo = echo.expand(*torch.broadcast_shapes(echo.shape[:-2], trials), -1, -1)
+    echo = echo.expand(*np.broadcast_shapes(echo.shape[:-2], trials), -1, -1)
     clean = Recording(Signal(echo, radar.raw_axes(n_pulse, n_range)), radar)
     values = {
         "crossing_s": placed.crossing_s,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -177,7 +178,7 @@ def calibration_channel(
     clean = unit_phasor(torch.stack(torch.broadcast_tensors(*rows), -2), dtype)[..., None, :]
     shape = (2, n_period if fibre.every_period else 1, len(u))
     if fibre.snr_db is None:
-        trials = torch.broadcast_shapes(clean.shape[:-3], () if draws.trials is None else (len(draws.trials),))
+        trials = np.broadcast_shapes(clean.shape[:-3], () if draws.trials is None else (len(draws.trials),))
         found = clean.expand(*trials, *shape)
     else:
         std = 10 ** (-per_trial(fibre.snr_db, 3, u) / 20)

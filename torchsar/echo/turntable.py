@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -619,7 +620,7 @@ def simulate_turntable(
     course = _Course.of(radar, world, n_pulse, n_range, draws, device)
     record = _dechirped if isinstance(world.fidelity, Dechirped) else _phase_only
     clean, data, std, axes, aux = record(radar, world, course, n_range, draws, dtype)
-    trials = torch.broadcast_shapes(
+    trials = np.broadcast_shapes(
         data.shape[:-2], () if draws.trials is None else (len(draws.trials),)
     )  # without random numbers the data have no trials yet
     clean, data, psi, moved = (
@@ -644,7 +645,7 @@ def simulate_turntable(
 
 
 def _rotation_truth(
-    rotation: Rotation, yc_m: Tensor | float, duration_s: float, device: torch.device, trials: torch.Size
+    rotation: Rotation, yc_m: Tensor | float, duration_s: float, device: torch.device, trials: tuple[int, ...]
 ) -> dict[str, Tensor]:
     """True values of the rotation by name."""
     if not isinstance(rotation, PolynomialRotation):

@@ -22,6 +22,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
@@ -278,7 +279,7 @@ class PulseNufft:
         Returns:
             Lines, shape (..., lines, range).
         """
-        trials = torch.broadcast_shapes(y.shape[:-2], points.first.shape[:-1])
+        trials = np.broadcast_shapes(y.shape[:-2], points.first.shape[:-1])
         first, weights = _joined(points.first, trials, 1), _joined(points.weights, trials, 2)
         grid = spread_rows(
             weights, _joined(torch.view_as_real(y.resolve_conj()).flatten(-2), trials, 2), first, points.rows
@@ -298,14 +299,14 @@ class PulseNufft:
         Returns:
             Pulses, shape (..., m, range).
         """
-        trials = torch.broadcast_shapes(x.shape[:-2], points.first.shape[:-1])
+        trials = np.broadcast_shapes(x.shape[:-2], points.first.shape[:-1])
         first, weights = _joined(points.first, trials, 1), _joined(points.weights, trials, 2)
         grid = _Lines.apply(_joined(x, trials, 2), self._factor, self.length, points.rows)
         rows = interpolate_rows(weights, torch.view_as_real(grid).flatten(-2), first).unflatten(-1, (-1, 2))
         return torch.view_as_complex(rows).view(*trials, *rows.shape[-3:-1])
 
 
-def _joined(x: Tensor, trials: torch.Size, trailing: int) -> Tensor:
+def _joined(x: Tensor, trials: tuple[int, ...], trailing: int) -> Tensor:
     """x for all trials, with one leading dim."""
     return x.expand(*trials, *x.shape[x.ndim - trailing :]).reshape(-1, *x.shape[x.ndim - trailing :])
 

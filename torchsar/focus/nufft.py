@@ -16,6 +16,7 @@ import functools
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -198,7 +199,7 @@ def interpolate(grid: Tensor, points: Points) -> Tensor:
         Values at the points, shape (..., m).
     """
     taps, m = points.weights.shape[0], points.weights.shape[-1]
-    rows = torch.broadcast_shapes(grid.shape[:-1], points.first.shape[:-1])
+    rows = np.broadcast_shapes(grid.shape[:-1], points.first.shape[:-1])
     padded = torch.cat([grid, grid[..., : taps - 1]], -1).expand(*rows, grid.shape[-1] + taps - 1)
     flat, index = padded.reshape(-1), _flat_index(points.first.expand(*rows, m), padded.shape[-1])
     result = flat.index_select(0, index).reshape(*rows, m) * points.weights[0]
@@ -221,7 +222,7 @@ def spread(values: Tensor, points: Points, length: int) -> Tensor:
         Grid, shape (..., length).
     """
     taps, m = points.weights.shape[0], points.weights.shape[-1]
-    rows = torch.broadcast_shapes(values.shape[:-1], points.first.shape[:-1])
+    rows = np.broadcast_shapes(values.shape[:-1], points.first.shape[:-1])
     width = length + taps - 1
     index = _flat_index(points.first.expand(*rows, m), width)
     flat = torch.zeros(math.prod(rows) * width, dtype=values.dtype, device=values.device)

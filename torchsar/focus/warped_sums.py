@@ -20,6 +20,7 @@ import importlib
 import math
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -253,7 +254,7 @@ class Resampled:
         Returns:
             Pulses, shape (..., pulse, range).
         """
-        trials = torch.broadcast_shapes(image.shape[:-2], self.position.shape[:-1])
+        trials = np.broadcast_shapes(image.shape[:-2], self.position.shape[:-1])
         with torch.enable_grad():
             pulses = image.new_zeros(*trials, self.n_pulse, image.shape[-1]).requires_grad_()
             return torch.autograd.grad(
@@ -323,7 +324,7 @@ def _piece(position: Tensor, pulses: Tensor) -> tuple[Tensor, Tensor]:
 
 def _pulses_at(pulses: Tensor, index: Tensor) -> Tensor:
     """pulses[..., index, :] with one index per trial."""
-    trials = torch.broadcast_shapes(pulses.shape[:-2], index.shape[:-1])
+    trials = np.broadcast_shapes(pulses.shape[:-2], index.shape[:-1])
     shape = (*trials, index.shape[-1], pulses.shape[-1])
     return pulses.expand(*trials, *pulses.shape[-2:]).gather(-2, index[..., None].expand(shape))
 
@@ -373,7 +374,7 @@ class Compiled:
 
     def _together(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Data and points with the same trials, in double precision."""
-        trials = torch.broadcast_shapes(x.shape[:-2], self.points.shape[:-1])
+        trials = np.broadcast_shapes(x.shape[:-2], self.points.shape[:-1])
         return x.expand(*trials, *x.shape[-2:]).to(torch.complex128), self.points.expand(*trials, self.points.shape[-1])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -70,7 +71,7 @@ def impulse_response(
         *(torch.as_tensor(a, dtype=torch.float64, device=signal.data.device) for a in at_m)
     )
     positions = [p if per_target else p[..., None] for p in positions]
-    shape = torch.broadcast_shapes(positions[0].shape, (*signal.trials, 1))
+    shape = np.broadcast_shapes(positions[0].shape, (*signal.trials, 1))
     centre = [
         _nearest(axis.index_of(p.cpu()).to(p.device), axis.n, axis.name).expand(shape)
         for axis, p in zip(signal.axes, positions, strict=True)
@@ -118,7 +119,7 @@ def _patch(data: Tensor, rows: Tensor, cols: Tensor, height: int, width: int) ->
     j = cols[..., None, None] + torch.arange(width, device=data.device) - width // 2
     inside = (i >= 0) & (i < n_a) & (j >= 0) & (j < n_r)
     flat = (i.clamp(0, n_a - 1) * n_r + j.clamp(0, n_r - 1)).flatten(-3)
-    trials = torch.broadcast_shapes(data.shape[:-2], flat.shape[:-1])
+    trials = np.broadcast_shapes(data.shape[:-2], flat.shape[:-1])
     values = data.flatten(-2).expand(*trials, -1).gather(-1, flat.expand(*trials, -1))
     return values.reshape(*trials, *inside.shape[-3:]) * inside
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -41,7 +42,7 @@ def grid_search(
             or an axis is empty or not finite.
     """
     axes = _checked(axes)
-    shape = torch.broadcast_shapes(tuple(trials), *(axis.shape[:-1] for axis in axes))
+    shape = np.broadcast_shapes(tuple(trials), *(axis.shape[:-1] for axis in axes))
     sizes = [axis.shape[-1] for axis in axes]
     total = math.prod(sizes)
     if total > limit:

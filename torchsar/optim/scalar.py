@@ -137,5 +137,7 @@ def _finished(active: Tensor) -> bool:
 
 def _slope(cost: Cost, x: Tensor) -> Tensor:
     """Derivative of the cost per trial."""
+    # torch.func.grad would import the compiler of torch, which takes seconds
     with torch.enable_grad():
-        return torch.func.grad(lambda value: cost(value).sum())(x.detach())
+        x = x.detach().requires_grad_()
+        return torch.autograd.grad(cost(x).sum(), x)[0]

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -156,7 +157,7 @@ def turned_with_earth(point_m: Tensor, time_s: Tensor) -> Tensor:
     """
     cos, sin = torch.cos(EARTH_RATE_RAD_S * time_s), torch.sin(EARTH_RATE_RAD_S * time_s)
     x, y, z = (point_m[..., None, i] for i in range(3))
-    return torch.stack([cos * x - sin * y, sin * x + cos * y, z.expand(torch.broadcast_shapes(x.shape, cos.shape))], -1)
+    return torch.stack([cos * x - sin * y, sin * x + cos * y, z.expand(np.broadcast_shapes(x.shape, cos.shape))], -1)
 
 
 def earth_velocity_m_s(point_m: Tensor) -> Tensor:

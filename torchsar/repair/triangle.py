@@ -34,6 +34,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -227,7 +228,7 @@ def _taken(lines: Tensor, start: Tensor, n: int) -> Tensor:
     if start.ndim == 0:
         return lines[..., start + torch.arange(n, device=lines.device)]
     index = start[..., None, None] + torch.arange(n, device=lines.device)
-    shape = torch.broadcast_shapes(lines.shape[:-2], start.shape)
+    shape = np.broadcast_shapes(lines.shape[:-2], start.shape)
     return lines.expand(*shape, *lines.shape[-2:]).gather(-1, index.expand(*shape, lines.shape[-2], n))
 
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from typing import Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -104,7 +105,7 @@ def _sampled(x: Tensor, instant: Tensor) -> Tensor:
     n = x.shape[-1]
     inside = instant.clamp(0, n - 1)
     first = torch.floor(inside).long().clamp(1, n - 3) - 1
-    shape = torch.broadcast_shapes(x.shape[:-1], instant.shape[:-1])
+    shape = np.broadcast_shapes(x.shape[:-1], instant.shape[:-1])
     x = x.expand(*shape, n)
     at = inside - (first + 1)
     weights = (

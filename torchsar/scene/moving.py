@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -489,7 +490,7 @@ class Fleet:
 
 def _joined(parts: list[Tensor]) -> Tensor:
     """Targets of all parts in one dimension, equal in all trials unless they are random."""
-    trials = torch.broadcast_shapes(*(p.shape[:-1] for p in parts))
+    trials = np.broadcast_shapes(*(p.shape[:-1] for p in parts))
     return torch.cat([p.expand(*trials, -1) for p in parts], -1)
 
 

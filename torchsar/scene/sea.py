@@ -114,7 +114,7 @@ def _entries(table: Tensor, index: Tensor, dim: int) -> Tensor:
     """Entries of a table (..., row, column) along a dimension at indices (n,) or (..., n)."""
     if index.ndim == 1:
         return table.index_select(dim, index)
-    trials = torch.broadcast_shapes(table.shape[:-2], index.shape[:-1])
+    trials = np.broadcast_shapes(table.shape[:-2], index.shape[:-1])
     index = index[..., None] if dim == -2 else index[..., None, :]
     shape = (index.shape[-2], table.shape[-1]) if dim == -2 else (table.shape[-2], index.shape[-1])
     return table.expand(*trials, -1, -1).gather(dim, index.expand(*trials, *shape))

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -246,7 +247,7 @@ class Together:
             Scatterers of shape (..., target).
         """
         all_parts = [scene.scatterers(draws.part(name)) for name, scene in self.parts.items()]
-        trials = torch.broadcast_shapes(
+        trials = np.broadcast_shapes(
             *(p.amplitude.shape[:-1] for p in all_parts), *(p.azimuth_m.shape[:-1] for p in all_parts)
         )  # parts without random numbers are equal in all trials
         return Scatterers(
