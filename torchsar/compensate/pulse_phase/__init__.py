@@ -3,6 +3,7 @@
 from torchsar.compensate.pulse_phase.descent import maximum_contrast, minimum_entropy, sharpest_phase
 from torchsar.compensate.pulse_phase.gradient import Listed, Measured, Shrinking, pga, pga_sca
 from torchsar.compensate.pulse_phase.imaging import Imaging
+from torchsar.compensate.pulse_phase.linking import link_phases
 from torchsar.compensate.pulse_phase.pairs import sca
 from torchsar.compensate.pulse_phase.recommended import autofocus
 from torchsar.compensate.pulse_phase.sharpen import entropy_fixed_point
@@ -10,6 +11,7 @@ from torchsar.compensate.pulse_phase.stages import (
     Autofocus,
     CorrectPulsePhase,
     EntropyFixedPoint,
+    LinkPhases,
     Pga,
     PgaSca,
     Sca,
@@ -23,6 +25,7 @@ __all__ = [
     "CorrectPulsePhase",
     "EntropyFixedPoint",
     "Imaging",
+    "LinkPhases",
     "Listed",
     "Measured",
     "Pga",
@@ -34,6 +37,7 @@ __all__ = [
     "autofocus",
     "correct_pulse_phase",
     "entropy_fixed_point",
+    "link_phases",
     "maximum_contrast",
     "minimum_entropy",
     "pga",

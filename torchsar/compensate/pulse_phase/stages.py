@@ -14,6 +14,7 @@ from torchsar.compensate.pulse_phase.data import on_the_circle, rotate
 from torchsar.compensate.pulse_phase.descent import sharpest_phase
 from torchsar.compensate.pulse_phase.gradient import Kernel, Listed, Measured, Shrinking, Windows, pga, pga_sca
 from torchsar.compensate.pulse_phase.imaging import Imaging
+from torchsar.compensate.pulse_phase.linking import link_phases
 from torchsar.compensate.pulse_phase.pairs import sca
 from torchsar.compensate.pulse_phase.recommended import autofocus
 from torchsar.compensate.pulse_phase.sharpen import entropy_fixed_point
@@ -83,6 +84,24 @@ class Sca(Stage):
             `Estimate` by the function `sca` with `phase_rad` of shape (..., pulse), to be removed.
         """
         return sca(signal.data)
+
+
+class LinkPhases(Stage):
+    """Phase per pulse of a homogeneous scene by maximum likelihood; see `link_phases`."""
+
+    provides = ("phase_rad",)
+
+    def forward(self, signal: Signal) -> Estimate:
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+
+        Returns:
+            `Estimate` by the function `link_phases` with `phase_rad` of shape (..., pulse), to be
+            removed.
+        """
+        return link_phases(signal.data)
 
 
 def windows_of(windows: Literal["shrinking", "measured"] | list[float]) -> Windows:

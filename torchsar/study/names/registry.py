@@ -167,6 +167,7 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "pga_sca": compensate.PgaSca,
     "entropy_fixed_point": compensate.EntropyFixedPoint,
     "sharpest_phase": compensate.SharpestPhase,
+    "link_phases": compensate.LinkPhases,
     "autofocus": compensate.TargetAutofocus,
     "pulse_phase_correct": compensate.CorrectPulsePhase,
     "segmented_interference": compensate.SegmentedInterference,

@@ -1,0 +1,155 @@
+"""Phase linking against direct evaluation, the bound, noise, and scenes that it cannot serve."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsar.compensate import LinkPhases, link_phases
+from torchsar.compensate.pulse_phase.linking import _Scene
+from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
+from torchsar.core import Axis, Signal
+from torchsar.metrics.phase import phase_rmse
+
+F64 = torch.float64
+N, ROWS = 128, 48
+
+
+def normal(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.view_as_complex(torch.randn(*shape, 2, generator=generator, dtype=F64)) * math.sqrt(0.5)
+
+
+def clutter(trials: int, width: float, snr_db: float, seed: int, centre: float = 0.0, points: int = 0) -> Tensor:
+    """Sum of scatterers at random Doppler frequencies in each range cell, and noise."""
+    generator = torch.Generator().manual_seed(seed)
+    count = 2 * N
+    doppler = centre + width * (torch.rand(trials, ROWS, count, generator=generator, dtype=F64) - 0.5)
+    amplitude = normal(generator, trials, ROWS, count) / math.sqrt(count)
+    time = torch.arange(N, dtype=F64)
+    data = torch.einsum("trc,trcn->tnr", amplitude, torch.exp(2j * math.pi * doppler[..., None] * time))
+    for cell in range(points):
+        data[:, :, 7 * cell] += 5.6 * torch.exp(2j * math.pi * width * (cell / points - 0.5) * time)[:, None].mT
+    return data + 10 ** (-snr_db / 20) * normal(generator, trials, N, ROWS)
+
+
+def errors(kind: str, trials: int, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    if kind == "white":
+        return 2 * math.pi * torch.rand(trials, N, generator=generator, dtype=F64)
+    if kind == "jumps":
+        steps = (torch.rand(trials, N, generator=generator) < 0.03) * torch.randn(trials, N, generator=generator)
+        return 3 * steps.to(F64).cumsum(-1)
+    return torch.randn(trials, N, generator=generator, dtype=F64).cumsum(-1)
+
+
+def bound(width: float, snr_db: float) -> float:
+    """Cramer-Rao bound in rad of a box-shaped spectrum, without constant and linear phase."""
+    lag = torch.arange(N, dtype=F64)[:, None] - torch.arange(N, dtype=F64)
+    covariance = torch.sinc(width * lag) + 10 ** (-snr_db / 10) * torch.eye(N, dtype=F64)
+    information = 2 * ROWS * (torch.linalg.inv(covariance) * covariance - torch.eye(N, dtype=F64))
+    line = torch.linalg.qr(torch.stack([torch.ones(N, dtype=F64), torch.linspace(-1, 1, N, dtype=F64)], -1)).Q
+    flat = torch.eye(N, dtype=F64) - line @ line.mT
+    return float(torch.linalg.pinv(flat @ information @ flat, hermitian=True).diagonal().mean().sqrt())
+
+
+@pytest.mark.parametrize(
+    ("width", "snr_db", "kind", "centre", "points"),
+    [
+        (0.3, 5.0, "white", 0.0, 0),
+        (0.6, 5.0, "walk", 0.3, 0),
+        (0.6, 5.0, "white", 0.0, 5),
+        (0.8, 10.0, "jumps", 0.0, 0),
+        (0.9, 10.0, "white", 0.0, 0),
+    ],
+)
+def test_homogeneous_clutter_is_solved_near_the_bound(
+    width: float, snr_db: float, kind: str, centre: float, points: int
+) -> None:
+    phase = errors(kind, 4, 1)
+    data = clutter(4, width, snr_db, 2, centre, points) * torch.exp(1j * phase)[..., None]
+    found = link_phases(data)
+    error = phase_rmse(found["phase_rad"], phase)
+    assert float(error.max()) < 0.3 and bool(found.ok.all())
+    assert float(error.median()) < 1.4 * bound(width, snr_db)
+    ratio = error.square().mean().sqrt() / found.std["phase_rad"].square().mean().sqrt()
+    assert (0.5 if points else 0.7) < float(ratio) < 1.4
+
+
+def test_added_phases_come_out_again_in_any_batch_and_precision() -> None:
+    data, phase = clutter(2, 0.5, 10.0, 3), errors("white", 2, 4)
+    plain, turned = link_phases(data), link_phases(data * torch.exp(1j * phase)[..., None])
+    assert float(phase_rmse(turned["phase_rad"], plain["phase_rad"] + phase).max()) < 0.01
+    alone = link_phases(1e-20 * data[1])
+    assert float(phase_rmse(alone["phase_rad"], plain["phase_rad"][1])) < 0.01
+    single = link_phases((1e20 * data[0]).to(torch.complex64))
+    assert single["phase_rad"].dtype == torch.float32
+    assert float(phase_rmse(single["phase_rad"], plain["phase_rad"][0])) < 0.01
+
+
+def test_lost_pulses_are_left_out() -> None:
+    data, phase = clutter(1, 0.5, 10.0, 5)[0], errors("walk", 1, 6)[0]
+    data[[3, 40, 41, 90]] = 0
+    found = link_phases(data * torch.exp(1j * phase)[..., None])
+    present = (data != 0).any(-1)
+    assert bool(found.ok) and float(phase_rmse(found["phase_rad"], phase, present)) < 0.3
+    assert float(found.std["phase_rad"][~present].min()) > 1.5 > 0.5 > float(found.std["phase_rad"][present].max())
+
+
+def test_what_has_no_coherence_is_not_ok() -> None:
+    generator = torch.Generator().manual_seed(7)
+    trials = torch.stack([*normal(generator, 12, 64, 24), torch.zeros(64, 24), clutter(1, 0.6, -10.0, 8)[0, :64, :24]])
+    found = link_phases(trials)
+    assert not bool(found.ok.any()) and bool(torch.isfinite(found["phase_rad"]).all())
+    with pytest.warns(UserWarning, match="one range cell"):
+        assert not bool(link_phases(clutter(1, 0.2, 20.0, 9)[0, :, :1]).ok)
+    with pytest.warns(UserWarning, match="2 pulse"):
+        assert not bool(link_phases(data := normal(generator, 2, 8)).ok) and data.shape == (2, 8)
+
+
+def test_the_likelihood_is_that_of_direct_evaluation() -> None:
+    """The value for given phases: sum over the cells of ln det R + z^H D R^-1 D^H z."""
+    generator = torch.Generator().manual_seed(10)
+    strong = torch.tensor([4.0, 4.0, 4.0, 4.0, 1.0, 1.0], dtype=F64)  # a group of four and one of two
+    rows = strong[:, None] * normal(generator, 2, 6, 10)
+    present = torch.ones(2, 10, dtype=torch.bool)
+    present[1, 4] = False
+    rows = rows * present[:, None]
+    scene, u = _Scene.of(rows, present), torch.exp(1j * torch.randn(2, 10, generator=generator, dtype=F64))
+    fit = scene.fit(u, lambda power, _: power)
+    value = fit.constant + torch.einsum("tp,tpq,tq->t", u.conj(), fit.matrix, u).real
+    for trial in range(2):
+        at = present[trial].nonzero()[:, 0]
+        z = rows[trial] * torch.sqrt(6 * len(at) / rows[trial].abs().square().sum())
+        total = 0.0
+        for group in (z[:4], z[4:]):
+            straight = group * u[trial].conj()
+            power = torch.fft.fft(straight, 20).abs().square().sum(0) / len(group) / len(at)
+            power = power.clamp_min(1e-4 * float(power.mean()))
+            lag = ((at[:, None] - at)[..., None] * torch.arange(20)).to(F64)
+            covariance = (power * torch.exp(2j * math.pi * lag / 20)).mean(-1)
+            inverse = torch.linalg.inv(covariance)
+            total += len(group) * float(torch.linalg.slogdet(covariance).logabsdet)
+            total += float(torch.einsum("cp,pq,cq->", straight[:, at].conj(), inverse, straight[:, at]).real)
+        assert float(value[trial]) == pytest.approx(total, rel=1e-9)
+
+
+def test_spectra_are_smoothed_between_their_edges() -> None:
+    generator = torch.Generator().manual_seed(11)
+    looks, true = 40, torch.where((torch.arange(512) - 256).abs() < 130, 4.0, 0.5).to(F64)
+    # two neighbouring bins of a padded transform are nearly the same
+    power = true * normal(generator, looks, 256).abs().square().mean(0).repeat_interleave(2)
+    smooth = smoothed_spectrum(power, torch.tensor(float(looks)))
+    inside = torch.ones(512, dtype=torch.bool)
+    inside[[*range(122, 132), *range(380, 390)]] = False
+    assert float((smooth / true - 1)[inside].abs().max()) < 0.12 < float((power / true - 1).abs().max())
+    one = torch.ones(64, dtype=F64)
+    torch.testing.assert_close(smoothed_spectrum(3 * one, torch.tensor(5.0)), 3 * one)
+
+
+def test_the_stage_gives_what_the_function_gives() -> None:
+    data = clutter(1, 0.5, 10.0, 12)[0, :64]
+    signal = Signal(data, (Axis("pulse", 64, 0.0, 1e-3, "s"), Axis("range", ROWS, 0.0, 1.0, "m")))
+    torch.testing.assert_close(LinkPhases()(signal)["phase_rad"], link_phases(data)["phase_rad"])
