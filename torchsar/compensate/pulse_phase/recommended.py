@@ -47,8 +47,8 @@ def autofocus(
     twice as many Doppler cells. The third step reduces the remaining error by half or more.
     Differentiable without `imaging`.
 
-    Do not use it for homogeneous clutter that fills a large part of the Doppler band. Wrong phases
-    lower the entropy of such an image, and `ok` may be True although the phase is wrong.
+    For homogeneous clutter that fills a large part of the Doppler band use `link_phases`. Wrong
+    phases lower the entropy of such an image, and `ok` may be True although the phase is wrong.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
