@@ -139,7 +139,10 @@ def test_geometry_and_radar_of_a_spotlight(tmp_path):
         (turntable(angle_deg=np.full(5, np.nan)), "angle_deg must be 5 finite real numbers"),
         (spotlight(r0_m=np.zeros(5)), "r0_m must be positive"),
         (turntable(sig=np.full((16, 5), np.nan + 0j)), "80 of 80 samples are NaN or Inf"),
-        (turntable(sig=np.array([None], dtype=object)), "must be a numpy archive .* without pickled objects"),
+        (
+            turntable(sig=np.array([None], dtype=object)),
+            "sig must hold plain numbers without pickled objects, got object",
+        ),
     ],
 )
 def test_invalid_files_raise_with_the_name_of_the_file(tmp_path, values, match):

@@ -135,7 +135,11 @@ def test_unsuitable_measured_tracks_are_refused(tmp_path: Path) -> None:
     (tmp_path / "three.csv").write_text("1,2,3\n4,5,6\n")
     (tmp_path / "words.txt").write_text("no numbers\nat all\n")
     written(tmp_path, ".npy", np.array([0.0, 1.0, 3.0]), np.zeros(3))
+    (tmp_path / "cut.npz").write_bytes(written(tmp_path, ".npz", np.arange(3.0), np.zeros(3)).read_bytes()[:99])
+    np.save(tmp_path / "complex.npy", np.ones((3, 2)) * 1j)
     for name, message in (
+        ("cut.npz", "cut.npz is cut off or damaged"),
+        ("complex.npy", "complex.npy must hold real numbers, got complex128"),
         ("three.csv", r"three.csv: expected two columns.*\(2, 3\)"),
         ("words.txt", "words.txt: expected two columns"),
         ("track.npy", "track.npy: times.*rise evenly"),

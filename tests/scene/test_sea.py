@@ -112,6 +112,9 @@ def test_images_come_from_files(tmp_path):
         torch.testing.assert_close(sea.intensity, torch.as_tensor(image))
         assert sea.power_db == 3.0
     (tmp_path / "text.npy").write_text("no array")
+    whole = (tmp_path / "two.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    np.save(tmp_path / "words.npy", np.array([["sea", "land"]]))
     for path, key, error, sentence in (
         (
             "two.npz",
@@ -121,7 +124,9 @@ def test_images_come_from_files(tmp_path):
         ),
         ("two.npz", "land", ValueError, "got key='land'"),
         ("none.npy", None, FileNotFoundError, "none.npy does not exist"),
-        ("text.npy", None, ValueError, "text.npy is no numpy file of plain numbers"),
+        ("cut.npz", "sea", ValueError, "cut.npz is cut off or damaged"),
+        ("words.npy", None, ValueError, r"words.npy must hold numbers, got <U4 of shape \(1, 2\)"),
+        ("text.npy", None, ValueError, "text.npy must be a numpy archive .* but it is a file of another kind"),
     ):
         with pytest.raises(error, match=sentence):
             ImageReflectivity.from_file(tmp_path / path, 1.0, 1.0, key)

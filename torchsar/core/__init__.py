@@ -17,16 +17,18 @@ from torchsar.core.fft import (
     to_frequency,
     transform_in_blocks,
 )
-from torchsar.core.memory import PeakMemory, keep_freed_memory
+from torchsar.core.memory import PeakMemory, keep_freed_memory, machine_memory_bytes
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
 from torchsar.core.select import best_of, per_trial, take
 from torchsar.core.signal import Recording, Signal, Truth
 from torchsar.core.spline import UniformSpline
 from torchsar.core.stage import Stage
+from torchsar.core.stored import ArrayFile, StoredArray
 
 __all__ = [
     "Alternate",
+    "ArrayFile",
     "Axis",
     "Chain",
     "Draws",
@@ -35,6 +37,7 @@ __all__ = [
     "Recording",
     "Signal",
     "Stage",
+    "StoredArray",
     "Trace",
     "Truth",
     "Turn",
@@ -50,6 +53,7 @@ __all__ = [
     "keep_freed_memory",
     "legendre",
     "linear_phasor",
+    "machine_memory_bytes",
     "outer_phasor",
     "over_blocks",
     "per_trial",

@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 
-def refuse_non_finite(x: Tensor, what: str) -> None:
+def refuse_non_finite(
+    x: Tensor, what: str, advice: str = "set missing samples to zero, or correct the code that reads the data"
+) -> None:
     """Raise ValueError if samples are NaN or infinite.
 
     For valid data the check takes the time of one sum over the samples. It has no effect inside
@@ -15,6 +17,7 @@ def refuse_non_finite(x: Tensor, what: str) -> None:
     Args:
         x: Samples of any shape, real or complex.
         what: Name of the samples for the message.
+        advice: What to do about such samples, for the message.
 
     Raises:
         ValueError: If a sample is NaN or infinite; the message has the number of such samples and
@@ -30,7 +33,4 @@ def refuse_non_finite(x: Tensor, what: str) -> None:
         return
     if count:
         first = tuple(int(i) for i in bad.nonzero()[0])
-        raise ValueError(
-            f"{what}: {count} of {x.numel()} samples are NaN or Inf, the first at index {first}; "
-            "set missing samples to zero, or correct the code that reads the data"
-        )
+        raise ValueError(f"{what}: {count} of {x.numel()} samples are NaN or Inf, the first at index {first}; {advice}")

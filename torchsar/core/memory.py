@@ -1,4 +1,4 @@
-"""Peak memory of a block of code, and reuse of freed memory."""
+"""Memory of the machine, peak memory of a block of code, and reuse of freed memory."""
 
 from __future__ import annotations
 
@@ -39,6 +39,18 @@ def keep_freed_memory() -> bool:
         and set_option(_TRIM_THRESHOLD, _KEPT_BYTES) == 1
         and set_option(_ARENA_MAX, 1) == 1  # arenas of other threads would return their memory
     )
+
+
+def machine_memory_bytes() -> int | None:
+    """Return the size of the main memory of this machine.
+
+    Returns:
+        The size in bytes, or None on systems that do not report it.
+    """
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return None
 
 
 def _of_c_library(name: str) -> Callable[..., int] | None:

@@ -15,6 +15,7 @@ from torchsar.core.check import refuse_non_finite
 
 # Limit of plausibility, for errors in files: 200 dB is a factor of 1e10 in amplitude.
 AGC_LIMIT_DB = 200.0
+_ADVICE = "the numbers are too large for this type: scale the samples, or choose complex128"
 
 
 @dataclass(frozen=True)
@@ -181,8 +182,9 @@ class Recording:
 
         Raises:
             ValueError: If `dtype` or the samples are not complex, there are no samples, a sample is
-                not finite, side data are not numbers, `agc_db` or `line_number` does not have one
-                entry per line, or `agc_db` exceeds +-200 dB.
+                not finite or becomes infinite by the conversion, side data are not numbers,
+                `agc_db` or `line_number` does not have one entry per line, or `agc_db` exceeds
+                +-200 dB.
         """
         if not dtype.is_complex:
             raise ValueError(f"{what}: dtype must be complex64 or complex128, got {dtype}")
@@ -207,6 +209,7 @@ class Recording:
                     f"{float(level.min()):g} to {float(level.max()):g}"
                 )
             x = x * (10 ** (level / 20)).to(x.real.dtype)[..., None]
+        refuse_non_finite(x, f"{what}, converted to {dtype}", _ADVICE)
         return cls(Signal(x, radar.raw_axes(x.shape[-2], x.shape[-1], start_s)), radar, side)
 
     def to(self, *args: Any, **kwargs: Any) -> Recording:

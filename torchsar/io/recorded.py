@@ -5,13 +5,15 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from torchsar.core import Recording
+from torchsar.core import ArrayFile, Recording, StoredArray
+from torchsar.io.fields import archive, naming, number, refuse_missing, shown
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
 
 # keys of the archive: samples, then numbers
@@ -47,28 +49,15 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
         ValueError: If the file is not such an archive, or a key is missing or invalid.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"data.file: {path} does not exist; give the path of a raw stripmap .npz file")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{path} must be a numpy archive (.npz) without pickled objects: {error}") from None
-    missing = [key for key in _REQUIRED if key not in arrays]
-    if missing:
-        raise ValueError(
-            f"{path} lacks the keys {missing}; a raw stripmap archive must hold {list(_REQUIRED)}, "
-            f"got the keys {sorted(arrays)}"
-        )
-    number = {key: _number(arrays, key, path) for key in _REQUIRED[1:]}
-    c = _number(arrays, "c_m_s", path) if "c_m_s" in arrays else LIGHT_M_S
-    first_cell = _first_cell(arrays, path)
-    try:
-        radar = _radar(number, c, first_cell)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    aux: dict[str, Any] = {name: arrays[name] for name in _AUX if name in arrays}
-    return Recording.from_arrays(_complex(arrays["iq"], path), radar, dtype=dtype, what=str(path), **aux)
+    fields = archive(path, "raw stripmap data")
+    refuse_missing(fields, _REQUIRED, "a raw stripmap archive")
+    numbers = {key: number(fields[key], signed=key == "chirp_rate_hz_s") for key in _REQUIRED[1:]}
+    c = number(fields["c_m_s"]) if "c_m_s" in fields else LIGHT_M_S
+    iq = _samples(fields["iq"])
+    with naming(path):
+        radar = _radar(numbers, c, _first_cell(fields))
+        aux: dict[str, Any] = {name: _side(fields[name], iq) for name in _AUX if name in fields}
+        return Recording.from_arrays(_complex(iq.load()), radar, dtype=dtype, what=str(path), **aux)
 
 
 def _radar(number: dict[str, float], c: float, first_cell: int) -> StripmapRadar:
@@ -85,39 +74,40 @@ def _radar(number: dict[str, float], c: float, first_cell: int) -> StripmapRadar
     )
 
 
-def _number(arrays: dict[str, np.ndarray], key: str, path: Path) -> float:
-    """One finite number, positive except for the chirp rate, whose sign is the direction."""
-    value = np.asarray(arrays[key])
-    signed = key == "chirp_rate_hz_s"
-    plain = value.ndim == 0 and value.dtype.kind in "iuf"
-    if not (plain and np.isfinite(value) and (value != 0 if signed else value > 0)):
-        raise ValueError(
-            f"{path}: {key} must be one "
-            f"{'number other than zero' if signed else 'positive number'}, got {_shown(value)}"
-        )
-    return float(value)
-
-
-def _first_cell(arrays: dict[str, np.ndarray], path: Path) -> int:
+def _first_cell(fields: ArrayFile) -> int:
     """Index of the first sample, counted from 1."""
-    value = np.asarray(arrays.get("first_cell", 1))
-    if value.ndim or value.dtype.kind not in "iuf" or value != np.round(value):
-        raise ValueError(f"{path}: first_cell must be one whole number, got {_shown(value)}")
+    if "first_cell" not in fields:
+        return 1
+    field = fields["first_cell"]
+    value = float(field.load()) if field.shape == () and field.dtype.kind in "iuf" else math.nan
+    if not value.is_integer():
+        raise ValueError(f"{field.what} must be one whole number, got {shown(field)}")
     return int(value)
 
 
-def _shown(value: np.ndarray) -> str:
-    """Value or shape of an array for messages."""
-    return repr(value.item()) if value.ndim == 0 else f"{value.dtype} of shape {value.shape}"
-
-
-def _complex(iq: np.ndarray, path: Path) -> np.ndarray:
-    """Samples as complex numbers."""
-    if np.iscomplexobj(iq) and iq.ndim == 2:
-        return iq
-    if iq.ndim == 3 and iq.shape[-1] == 2 and iq.dtype.kind in "iuf":
-        return iq[..., 0].astype(np.float32) + 1j * iq[..., 1].astype(np.float32)
+def _samples(field: StoredArray) -> StoredArray:
+    """The samples, complex or as I and Q."""
+    real = len(field.shape) == 3 and field.shape[-1] == 2 and field.dtype.kind in "iuf"
+    if 0 not in field.shape and (real or (len(field.shape) == 2 and field.dtype.kind == "c")):
+        return field
     raise ValueError(
-        f"{path}: iq must be complex (line, sample) or (line, sample, 2) with real I and Q, got {iq.dtype} of "
-        f"shape {iq.shape}"
+        f"{field.what} must be complex (line, sample) or (line, sample, 2) with real I and Q, at least one sample, got "
+        f"{field.described}"
     )
+
+
+def _side(field: StoredArray, iq: StoredArray) -> np.ndarray:
+    """Side data, which have an entry per line or per sample."""
+    if math.prod(field.shape) > math.prod(iq.shape):
+        raise ValueError(
+            f"{field.what} must have one entry per line or per sample of {iq.described}, got {field.described}"
+        )
+    return field.load()
+
+
+def _complex(iq: np.ndarray) -> np.ndarray:
+    """Samples as complex numbers, of single precision if that holds I and Q exactly."""
+    if iq.ndim == 2:
+        return iq
+    part = np.result_type(iq, np.float32)
+    return np.ascontiguousarray(iq, part).view(np.result_type(part, np.complex64))[..., 0]

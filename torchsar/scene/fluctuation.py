@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, UniformSpline
+from torchsar.core import ArrayFile, Draws, UniformSpline
 from torchsar.scene.trials import finite, positive, refuse_unless, refuse_unless_finite, with_dims
 from torchsar.scene.vibration import Motion
 
@@ -369,10 +369,13 @@ class MeasuredTrack:
 def _columns_of(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Times and displacements of a file."""
     try:
-        if path.suffix == ".npz":
-            with np.load(path) as held:
-                return held["time_s"], held["displacement_m"]
-        table = np.load(path) if path.suffix == ".npy" else _read_text(path)
+        if path.suffix not in (".npy", ".npz"):
+            table = _read_text(path)
+        else:
+            stored = ArrayFile(path)
+            if "" not in stored:
+                return stored["time_s"].load("iuf"), stored["displacement_m"].load("iuf")
+            table = stored[""].load("iuf")
     except (KeyError, OSError, ValueError) as problem:
         raise ValueError(
             f"{path}: expected two columns, time in s and displacement in m (.npz: time_s and "

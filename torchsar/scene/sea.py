@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, real_dtype
+from torchsar.core import ArrayFile, Draws, real_dtype
 from torchsar.scene.trials import positive, refuse_unless, refuse_unless_finite, with_dims
 
 # limits of the shape of a gamma distribution, between which the table is checked
@@ -374,15 +374,10 @@ def _image(path: Path, key: str | None) -> Tensor:
         raise FileNotFoundError(
             f"{path} does not exist; give the path of a .npy or .npz file with the image of a surface"
         )
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return torch.as_tensor(loaded)
-        with loaded:
-            names = list(loaded.files)
-            key = names[0] if key is None and len(names) == 1 else key
-            if key in names:
-                return torch.as_tensor(loaded[key])
-    except (ValueError, OSError, TypeError) as error:
-        raise ValueError(f"{path} is no numpy file of plain numbers ({error})") from None
-    raise ValueError(f"{path} holds the arrays {names}; give the name of one of them as key, got key={key!r}")
+    arrays = ArrayFile(path)
+    name = next(iter(arrays)) if key is None and len(arrays) == 1 else key
+    if name is None or name not in arrays:
+        raise ValueError(
+            f"{path} holds the arrays {list(arrays)}; give the name of one of them as key, got key={key!r}"
+        )
+    return torch.as_tensor(arrays[name].load("biufc"))

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Chain, Draws, Estimate, Recording, Trace
+from torchsar.core import Chain, Draws, Estimate, Recording, Trace, machine_memory_bytes
 from torchsar.echo import apply_impairments
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded, Method
@@ -84,12 +84,8 @@ class Bench:
 
     def _refuse_oversize(self) -> None:
         """Raise ConfigError if the raw data of a trial exceed the memory of the machine."""
-        try:
-            memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        except (AttributeError, ValueError, OSError):  # not available on every operating system
-            return
-        size = 8 * self.system.samples(self._still, self.radar)
-        if size > memory:
+        size, memory = 8 * self.system.samples(self._still, self.radar), machine_memory_bytes()
+        if memory is not None and size > memory:
             raise ConfigError(
                 f"{self.file}: world: the raw data of a trial take {size / 1e9:.3g} GB, and this machine has "
                 f"{memory / 1e9:.3g} GB; reduce the number of pulses or samples of the world"

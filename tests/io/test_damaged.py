@@ -1,0 +1,223 @@
+"""Archives that are damaged, of another kind or of the wrong content give one sentence or load."""
+
+from __future__ import annotations
+
+import io
+import tracemalloc
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchsar.cli import main
+from torchsar.core import Recording, stored
+from torchsar.io import read_inverse, read_stripmap
+
+Members = dict[str, np.ndarray]
+Reader = Callable[[Path], Recording]
+_RNG = np.random.default_rng(7)
+
+STRIPMAP: Members = {
+    "iq": _RNG.integers(-7, 8, (12, 40, 2)).astype(np.int8),
+    **{
+        name: np.array(value)
+        for name, value in {
+            "fs_hz": 50e6,
+            "prf_hz": 400.0,
+            "f0_hz": 5.3e9,
+            "chirp_rate_hz_s": -0.72e12,
+            "pulse_s": 1e-7,
+            "slant_range_cell1_m": 9000.0,
+            "first_cell": 11,
+            "v_eff_m_s": 7000.0,
+        }.items()
+    },
+    "agc_db": np.arange(12, dtype=np.uint8),
+    "line_number": np.arange(12),
+    "pilot": np.exp(1j * np.arange(40)),
+}
+PROFILES: Members = {
+    "profiles": _RNG.normal(size=(6, 8)) * (1 + 2j),
+    "range_step_m": np.array(0.375),
+    "bandwidth_hz": np.array(400e6),
+    "prf_hz": np.array(100.0),
+}
+TURNTABLE: Members = {
+    "sig": _RNG.normal(size=(8, 6)) * (1 + 2j),
+    "freq_hz": 9e9 + 2e6 * np.arange(8),
+    "angle_deg": np.linspace(-1.0, 1.0, 6),
+}
+SPOTLIGHT: Members = {
+    "fp": _RNG.normal(size=(8, 6)) * (1 + 2j),
+    "freq_hz": 9e9 + 2e6 * np.arange(8),
+    **{name: np.linspace(7000.0, 7010.0, 6) for name in ("x_m", "y_m", "z_m", "r0_m")},
+}
+ARCHIVES: list[tuple[Reader, Members]] = [
+    (read_stripmap, STRIPMAP),
+    (read_inverse, PROFILES),
+    (read_inverse, TURNTABLE),
+    (read_inverse, SPOTLIGHT),
+]
+TYPES = [bool, "U3", "S0", object, "M8[s]", np.clongdouble, np.longdouble, np.float16, ">f8", ">c8", ">i4", np.uint64]
+NUMBERS = [np.nan, np.inf, -np.inf, 1e300, -1e300, 1e308, 5e-324, 0.0, -1.0, 1e25]
+
+
+def packed(members: Members, packing: int = zipfile.ZIP_DEFLATED) -> bytes:
+    """The members as an archive, in one of the packings of zipfile."""
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w", packing) as archive:
+        for name, value in members.items():
+            archive.writestr(f"{name}.npy", value if isinstance(value, bytes) else as_npy(value))
+    return whole.getvalue()
+
+
+def as_npy(value: np.ndarray) -> bytes:
+    """An array in the format .npy."""
+    member = io.BytesIO()
+    np.save(member, value)
+    return member.getvalue()
+
+
+def damaged(members: Members, seed: int) -> bytes:
+    """An archive with one kind of damage, by turns, at a random place."""
+    rng = np.random.default_rng(seed)
+    name = str(rng.choice(list(members)))
+    value, packing = members[name], int(rng.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2]))
+    whole = bytearray(packed(members, packing))
+    kind = seed % 9
+    if kind == 0:
+        return bytes(whole[: rng.integers(len(whole))])
+    if kind in (1, 2):
+        for at in rng.integers(len(whole), size=int(rng.integers(1, 40))):
+            whole[at] ^= int(rng.integers(1, 256))
+        return bytes(whole)
+    if kind == 3:  # the bytes of a member instead of those of the archive: checksums fit
+        inner = bytearray(as_npy(value))
+        for at in rng.integers(len(inner), size=int(rng.integers(1, 9))):
+            inner[at] ^= int(rng.integers(1, 256))
+        return packed({**members, name: bytes(inner)}, packing)  # pyright: ignore[reportArgumentType]
+    if kind == 4:
+        return packed({**members, name: rng.bytes(200)}, packing)  # pyright: ignore[reportArgumentType]
+    if kind == 5:
+        wrong = np.dtype(TYPES[rng.integers(len(TYPES))])
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return packed({**members, name: value.astype(np.int64).astype(wrong)}, packing)
+    if kind == 6:
+        shapes = [
+            value[..., None],
+            value[None],
+            value.T,
+            value.reshape(-1)[:0],
+            value.reshape(-1)[:1],
+            np.zeros((0, 3)),
+        ]
+        return packed({**members, name: shapes[rng.integers(len(shapes))]}, packing)
+    if kind == 7:
+        odd = np.array(value, dtype=np.complex128 if value.dtype.kind == "c" else np.float64)
+        odd.reshape(-1)[rng.integers(odd.size)] = NUMBERS[rng.integers(len(NUMBERS))]
+        return packed({**members, name: odd}, packing)
+    return packed({other: held for other, held in members.items() if other != name}, packing)
+
+
+def loads_or_says(read: Reader, path: Path) -> str:
+    """The sentence of the refusal, empty if the archive loads with finite samples."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # lines of zeros are no matter here
+            data = read(path).signal.data
+    except ValueError as error:
+        said = str(error)
+        assert said.startswith(str(path)) and "\n" not in said, said
+        return said
+    assert bool(torch.isfinite(data).all())
+    return ""
+
+
+@pytest.mark.parametrize("number", range(len(ARCHIVES)))
+def test_damage_gives_a_sentence_or_loads(tmp_path: Path, number: int) -> None:
+    read, members = ARCHIVES[number]
+    path = tmp_path / "data.npz"
+    path.write_bytes(packed(members))
+    assert loads_or_says(read, path) == ""
+    said = []
+    for seed in range(18 * number, 18 * number + 18):
+        path.write_bytes(damaged(members, seed))
+        said.append(loads_or_says(read, path))
+    assert len(set(said)) > 9  # the damages are of many kinds
+
+
+def encrypted(whole: bytes) -> bytes:
+    """The archive with the flag of encryption at every member."""
+    marked = bytearray(whole)
+    for start, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        at = marked.find(start)
+        while at >= 0:
+            marked[at + offset] |= 1
+            at = marked.find(start, at + 1)
+    return bytes(marked)
+
+
+WHOLE = packed(STRIPMAP)
+MISTAKEN: dict[str, tuple[bytes, str]] = {
+    "empty": (b"", "is empty"),
+    "cut off": (WHOLE[: len(WHOLE) // 2], "is cut off or damaged"),
+    "encrypted": (encrypted(WHOLE), "fs_hz is encrypted; save the archive without a password"),
+    "one array": (as_npy(STRIPMAP["iq"]), "holds a single array"),
+    "of another kind": (b"\x89HDF\r\n" + bytes(99), "is a file of another kind"),
+    "an empty archive": (packed({}), "lacks the keys"),
+    "too large a number": (
+        packed({**STRIPMAP, "iq": np.full((12, 40, 2), 1e300)}),
+        "converted to torch.complex64: 480 of 480 samples are NaN or Inf",
+    ),
+    "an infinite cell": (packed({**STRIPMAP, "first_cell": np.array(np.inf)}), "must be one whole number, got inf"),
+    "a long text": (packed({**STRIPMAP, "f0_hz": np.array("high" * 99)}), "got <U396 of shape ()"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKEN)
+def test_a_bad_archive_gives_one_sentence_and_nothing_is_written(
+    mistake: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content, sentence = MISTAKEN[mistake]
+    path = tmp_path / "data.npz"
+    path.write_bytes(content)
+    status = main(["run", "radarsat1", f"data.file={path}", "--out", str(tmp_path / "out")])
+    said = [line for line in capsys.readouterr().err.splitlines() if line != "torchsar: run radarsat1"]
+    assert status == 2 and len(said) == 1 and str(path) in said[0] and sentence in said[0], said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["unused", "prf_hz", "pilot"])
+def test_arrays_that_are_not_used_are_not_unpacked(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "data.npz"
+    path.write_bytes(packed({**STRIPMAP, name: np.zeros(1 << 24, np.uint8)}))
+    assert path.stat().st_size < 1 << 17
+    tracemalloc.start()
+    said = loads_or_says(read_stripmap, path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 22 and (name in said) == (name != "unused")
+
+
+def test_samples_that_exceed_the_memory_are_refused_by_their_header(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "data.npz"
+    path.write_bytes(WHOLE)
+    monkeypatch.setattr(stored, "machine_memory_bytes", lambda: 1500)
+    with pytest.raises(ValueError, match=r"data.npz: iq: int8 of shape \(12, 40, 2\) takes .* GB.* cut the array"):
+        read_stripmap(path)
+
+
+def test_numbers_keep_the_digits_that_the_chosen_type_can_hold(tmp_path: Path) -> None:
+    path, fine = tmp_path / "data.npz", np.full((12, 40, 2), 1 + 2.0**-40)
+    path.write_bytes(packed({**STRIPMAP, "iq": fine.astype(">f8"), "agc_db": np.zeros(12)}))
+    data = read_stripmap(path, torch.complex128).signal.data
+    assert bool((data == complex(fine[0, 0, 0], fine[0, 0, 0])).all())
+    path.write_bytes(packed({**PROFILES, "profiles": PROFILES["profiles"].astype(np.clongdouble)}))
+    np.testing.assert_array_equal(read_inverse(path, torch.complex128).signal.data.T, PROFILES["profiles"])

@@ -1,0 +1,152 @@
+"""Arrays in .npy and .npz files. Their shape, type and size are known before they are loaded."""
+
+from __future__ import annotations
+
+import io
+import math
+import textwrap
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from torchsar.core.memory import machine_memory_bytes
+
+# start of a file that holds a single array, and largest number of bytes before its numbers
+_MAGIC, _LONGEST_HEADER = b"\x93NUMPY", 1 << 16
+_AGAIN = "copy or save the file again"
+
+
+@dataclass(frozen=True)
+class StoredArray:
+    """Array in a file that has not been loaded.
+
+    Args:
+        what: Path of the file and name of the array, for messages.
+        shape: Shape of the array.
+        dtype: Type of its numbers in the file.
+        opened: Function that opens the array as a stream in the format .npy.
+    """
+
+    what: str
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    opened: Callable[[], IO[bytes]]
+
+    @property
+    def described(self) -> str:
+        """The type and the shape in words, for messages."""
+        return f"{self.dtype} of shape {self.shape}"
+
+    def load(self, kinds: str = "") -> np.ndarray:
+        """Load the array in the byte order of this machine.
+
+        Args:
+            kinds: Accepted types, each by a letter as in `numpy.dtype.kind`; empty for all.
+
+        Returns:
+            The array. Numbers that are wider than those of torch become float64 or complex128.
+
+        Raises:
+            ValueError: If the type is not accepted, the memory of the machine cannot hold the array
+                and a converted copy, or the file is damaged.
+        """
+        if kinds and self.dtype.kind not in kinds:
+            raise ValueError(f"{self.what} must hold {'' if 'c' in kinds else 'real '}numbers, got {self.described}")
+        size, memory = math.prod(self.shape) * self.dtype.itemsize, machine_memory_bytes()
+        if memory is not None and 2 * size > memory:
+            raise ValueError(
+                f"{self.what}: {self.described} takes {size / 1e9:.3g} GB, twice as much with a converted copy, and "
+                f"this machine has {memory / 1e9:.3g} GB; cut the array into parts"
+            )
+        widest = np.dtype({"f": np.float64, "c": np.complex128}.get(self.dtype.kind, self.dtype))
+        kept = widest if self.dtype.itemsize > widest.itemsize else self.dtype.newbyteorder("=")
+        try:
+            with self.opened() as stream, np.errstate(over="ignore"):
+                return np.lib.format.read_array(stream, allow_pickle=False).astype(kept, copy=False)
+        except Exception as error:  # the parsers of numpy and zipfile raise errors of many kinds
+            raise ValueError(f"{self.what} cannot be loaded ({_reason(error)}); {_AGAIN}") from None
+
+
+class ArrayFile(Mapping[str, StoredArray]):
+    """The arrays of a .npz file by name, or the single array of a .npy file under the name "".
+
+    Only the headers of those arrays are read that are looked up, and nothing is loaded.
+
+    Args:
+        path: Path of the file; its suffix is of no importance.
+
+    Raises:
+        ValueError: If the file is empty, damaged, or of another format. A lookup raises it if the
+            array is damaged, encrypted, or does not hold plain numbers or text.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        try:
+            with self.path.open("rb") as file:
+                start = file.read(len(_MAGIC))
+        except OSError as error:
+            raise ValueError(f"{path} cannot be read ({error.strerror or error})") from None
+        if not start:
+            raise ValueError(f"{path} is empty; {_AGAIN}")
+        self._members = {"": None} if start == _MAGIC else self._archived(start)
+
+    def _archived(self, start: bytes) -> dict[str, zipfile.ZipInfo | None]:
+        """The members of the archive by name."""
+        try:
+            with zipfile.ZipFile(self.path) as archive:
+                return {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        except Exception as error:  # the parsers of numpy and zipfile raise errors of many kinds
+            if start.startswith(b"PK"):
+                raise ValueError(f"{self.path} is cut off or damaged ({_reason(error)}); {_AGAIN}") from None
+        raise ValueError(
+            f"{self.path} must be a numpy archive (.npz) or array (.npy), but it is a file of another kind; save the "
+            "arrays by numpy.savez"
+        )
+
+    def __getitem__(self, name: str) -> StoredArray:
+        info, what = self._members[name], f"{self.path}: {name}" if name else str(self.path)
+        size, opened = self.path.stat().st_size, partial(self.path.open, "rb")
+        if info is not None:
+            if info.flag_bits & 1:
+                raise ValueError(f"{what} is encrypted; save the archive without a password")
+            size, opened = info.file_size, partial(_member, self.path, info)
+        try:
+            with opened() as stream:
+                start = io.BytesIO(stream.read(_LONGEST_HEADER))
+            one = np.lib.format.read_magic(start) == (1, 0)
+            read = np.lib.format.read_array_header_1_0 if one else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(start)
+        except Exception as error:  # the parsers of numpy and zipfile raise errors of many kinds
+            raise ValueError(f"{what} is damaged or no numpy array ({_reason(error)}); {_AGAIN}") from None
+        if dtype.hasobject:
+            raise ValueError(f"{what} must hold plain numbers without pickled objects, got {dtype}; convert it")
+        held, needed = size - start.tell(), math.prod(shape) * dtype.itemsize
+        if min(shape, default=0) < 0 or held != needed:
+            raise ValueError(f"{what} is damaged: {dtype} of shape {shape} needs {needed} bytes, got {held}; {_AGAIN}")
+        return StoredArray(what, shape, dtype, opened)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._members
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._members)
+
+    def __len__(self) -> int:
+        return len(self._members)
+
+
+def _member(path: Path, info: zipfile.ZipInfo) -> IO[bytes]:
+    """A member of an archive as a stream."""
+    with zipfile.ZipFile(path) as archive:
+        return archive.open(info)  # the file stays open until the stream is closed
+
+
+def _reason(error: Exception) -> str:
+    """The beginning of the text of an error in one line, or its kind if the text is empty."""
+    return textwrap.shorten(str(error), 120, placeholder=" ...") or type(error).__name__

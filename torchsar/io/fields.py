@@ -1,0 +1,129 @@
+"""Checks of the fields of an archive of recorded data, before they are loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsar.core import ArrayFile, StoredArray
+
+_SHORT = 64  # bytes of the longest value that messages show
+
+
+def archive(path: Path, content: str) -> ArrayFile:
+    """Open an archive of recorded data.
+
+    Args:
+        path: Path of the archive.
+        content: What it should hold, for messages.
+
+    Returns:
+        Its fields by name, not loaded.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is not an archive.
+    """
+    if not path.is_file():
+        what = "is no file" if path.exists() else "does not exist"
+        raise FileNotFoundError(f"data.file: {path} {what}; give the path of an .npz file with {content}")
+    fields = ArrayFile(path)
+    if "" in fields:
+        raise ValueError(f"{path} must be a numpy archive (.npz) with {content}, but it holds a single array (.npy)")
+    return fields
+
+
+@contextmanager
+def naming(what: str | Path) -> Iterator[None]:
+    """Put the name of a file or a field before each ValueError that does not begin with it.
+
+    Args:
+        what: Path of the file, or path and name of the field.
+
+    Yields:
+        Nothing.
+    """
+    try:
+        yield
+    except ValueError as error:
+        text = str(error)
+        raise ValueError(text if text.startswith(str(what)) else f"{what}: {text}") from None
+
+
+def refuse_missing(fields: ArrayFile, keys: tuple[str, ...], kind: str) -> None:
+    """Check that an archive has all keys that one of its kind must have.
+
+    Args:
+        fields: The fields of the archive.
+        keys: The required keys.
+        kind: Kind of the archive, for messages.
+
+    Raises:
+        ValueError: If a key is missing.
+    """
+    missing = [key for key in keys if key not in fields]
+    if missing:
+        raise ValueError(
+            f"{fields.path} lacks the keys {missing}; {kind} must hold {list(keys)}, got the keys {sorted(fields)}"
+        )
+
+
+def number(field: StoredArray, signed: bool = False) -> float:
+    """Load one number.
+
+    Args:
+        field: The field.
+        signed: Whether the number may be negative.
+
+    Returns:
+        The number, finite and not zero.
+
+    Raises:
+        ValueError: If the field holds anything else.
+    """
+    accepted = "number other than zero" if signed else "positive number"
+    if field.shape != () or field.dtype.kind not in "iuf":
+        raise ValueError(f"{field.what} must be one {accepted}, got {shown(field)}")
+    value = float(field.load())
+    if not (np.isfinite(value) and (value != 0 if signed else value > 0)):
+        raise ValueError(f"{field.what} must be one {accepted}, got {value}")
+    return value
+
+
+def vector(field: StoredArray, n: int) -> Tensor:
+    """Load finite real numbers.
+
+    Args:
+        field: The field.
+        n: How many numbers it must hold.
+
+    Returns:
+        The numbers, shape (n,), float64.
+
+    Raises:
+        ValueError: If the field holds anything else.
+    """
+    if field.shape != (n,) or field.dtype.kind not in "iuf":
+        raise ValueError(f"{field.what} must be {n} finite real numbers, got {shown(field)}")
+    value = field.load().astype(np.float64)
+    if not np.isfinite(value).all():
+        raise ValueError(f"{field.what} must be {n} finite real numbers, got NaN or Inf among them")
+    return torch.from_numpy(value)
+
+
+def shown(field: StoredArray) -> str:
+    """Describe a field for messages.
+
+    Args:
+        field: The field.
+
+    Returns:
+        The value of a short field without dimensions, the type and the shape of any other.
+    """
+    short = not field.shape and field.dtype.itemsize <= _SHORT
+    return repr(field.load().item()) if short else field.described
