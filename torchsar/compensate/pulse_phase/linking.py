@@ -16,23 +16,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import Pulses, prepare
+from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, power_groups
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
-from torchsar.compensate.pulse_phase.verdict import LEAST_STREHL
+from torchsar.compensate.pulse_phase.verdict import LEAST_STREHL, occupied_band
 from torchsar.core import Estimate, cis, over_blocks
 
-# Range cells are grouped by power, because each group has its own spectrum: largest ratio of the
-# powers in a group, and number of groups; the last one also takes all weaker cells.
-_GROUP_RATIO, _GROUPS = 4.0, 4
 # Bands of the first guess as shares of the pulse rate, and the share of its power in the band.
 _WIDTHS, _IN_BAND = (0.1, 0.25, 0.45, 0.65, 0.8, 0.9), 0.85
-# least spectral density relative to its mean: it keeps R invertible where noise is weak
-_FLOOR = 1e-4
 # Largest number of estimates of the spectrum; those smoothed by a window, because the first phases
 # are far off, and its half width in bins; Newton steps of the phases after each.
 _ROUNDS, _COARSE_ROUNDS, _WINDOW, _STEPS = 16, 2, 4, 4
@@ -41,10 +38,14 @@ _STILL_RAD = 0.01  # phase change, rms over the pulses, that ends the rounds
 # of pulses that has slipped by a cell is the usual local minimum. Kinks are sought in two rounds;
 # the best of them are refined, as often as one gains so many nats.
 _SLOPES, _KINKS, _KINK_ROUNDS, _REFINED, _REPEATS, _GAIN_NATS = (1, 2, 4, 8), 64, (0, 3), 4, 8, 0.5
+_EDGES, _BLOCK_SLOPES = 16, (2, 4)
 _PRIOR = 3 / math.pi**2  # information in 1/rad^2 of a phase that is uniform over a turn
 # Gain of the log likelihood per pulse by which the phases fit circular noise: 1.1 to 2.3 nats were
 # measured for 4 to 192 range cells and 64 to 256 pulses. A scene must gain twice as much.
 _NOISE_NATS, _MARGIN = 2.0, 2.0
+# The errors of neighbouring pulses depend on each other, so that the rms error of a scene may
+# exceed its standard deviation by this factor.
+_SPREAD = 1.4
 _BLOCK_BYTES = 64 << 20  # limits the memory of a block of trials
 
 
@@ -52,19 +53,21 @@ def link_phases(data: Tensor) -> Estimate:
     """Estimate the phase of each pulse of a homogeneous scene by maximum likelihood.
 
     The scene is speckle with any Doppler spectrum. Its error does not depend on the size or kind of
-    the phase errors. The time grows with the cube of the number of pulses. Not differentiable.
+    the phase errors. The time grows with the cube of the number of pulses. Differentiable: the
+    derivative is that of a Newton step of the phases for the spectra found.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed. The standard deviation of each pulse is
-        the Cramer-Rao bound for the estimated spectrum, raised by the share of the likelihood that
-        the phases gain on noise. A constant and a linear phase only add a phase to the image and
-        shift it; they are left out of the standard deviation. `quality` is the predicted Strehl
-        ratio times the share of the likelihood that noise does not explain. `ok` is False where the
-        Strehl ratio is below 0.8 or the gain in likelihood below twice that of noise. `info` holds
-        "gain_nats" of shape (...,): log likelihood minus that of white noise.
+        the Cramer-Rao bound for the estimated spectrum and for the number of independent range
+        cells (see `occupied_band`), raised by the share of the likelihood that the phases gain on
+        noise. A constant and a linear phase only add a phase to the image and shift it; they are
+        left out of the standard deviation. `quality` is the predicted Strehl ratio times the share
+        of the likelihood that noise does not explain. `ok` is False where the Strehl ratio for 1.4
+        times the standard deviation is below 0.8 or the gain in likelihood below twice that of
+        noise. `info` holds "gain_nats" of shape (...,): log likelihood minus that of white noise.
 
     Raises:
         TypeError: If the data are not complex.
@@ -74,16 +77,32 @@ def link_phases(data: Tensor) -> Estimate:
         Guarnieri and Tebaldini, IEEE Trans. Geosci. Remote Sens. 46(11), 2008 (phase linking).
     """
     pulses = prepare(data, "link_phases")
-    rows, n = pulses.rows.detach(), pulses.n
+    return linked(pulses)
+
+
+def linked(pulses: Pulses) -> Estimate:
+    """Estimate the phases of pulses that were checked; see `link_phases`.
+
+    Args:
+        pulses: The pulses.
+
+    Returns:
+        The `Estimate` that `link_phases` returns.
+    """
+    rows, n = pulses.rows, pulses.n
     size = max(1, _BLOCK_BYTES // (16 * n * (6 * n + 2 * rows.shape[1] + 8 * _KINKS)))
-    parts = [slice(first, first + size) for first in range(0, len(rows), size)]
+    parts = [slice(first, first + size) for first in range(0, max(1, len(rows)), size)]
     done: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
 
     def work(part: slice) -> None:
         done[part.start] = _linked(rows[part], pulses.present[part])
 
-    with torch.no_grad():
-        over_blocks(work, parts, rows)
+    if rows.requires_grad and torch.is_grad_enabled():
+        for part in parts:
+            work(part)
+    else:
+        with torch.no_grad():
+            over_blocks(work, parts, rows)
     phase, std, gain = (torch.cat([done[part.start][i] for part in parts]) for i in range(3))
     return _estimate(pulses, phase, std, gain)
 
@@ -93,20 +112,34 @@ def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor) -> Estim
     noise = _NOISE_NATS * pulses.present.sum(-1)
     scene = (1 - noise / _or_one(gain)).clamp(0, 1)
     std = torch.where(scene[:, None] > 0, std / _or_one(scene).sqrt()[:, None], torch.inf).clamp_max(_PRIOR**-0.5)
-    strehl = torch.exp(-std.square().mean(-1))
+    strehl = torch.exp(-(std.square() * pulses.present).sum(-1) / pulses.present.sum(-1).clamp_min(1))
     return Estimate(
         value={"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
         std={"phase_rad": std.reshape(*trials, pulses.n).to(real)},
         quality=(strehl * scene).reshape(trials).to(real),
-        ok=((strehl > LEAST_STREHL) & (gain > _MARGIN * noise)).reshape(trials),
+        ok=((strehl ** (_SPREAD**2) > LEAST_STREHL) & (gain > _MARGIN * noise)).reshape(trials),
         info={"gain_nats": gain.reshape(trials)},
     )
 
 
 def _linked(rows: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Phase and standard deviation (trial, pulse) in rad, and gain (trial,) in nats, of a block."""
-    scene = _Scene.of(rows, present)
-    u = scene.start(torch.where(present, pair_phase(rows, present), 0).to(torch.float64))
+    with torch.no_grad():
+        scene = _Scene.of(rows.detach(), present)
+        u = _search(scene, torch.where(present, pair_phase(rows, present), 0).to(torch.float64))
+        fit = scene.fit(u, smoothed_spectrum)
+        gain = scene.independent * (scene.samples - fit.constant - _value(fit.matrix, u))
+        information = scene.fit(u, smoothed_spectrum, tapered=True).information
+        std = _deviation(scene.independent[:, None, None] * information)
+    if not rows.requires_grad or not torch.is_grad_enabled():
+        return torch.angle(u), std, gain
+    step = _step(_Scene.of(rows, present).matrix(fit.inverses), u)
+    return torch.angle(u) + step - step.detach(), std, gain
+
+
+def _search(scene: _Scene, phase: Tensor) -> Tensor:
+    """Phases of greatest likelihood as exp(j phase), (trial, pulse), sought from `phase`."""
+    u = scene.start(phase)
     active = torch.arange(len(u), device=u.device)
     for count in range(_ROUNDS):
         smooth = _windowed if count < _COARSE_ROUNDS else smoothed_spectrum
@@ -120,8 +153,7 @@ def _linked(rows: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             active = active[moved > _STILL_RAD]
             if not len(active):
                 break
-    fit = scene.fit(u, smoothed_spectrum)
-    return torch.angle(u), _deviation(fit.information), scene.samples - fit.constant - _value(fit.matrix, u)
+    return u
 
 
 Smooth = Callable[[Tensor, Tensor], Tensor]
@@ -132,11 +164,13 @@ class _Fit:
     """Likelihood of the phases for given spectra.
 
     Args:
+        inverses: R^-T of each group, shape (trial, pulse, pulse).
         matrix: R^-T o C, summed over the range cells, shape (trial, pulse, pulse), Hermitian.
         constant: ln det R, summed over the range cells, shape (trial,).
         information: Fisher information of the phases in 1/rad^2, shape (trial, pulse, pulse).
     """
 
+    inverses: list[Tensor]
     matrix: Tensor
     constant: Tensor
     information: Tensor
@@ -153,11 +187,13 @@ class _Scene:
         present: Pulses that were received, shape (trial, pulse), bool.
         samples: Number of samples, shape (trial,), which is also the negative log likelihood of
             white noise, since the samples have a mean power of 1.
+        independent: Share of the range cells that are independent, shape (trial,).
     """
 
     groups: list[tuple[Tensor, Tensor, Tensor]]
     present: Tensor
     samples: Tensor
+    independent: Tensor
 
     @staticmethod
     def of(rows: Tensor, present: Tensor) -> _Scene:
@@ -166,20 +202,17 @@ class _Scene:
         total = (z.real.square() + z.imag.square()).sum((-2, -1))
         z = z * torch.where(total > 0, samples / _or_one(total), 1).sqrt()[:, None, None]
         power = (z.real.square() + z.imag.square()).sum(-2)
-        ratio = power.amax(-1, keepdim=True) / power.clamp_min(torch.finfo(torch.float64).tiny)
-        member = (ratio.log() / math.log(_GROUP_RATIO)).clamp(0, _GROUPS - 1).long()
         groups = []
-        for index in range(_GROUPS):
-            inside = member == index
+        for inside in power_groups(power):
             if bool(inside.any()):
                 own = z * inside[:, None, :]
                 groups.append((own, own @ own.mH, inside.sum(-1).to(torch.float64)))
-        return _Scene(groups, present, samples)
+        return _Scene(groups, present, samples, occupied_band(rows))
 
     def trials(self, at: Tensor) -> _Scene:
         """The scenes of some of the trials, given by their indices."""
         groups = [(own[at], products[at], cells[at]) for own, products, cells in self.groups]
-        return _Scene(groups, self.present[at], self.samples[at])
+        return _Scene(groups, self.present[at], self.samples[at], self.independent[at])
 
     def start(self, phase: Tensor) -> Tensor:
         """The phases of greatest likelihood for one of several bands, as exp(j phase)."""
@@ -197,24 +230,39 @@ class _Scene:
             least = torch.minimum(value, least)
         return best
 
-    def fit(self, u: Tensor, smooth: Smooth) -> _Fit:
-        """The likelihood with the smoothed spectra of the samples without the phases of u."""
+    def fit(self, u: Tensor, smooth: Smooth, tapered: bool = False) -> _Fit:
+        """The likelihood with the smoothed spectra of the samples without the phases of u.
+
+        Without a taper the strong part of a spectrum leaks into the weak part: the phases come out
+        more exact, but their information too low.
+        """
         n = u.shape[-1]
-        matrix, information = torch.zeros_like(self.groups[0][1]), torch.zeros_like(self.groups[0][1].real)
+        at = torch.arange(1, n + 1, dtype=torch.float64, device=u.device) * (math.pi / (n + 1))
+        taper = math.sqrt(2 * n / (n + 1)) * torch.sin(at) if tapered else torch.ones_like(at)
+        inverses, information = [], torch.zeros_like(self.groups[0][1].real)
         constant = torch.zeros_like(self.samples)
-        for own, products, cells in self.groups:
-            spectrum = torch.fft.fft(own * u.conj()[..., None], 2 * n, dim=-2)
+        for own, _, cells in self.groups:
+            spectrum = torch.fft.fft(own * (taper * u.conj())[..., None], 2 * n, dim=-2)
             power = (spectrum.real.square() + spectrum.imag.square()).sum(-1)
             mean = power.mean(-1, keepdim=True)
             power = torch.where(mean > 0, power, 1) / _or_one(cells * self.present.sum(-1))[:, None]
-            power = torch.maximum(power, _FLOOR * power.mean(-1, keepdim=True))
-            lower, log_det = self._factor(torch.fft.ifft(smooth(power, cells.clamp_min(1)))[..., :n])
+            power = torch.maximum(power, SPECTRAL_FLOOR * power.mean(-1, keepdim=True))
+            lower, log_det = self._factor(
+                torch.fft.ifft(smooth(power, (cells * self.independent).clamp_min(1)))[..., :n]
+            )
             inverse = torch.cholesky_inverse(lower).mT
-            matrix = matrix + inverse * products
+            inverses.append(inverse)
             constant = constant + cells * log_det
             own_information = (inverse * (lower @ lower.mH)).real - torch.eye(n, dtype=torch.float64, device=u.device)
             information = information + 2 * cells[:, None, None] * own_information
-        return _Fit(matrix, constant, information)
+        return _Fit(inverses, self.matrix(inverses), constant, information)
+
+    def matrix(self, inverses: list[Tensor]) -> Tensor:
+        """R^-T o C, summed over the range cells, for the R^-T of each group."""
+        return sum(
+            (one * products for one, (_, products, _) in zip(inverses, self.groups, strict=True)),
+            torch.zeros_like(self.groups[0][1]),
+        )
 
     @property
     def _cells(self) -> Tensor:
@@ -279,6 +327,17 @@ def _newton(matrix: Tensor, u: Tensor, steps: int) -> Tensor:
     return u
 
 
+def _step(matrix: Tensor, u: Tensor) -> Tensor:
+    """Newton step of the phases of u in rad, (trial, pulse), differentiable in the matrix."""
+    turned = u.conj()[..., :, None] * matrix * u[..., None, :]
+    slope = turned.sum(-1)
+    bend = 2 * (turned.real - torch.diag_embed(slope.real)).detach()
+    # a constant phase has no curvature and no slope
+    ridge = 1e-6 * torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1).detach()
+    eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
+    return -torch.linalg.solve(bend + ridge[:, None, None] * eye, 2 * slope.imag)
+
+
 def _without_kinks(matrix: Tensor, u: Tensor) -> Tensor:
     """Remove kinks of the phase as long as that lowers u^H M u."""
     value, n = _value(matrix, u), u.shape[-1]
@@ -299,16 +358,31 @@ def _without_kinks(matrix: Tensor, u: Tensor) -> Tensor:
 
 
 def _bent(matrix: Tensor, u: Tensor) -> Tensor:
-    """The kinks of u with the lowest values, shape (trial, kink, pulse)."""
-    n = u.shape[-1]
-    pulse = torch.arange(n, dtype=torch.float64, device=u.device)
-    first = torch.linspace(0, n, _KINKS + 2, dtype=torch.float64, device=u.device)[1:-1].round()
-    slope = torch.tensor([s for size in _SLOPES for s in (size, -size)], dtype=torch.float64, device=u.device)
-    ramps = slope[:, None, None] * (2 * math.pi / n) * (pulse - first[:, None]).clamp_min(0)
-    kinks = cis(ramps.flatten(0, 1))
+    """The bends of u with the lowest values, shape (trial, bend, pulse)."""
+    bends = _bends(u.shape[-1], u.device)
     turned = u.conj()[..., :, None] * matrix * u[..., None, :]
-    values = ((turned @ kinks.mT) * kinks.mH).sum(-2).real
-    return u[:, None] * kinks[values.topk(_REFINED, largest=False).indices]
+    values = ((turned @ bends.mT) * bends.mH).sum(-2).real
+    return u[:, None] * bends[values.topk(_REFINED, largest=False).indices]
+
+
+@lru_cache(maxsize=4)
+def _bends(n: int, device: torch.device) -> Tensor:
+    """Changes of slope from a pulse to the end or for a block of pulses, shape (bend, pulse)."""
+    pulse = torch.arange(n, dtype=torch.float64, device=device)
+    cell = 2 * math.pi / n
+
+    def ramps(slopes: tuple[int, ...], first: Tensor, last: Tensor) -> Tensor:
+        slope = cell * torch.tensor([s for size in slopes for s in (size, -size)], dtype=torch.float64, device=device)
+        length = (pulse - first[:, None]).clamp_min(0).minimum((last - first)[:, None])
+        return (slope[:, None, None] * length).flatten(0, 1)
+
+    first = torch.linspace(0, n, _KINKS + 2, dtype=torch.float64, device=device)[1:-1].round()
+    edge = torch.linspace(0, n, _EDGES + 1, dtype=torch.float64, device=device).round()
+    pairs = torch.combinations(torch.arange(_EDGES + 1, device=device))
+    inner = pairs[(pairs[:, 0] > 0) & (pairs[:, 1] < _EDGES)]
+    kinks = ramps(_SLOPES, first, torch.full_like(first, n))
+    blocks = ramps(_BLOCK_SLOPES, edge[inner[:, 0]], edge[inner[:, 1]])
+    return cis(torch.cat([kinks, blocks]))
 
 
 def _deviation(information: Tensor) -> Tensor:

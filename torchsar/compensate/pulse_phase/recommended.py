@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, rotate, starting_phase
+from torchsar.compensate.pulse_phase.data import Pulses, prepare, refuse_odd_counts, rotate, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
+from torchsar.compensate.pulse_phase.linking import linked
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn, settled
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
@@ -40,15 +41,16 @@ def autofocus(
 ) -> Estimate:
     """Estimate the phase of each pulse; the recommended autofocus.
 
-    The method has three steps. The first is `sca`. The second repeats the iterations of
+    In sparse scenes the phases sharpen the image. In scenes whose homogeneous description is more
+    likely (see `describe`), such as clutter that fills a large part of the Doppler band, they are
+    those of `link_phases`, because sharpness does not find them.
+
+    The sharpening has three steps. The first is `sca`. The second repeats the iterations of
     `entropy_fixed_point` until the phases no longer change; cells below 2.5 times the mean power of
     the image get no weight (5 times in the first six iterations if noise is weak). In the third
     step the phase of each pulse is measured against a Wiener estimate of the scene, on an image of
     twice as many Doppler cells. The third step reduces the remaining error by half or more.
     Differentiable without `imaging`.
-
-    For homogeneous clutter that fills a large part of the Doppler band use `link_phases`. Wrong
-    phases lower the entropy of such an image, and `ok` may be True although the phase is wrong.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
@@ -67,7 +69,8 @@ def autofocus(
             unambiguous cross range. A slope of the phase over pulses displaces the image, and a
             displaced image has the wrong migration; therefore the slope is then estimated too.
             After the three steps, 48 slopes over one turn per pulse are tried and the best is
-            refined; then the second and the third step are repeated with `imaging`.
+            refined; then the second and the third step are repeated with `imaging`. The scene is
+            then taken to be sparse.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
@@ -75,7 +78,9 @@ def autofocus(
         unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
         cell contributes to the sharpness, and the Strehl ratio predicted from the standard
         deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of
-        speckle.
+        speckle. Phases of `link_phases` have its standard deviations, `quality` and `ok`. `info`
+        holds "homogeneous" of shape (...,), bool, True where the homogeneous description is more
+        likely; `ok` is False if linked phases then do not confirm that.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -109,7 +114,36 @@ def autofocus(
             taken = taken + more
         return phase, taken, (lambda some, _, at: fixed_point(some, at, again)[0]) if polish else settled
 
-    return estimated(pulses, starting_phase(start, pulses, "autofocus"), find, at_rest=True)
+    sharpest = estimated(
+        pulses, starting_phase(start, pulses, "autofocus"), find, at_rest=True, compare=imaging is None
+    )
+    return _with_linked(pulses, sharpest)
+
+
+def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
+    """The estimate with the linked phases in trials whose scene is more likely homogeneous.
+
+    Where that description turns out to be less likely with the linked phases, the sharpest phases
+    stay; they are not ok, because the descriptions contradict each other.
+    """
+    at = sharpest.info["homogeneous"].flatten().nonzero()[:, 0]
+    if not len(at):
+        return sharpest
+    some = linked(Pulses(pulses.rows[at], pulses.present[at], at.shape))
+    likelier = some.info["gain_nats"] > sharpest.info["sparse_gain_nats"].flatten()[at]
+    at = at[likelier]
+
+    def mixed(of_all: Tensor, of_some: Tensor) -> Tensor:
+        flat = of_all.reshape(len(pulses.rows), *of_some.shape[1:])
+        return flat.index_copy(0, at, of_some[likelier].to(of_all.dtype)).reshape(of_all.shape)
+
+    return Estimate(
+        value={"phase_rad": mixed(sharpest["phase_rad"], some["phase_rad"])},
+        std={"phase_rad": mixed(sharpest.std["phase_rad"], some.std["phase_rad"])},
+        quality=mixed(sharpest.quality, some.quality),
+        ok=mixed(sharpest.ok, some.ok),
+        info=sharpest.info,
+    )
 
 
 def _first_floor(rows: Tensor) -> Tensor:

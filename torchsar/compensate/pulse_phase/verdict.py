@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import Pulses, rotate
+from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.core import Estimate, block_bytes_of, over_blocks
 from torchsar.metrics.phase import phase_rmse
 
@@ -95,7 +96,9 @@ def occupied_band(rows: Tensor) -> Tensor:
     return torch.where(density.sum(-1) > 0, density.mean(-1).square() / _or_one(density.square().mean(-1)), 1)
 
 
-def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = False) -> Estimate:
+def estimated(
+    pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = False, compare: bool = True
+) -> Estimate:
     """Run an autofocus method on all trials and predict the accuracy of its phases.
 
     Trials are processed in blocks that fit into the cache, or all at once if gradients are
@@ -115,37 +118,45 @@ def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = 
             phase) that continues the method from a phase, on all or on half of the rows.
         at_rest: True if continuing the method does not move its result; the second part of the
             standard deviation is then left out.
+        compare: False if the scene is not to be compared with a homogeneous one, because its image
+            is not the Fourier transform along pulses.
 
     Returns:
         `phase_rad` of shape (..., pulse) with its standard deviation. Sharpness is the amount by
         which the image entropy lies below that of speckle. `quality` is the Strehl ratio predicted
         from the standard deviation, times the share of the sharpness that noise does not explain.
         `ok` is False unless the image is 1.5 times as sharp as autofocus can make pure noise, more
-        than one row contributes to the sharpness, and that Strehl ratio exceeds 0.8. `info` holds
-        "present", shape (..., pulse), False for pulses that hold only zeros; and, of shape (...,),
-        "iterations", "sharpness_nats", "noise_sharpness_nats" (the largest sharpness that noise can
-        reach), "effective_rows" (number of rows over which the energy is spread) and "telling_rows"
-        (number of rows over which the sharpness is spread).
+        than one row contributes to the sharpness, that Strehl ratio exceeds 0.8, and a homogeneous
+        description of the scene is not more likely (see `describe`), because sharpness does not
+        find the phases of homogeneous clutter. `info` holds "present", shape (..., pulse), False
+        for pulses that hold only zeros; and, of shape (...,), "homogeneous" (True where that
+        description is more likely), "sparse_gain_nats" (gain of the log likelihood of the sparse
+        description over white noise), "iterations", "sharpness_nats", "noise_sharpness_nats" (the
+        largest sharpness that noise can reach), "effective_rows" (number of rows over which the
+        energy is spread) and "telling_rows" (number of rows over which the sharpness is spread).
     """
     rows, present = pulses.rows, pulses.present
     if not len(rows) or pulses.n < 3:
         return _gathered(pulses, [_no_estimate(rows)])
     if len(rows) == 1 or (rows.requires_grad and torch.is_grad_enabled()):
-        return _gathered(pulses, [_assessed(rows, present, start, find, at_rest)])
+        return _gathered(pulses, [_assessed(rows, present, start, find, at_rest, compare)])
     height = max(1, block_bytes_of(rows.device) // (rows[0].numel() * rows.element_size()))
     parts = [slice(first, first + height) for first in range(0, len(rows), height)]
     done: dict[int, tuple[Tensor, ...]] = {}
 
     def work(part: slice) -> None:
-        done[part.start] = _assessed(rows[part], present[part], None if start is None else start[part], find, at_rest)
+        begin = None if start is None else start[part]
+        done[part.start] = _assessed(rows[part], present[part], begin, find, at_rest, compare)
 
     with torch.no_grad():
         over_blocks(work, parts, rows)
     return _gathered(pulses, [done[part.start] for part in parts])
 
 
-def _assessed(rows: Tensor, present: Tensor, start: Tensor | None, find: Find, at_rest: bool) -> tuple[Tensor, ...]:
-    """Phase, iterations, sharpness, effective rows of both, and standard deviation per trial."""
+def _assessed(
+    rows: Tensor, present: Tensor, start: Tensor | None, find: Find, at_rest: bool, compare: bool
+) -> tuple[Tensor, ...]:
+    """Phase, iterations, sharpness, effective rows of both, std, and the descriptions per trial."""
     phase, taken, again = find(rows, present, start)
     with torch.no_grad():
         sharp, effective, sharpness_rows = sharpness_beyond_speckle(torch.fft.fft(rotate(rows, phase), norm="ortho"))
@@ -153,24 +164,29 @@ def _assessed(rows: Tensor, present: Tensor, start: Tensor | None, find: Find, a
         std = _half_difference(rows, present, phase, again) / occupied.sqrt()
         if not at_rest:
             std = torch.hypot(std, _drift(rows, present, phase, again))
-    return phase, taken, sharp, effective * occupied, sharpness_rows, std
+        scene = describe(rows, phase, occupied)
+    homogeneous = scene.homogeneous & compare
+    return phase, taken, sharp, effective * occupied, sharpness_rows, std, scene.sparse, homogeneous
 
 
 def _no_estimate(rows: Tensor) -> tuple[Tensor, ...]:
     """The result of `_assessed` where no phase can be found: too few pulses, or no trials."""
     zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
-    return rows[:, 0].real * 0, zero.long(), zero, zero, zero, zero + math.pi / math.sqrt(3)
+    return rows[:, 0].real * 0, zero.long(), zero, zero, zero, zero + math.pi / math.sqrt(3), zero, zero > 0
 
 
 def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     """Estimate from the results of all blocks of trials."""
-    phase, taken, sharp, effective, sharpness_rows, std_rad = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
+    phase, taken, sharp, effective, sharpness_rows, std_rad, sparse, homogeneous = (
+        torch.cat(pieces) for pieces in zip(*parts, strict=True)
+    )
     present, shape = pulses.present, pulses.trials
     noise = sharpness_of_noise(effective.clamp_min(1))
     enough_pulses = present.sum(-1) >= 3
     strehl = torch.exp(-std_rad.square())
     quality = torch.where(enough_pulses, strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1)), 0)
     ok = enough_pulses & (sharp > _MARGIN * noise) & (sharpness_rows > _LEAST_ROWS) & (strehl > LEAST_STREHL)
+    ok = ok & ~homogeneous
     phase = torch.where(enough_pulses[:, None], phase, 0)
     info = {
         "iterations": taken,
@@ -178,6 +194,8 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
         "noise_sharpness_nats": noise,
         "effective_rows": effective,
         "telling_rows": sharpness_rows,
+        "sparse_gain_nats": sparse,
+        "homogeneous": homogeneous,
     }
     std = std_rad[:, None].expand(-1, pulses.n).to(phase.dtype)
     return Estimate(

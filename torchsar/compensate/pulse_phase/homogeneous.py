@@ -1,0 +1,148 @@
+"""Decision between two descriptions of a scene by their likelihoods: sparse or homogeneous.
+
+In a sparse scene few cells of the image hold the energy. In a homogeneous scene every range cell is
+speckle, whose power over Doppler is the same in all range cells but for a factor. Methods that
+sharpen the image end with wrong phases in a homogeneous scene; function `link_phases` does not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.pulse_phase.data import rotate
+from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
+
+# Range cells are grouped by power, because each group has its own spectrum: largest ratio of the
+# powers in a group, and number of groups; the last one also takes all weaker cells.
+_GROUP_RATIO, _GROUPS = 4.0, 4
+# least spectral density relative to its mean: it keeps R invertible where noise is weak
+SPECTRAL_FLOOR = 1e-4
+_LAGS = 8  # distances of the pulses whose coherence is compared with that of noise
+_LEAST_REST = 1e-14  # power of the weak cells relative to the mean: below it sums are inexact
+_SURE = 4.0  # standard deviations by which coherence must exceed that of noise
+
+
+@dataclass(frozen=True)
+class Descriptions:
+    """Gains of the log likelihood of two descriptions of the scene over white noise, in nats.
+
+    Args:
+        sparse: Gain of the sparse description, shape (trial,).
+        homogeneous: True where the homogeneous description is more likely, shape (trial,), bool.
+    """
+
+    sparse: Tensor
+    homogeneous: Tensor
+
+
+def power_groups(power: Tensor) -> Tensor:
+    """Assign range cells to groups of similar power.
+
+    Args:
+        power: Power of the range cells, shape (trial, range).
+
+    Returns:
+        True for the range cells of each group, shape (group, trial, range), bool. The first group
+        holds the cells down to a quarter of the greatest power, and the last one all weaker cells.
+    """
+    ratio = power.amax(-1, keepdim=True) / power.clamp_min(torch.finfo(power.dtype).tiny)
+    member = (ratio.log() / math.log(_GROUP_RATIO)).clamp(0, _GROUPS - 1).long()
+    return torch.stack([member == group for group in range(_GROUPS)])
+
+
+def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> Descriptions:
+    """Compare the likelihoods of the two descriptions of a scene for given phases.
+
+    The homogeneous description is judged by the greater of two gains: that of the Doppler spectra
+    for the given phases, and that of the coherence of neighbouring pulses, which no phase error
+    changes. The coherence must exceed that of noise in any case.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        phase_rad: Phases to be removed in rad, shape (trial, pulse).
+        independent: Share of the range cells that are independent, shape (trial,), see
+            `occupied_band`.
+
+    Returns:
+        The gains and the decision.
+    """
+    n = rows.shape[-1]
+    energy = rows.real.square() + rows.imag.square()
+    mean = energy.mean((-2, -1), dtype=torch.float64)
+    power = energy.mean(-1, dtype=torch.float64) / _or_one(mean)[:, None]
+    groups = power_groups(power).to(torch.float64)
+    cells = groups.sum(-1)
+    of_group = (groups * power).sum(-1) / _or_one(cells)
+    by_power = -(n * cells * _or_one(of_group).log()).sum(0)
+
+    image = torch.fft.fft(rotate(rows, phase_rad), 2 * n)
+    power = (image.real.square() + image.imag.square()) / _or_one(n * mean).to(energy.dtype)[:, None, None]
+    sparse = sparse_gain_nats(power[..., ::2])
+    spectra = torch.einsum("gtr,trk->gtk", groups.to(power.dtype), power).to(torch.float64)
+    by_spectra = -(cells * n * (_whittle(spectra / _or_one(cells)[..., None], cells * independent))).sum(0)
+
+    gain, deviation = _coherence(rows, groups, cells, independent)
+    excess = sparse - by_power
+    likelier = torch.maximum(by_spectra - by_power, gain) > excess
+    return Descriptions(sparse, likelier & (gain > _SURE * deviation))
+
+
+def sparse_gain_nats(power: Tensor) -> Tensor:
+    """Compute the gain of the log likelihood if the strongest cells each have a power of their own.
+
+    All other cells share one power. The number of strong cells, K of N, is the one of the greatest
+    gain. Each costs 2 + ln(N / K) nats, for its power and its place.
+
+    Args:
+        power: Powers of the image with a mean of 1, shape (trial, range, Doppler).
+
+    Returns:
+        The gain over N cells of one power in nats, shape (trial,), 0 or more, float64.
+    """
+    total = power[0].numel() if len(power) else 1
+    strongest = power.flatten(1).topk(max(1, total // 2), sorted=True).values.to(torch.float64)
+    strongest = strongest.clamp_min(torch.finfo(power.dtype).tiny)
+    count = torch.arange(1, strongest.shape[-1] + 1, dtype=torch.float64, device=power.device)
+    whole = power.sum((-2, -1), dtype=torch.float64)[:, None]
+    rest = ((whole - strongest.cumsum(-1)) / (total - count)).clamp_min(_LEAST_REST)
+    own = strongest.log().cumsum(-1) + count * (2 + torch.log(total / count))
+    gain = total - own - (total - count) * (1 + rest.log())
+    return torch.where(whole[:, 0] > 0, gain.amax(-1).clamp_min(0), 0)
+
+
+def _whittle(power: Tensor, looks: Tensor) -> Tensor:
+    """Mean negative log likelihood of a sample, less that of white noise, (group, trial)."""
+    mean = power.mean(-1, keepdim=True)
+    power = torch.where(mean > 0, torch.maximum(power, SPECTRAL_FLOOR * mean), 1)
+    smooth = smoothed_spectrum(power, looks.clamp_min(1))
+    return (smooth.log() + power / smooth).mean(-1) - 1
+
+
+def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor) -> tuple[Tensor, Tensor]:
+    """Gain by the coherence of neighbouring pulses and its standard deviation in noise, (trial,).
+
+    To second order in the coherence the gain of a sample is the sum of its squares over the lags.
+    """
+    n, energy = rows.shape[-1], rows.real.square() + rows.imag.square()
+    kinds = groups.to(energy.dtype)
+    pulse = torch.einsum("gtr,trp->gtp", kinds, energy)
+    row = kinds * energy.sum(-1)
+    looks = row.sum(-1).square() / _or_one(row.square().sum(-1)) * independent
+    excess = torch.zeros_like(cells)
+    lags = min(_LAGS, n - 1)
+    for lag in range(1, lags + 1):
+        product = torch.einsum("gtr,trp->gtp", kinds.to(rows.dtype), rows[..., lag:] * rows[..., :-lag].conj())
+        square = (product.real.square() + product.imag.square()).sum(-1)
+        excess = excess + square / _or_one((pulse[..., lag:] * pulse[..., :-lag]).sum(-1)) - 1 / looks.clamp_min(1)
+    weight = torch.where(cells > 1, n * cells, 0)
+    deviation = weight * math.sqrt(lags / n) / looks.clamp_min(1)
+    return (weight * excess).sum(0).to(torch.float64), deviation.square().sum(0).sqrt().to(torch.float64)
+
+
+def _or_one(x: Tensor) -> Tensor:
+    """x where it is positive, else 1."""
+    return torch.where(x > 0, x, 1)
