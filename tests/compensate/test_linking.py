@@ -112,7 +112,7 @@ def test_the_gain_of_a_sparse_scene_is_that_of_its_best_number_of_cells() -> Non
     power = power / power.mean((-2, -1), keepdim=True)
     for trial in range(2):
         p, gains = power[trial].flatten().sort(descending=True).values, [0.0]
-        for strong in range(1, 16):
+        for strong in range(1, 30):
             rest = p[strong:].mean()
             own = (p[:strong].log() + 1).sum() + strong * (1 + math.log(30 / strong))
             gains.append(float(30 - own - (30 - strong) * (1 + rest.log())))
@@ -169,21 +169,27 @@ def test_the_likelihood_is_that_of_direct_evaluation() -> None:
     present[1, 4] = False
     rows = rows * present[:, None]
     scene, u = _Scene.of(rows, present), torch.exp(1j * torch.randn(2, 10, generator=generator, dtype=F64))
-    fit = scene.fit(u, lambda power, _: power)
+    spectra = [1 + torch.rand(2, 20, generator=generator, dtype=F64) for _ in scene.groups]
+    fit = scene.fit(spectra)
+    adapted = scene.adapted(u, fit)
     value = fit.constant + torch.einsum("tp,tpq,tq->t", u.conj(), fit.matrix, u).real
     for trial in range(2):
         at = present[trial].nonzero()[:, 0]
         z = rows[trial] * torch.sqrt(6 * len(at) / rows[trial].abs().square().sum())
         total = 0.0
-        for group in (z[:4], z[4:]):
-            straight = group * u[trial].conj()
-            power = torch.fft.fft(straight, 20).abs().square().sum(0) / len(group) / len(at)
-            power = power.clamp_min(1e-4 * float(power.mean()))
+        for group, spectrum, again in zip((z[:4], z[4:]), spectra, adapted, strict=True):
+            straight = (group * u[trial].conj())[:, at]
             lag = ((at[:, None] - at)[..., None] * torch.arange(20)).to(F64)
-            covariance = (power * torch.exp(2j * math.pi * lag / 20)).mean(-1)
+            covariance = (spectrum[trial] * torch.exp(2j * math.pi * lag / 20)).mean(-1)
             inverse = torch.linalg.inv(covariance)
             total += len(group) * float(torch.linalg.slogdet(covariance).logabsdet)
-            total += float(torch.einsum("cp,pq,cq->", straight[:, at].conj(), inverse, straight[:, at]).real)
+            total += float(torch.einsum("cp,pq,cq->", straight.conj(), inverse, straight).real)
+            tones = torch.exp(2j * math.pi * (torch.arange(20)[:, None] * at).to(F64) / 20)
+            gain = torch.einsum("kp,pq,kq->k", tones.conj(), inverse, tones).real
+            power = torch.einsum("kp,pq,cq->ck", tones.conj(), inverse, straight).abs().square().mean(0)
+            power = len(at) * power / gain.square()
+            smooth = smoothed_spectrum(power[None], scene.independent[trial : trial + 1] * len(group))[0]
+            torch.testing.assert_close(again[trial], smooth, rtol=1e-9, atol=0)
         assert float(value[trial]) == pytest.approx(total, rel=1e-9)
 
 

@@ -15,15 +15,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import Pulses, prepare
-from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, power_groups
+from torchsar.compensate.pulse_phase.data import Pulses, prepare, starting_phase
+from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, SPECTRAL_FLOOR, describe, power_groups
+from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 from torchsar.compensate.pulse_phase.verdict import LEAST_STREHL, occupied_band
 from torchsar.core import Estimate, cis, over_blocks
@@ -33,6 +35,9 @@ _WIDTHS, _IN_BAND = (0.1, 0.25, 0.45, 0.65, 0.8, 0.9), 0.85
 # Largest number of estimates of the spectrum; those smoothed by a window, because the first phases
 # are far off, and its half width in bins; Newton steps of the phases after each.
 _ROUNDS, _COARSE_ROUNDS, _WINDOW, _STEPS = 16, 2, 4, 4
+# Triples of rounds with adapted spectra; longest extrapolation; change, as a share of the predicted
+# standard deviation, that ends them; least density relative to the mean, which rounding allows.
+_REFINEMENTS, _LONGEST, _SMALL, _LEAST_FLOOR = 6, 8.0, 0.3, 1e-8
 _STILL_RAD = 0.01  # phase change, rms over the pulses, that ends the rounds
 # Kinks: from one of 64 pulses on, the slope of the phase changes by so many Doppler cells. A block
 # of pulses that has slipped by a cell is the usual local minimum. Kinks are sought in two rounds;
@@ -46,10 +51,12 @@ _NOISE_NATS, _MARGIN = 2.0, 2.0
 # The errors of neighbouring pulses depend on each other, so that the rms error of a scene may
 # exceed its standard deviation by this factor.
 _SPREAD = 1.4
+# the phases that sharpen a sparse scene, as in `autofocus`
+_SHARPEN = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)
 _BLOCK_BYTES = 64 << 20  # limits the memory of a block of trials
 
 
-def link_phases(data: Tensor) -> Estimate:
+def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
     """Estimate the phase of each pulse of a homogeneous scene by maximum likelihood.
 
     The scene is speckle with any Doppler spectrum. Its error does not depend on the size or kind of
@@ -58,6 +65,8 @@ def link_phases(data: Tensor) -> Estimate:
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+        start: Phase to start from in rad, shape (..., pulse), if it is known to about a radian; by
+            default the search starts from phases that fit one of several Doppler bands best.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed. The standard deviation of each pulse is
@@ -66,25 +75,35 @@ def link_phases(data: Tensor) -> Estimate:
         noise. A constant and a linear phase only add a phase to the image and shift it; they are
         left out of the standard deviation. `quality` is the predicted Strehl ratio times the share
         of the likelihood that noise does not explain. `ok` is False where the Strehl ratio for 1.4
-        times the standard deviation is below 0.8 or the gain in likelihood below twice that of
-        noise. `info` holds "gain_nats" of shape (...,): log likelihood minus that of white noise.
+        times the standard deviation is below 0.8, the gain in likelihood below twice that of noise,
+        fewer than ten independent range cells hold the energy, or a sparse description of the scene
+        with the phases that sharpen it is more likely. `info` holds "gain_nats" of shape
+        (...,): log likelihood minus that of white noise.
 
     Raises:
-        TypeError: If the data are not complex.
-        ValueError: If the data are empty or not finite.
+        TypeError: If the data are not complex or the start is not a tensor.
+        ValueError: If the data are empty or not finite, or the start does not have one phase per
+            pulse.
 
     Reference:
         Guarnieri and Tebaldini, IEEE Trans. Geosci. Remote Sens. 46(11), 2008 (phase linking).
     """
     pulses = prepare(data, "link_phases")
-    return linked(pulses)
+    found = linked(pulses, starting_phase(start, pulses, "link_phases"))
+    if pulses.n < 3:
+        return found
+    with torch.no_grad():
+        sharp = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
+        sparse = describe(pulses.rows, sharp, occupied_band(pulses.rows)).sparse.reshape(pulses.trials)
+    return replace(found, ok=found.ok & (found.info["gain_nats"] > sparse))
 
 
-def linked(pulses: Pulses) -> Estimate:
+def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
     """Estimate the phases of pulses that were checked; see `link_phases`.
 
     Args:
         pulses: The pulses.
+        start: Phase to start from in rad, shape (trial, pulse), or None.
 
     Returns:
         The `Estimate` that `link_phases` returns.
@@ -95,7 +114,7 @@ def linked(pulses: Pulses) -> Estimate:
     done: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
 
     def work(part: slice) -> None:
-        done[part.start] = _linked(rows[part], pulses.present[part])
+        done[part.start] = _linked(rows[part], pulses.present[part], None if start is None else start[part])
 
     if rows.requires_grad and torch.is_grad_enabled():
         for part in parts:
@@ -113,47 +132,85 @@ def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor) -> Estim
     scene = (1 - noise / _or_one(gain)).clamp(0, 1)
     std = torch.where(scene[:, None] > 0, std / _or_one(scene).sqrt()[:, None], torch.inf).clamp_max(_PRIOR**-0.5)
     strehl = torch.exp(-(std.square() * pulses.present).sum(-1) / pulses.present.sum(-1).clamp_min(1))
+    row = (pulses.rows.detach().real.square() + pulses.rows.detach().imag.square()).sum(-1, dtype=torch.float64)
+    effective = row.sum(-1).square() / _or_one(row.square().sum(-1)) * occupied_band(pulses.rows.detach())
     return Estimate(
         value={"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
         std={"phase_rad": std.reshape(*trials, pulses.n).to(real)},
         quality=(strehl * scene).reshape(trials).to(real),
-        ok=((strehl ** (_SPREAD**2) > LEAST_STREHL) & (gain > _MARGIN * noise)).reshape(trials),
+        ok=((strehl ** (_SPREAD**2) > LEAST_STREHL) & (gain > _MARGIN * noise) & (effective > LEAST_LOOKS)).reshape(
+            trials
+        ),
         info={"gain_nats": gain.reshape(trials)},
     )
 
 
-def _linked(rows: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Phase and standard deviation (trial, pulse) in rad, and gain (trial,) in nats, of a block."""
     with torch.no_grad():
         scene = _Scene.of(rows.detach(), present)
-        u = _search(scene, torch.where(present, pair_phase(rows, present), 0).to(torch.float64))
-        fit = scene.fit(u, smoothed_spectrum)
+        u, fit = _refined(scene, _search(scene) if start is None else cis(start.to(torch.float64)))
+        if start is not None:
+            bent = _without_kinks(fit.matrix, u)
+            if bool((bent != u).any()):
+                u, fit = _refined(scene, bent)
         gain = scene.independent * (scene.samples - fit.constant - _value(fit.matrix, u))
-        information = scene.fit(u, smoothed_spectrum, tapered=True).information
-        std = _deviation(scene.independent[:, None, None] * information)
+        std = _deviation(scene.independent[:, None, None] * scene.information(fit))
     if not rows.requires_grad or not torch.is_grad_enabled():
         return torch.angle(u), std, gain
     step = _step(_Scene.of(rows, present).matrix(fit.inverses), u)
     return torch.angle(u) + step - step.detach(), std, gain
 
 
-def _search(scene: _Scene, phase: Tensor) -> Tensor:
-    """Phases of greatest likelihood as exp(j phase), (trial, pulse), sought from `phase`."""
-    u = scene.start(phase)
+def _search(scene: _Scene) -> Tensor:
+    """Phases of greatest likelihood for periodograms, as exp(j phase), (trial, pulse)."""
+    u = scene.start()
     active = torch.arange(len(u), device=u.device)
     for count in range(_ROUNDS):
+        some = scene.trials(active)
         smooth = _windowed if count < _COARSE_ROUNDS else smoothed_spectrum
-        matrix = scene.trials(active).fit(u[active], smooth).matrix
+        matrix = some.fit(some.periodograms(u[active], smooth)).matrix
         new = _newton(matrix, u[active], _STEPS)
         if count in _KINK_ROUNDS:
             new = _without_kinks(matrix, new)
-        moved = torch.angle(new * u[active].conj()).square().mean(-1).sqrt()
+        moved = _distance(new, u[active])
         u = u.index_copy(0, active, new)
         if count > max(_KINK_ROUNDS):
             active = active[moved > _STILL_RAD]
             if not len(active):
                 break
     return u
+
+
+def _refined(scene: _Scene, u: Tensor) -> tuple[Tensor, _Fit]:
+    """The phases of greatest likelihood for adapted spectra, and the fit with these spectra.
+
+    Phases and spectra are found in turn. A smooth error of the phase widens the spectrum, and the
+    wider spectrum hardly opposes it; three rounds are therefore extrapolated (squared iteration).
+    """
+    spectra = scene.periodograms(u, smoothed_spectrum)
+    std = _deviation(scene.information(scene.fit(spectra))).square().mean(-1).sqrt()
+    active = torch.arange(len(u), device=u.device)
+    for _ in range(_REFINEMENTS):
+        some, first = scene.trials(active), u[active]
+        own = [of_all[active] for of_all in spectra]
+        second, own = some.round(first, own)
+        third, own = some.round(second, own)
+        step, next_ = torch.angle(second * first.conj()), torch.angle(third * second.conj())
+        bend = (next_ - step).norm(dim=-1, keepdim=True)
+        reach = (step.norm(dim=-1, keepdim=True) / _or_one(bend)).where(bend > 0, 1).clamp(1, _LONGEST)
+        new, own = some.round(first * cis(2 * reach * step + reach.square() * (next_ - step)), own)
+        u = u.index_copy(0, active, new)
+        spectra = [of_all.index_copy(0, active, of_some) for of_all, of_some in zip(spectra, own, strict=True)]
+        active = active[_distance(new, first) > _SMALL * std[active]]
+        if not len(active):
+            break
+    return u, scene.fit(spectra)
+
+
+def _distance(u: Tensor, v: Tensor) -> Tensor:
+    """Difference of phases in rad, rms over the pulses, (trial,)."""
+    return torch.angle(u * v.conj()).square().mean(-1).sqrt()
 
 
 Smooth = Callable[[Tensor, Tensor], Tensor]
@@ -164,16 +221,16 @@ class _Fit:
     """Likelihood of the phases for given spectra.
 
     Args:
+        spectra: Doppler spectrum of each group at twice as many bins as pulses, (trial, bin).
         inverses: R^-T of each group, shape (trial, pulse, pulse).
         matrix: R^-T o C, summed over the range cells, shape (trial, pulse, pulse), Hermitian.
         constant: ln det R, summed over the range cells, shape (trial,).
-        information: Fisher information of the phases in 1/rad^2, shape (trial, pulse, pulse).
     """
 
+    spectra: list[Tensor]
     inverses: list[Tensor]
     matrix: Tensor
     constant: Tensor
-    information: Tensor
 
 
 @dataclass(frozen=True)
@@ -214,48 +271,80 @@ class _Scene:
         groups = [(own[at], products[at], cells[at]) for own, products, cells in self.groups]
         return _Scene(groups, self.present[at], self.samples[at], self.independent[at])
 
-    def start(self, phase: Tensor) -> Tensor:
+    def start(self) -> Tensor:
         """The phases of greatest likelihood for one of several bands, as exp(j phase)."""
-        n = phase.shape[-1]
-        lag = torch.arange(n, dtype=torch.float64, device=phase.device)
+        n = self.present.shape[-1]
+        lag = torch.arange(n, dtype=torch.float64, device=self.present.device)
         every = sum(products for _, products, _ in self.groups) / self._cells[:, None, None]
-        least, best = torch.full_like(phase[:, 0], torch.inf), cis(phase)
+        flat = torch.ones_like(every[:, 0])
+        least, best = torch.full_like(self.samples, torch.inf), flat
         for width in _WIDTHS:
             band = _IN_BAND * torch.sinc(width * lag) + (1 - _IN_BAND) * (lag == 0)
-            lower, log_det = self._factor(band.to(torch.complex128).expand(len(phase), -1))
+            lower, log_det = self._factor(self._toeplitz(band.to(flat.dtype).expand_as(flat)))
             matrix = torch.cholesky_inverse(lower).mT * every
-            u = _newton(matrix, _smallest(matrix, cis(phase)), _STEPS)
+            u = _newton(matrix, _smallest(matrix, flat), _STEPS)
             value = log_det + _value(matrix, u)
             best = torch.where((value < least)[:, None], u, best)
             least = torch.minimum(value, least)
         return best
 
-    def fit(self, u: Tensor, smooth: Smooth, tapered: bool = False) -> _Fit:
-        """The likelihood with the smoothed spectra of the samples without the phases of u.
-
-        Without a taper the strong part of a spectrum leaks into the weak part: the phases come out
-        more exact, but their information too low.
-        """
-        n = u.shape[-1]
-        at = torch.arange(1, n + 1, dtype=torch.float64, device=u.device) * (math.pi / (n + 1))
-        taper = math.sqrt(2 * n / (n + 1)) * torch.sin(at) if tapered else torch.ones_like(at)
-        inverses, information = [], torch.zeros_like(self.groups[0][1].real)
-        constant = torch.zeros_like(self.samples)
+    def periodograms(self, u: Tensor, smooth: Smooth) -> list[Tensor]:
+        """Smoothed mean periodograms of each group, without the phases of u."""
+        spectra = []
         for own, _, cells in self.groups:
-            spectrum = torch.fft.fft(own * (taper * u.conj())[..., None], 2 * n, dim=-2)
+            spectrum = torch.fft.fft(own * u.conj()[..., None], 2 * u.shape[-1], dim=-2)
             power = (spectrum.real.square() + spectrum.imag.square()).sum(-1)
-            mean = power.mean(-1, keepdim=True)
-            power = torch.where(mean > 0, power, 1) / _or_one(cells * self.present.sum(-1))[:, None]
-            power = torch.maximum(power, SPECTRAL_FLOOR * power.mean(-1, keepdim=True))
-            lower, log_det = self._factor(
-                torch.fft.ifft(smooth(power, (cells * self.independent).clamp_min(1)))[..., :n]
+            spectra.append(
+                self._smoothed(power / _or_one(self.present.sum(-1))[:, None], cells, smooth, SPECTRAL_FLOOR)
             )
-            inverse = torch.cholesky_inverse(lower).mT
-            inverses.append(inverse)
+        return spectra
+
+    def adapted(self, u: Tensor, fit: _Fit) -> list[Tensor]:
+        """Smoothed powers of each group behind filters that suppress all other frequencies.
+
+        The filters are R^-1 a / (a^H R^-1 a) with the covariances of a fit, where a is a tone. A
+        periodogram raises weak parts of the spectrum by what leaks from strong ones.
+        """
+        spectra, n = [], u.shape[-1]
+        kept = self.present[:, :, None] & self.present[:, None, :]
+        for (own, _, cells), inverse in zip(self.groups, fit.inverses, strict=True):
+            tones = torch.fft.fft(inverse.mT @ (own * u.conj()[..., None]), 2 * n, dim=-2)
+            sums = torch.roll(torch.nn.functional.pad(_lag_sums(inverse.mT * kept), (1, 0)), -n, -1)
+            gain = torch.fft.fft(sums).real
+            power = (tones.real.square() + tones.imag.square()).sum(-1) / gain.square()
+            spectra.append(
+                self._smoothed(power * self.present.sum(-1)[:, None], cells, smoothed_spectrum, _LEAST_FLOOR)
+            )
+        return spectra
+
+    def _smoothed(self, power: Tensor, cells: Tensor, smooth: Smooth, floor: float) -> Tensor:
+        """Smoothed mean of powers that were summed over the cells of a group."""
+        mean = power.mean(-1, keepdim=True)
+        power = torch.where(mean > 0, torch.maximum(power, floor * mean), 1) / _or_one(cells)[:, None]
+        return smooth(power, (cells * self.independent).clamp_min(1))
+
+    def round(self, u: Tensor, spectra: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
+        """A Newton step of the phases for given spectra, and the spectra adapted to the result."""
+        fit = self.fit(spectra)
+        u = _newton(fit.matrix, u, 1)
+        return u, self.adapted(u, fit)
+
+    def fit(self, spectra: list[Tensor]) -> _Fit:
+        """The likelihood with given spectra of the groups."""
+        inverses, constant = [], torch.zeros_like(self.samples)
+        for (_, _, cells), spectrum in zip(self.groups, spectra, strict=True):
+            lower, log_det = self._factor(self._toeplitz(torch.fft.ifft(spectrum)))
+            inverses.append(torch.cholesky_inverse(lower).mT)
             constant = constant + cells * log_det
-            own_information = (inverse * (lower @ lower.mH)).real - torch.eye(n, dtype=torch.float64, device=u.device)
-            information = information + 2 * cells[:, None, None] * own_information
-        return _Fit(inverses, self.matrix(inverses), constant, information)
+        return _Fit(spectra, inverses, self.matrix(inverses), constant)
+
+    def information(self, fit: _Fit) -> Tensor:
+        """Fisher information of the phases in 1/rad^2, shape (trial, pulse, pulse)."""
+        total, eye = 0.0, torch.eye(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
+        for (_, _, cells), spectrum, inverse in zip(self.groups, fit.spectra, fit.inverses, strict=True):
+            covariance = self._toeplitz(torch.fft.ifft(spectrum))
+            total = total + 2 * cells[:, None, None] * ((inverse * covariance).real - eye)
+        return torch.as_tensor(total)
 
     def matrix(self, inverses: list[Tensor]) -> Tensor:
         """R^-T o C, summed over the range cells, for the R^-T of each group."""
@@ -268,18 +357,28 @@ class _Scene:
     def _cells(self) -> Tensor:
         return sum((cells for *_, cells in self.groups[1:]), self.groups[0][2])
 
-    def _factor(self, lags: Tensor) -> tuple[Tensor, Tensor]:
-        """Cholesky factor and log determinant of the covariance of the present pulses.
+    def _toeplitz(self, lags: Tensor) -> Tensor:
+        """Covariance of the present pulses, (trial, pulse, pulse); other pulses have variance 1.
 
-        It is Toeplitz with the first column `lags` (trial, pulse); other pulses have variance 1.
+        It is Hermitian and Toeplitz with the first column `lags` (trial, at least pulse).
         """
-        n = lags.shape[-1]
+        n = self.present.shape[-1]
         at = torch.arange(n, device=lags.device)
-        lag = at[:, None] - at
-        both = torch.cat([lags, lags[:, 1:].conj().flip(-1)], -1)[:, lag % (2 * n - 1)]
+        both = torch.cat([lags[:, :n], lags[:, 1:n].conj().flip(-1)], -1)[:, (at[:, None] - at) % (2 * n - 1)]
         kept = self.present[:, :, None] & self.present[:, None, :]
-        lower = torch.linalg.cholesky(torch.where(kept, both, torch.eye(n, dtype=lags.dtype, device=lags.device)))
+        return torch.where(kept, both, torch.eye(n, dtype=lags.dtype, device=lags.device))
+
+    def _factor(self, covariance: Tensor) -> tuple[Tensor, Tensor]:
+        """Cholesky factor and log determinant of covariances."""
+        lower = torch.linalg.cholesky(covariance)
         return lower, 2 * torch.diagonal(lower, dim1=-2, dim2=-1).real.log().sum(-1)
+
+
+def _lag_sums(matrix: Tensor) -> Tensor:
+    """Sums of the elements (row, column) of equal row - column, from 1 - n to n - 1."""
+    n = matrix.shape[-1]
+    skewed = torch.nn.functional.pad(matrix.flip(-1), (0, n)).flatten(-2)[..., : n * (2 * n - 1)]
+    return skewed.unflatten(-1, (n, 2 * n - 1)).sum(-2)
 
 
 def _windowed(power: Tensor, _: Tensor) -> Tensor:

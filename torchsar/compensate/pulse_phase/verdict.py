@@ -23,7 +23,7 @@ SPECKLE_NATS = 1 - 0.5772156649015329
 LEAST_STREHL = 0.8  # Strehl ratio of a well-focused image, a convention (Marechal)
 # factor by which the sharpness must exceed that of noise: `sharpness_of_noise` errs by up to 15 %
 _MARGIN = 1.5
-_LEAST_ROWS = 1.5  # a single row cannot separate phase errors from the scene; 1 is a single row
+LEAST_ROWS = 1.5  # a single row cannot separate phase errors from the scene; 1 is a single row
 # limits of `_drift`, found by trial: more rounds, or rounds after smaller steps, cost time and
 # rarely change the result
 _ROUNDS = 6
@@ -185,7 +185,7 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     enough_pulses = present.sum(-1) >= 3
     strehl = torch.exp(-std_rad.square())
     quality = torch.where(enough_pulses, strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1)), 0)
-    ok = enough_pulses & (sharp > _MARGIN * noise) & (sharpness_rows > _LEAST_ROWS) & (strehl > LEAST_STREHL)
+    ok = enough_pulses & (sharp > _MARGIN * noise) & (sharpness_rows > LEAST_ROWS) & (strehl > LEAST_STREHL)
     ok = ok & ~homogeneous
     phase = torch.where(enough_pulses[:, None], phase, 0)
     info = {
