@@ -318,8 +318,8 @@ class FrequencyBasis:
     The phase of a Doppler row is computed in float64 at a few range frequencies, the nodes
     (`nodes_hz`); one matrix product then evaluates it at all range frequencies. The number of nodes
     follows from the ratio of sampling rate to carrier and from the squint, so that the error stays
-    below 1e-6 turn. Where the squint is so large that 48 nodes are not enough, all range frequencies
-    are nodes, and nothing is interpolated.
+    below 1e-6 turn. Where the squint is so large that 48 nodes are not enough, all range
+    frequencies are nodes, and nothing is interpolated.
 
     Args:
         radar: Radar of the recording.
@@ -618,8 +618,7 @@ class Focuser(Stage):
             band_hz=self.band_hz,
         )
         azimuth, range_ = self.radar.image_axes(signal.axes)
-        factor = data.shape[-2] // azimuth.n
-        return Signal(data, (replace(azimuth, n=data.shape[-2], step=azimuth.step / factor), range_))
+        return Signal(data, (azimuth.resampled(data.shape[-2] // azimuth.n), range_))
 
 
 class OmegaK(Focuser):
@@ -661,7 +660,11 @@ class StoredOmegaK(Stage):
                 "filter",
                 at.weighted(
                     bulk_filter(
-                        FrequencyBasis(radar, n_range, device, at.sin_reach), at, range_m, stage.spectrum(n_range, device), dtype
+                        FrequencyBasis(radar, n_range, device, at.sin_reach),
+                        at,
+                        range_m,
+                        stage.spectrum(n_range, device),
+                        dtype,
                     )
                 ),
             )

@@ -2,10 +2,10 @@
 
 At the range frequency f relative to the carrier f0, a beam with the Doppler centroid f_dc at the
 carrier has the centroid f_dc (1 + f / f0). The spectrum of a target is thus skewed: over the pulse
-bandwidth B its centroid moves by |f_dc| B / f0. Pulses sample it modulo the PRF. It can be recovered
-where the Doppler band at each range frequency fits the PRF, by adding to each sample of the
-two-dimensional spectrum the multiple of the PRF that is nearest to the centroid of its range
-frequency.
+bandwidth B its centroid moves by |f_dc| B / f0. Pulses sample it modulo the PRF. Where the Doppler
+band at each range frequency fits the PRF, it can be recovered: to each sample of the
+two-dimensional spectrum, that multiple of the PRF is added which brings it nearest to the centroid
+of its range frequency.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import block_bytes_of, over_blocks, real_dtype, spectrum_in_blocks, transform_in_blocks
+from torchsar.core import Signal, block_bytes_of, over_blocks, real_dtype, spectrum_in_blocks, transform_in_blocks
 from torchsar.focus.omega_k import BAND_EDGE, FrameGeometry, band_weight, through_doppler
 from torchsar.radar import StripmapRadar
 
 # chosen: excess of the band of an image over its sampling rate, relative to this rate, that is
 # tolerated; interpolation between lines then errs by 1 % of the azimuth width
-_EXCESS = 0.05
+EXCESS = 0.05
 # chosen: skew relative to the processed band, below which the weights of the band are those of the
 # carrier for all range frequencies; its edges are 0.1 wide
 _LEAST_SKEW = 1e-3
@@ -85,7 +85,29 @@ def azimuth_factor(radar: StripmapRadar, doppler_hz: Tensor | float, band_hz: fl
         band = band_hz * (1 + BAND_EDGE)
     else:
         band = aperture_band_hz(radar, radar.near_range_m, 0.0, radar.velocity_m_s)
-    return max(1, math.ceil((min(band, radar.prf_hz) + skew) / radar.prf_hz - _EXCESS))
+    return max(1, math.ceil((min(band, radar.prf_hz) + skew) / radar.prf_hz - EXCESS))
+
+
+def common_lines(one: Signal, other: Signal) -> tuple[Signal, Signal]:
+    """Reduce two images of one recording, with different numbers of lines per pulse, to their
+    common lines.
+
+    Args:
+        one: Image with axes (azimuth, range).
+        other: Image with axes (azimuth, range), whose number of lines is a multiple or a divisor.
+
+    Returns:
+        The two images with the lines of the coarser one.
+    """
+    lines = min(image.axis("azimuth").n for image in (one, other))
+
+    def coarser(image: Signal) -> Signal:
+        axis = image.axis("azimuth")
+        factor = axis.n // lines
+        every = replace(axis, n=lines, step=axis.step * factor)
+        return image if factor == 1 else Signal(image.data[..., ::factor, :], (every, image.axis("range")))
+
+    return coarser(one), coarser(other)
 
 
 @dataclass(frozen=True)
@@ -224,13 +246,13 @@ class DopplerSkew:
 def _refuse_aliased(radar: StripmapRadar, n_range: int, centre_hz: Tensor, velocity_m_s: Tensor) -> None:
     """Raise ValueError for a squinted aperture whose Doppler band exceeds the PRF."""
     skew = skew_hz(radar, centre_hz)
-    if radar.integration_s is None or skew <= _EXCESS * radar.prf_hz:
+    if radar.integration_s is None or skew <= EXCESS * radar.prf_hz:
         return
     middle = radar.near_range_m + n_range // 2 * radar.range_step_m
     doppler, velocity = float(centre_hz.abs().min()), float(velocity_m_s.max())
     top = 1 + radar.pulse.bandwidth_hz / (2 * radar.carrier_hz)
     band = top * aperture_band_hz(radar, middle, doppler, velocity)
-    if band > (1 + _EXCESS) * radar.prf_hz:
+    if band > (1 + EXCESS) * radar.prf_hz:
         raise ValueError(
             f"the Doppler band of a {radar.integration_s:g} s aperture, {band:.5g} Hz at the highest range frequency, "
             f"exceeds the PRF of {radar.prf_hz:g} Hz; shorten integration_s of the radar, or process a band_hz of at "
