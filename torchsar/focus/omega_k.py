@@ -294,11 +294,14 @@ def residual_frequency(at: FrameGeometry, offset_hz: Tensor) -> Tensor:
 
 
 def is_below(values: Tensor, limit: float) -> bool:
-    """Return whether all magnitudes are below a limit; False inside vmap, where values are unknown.
+    """Return whether all magnitudes are below a limit.
 
     Args:
         values: Values, any shape.
         limit: Limit of their magnitude.
+
+    Returns:
+        True if all are below; False inside vmap, where values are unknown.
     """
     try:
         return float(values.detach().abs().max()) < limit
@@ -342,7 +345,8 @@ class FrequencyBasis:
         angle = math.pi * (torch.arange(k, dtype=torch.float64, device=device) + 0.5) / k
         order = torch.arange(k, dtype=torch.float64, device=device)
         self.nodes_hz = torch.cos(angle) * radar.sampling_hz / 2
-        self._to_coefficients = torch.cos(angle[:, None] * order) * torch.where(order == 0, 1 / k, 2 / k)
+        # torch.where of two Python numbers would be float32
+        self._to_coefficients = torch.cos(angle[:, None] * order) * torch.where(order == 0, 1.0, 2.0) / k
         u = (radar.range_frequency_hz(n, device) / (radar.sampling_hz / 2)).clamp(-1, 1)
         self._polynomials = torch.cos(torch.acos(u) * order[:, None])
 

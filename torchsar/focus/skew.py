@@ -69,7 +69,8 @@ def azimuth_factor(radar: StripmapRadar, doppler_hz: Tensor | float, band_hz: fl
 
     The image of a target spans the Doppler band of its aperture plus |doppler_hz| B / f0, by which
     the centroid moves over the pulse bandwidth B. An image with one line per pulse holds this sum
-    up to the PRF.
+    up to the PRF. The largest centroid counts, of all trials and of the nominal pointing of the
+    radar, so that estimates near the nominal pointing give images of one size.
 
     Args:
         radar: Radar of the recording.
@@ -80,7 +81,7 @@ def azimuth_factor(radar: StripmapRadar, doppler_hz: Tensor | float, band_hz: fl
     Returns:
         The least whole number of lines per pulse whose rate holds the sum within a twentieth.
     """
-    skew = skew_hz(radar, doppler_hz)
+    skew = max(skew_hz(radar, doppler_hz), skew_hz(radar, radar.pointing_doppler_hz or 0.0))
     if band_hz is not None:
         band = band_hz * (1 + BAND_EDGE)
     else:
@@ -159,6 +160,26 @@ class DopplerSkew:
         base = torch.fft.fftfreq(raw.shape[-2], 1 / radar.prf_hz, dtype=torch.float64, device=raw.device)
         frequency = radar.range_frequency_hz(raw.shape[-1], raw.device)
         return DopplerSkew(radar, centre, base, frequency, band_hz, azimuth_factor(radar, centre, band_hz))
+
+    def sin_reach(self, geometry: FrameGeometry) -> float:
+        """Compute a bound of the sine of the squint, at the carrier, over all range frequencies.
+
+        The Doppler of each row grows with the centroid, at most in proportion to the highest
+        sampled frequency, and by one PRF where the nearest multiple is rounded up.
+
+        Args:
+            geometry: Geometry of all Doppler rows, at the centroid of the carrier.
+
+        Returns:
+            Magnitude of the sine; 0 inside vmap, where values are unknown.
+        """
+        skewed = skew_hz(self.radar, self.centre_hz) * self.radar.sampling_hz / (2 * self.radar.pulse.bandwidth_hz)
+        changes = math.ceil(skewed / self.radar.prf_hz) if skewed else 0
+        try:
+            one = float(self.radar.sin_squint(self.radar.prf_hz, geometry.velocity_m_s.detach()).max())
+        except RuntimeError:  # inside vmap a value cannot be read
+            return 0.0
+        return geometry.sin_reach + changes * one
 
     def orders(self, part: slice, scale: Tensor | float = 1.0) -> Tensor:
         """Compute the number of PRFs to add to the base Doppler of each row.

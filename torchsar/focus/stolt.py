@@ -125,7 +125,7 @@ def omega_k_stolt(
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
     skew = DopplerSkew.of(radar, raw, doppler_hz, geometry.velocity_m_s, band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2
-    basis = FrequencyBasis(radar, n, raw.device, geometry.sin_reach)
+    basis = FrequencyBasis(radar, n, raw.device, skew.sin_reach(geometry))
     mapping = StoltMap(basis, radar, n, eps, raw.dtype, raw.device)
     range_m = radar.near_range_m + centre * radar.range_step_m
 
