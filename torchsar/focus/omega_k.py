@@ -309,8 +309,8 @@ def is_below(values: Tensor, limit: float) -> bool:
         return False
 
 
-# chosen: variation of a phase in turns, up to which float32 keeps the image error below -90 dB
-_SINGLE_TURNS = 50.0
+# measured for white noise in float32: image error -95 dB at a variation of 166 turns, -87 dB at 339
+_SINGLE_TURNS = 200.0
 # chosen: number of nodes above which direct evaluation is preferred
 _MOST_NODES = 48
 
