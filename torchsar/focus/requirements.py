@@ -18,8 +18,8 @@ from torchsar.focus.omega_k import FrameGeometry, wavenumber
 from torchsar.focus.skew import EXCESS, skew_hz
 from torchsar.radar import StripmapRadar
 
-# measured PSLR in range beside that of exact focusing: 0.03 dB higher at 0.6 rad without squint, 0.10
-# dB higher at 0.53 rad and 0.8 dB at 1.2 rad with squint
+# measured PSLR in range beside that of exact focusing: 0.03 dB higher at 0.6 rad without squint,
+# 0.10 dB higher at 0.53 rad and 0.8 dB at 1.2 rad with squint
 COUPLING_RAD = 0.5
 
 

@@ -22,7 +22,7 @@ from torchsar.focus.omega_k import BAND_EDGE, FrameGeometry, band_weight, throug
 from torchsar.radar import StripmapRadar
 
 # tolerated excess of the band of an image over its sampling rate, relative to this rate; measured
-# error of the azimuth width of the interpolated image: below 0.1 % at 0.07, 0.7 % at 0.14, 8 % at 0.21
+# error of the azimuth width of the interpolated image: 0.1 % at 0.07, 0.7 % at 0.14, 8 % at 0.21
 EXCESS = 0.05
 # chosen: skew relative to the processed band, below which the weights of the band are those of the
 # carrier for all range frequencies; its edges are 0.1 wide
