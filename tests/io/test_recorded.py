@@ -119,4 +119,4 @@ def test_recorded_block_is_read(recorded):
     recording = read_stripmap(recorded("radarsat1_english_bay.npz"))
     assert recording.signal.data.shape == (1424, 2848)
     assert recording.radar.pulse.direction == -1
-    assert recording.radar.pulse_samples == 1349
+    assert recording.radar.pulse_samples == 1350  # of 1349.2 sample intervals, the first at its leading edge

@@ -126,9 +126,11 @@ class PaddedLines(Stage):
             velocity_m_s: Effective velocity in m/s; None for that of the focuser.
 
         Returns:
-            Image with axes (azimuth, range) and as many lines as the recording.
+            Image with axes (azimuth, range). It has as many lines as the recording, or the multiple
+            of them that the focuser makes.
         """
         n, radar = signal.axis("pulse").n, self.focuser.radar
         more = radar.aperture_lines(signal.axis("range").stop) if self.lines is None else self.lines
         padded = signal.with_axis(pad(signal.data, (0, 0, 0, more)), pulse=signal.axis("pulse").part(0, n + more))
-        return self.focuser(padded, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s).crop(azimuth=(0, n))
+        image = self.focuser(padded, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s)
+        return image.crop(azimuth=(0, n * (image.axis("azimuth").n // (n + more))))

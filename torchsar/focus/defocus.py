@@ -69,7 +69,7 @@ class InvertibleOmegaK:
         n, self.n = like.shape[-1], like.shape[-1]
         centre = n // 2
         range_m = radar.near_range_m + centre * radar.range_step_m
-        self.bulk = bulk_filter(FrequencyBasis(radar, n, like.device), at, range_m, reference, like.dtype)
+        self.bulk = bulk_filter(FrequencyBasis(radar, n, like.device, at.sin_reach), at, range_m, reference, like.dtype)
         self.fine, self.coarse = phasor_tables(refocus_turns_per_sample(at), -centre, n, like.dtype)
 
     def _residual(self) -> Tensor:

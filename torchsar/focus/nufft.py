@@ -25,6 +25,8 @@ from torchsar.core import real_dtype
 
 # fineness of the FFT grid relative to the samples, the usual choice in gridding
 OVERSAMPLING = 2
+# chosen: largest shift in grid steps for which float32 keeps the error of a transform below -90 dB
+_SINGLE = 100.0
 
 
 @dataclass(frozen=True)
@@ -186,6 +188,28 @@ class Points:
         further = torch.round(rest.detach())
         first = torch.remainder(whole.to(torch.int64) + further.to(torch.int64), length)
         return Points(first, kernel.weights(rest - further))
+
+    @staticmethod
+    def near(kernel: Kernel, start: Tensor, length: int, dtype: torch.dtype, shift: Tensor) -> Points:
+        """Compute grid indices and kernel weights like `of`, in the precision that the shift needs.
+
+        Args:
+            kernel: Interpolation kernel.
+            start: Positions in grid steps, float64, shape (m,) for all trials or (..., m).
+            length: Length of the grid.
+            dtype: Real type of the weights.
+            shift: Offsets added to `start`, in grid steps, float64, shape (..., m).
+
+        Returns:
+            Points for `interpolate` and `spread`.
+        """
+        try:
+            small = float(shift.detach().abs().max()) < _SINGLE
+        except RuntimeError:  # inside vmap a value cannot be read
+            small = False
+        if small:
+            return Points.of(kernel, start, length, dtype, shift.to(dtype))
+        return Points.of(kernel, start + shift, length, dtype)
 
 
 def interpolate(grid: Tensor, points: Points) -> Tensor:

@@ -42,6 +42,7 @@ from torchsar.core import (
     reduced_turns,
     spectrum_in_blocks,
     transform_in_blocks,
+    unit_phasor,
 )
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
@@ -222,6 +223,17 @@ class FrameGeometry:
         return lines if self.weight is None else lines * self.weight.to(real_dtype(lines.dtype))[..., None]
 
     @property
+    def sin_reach(self) -> float:
+        """Largest magnitude of the sine of the squint over all rows, at the carrier frequency; 0
+        inside vmap, where values are unknown.
+        """
+        sine = self.radar.sin_squint(self.doppler_hz.detach(), self.velocity_m_s.detach()[..., None])
+        try:
+            return float(sine.abs().max())
+        except RuntimeError:
+            return 0.0
+
+    @property
     def requires_grad(self) -> bool:
         """True if `doppler_hz`, `velocity_m_s` or `frame_hz` requires gradients."""
         return any(value.requires_grad for value in (self.doppler_hz, self.velocity_m_s, self.frame_hz))
@@ -281,27 +293,60 @@ def residual_frequency(at: FrameGeometry, offset_hz: Tensor) -> Tensor:
     return torch.sqrt(x.square() + root.square()) - f0 - offset_hz
 
 
+def is_below(values: Tensor, limit: float) -> bool:
+    """Return whether all magnitudes are below a limit.
+
+    Args:
+        values: Values, any shape.
+        limit: Limit of their magnitude.
+
+    Returns:
+        True if all are below; False inside vmap, where values are unknown.
+    """
+    try:
+        return float(values.detach().abs().max()) < limit
+    except RuntimeError:
+        return False
+
+
+# measured for white noise in float32: image error -95 dB at a variation of 166 turns, -87 dB at 339
+_SINGLE_TURNS = 200.0
+# chosen: number of nodes above which direct evaluation is preferred
+_MOST_NODES = 48
+
+
 class FrequencyBasis:
     """Chebyshev polynomials that interpolate smooth phases over the range band.
 
     The phase of a Doppler row is computed in float64 at a few range frequencies, the nodes
     (`nodes_hz`); one matrix product then evaluates it at all range frequencies. The number of nodes
-    follows from the ratio of sampling rate to carrier, so that the error stays below 1e-6 turn.
+    follows from the ratio of sampling rate to carrier and from the squint, so that the error stays
+    below 1e-6 turn. Where the squint is so large that 48 nodes are not enough, all range
+    frequencies are nodes, and nothing is interpolated.
 
     Args:
         radar: Radar of the recording.
         n: Number of range frequencies.
         device: Device of the result.
+        sin_reach: Largest magnitude of the sine of the squint over all Doppler rows.
     """
 
-    def __init__(self, radar: StripmapRadar, n: int, device: torch.device | None = None) -> None:
-        ratio = 0.5 * radar.carrier_hz / (radar.sampling_hz / 2)
-        rho = ratio + math.sqrt(ratio * ratio - 1) if ratio > 1 else 1.5
-        k = min(48, max(4, math.ceil(math.log(1e13) / math.log(rho))))
+    def __init__(
+        self, radar: StripmapRadar, n: int, device: torch.device | None = None, sin_reach: float = 0.0
+    ) -> None:
+        # the phase is singular where the square root of the mapping is zero
+        ratio = min(0.5, 1 - sin_reach) * radar.carrier_hz / (radar.sampling_hz / 2)
+        rho = ratio + math.sqrt(ratio * ratio - 1) if ratio > 1 else 1.0
+        k = max(4, math.ceil(math.log(1e13) / math.log(rho))) if rho > 1 else _MOST_NODES + 1
+        self.direct = k > _MOST_NODES
+        if self.direct:
+            self.nodes_hz = radar.range_frequency_hz(n, device)
+            return
         angle = math.pi * (torch.arange(k, dtype=torch.float64, device=device) + 0.5) / k
         order = torch.arange(k, dtype=torch.float64, device=device)
         self.nodes_hz = torch.cos(angle) * radar.sampling_hz / 2
-        self._to_coefficients = torch.cos(angle[:, None] * order) * torch.where(order == 0, 1 / k, 2 / k)
+        # torch.where of two Python numbers would be float32
+        self._to_coefficients = torch.cos(angle[:, None] * order) * torch.where(order == 0, 1.0, 2.0) / k
         u = (radar.range_frequency_hz(n, device) / (radar.sampling_hz / 2)).clamp(-1, 1)
         self._polynomials = torch.cos(torch.acos(u) * order[:, None])
 
@@ -315,6 +360,8 @@ class FrequencyBasis:
         Returns:
             Values at all range frequencies in FFT order, shape (..., row, n).
         """
+        if self.direct:
+            return values_at_nodes.to(dtype)
         return (values_at_nodes @ self._to_coefficients).to(dtype) @ self._polynomials.to(dtype)
 
     def phasor(self, turns_at_nodes: Tensor, dtype: torch.dtype) -> Tensor:
@@ -328,8 +375,13 @@ class FrequencyBasis:
         Returns:
             Phasors at all range frequencies in FFT order, shape (..., row, n).
         """
+        if self.direct:
+            return unit_phasor(turns_at_nodes, dtype)
         coefficients = turns_at_nodes @ self._to_coefficients
         constant = reduced_turns(coefficients[..., :1])
+        if dtype == torch.complex64 and not is_below(coefficients[..., 1:].abs().sum(-1), _SINGLE_TURNS):
+            turns = constant + coefficients[..., 1:] @ self._polynomials[1:]
+            return unit_phasor(turns, dtype)
         coefficients = torch.cat([constant, coefficients[..., 1:]], -1).to(real_dtype(dtype))
         return cis(2 * math.pi * (coefficients @ self._polynomials.to(coefficients.dtype)))
 
@@ -440,7 +492,7 @@ def omega_k(
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2
-    basis = FrequencyBasis(radar, n, raw.device)
+    basis = FrequencyBasis(radar, n, raw.device, geometry.sin_reach)
     range_m = radar.near_range_m + centre * radar.range_step_m
 
     def focus_rows(rows: Tensor, part: slice) -> Tensor:
@@ -569,7 +621,8 @@ class Focuser(Stage):
             reference=self.spectrum(signal.data.shape[-1], signal.data.device),
             band_hz=self.band_hz,
         )
-        return Signal(data, self.radar.image_axes(signal.axes))
+        azimuth, range_ = self.radar.image_axes(signal.axes)
+        return Signal(data, (azimuth.resampled(data.shape[-2] // azimuth.n), range_))
 
 
 class OmegaK(Focuser):
@@ -611,7 +664,11 @@ class StoredOmegaK(Stage):
                 "filter",
                 at.weighted(
                     bulk_filter(
-                        FrequencyBasis(radar, n_range, device), at, range_m, stage.spectrum(n_range, device), dtype
+                        FrequencyBasis(radar, n_range, device, at.sin_reach),
+                        at,
+                        range_m,
+                        stage.spectrum(n_range, device),
+                        dtype,
                     )
                 ),
             )

@@ -50,10 +50,12 @@ class PointPatches:
     Args:
         radar: Radar of the recording.
         spots: Azimuth line and range cell of the middle of each patch.
+        lines: Number of pulses of the recording; an image may have a multiple of it as lines.
     """
 
     radar: StripmapRadar
     spots: Sequence[tuple[int, int]]
+    lines: int
 
     @staticmethod
     def about(
@@ -85,17 +87,18 @@ class PointPatches:
         axes = radar.image_axes(radar.raw_axes(*size))
         lines, cells = (axis.index_of(x).round().long().tolist() for axis, x in zip(axes, at, strict=True))
         spots = [(min(max(i, HALF), size[0] - HALF), j) for i, j in zip(lines, cells, strict=True)]
-        return PointPatches(radar, spots)
+        return PointPatches(radar, spots, size[0])
 
     def cut(self, image: Tensor) -> Tensor:
         """Cut the patches from a focused image.
 
         Args:
-            image: Image, shape (line, cell), complex.
+            image: Image, shape (line, cell), complex. Of several lines per pulse the first is used.
 
         Returns:
             Patches, complex128, shape (patch, line, cell).
         """
+        image = image[:: image.shape[0] // self.lines]
         parts = [image[i - HALF : i + HALF, j - HALF : j + HALF] for i, j in self.spots]
         return torch.stack(parts).to(torch.complex128)
 

@@ -87,7 +87,7 @@ def range_doppler(
         # +2j pi k q / n, so that points have the opposite sign
         start = migration(at) * centre_cells
         shift = start[..., None] + migration(at)[..., None] * (range_cells - centre_cells)
-        points = Points.of(plan.kernel, -per_sample * cell, plan.length, real, (-per_sample * shift).to(real))
+        points = Points.near(plan.kernel, -per_sample * cell, plan.length, real, -per_sample * shift)
         turns = refocus_turns_per_sample(at)
         constant = unit_phasor(turns * centre_cells + STATIONARY_TURNS, raw.dtype) / n
         lines = plan.type2(torch.fft.fftshift(spectrum, dim=-1), points)

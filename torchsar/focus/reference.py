@@ -22,7 +22,7 @@ def matched_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch
         Spectrum in FFT order, shape (n,), complex128; a compressed echo of unit amplitude
         has a peak of 1.
     """
-    spectrum = pulse.spectrum(n, sampling_hz, device)
+    spectrum = pulse.band_spectrum(n, sampling_hz, device)
     return spectrum.conj() * (n / spectrum.abs().square().sum())
 
 
@@ -44,7 +44,7 @@ def flat_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.de
         Spectrum in FFT order, shape (n,), complex128; a compressed echo of unit amplitude
         has a peak of 1.
     """
-    spectrum = pulse.spectrum(n, sampling_hz, device)
+    spectrum = pulse.band_spectrum(n, sampling_hz, device)
     frequency = torch.fft.fftfreq(n, 1 / sampling_hz, dtype=torch.float64, device=device)
     inside = frequency.abs() <= pulse.bandwidth_hz / 2
     power = spectrum.abs().square()
@@ -67,7 +67,7 @@ def phase_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.d
         Spectrum in FFT order, shape (n,), complex128; a compressed echo of unit amplitude
         has a peak of 1.
     """
-    spectrum = pulse.spectrum(n, sampling_hz, device)
+    spectrum = pulse.band_spectrum(n, sampling_hz, device)
     size = spectrum.abs().clamp_min(torch.finfo(torch.float64).tiny)
     return spectrum.conj() / size * (n / size.sum())
 

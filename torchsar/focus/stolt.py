@@ -1,4 +1,4 @@
-"""Omega-K focusing with the Stolt mapping, exact over the whole swath."""
+"""Omega-K focusing with the Stolt mapping, exact over the whole swath and at any squint."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from torchsar.focus.omega_k import (
     FrameGeometry,
     FrequencyBasis,
     bulk_filter,
+    is_below,
     refocus,
     refocus_turns_per_sample,
     residual_frequency,
-    through_doppler,
 )
+from torchsar.focus.skew import DopplerSkew, through_skewed_doppler
 from torchsar.radar import StripmapRadar
+
+# chosen: largest shift in grid points for which float32 positions keep the image error below -80 dB
+_SINGLE = 200.0
 
 
 class StoltMap:
@@ -56,7 +60,13 @@ class StoltMap:
         """
         residual = residual_frequency(at, self.basis.nodes_hz) / self.step_hz
         real = real_dtype(lines.dtype)
-        points = Points.of(self.plan.kernel, self.start, self.plan.length, real, self.basis.evaluate(residual, real))
+        # float32 serves for small shifts, which are the rule, and takes half the time
+        exact = real if is_below(residual, _SINGLE) else torch.float64
+        shift = self.basis.evaluate(residual, exact)
+        if exact == real:
+            points = Points.of(self.plan.kernel, self.start, self.plan.length, real, shift)
+        else:
+            points = Points.of(self.plan.kernel, self.start + shift, self.plan.length, real)
         return torch.fft.fftshift(torch.fft.ifft(self.plan.type2(lines, points)), dim=-1)
 
 
@@ -74,13 +84,22 @@ def omega_k_stolt(
     """Focus by omega-K with Stolt interpolation.
 
     The image of a target is exact at every range. Coordinates and phases are those of `omega_k`,
-    and for narrow swaths the two functions give the same image. The computation takes two to three
-    times as long as `omega_k`. Differentiable in the raw data, the velocity and `frame_hz`.
+    and for narrow swaths without squint the two functions give the same image. The computation
+    takes two to three times as long as `omega_k`. Differentiable in the raw data, the velocity and
+    `frame_hz`.
+
+    The Doppler of a squinted beam is proportional to the transmitted frequency. The azimuth
+    spectrum is therefore unwrapped about the centroid of each range frequency, so that the PRF has
+    to hold the Doppler band of an aperture at each range frequency only. Over the whole pulse
+    bandwidth B, the image of a target spans a wider band: by the squint, |doppler_hz| B / f0 is
+    added. If this sum exceeds the PRF by more than a twentieth, the image has a whole multiple of
+    the lines of the raw data, equally spaced between them, see `azimuth_factor`.
 
     Args:
         raw: Raw or range-compressed data, shape (..., pulse, range), complex.
         radar: Radar of the recording.
-        doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
+        doppler_hz: Absolute Doppler centroid at the carrier frequency in Hz, a number or shape
+            (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
         frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
@@ -88,34 +107,39 @@ def omega_k_stolt(
             centroid where the radar has none.
         reference: Spectrum of the range compression filter, shape (range,); None for
             range-compressed data.
-        band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF.
+        band_hz: Processed Doppler bandwidth about the centroid of each range frequency in Hz; None
+            for the whole PRF.
         eps: Relative error of the interpolation. The default keeps the image error below -80 dB;
             1e-12 suits complex128 references.
 
     Returns:
-        Image, shape (..., azimuth, range), complex.
+        Image, shape (..., azimuth, range), complex. The number of lines is that of the pulses times
+        `azimuth_factor`.
 
     Raises:
         ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
             of the leading dims of the data, the velocity is not positive, the magnitude of
-            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, or `band_hz` is not
-            positive.
+            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, `band_hz` is not
+            positive, or the Doppler band of a squinted aperture does not fit the PRF.
     """
-    geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
+    geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
+    skew = DopplerSkew.of(radar, raw, doppler_hz, geometry.velocity_m_s, band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2
-    basis = FrequencyBasis(radar, n, raw.device)
+    basis = FrequencyBasis(radar, n, raw.device, skew.sin_reach(geometry))
     mapping = StoltMap(basis, radar, n, eps, raw.dtype, raw.device)
     range_m = radar.near_range_m + centre * radar.range_step_m
 
-    def focus_rows(rows: Tensor, part: slice) -> Tensor:
-        at = geometry.rows(part)
+    def focus_rows(rows: Tensor, at: FrameGeometry) -> Tensor:
         lines = torch.fft.ifft(rows * bulk_filter(basis, at, range_m, reference, raw.dtype))
-        return at.weighted(refocus(mapping(lines, at), refocus_turns_per_sample(at), centre))
+        return refocus(mapping(lines, at), refocus_turns_per_sample(at), centre)
 
-    return through_doppler(raw, focus_rows, differentiable=geometry.requires_grad or raw.requires_grad)
+    return through_skewed_doppler(raw, focus_rows, geometry, skew)
 
 
 class OmegaKStolt(Focuser):
-    """Stage that focuses by omega-K with Stolt interpolation; arguments as in `Focuser`."""
+    """Stage that focuses by omega-K with Stolt interpolation; arguments as in `Focuser`.
+
+    At a large squint the image can have several lines per pulse, see `omega_k_stolt`.
+    """
 
     form = staticmethod(omega_k_stolt)

@@ -201,8 +201,9 @@ def focus_strip(
 
     Args:
         source: Raw lines, shape (..., line, sample), read by blocks.
-        focus: Focusing stage or chain that keeps the size of the matrix. It is called for each
-            block as focus(signal, **values(lines)), where `lines` is the slice of its raw lines.
+        focus: Focusing stage or chain that keeps the size of the matrix, or makes a whole multiple
+            of its lines, the same in every block. It is called for each block as focus(signal,
+            **values(lines)), where `lines` is the slice of its raw lines.
         radar: Radar of the recording.
         plan: Division of the strip into blocks, from `plan_strip`.
         axes: Axes of the raw matrix; None for those of the radar.
@@ -225,7 +226,9 @@ def focus_strip(
         )
     axes = radar.raw_axes(plan.n_lines, source.shape[-1]) if axes is None else axes
     for read, keep in plan.blocks:
-        yield keep, _focus_block(source, focus, radar, axes, read, keep, {} if values is None else values(read), device)
+        image = _focus_block(source, focus, radar, axes, read, keep, {} if values is None else values(read), device)
+        factor = image.data.shape[-2] // (keep.stop - keep.start)
+        yield slice(keep.start * factor, keep.stop * factor), image
 
 
 def _focus_block(
@@ -245,11 +248,13 @@ def _focus_block(
     del raw
     # the azimuth transform is circular: an image line outside the block appears at its position
     # modulo the block
-    first, count = (keep.start - read.start) % image.shape[-2], keep.stop - keep.start
+    factor = image.shape[-2] // (read.stop - read.start)
+    first, count = (keep.start - read.start) * factor % image.shape[-2], (keep.stop - keep.start) * factor
     if first + count > image.shape[-2]:
         image, first = torch.roll(image, -first, dims=-2), 0
     azimuth, image_range = radar.image_axes(axes)
-    return Signal(image.narrow(-2, first, count), (azimuth.part(keep.start, keep.stop), image_range))
+    kept = azimuth.part(keep.start, keep.stop).resampled(factor)
+    return Signal(image.narrow(-2, first, count), (kept, image_range))
 
 
 def write_strip(blocks: Iterator[tuple[slice, Signal]], target: Any) -> None:

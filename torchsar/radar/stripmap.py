@@ -26,7 +26,8 @@ class StripmapRadar:
         sampling_hz: Complex sampling rate in Hz, at least the bandwidth of the pulse.
         prf_hz: Pulse repetition frequency in Hz.
         velocity_m_s: Nominal effective velocity in m/s.
-        near_range_m: Slant range in metres of a target whose echo begins at sample 0.
+        near_range_m: Slant range in metres of a target whose echo has its leading edge exactly on
+            sample 0. After range compression this target is at sample 0.
         pointing_doppler_hz: Nominal Doppler of the beam centre in Hz, to which image coordinates
             refer. None where it has yet to be estimated.
         integration_s: Nominal coherent integration time (beam dwell) in seconds. None where the
@@ -81,7 +82,7 @@ class StripmapRadar:
 
     @property
     def pulse_samples(self) -> int:
-        """Number of samples of the transmitted pulse."""
+        """Number of samples of a pulse whose leading edge lies on a sample."""
         return self.pulse.n_samples(self.sampling_hz)
 
     def raw_axes(self, n_pulse: int, n_range: int, start_s: float = 0.0) -> tuple[Axis, Axis]:

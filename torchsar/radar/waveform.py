@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -9,13 +10,21 @@ from torch import Tensor
 
 from torchsar.core import unit_phasor
 
+# relative error of the product of duration and sampling rate, below which it is a whole number
+_ROUNDING = 1e-12
+# chosen: fine samples per sample, from which the spectrum of the pulse before sampling is computed
+_FINER = 16
+
 
 @dataclass(frozen=True)
 class LinearFM:
-    """Linear frequency-modulated pulse exp(j pi k t^2) for |t| < duration / 2.
+    """Linear frequency-modulated pulse exp(j pi k (t - T / 2)^2) for 0 <= t < T.
 
-    The chirp rate is k = direction * bandwidth / duration. The echo of a target at range R starts
-    at the fast time 2 R / c.
+    T is the duration, and k = direction * bandwidth / duration is the chirp rate. The time t counts
+    from the leading edge of the pulse, so that the frequency passes zero at t = T / 2. The first
+    sample lies exactly on the leading edge: sample i is taken at t = i / fs, where fs is the
+    sampling rate. The pulse has all samples with t < T, and T fs need not be a whole number. The
+    leading edge of the echo of a target at range R arrives at the fast time 2 R / c.
 
     Args:
         bandwidth_hz: Swept bandwidth in Hz.
@@ -41,13 +50,21 @@ class LinearFM:
         return self.direction * self.bandwidth_hz / self.duration_s
 
     def n_samples(self, sampling_hz: float) -> int:
-        """Return the number of samples of the pulse at a sampling rate, at least 1."""
-        return max(1, round(self.duration_s * sampling_hz))
+        """Return the number of samples of a pulse whose leading edge lies on a sample, at least 1.
+
+        Args:
+            sampling_hz: Complex sampling rate fs in Hz.
+
+        Returns:
+            Number of samples i = 0, 1, ... with i / fs < duration: the product of duration and fs,
+            rounded up.
+        """
+        return max(1, math.ceil(self.duration_s * sampling_hz * (1 - _ROUNDING)))
 
     def samples(
         self, sampling_hz: float, dtype: torch.dtype = torch.complex128, device: torch.device | str | None = None
     ) -> Tensor:
-        """Return the samples of the pulse, from its leading edge on.
+        """Return the samples of the pulse, the first of which lies on its leading edge.
 
         Args:
             sampling_hz: Complex sampling rate in Hz.
@@ -58,8 +75,16 @@ class LinearFM:
             The sampled pulse, shape (n_samples,), complex, of amplitude 1.
         """
         n = self.n_samples(sampling_hz)
-        t = (torch.arange(n, dtype=torch.float64, device=device) - (n - 1) / 2) / sampling_hz
+        t = torch.arange(n, dtype=torch.float64, device=device) / sampling_hz - self.duration_s / 2
         return unit_phasor(0.5 * self.rate_hz_s * t.square(), dtype)
+
+    def _refuse_short(self, n: int, sampling_hz: float) -> None:
+        """Raise ValueError for range lines that are shorter than the pulse."""
+        if n < self.n_samples(sampling_hz):
+            raise ValueError(
+                f"a line of {n} samples does not hold the pulse of {self.n_samples(sampling_hz)} samples; "
+                "record longer lines or shorten the pulse"
+            )
 
     def spectrum(self, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
         """Return the FFT of the zero-padded pulse, whose leading edge is at sample 0.
@@ -75,9 +100,36 @@ class LinearFM:
         Raises:
             ValueError: If a range line of n samples is shorter than the pulse.
         """
-        if n < self.n_samples(sampling_hz):
-            raise ValueError(
-                f"a line of {n} samples does not hold the pulse of {self.n_samples(sampling_hz)} samples; "
-                "record longer lines or shorten the pulse"
-            )
+        self._refuse_short(n, sampling_hz)
         return torch.fft.fft(self.samples(sampling_hz, device=device), n)
+
+    def band_spectrum(self, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
+        """Return the spectrum of the pulse before sampling, in the band of the sampling rate.
+
+        The edges of an echo lie anywhere between samples. The spectrum of its samples therefore
+        differs from echo to echo, because the pulse, which begins and ends abruptly, has
+        frequencies beyond the sampled band that alias. `spectrum` is that of an echo whose leading
+        edge lies on a sample. This spectrum is the mean over all positions of the edge, and
+        range compression with it finds each of them without bias.
+
+        Args:
+            n: Number of samples of a range line.
+            sampling_hz: Complex sampling rate in Hz.
+            device: Device of the result.
+
+        Returns:
+            The spectrum in FFT order, scaled like `spectrum`, shape (n,), complex128.
+
+        Raises:
+            ValueError: If a range line of n samples is shorter than the pulse.
+        """
+        self._refuse_short(n, sampling_hz)
+        rate, duration = _FINER * sampling_hz, self.duration_s
+        t = torch.arange(math.ceil(duration * rate * (1 - _ROUNDING)) + 1, dtype=torch.float64, device=device) / rate
+        # each fine sample stands for the part of the pulse within half a step of it
+        inside = (t + 0.5 / rate).clamp(max=duration) - (t - 0.5 / rate).clamp(min=0)
+        fine = unit_phasor(0.5 * self.rate_hz_s * (t - duration / 2).square(), torch.complex128) * inside.clamp(min=0)
+        whole = torch.fft.fft(fine, _FINER * n) * sampling_hz
+        band = torch.cat([whole[: n - n // 2], whole[whole.numel() - n // 2 :]])
+        # the averaging over a step attenuates the edges of the band
+        return band / torch.sinc(torch.fft.fftfreq(n, dtype=torch.float64, device=device) / _FINER)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchsar.compensate.doppler import wrap_hz
 from torchsar.core import Chain, Signal, Trace
 from torchsar.focus import ClosestRange
+from torchsar.focus.skew import common_lines
 from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
 from torchsar.radar import StripmapRadar
 from torchsar.study.trials.batch import IMAGE, Judged, Outcome, Trials
@@ -76,7 +77,12 @@ def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[s
     """
     lines, samples = (axis.n for axis in image.axes)
     if margin is None:
-        edge = min(radar.aperture_lines(image.axes[1].start) // 2, lines // 4)
+        # an image can have several lines per pulse
+        edge = min(
+            round(radar.aperture_lines(image.axes[1].start) * radar.velocity_m_s / radar.prf_hz / image.axes[0].step)
+            // 2,
+            lines // 4,
+        )
         margin = Margin(first_lines=edge, last_lines=edge, last_samples=radar.pulse_samples)
     spans = {"azimuth": (lines, margin.first_lines, margin.last_lines)}
     spans["range"] = (samples, margin.first_samples, margin.last_samples)
@@ -191,8 +197,10 @@ def compare(bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
     one, other = outcome.signal, None if ideal is None else ideal.signal
     if one is None or other is None or one is other or not one.names == other.names == IMAGE:
         return judged
-    part = window(one, bench.radar, bench.judging.margin)
-    pair = [image.crop(**part).to(torch.complex128) for image in (one, other)]  # sums over millions of pixels
+    pair = [
+        image.crop(**window(image, bench.radar, bench.judging.margin)).to(torch.complex128)  # sums over many pixels
+        for image in common_lines(one, other)
+    ]
     count = len(judged.metrics["seconds"])
     found = {"image_error_db": error_db(*pair), "image_correlation": correlation(*pair)}
     return replace(judged, metrics={**judged.metrics, **{name: value.expand(count) for name, value in found.items()}})

@@ -1,0 +1,1 @@
+"""Generators of raw data written from the signal models of the papers alone, in the time domain."""
