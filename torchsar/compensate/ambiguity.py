@@ -266,6 +266,9 @@ class DopplerCentroid(Stage):
 
     Provides `doppler_hz` (absolute, positive when closing), `doppler_baseband_hz`, `ambiguity`
     (whole number of PRFs, as float64) and `squint_deg` (positive ahead, for the nominal velocity).
+    In trials that are not ok, the neutral values are those of the centroid with the estimated
+    baseband value that is nearest to `pointing_doppler_hz` of the radar (or 0 if that is None); if
+    the baseband value is not reliable either, those of `pointing_doppler_hz` itself.
 
     Args:
         radar: Radar parameters.
@@ -295,6 +298,8 @@ class DopplerCentroid(Stage):
         if reach < 1:
             raise ValueError(f"reach must be 1 or more (largest Doppler ambiguity to search, in PRFs), got {reach}")
         self.radar, self.reference, self.reach, self.blocks = radar, reference, possible_reach(radar, reach), blocks
+        nominal = torch.tensor(radar.pointing_doppler_hz or 0.0, dtype=torch.float64)
+        self.neutral = {name: float(value) for name, value in self._values(nominal).items()}
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
         """Compute the range reference spectrum for lines of n samples.
@@ -343,9 +348,7 @@ class DopplerCentroid(Stage):
         absolute, std = complete_aperture_centroid(
             raw, radar, absolute, first.std["doppler_baseband_hz"], self.reference
         )
-        baseband = wrap_hz(absolute, radar.prf_hz)
         probability = torch.softmax(joint, -1).amax(-1)
-        squint = torch.rad2deg(torch.asin(radar.sin_squint(absolute).clamp(-1, 1)))
         info = {
             **first.info,
             **evidence,
@@ -354,14 +357,29 @@ class DopplerCentroid(Stage):
             "coherence": first.quality,
         }
         return Estimate(
-            {
-                "doppler_hz": absolute,
-                "doppler_baseband_hz": baseband,
-                "ambiguity": torch.round((absolute - baseband) / radar.prf_hz),
-                "squint_deg": squint,
-            },
+            self._values(absolute),
             probability,
             first.ok & (probability > 0.9),
             {"doppler_hz": std, "doppler_baseband_hz": std},
             info,
+            self._values(self._nearest(base, absolute, first.ok)),
         )
+
+    def _nearest(self, base: Tensor, absolute: Tensor, reliable: Tensor) -> Tensor:
+        """The centroid nearest to the nominal Doppler, which is assumed where the ambiguity is not
+        known; the nominal Doppler itself where the baseband centroid is not reliable either.
+        """
+        nominal, prf = self.neutral["doppler_hz"], self.radar.prf_hz
+        near = nominal + wrap_hz(base - nominal, prf)
+        near = torch.where((absolute - near).abs() < prf / 2, absolute, near)
+        return torch.where(reliable, near, nominal)
+
+    def _values(self, doppler_hz: Tensor) -> dict[str, Tensor]:
+        """All values that an absolute Doppler centroid in Hz determines."""
+        baseband = wrap_hz(doppler_hz, self.radar.prf_hz)
+        return {
+            "doppler_hz": doppler_hz,
+            "doppler_baseband_hz": baseband,
+            "ambiguity": torch.round((doppler_hz - baseband) / self.radar.prf_hz),
+            "squint_deg": torch.rad2deg(torch.asin(self.radar.sin_squint(doppler_hz).clamp(-1, 1))),
+        }
