@@ -395,7 +395,7 @@ class DopplerCentroid(Stage):
         """The centroid nearest to the nominal Doppler, which is assumed where the ambiguity is not
         known; the nominal Doppler itself where the baseband centroid is not reliable either.
         """
-        nominal, prf = self.neutral["doppler_hz"], self.radar.prf_hz
+        nominal, prf = self.radar.pointing_doppler_hz or 0.0, self.radar.prf_hz
         near = nominal + wrap_hz(base - nominal, prf)
         near = torch.where((absolute - near).abs() < prf / 2, absolute, near)
         return torch.where(reliable, near, nominal)

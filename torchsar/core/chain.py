@@ -6,7 +6,6 @@ import inspect
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +13,6 @@ from torch import Tensor, nn
 from torchsar.core.estimate import Estimate
 from torchsar.core.signal import Recording, Signal
 
-InDoubt = Literal["neutral", "apply"]
 Given = Mapping[str, Tensor | Estimate]
 
 
@@ -29,14 +27,14 @@ class Use(nn.Module):
         in_doubt: What the stage does in trials whose estimates are not ok, see `use`.
     """
 
-    def __init__(self, stage: nn.Module, names: Mapping[str, str], in_doubt: InDoubt = "neutral") -> None:
+    def __init__(self, stage: nn.Module, names: Mapping[str, str], in_doubt: str = "neutral") -> None:
         super().__init__()
         self.stage = stage
         self.names = dict(names)
-        self.in_doubt: InDoubt = in_doubt
+        self.in_doubt = in_doubt
 
 
-def use(stage: nn.Module, *, in_doubt: InDoubt = "neutral", **names: str) -> Use:
+def use(stage: nn.Module, *, in_doubt: str = "neutral", **names: str) -> Use:
     """Connect parameters of a stage to values of earlier stages or to recorded side data.
 
     In the following example the values come from the stages named "doppler" and "velocity".
@@ -158,7 +156,7 @@ class _Log:
     seconds: dict[str, float] = field(default_factory=dict)
     bytes: dict[str, int] = field(default_factory=dict)
     neutral: dict[str, Tensor] = field(default_factory=dict)
-    arguments: dict[str, dict[str, Tensor]] = field(default_factory=dict)
+    arguments: dict[str, Mapping[str, Tensor]] = field(default_factory=dict)
 
     def trace(self, known: _Known) -> Trace:
         """The trace of the run, with these values and estimates."""
@@ -314,9 +312,9 @@ class Chain(nn.Module):
             KeyError: If a stage or a given value has an unknown name.
         """
         part, known = self._part(trace, start, None, given)
-        tables = (trace.inputs, trace.outputs, trace.arguments)
-        inputs, outputs, arguments = ({name: of[name] for name in of if name not in part} for of in tables)
-        log = _Log(inputs, outputs, arguments=arguments)
+        before = [name for name in trace.inputs if name not in part]
+        log = _Log({name: trace.inputs[name] for name in before}, {name: trace.outputs[name] for name in before})
+        log.arguments |= {name: trace.arguments[name] for name in before}
         self._run(part, trace.inputs[start], known, log)
         return log.trace(known)
 
