@@ -5,6 +5,9 @@ A new stage joins by one line.
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import pkgutil
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -14,6 +17,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import torchsar
 from tests.helpers import (
     small_bistatic,
     small_bistatic_echo,
@@ -23,6 +27,7 @@ from tests.helpers import (
     small_recording,
 )
 from torchsar.compensate import (
+    AlignEnvelopes,
     Autofocus,
     ChirpletClean,
     CoarseRotation,
@@ -33,6 +38,7 @@ from torchsar.compensate import (
     EnergyCentre,
     EntropyFixedPoint,
     EntropyObjective,
+    EqualisePulses,
     LinkPhases,
     MirrorProduct,
     MlPeak,
@@ -42,6 +48,7 @@ from torchsar.compensate import (
     PhaseIncrement,
     PhasePolish,
     PointDoppler,
+    PulseGain,
     RadialMotion,
     RangeDependentCentroid,
     RotationAutofocus,
@@ -52,7 +59,10 @@ from torchsar.compensate import (
     RotationSearch,
     Sca,
     SegmentedInterference,
+    SharpestPhase,
+    ShiftRange,
     SpectrumCorrelation,
+    TargetAutofocus,
     UnevenRotation,
 )
 from torchsar.core import Alternate, Estimate, Signal, Stage, Turn, real_dtype
@@ -79,9 +89,11 @@ from torchsar.multichannel import (
     CompressChannels,
     CorrectBalance,
     CorrectMigration,
+    Detector,
     Dwell,
     EstimateBalance,
     EstimateSynchronisation,
+    Extraction,
     FlatBand,
     FocusAzimuth,
     FocusPlan,
@@ -90,7 +102,9 @@ from torchsar.multichannel import (
     Keystone,
     LeastSquares,
     LikelihoodVelocity,
+    MigratingLines,
     MinimumMeanSquare,
+    MoversImage,
     MovingPointVelocity,
     Reconstruct,
     RemoveSynchronisation,
@@ -111,6 +125,7 @@ from torchsar.repair import (
     CorrectJitter,
     CorrectResponse,
     DropInterference,
+    EstimateFlatResponse,
     EstimateImbalance,
     EstimateResponse,
     LinearFill,
@@ -660,3 +675,65 @@ def test_all_zero_trial_stays_finite(case: Case) -> None:
     data[0] = 0
     out = results(stage(signal.with_data(data), **case.values(signal)))
     assert all(torch.isfinite(value).all() for value in out.values())
+
+
+def _estimators() -> set[type[Stage]]:
+    """Every stage of the library that may return an Estimate."""
+    for module in pkgutil.walk_packages(torchsar.__path__, "torchsar."):
+        if not module.name.startswith(("torchsar.study", "torchsar.cli", "torchsar.plot")):
+            importlib.import_module(module.name)
+    waiting, found = [Stage], set()
+    while waiting:
+        stages = waiting.pop().__subclasses__()
+        waiting += stages
+        found |= {s for s in stages if "Estimate" in str(inspect.signature(s.forward).return_annotation)}
+    return {s for s in found if s.__module__.startswith("torchsar.") and not s.__name__.startswith("_")}
+
+
+# estimators that are not in the list above, with how they are built
+MORE = {
+    "AlignEnvelopes": AlignEnvelopes,
+    "EstimateFlatResponse": lambda: EstimateFlatResponse(RADAR),
+    "MigratingLines": lambda: MigratingLines(BISTATIC, Interferometry(BISTATIC, LIT)),
+    "MoversImage": lambda: MoversImage(BISTATIC, LeastSquares(2), "subtract", Extraction(1.4, 4.0), Detector()),
+    "PulseGain": PulseGain,
+    "SharpestPhase": SharpestPhase,
+    "SplitSweeps": lambda: SplitSweeps(LADAR, "search"),
+    "TargetAutofocus": lambda: TargetAutofocus(TURNTABLE),
+}
+
+
+def test_every_estimator_has_neutral_values_or_says_why_not() -> None:
+    built = [case.build() for case in CASES] + [build() for build in MORE.values()]
+    assert _estimators() - {type(stage) for stage in built} == set(), "add these to CASES or MORE"
+    for stage in built:
+        assert set(stage.neutral) == set(stage.provides), type(stage).__name__
+        reasons = [value for value in stage.neutral.values() if isinstance(value, str)]
+        assert all(len(reason.split()) > 3 for reason in reasons), type(stage).__name__
+
+
+def test_a_neutral_value_has_no_effect_or_is_nominal() -> None:
+    """Correctors leave the signal unchanged when they get the neutral values."""
+    pairs = [
+        (Autofocus(), CorrectPulsePhase(), (48,)),
+        (EstimateImbalance(), CorrectImbalance(), (2,)),
+        (PilotJitter(), CorrectJitter(), (4,)),
+        (AlignEnvelopes(), ShiftRange(), (48,)),
+        (PulseGain(), EqualisePulses(), (48,)),
+        (LineIntegrity(), LinearFill(RADAR), (48,)),
+    ]
+    signal = raw(2)
+    for estimator, corrector, shape in pairs:
+        known = {name for name in inspect.signature(corrector.forward).parameters if name in estimator.neutral}
+        given = {
+            name: torch.full((2,) if name == "period" else (2, *shape), value)
+            for name, value in estimator.neutral.items()
+            if name in known and not isinstance(value, str)
+        }
+        out = corrector(signal, **given)
+        torch.testing.assert_close(out.data, signal.data, rtol=0, atol=1e-12 * float(signal.data.abs().max()))
+    pointing = replace(RADAR, pointing_doppler_hz=-250.0)
+    assert DopplerCentroid(pointing).neutral["doppler_hz"] == -250.0
+    assert DopplerCentroid(pointing).neutral["ambiguity"] == -1.0
+    assert PhaseIncrement(pointing).neutral["doppler_baseband_hz"] == 150.0
+    assert EffectiveVelocity(OmegaK(RADAR)).neutral["velocity_m_s"] == RADAR.velocity_m_s

@@ -131,6 +131,10 @@ def test_unknown_config_names_what_there_is() -> None:
         ),
         (["processor.recommended.stages.focus.uses.dopler_hz=doppler"], ["processor.recommended", "'dopler_hz'"]),
         (["processor.recommended.stages.focus.uses=7"], ["processor.recommended.stages.focus.uses", "7"]),
+        (
+            ["processor.recommended.stages.focus.in_doubt=zero"],
+            ["processor.recommended.stages.focus.in_doubt", "'neutral'", "'apply'", "'zero'"],
+        ),
         (["processor.recommended.stages.a-b.stage=omega_k"], ["a-b", "stage name"]),
         (["processor.recommended.stages=null"], ["processor.recommended", "'stages'"]),
         (["processor.squint_ignored.rerun.method=other"], ["processor.squint_ignored.rerun.method", "'other'"]),

@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from tests.study.scenes import CORRECT, IMAGE, ISAL, bench_of, loaded_as, run, world
+from tests.study.scenes import CORRECT, IMAGE, ISAL, bench_of, loaded_as, run, world, write
 from torchsar.cli import main
 from torchsar.core import Draws
 from torchsar.focus import TargetImage
@@ -150,6 +150,18 @@ def test_all_corrections_of_a_chain_are_judged_together(tmp_path: Path) -> None:
     # the second estimator alone says little of the phase that was put in
     assert error["again"] == pytest.approx(error["recommended"], abs=1e-6)
     assert error["started"] < error["sca"]  # a phase that was only a start is not counted twice
+
+
+def test_an_estimate_in_doubt_is_not_used_unless_the_method_says_so_and_the_report_tells(tmp_path: Path) -> None:
+    """Noise alone: no phase is removed, but for the method with `in_doubt: apply`."""
+    applied = {"phase": {"stage": "autofocus"}, "correct": {**CORRECT, "in_doubt": "apply"}, "image": IMAGE}
+    config = write(tmp_path, "isal", processor={**ISAL["processor"], "applied": {"stages": applied}})
+    methods = run(config, tmp_path / "out", "world.noise.snr_db=-60", "world.trials=2")["methods"]
+    entropy = {name: method["metrics"]["entropy_nats"] for name, method in methods.items()}
+    assert entropy["recommended"] == pytest.approx(entropy["none"], abs=1e-6) and entropy["applied"] < entropy["none"]
+    assert methods["recommended"]["neutral"] == {"correct.phase_rad": 2} and methods["applied"]["neutral"] == {}
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Estimate not ok, neutral value used: correct.phase_rad in 2 of 2 trials" in report
 
 
 def test_noise_near_the_end_of_float32_leaves_figures(tmp_path: Path) -> None:

@@ -56,9 +56,10 @@ def test_failure_is_not_called_success(snr_db: float) -> None:
     for algorithm in ("sca", "pga", "pga_sca", "entropy_fixed_point", "least_entropy", "recommended"):
         found = point(algorithm, snr_db)
         assert found["median"] > 1.4 and found["ok_share"] <= 0.01
-    assert (
-        point("recommended", snr_db, "entropy_above_ideal_nats")["median"] < 0
-    )  # lower entropy than the error-free image, and wrong
+    # lower entropy than the error-free image, and wrong; the recommended method is in doubt and
+    # removes no phase
+    assert point("least_entropy", snr_db, "entropy_above_ideal_nats")["median"] < 0
+    assert 0 < point("recommended", snr_db, "entropy_above_ideal_nats")["median"] < 0.05
 
 
 @pytest.mark.parametrize("snr_db", BRIEF)

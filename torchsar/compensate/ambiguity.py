@@ -254,6 +254,30 @@ def possible_reach(radar: StripmapRadar, reach: int) -> int:
     return max(0, min(reach, math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)))
 
 
+@torch.no_grad()
+def coherent_lines(raw: Tensor) -> Tensor:
+    """Test whether the phases of the lines follow from one line to the next.
+
+    The phase increments between adjacent lines, or their changes, must add up to more than random
+    phases would. Lines with random phases pass in about 2 of 1,000 trials.
+
+    Args:
+        raw: Lines, shape (..., pulse, range), complex.
+
+    Returns:
+        True where they do, shape (...,), bool.
+    """
+    x = unit_peak(raw)
+    step = torch.linalg.vecdot(x[..., :-1, :], x[..., 1:, :]).to(torch.complex128)
+    change = step[..., :-1].conj() * step[..., 1:]
+
+    def adds_up(z: Tensor) -> Tensor:
+        # for random phases the ratio of both sides is exceeded with probability exp(-7)
+        return z.sum(-1).abs().square() > 7 * z.abs().square().sum(-1)
+
+    return adds_up(step) | adds_up(change)
+
+
 class DopplerCentroid(Stage):
     """Absolute Doppler centroid with its ambiguity and the squint angle; the recommended estimator.
 
@@ -266,6 +290,9 @@ class DopplerCentroid(Stage):
 
     Provides `doppler_hz` (absolute, positive when closing), `doppler_baseband_hz`, `ambiguity`
     (whole number of PRFs, as float64) and `squint_deg` (positive ahead, for the nominal velocity).
+    In trials that are not ok, the neutral values are those of the centroid with the estimated
+    baseband value that is nearest to `pointing_doppler_hz` of the radar (or 0 if that is None); if
+    the baseband value is not reliable either, those of `pointing_doppler_hz` itself.
 
     Args:
         radar: Radar parameters.
@@ -295,6 +322,8 @@ class DopplerCentroid(Stage):
         if reach < 1:
             raise ValueError(f"reach must be 1 or more (largest Doppler ambiguity to search, in PRFs), got {reach}")
         self.radar, self.reference, self.reach, self.blocks = radar, reference, possible_reach(radar, reach), blocks
+        nominal = torch.tensor(radar.pointing_doppler_hz or 0.0, dtype=torch.float64)
+        self.neutral = {name: float(value) for name, value in self._values(nominal).items()}
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
         """Compute the range reference spectrum for lines of n samples.
@@ -323,7 +352,9 @@ class DopplerCentroid(Stage):
             `doppler_hz` (absolute) and `doppler_baseband_hz`, with their standard deviations in Hz,
             `ambiguity` (whole number of PRFs) and `squint_deg`, shape (...,) each. `quality` is the
             probability that the ambiguity is right. `ok` is False where that probability is 0.9 or
-            less, or where the baseband centroid is unreliable. `info` holds
+            less, or where the baseband centroid is unreliable or the phases of the lines are random
+            (`coherent_lines`). A smooth phase error of the lines shifts the centroid and cannot be
+            told from motion. `info` holds
 
             - "block_hz" and "block_power", see `baseband_estimate`;
             - "looks", "lines", "entropy", "line_doppler_hz" and "line_doppler_std_hz", see
@@ -334,7 +365,7 @@ class DopplerCentroid(Stage):
         """
         raw, radar = signal.data, self.radar
         first = phase_increment(raw, radar.prf_hz, self.blocks)
-        base = first["doppler_baseband_hz"]
+        base, reliable = first["doppler_baseband_hz"], first.ok & coherent_lines(raw)
         evidence = ambiguity_evidence(raw, radar, base, self.spectrum(raw.shape[-1], raw.device), self.reach)
         turns = candidate_turns(self.reach, raw.device)
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
@@ -343,9 +374,7 @@ class DopplerCentroid(Stage):
         absolute, std = complete_aperture_centroid(
             raw, radar, absolute, first.std["doppler_baseband_hz"], self.reference
         )
-        baseband = wrap_hz(absolute, radar.prf_hz)
         probability = torch.softmax(joint, -1).amax(-1)
-        squint = torch.rad2deg(torch.asin(radar.sin_squint(absolute).clamp(-1, 1)))
         info = {
             **first.info,
             **evidence,
@@ -354,14 +383,29 @@ class DopplerCentroid(Stage):
             "coherence": first.quality,
         }
         return Estimate(
-            {
-                "doppler_hz": absolute,
-                "doppler_baseband_hz": baseband,
-                "ambiguity": torch.round((absolute - baseband) / radar.prf_hz),
-                "squint_deg": squint,
-            },
+            self._values(absolute),
             probability,
-            first.ok & (probability > 0.9),
+            reliable & (probability > 0.9),
             {"doppler_hz": std, "doppler_baseband_hz": std},
             info,
+            self._values(self._nearest(base, absolute, reliable)),
         )
+
+    def _nearest(self, base: Tensor, absolute: Tensor, reliable: Tensor) -> Tensor:
+        """The centroid nearest to the nominal Doppler, which is assumed where the ambiguity is not
+        known; the nominal Doppler itself where the baseband centroid is not reliable either.
+        """
+        nominal, prf = self.radar.pointing_doppler_hz or 0.0, self.radar.prf_hz
+        near = nominal + wrap_hz(base - nominal, prf)
+        near = torch.where((absolute - near).abs() < prf / 2, absolute, near)
+        return torch.where(reliable, near, nominal)
+
+    def _values(self, doppler_hz: Tensor) -> dict[str, Tensor]:
+        """All values that an absolute Doppler centroid in Hz determines."""
+        baseband = wrap_hz(doppler_hz, self.radar.prf_hz)
+        return {
+            "doppler_hz": doppler_hz,
+            "doppler_baseband_hz": baseband,
+            "ambiguity": torch.round((doppler_hz - baseband) / self.radar.prf_hz),
+            "squint_deg": torch.rad2deg(torch.asin(self.radar.sin_squint(doppler_hz).clamp(-1, 1))),
+        }

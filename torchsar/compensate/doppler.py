@@ -12,6 +12,7 @@ neither estimator.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from itertools import pairwise
 
 import torch
@@ -374,6 +375,25 @@ def block_centres(count: int, device: torch.device | None = None) -> Tensor:
     return (2 * torch.arange(count, dtype=torch.float64, device=device) + 1) / count - 1
 
 
+def nominal_doppler(radar: StripmapRadar) -> dict[str, float]:
+    """Return the Doppler centroid that is assumed where it cannot be estimated.
+
+    Args:
+        radar: Radar parameters.
+
+    Returns:
+        `doppler_hz`, which is `pointing_doppler_hz` of the radar, or 0 if that is None; and
+        `doppler_baseband_hz`, the same wrapped into the interval -PRF/2 .. PRF/2.
+    """
+    nominal = radar.pointing_doppler_hz or 0.0
+    wrapped = wrap_hz(torch.tensor(nominal, dtype=torch.float64), radar.prf_hz)
+    return {"doppler_hz": nominal, "doppler_baseband_hz": float(wrapped)}
+
+
+def _nominal_baseband(radar: StripmapRadar, names: Iterable[str]) -> dict[str, float]:
+    return dict.fromkeys(names, nominal_doppler(radar)["doppler_baseband_hz"])
+
+
 class PhaseIncrement(Stage):
     """Baseband Doppler centroid from the phase increment between lines.
 
@@ -396,6 +416,7 @@ class PhaseIncrement(Stage):
         if over not in OVER:
             raise ValueError(f"over must be one of {OVER} (how blocks are combined), got {over!r}")
         self.prf_hz, self.blocks, self.over = radar.prf_hz, blocks, over
+        self.neutral = _nominal_baseband(radar, self.provides)
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the baseband Doppler centroid of a signal of axes (pulse, range).
@@ -422,6 +443,7 @@ class EnergyCentre(Stage):
     def __init__(self, radar: StripmapRadar, blocks: tuple[int, int] = (8, 8)) -> None:
         super().__init__()
         self.prf_hz, self.blocks = radar.prf_hz, blocks
+        self.neutral = _nominal_baseband(radar, self.provides)
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the baseband Doppler centroid of a signal of axes (pulse, range).
@@ -452,6 +474,7 @@ class RangeDependentCentroid(Stage):
     def __init__(self, radar: StripmapRadar, order: int = 1, blocks: tuple[int, int] = (8, 16)) -> None:
         super().__init__()
         self.prf_hz, self.order, self.blocks = radar.prf_hz, order, blocks
+        self.neutral = _nominal_baseband(radar, self.provides)
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None) -> Estimate:
         """Estimate the centroid of every range cell of a signal of axes (pulse, range).
@@ -494,6 +517,7 @@ class RangeDependentCentroid(Stage):
             (total > 0) & (std < 0.1 * self.prf_hz),
             {"doppler_baseband_hz": std},
             {"block_hz": scale * torch.angle(products), "coefficients_hz": scale * coefficients},
+            {} if doppler_hz is None else {"doppler_range_hz": doppler_hz[..., None]},
         )
 
 

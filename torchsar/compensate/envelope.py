@@ -341,6 +341,7 @@ class AlignEnvelopes(Stage):
     """
 
     provides = ("shift_m", "velocity_m_s")
+    neutral = {"shift_m": 0.0, "velocity_m_s": 0.0}
 
     def __init__(self, degree: int | None = 2, tones: int = 0, passes: int = 6, blocks: int = 16) -> None:
         super().__init__()

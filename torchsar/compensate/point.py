@@ -18,7 +18,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.compensate.doppler import point_doppler, wrap_hz
+from torchsar.compensate.doppler import nominal_doppler, point_doppler, wrap_hz
 from torchsar.core import Estimate, Signal, Stage, cis, settle
 from torchsar.metrics.bounds import tone_frequency_bound_hz
 from torchsar.metrics.impulse import impulse_response
@@ -134,7 +134,7 @@ class PointDoppler(Stage):
 
     def __init__(self, radar: StripmapRadar, crossing_s: float | None = None) -> None:
         super().__init__()
-        self.radar, self.crossing_s = radar, crossing_s
+        self.radar, self.crossing_s, self.neutral = radar, crossing_s, nominal_doppler(radar)
 
     @torch.no_grad()
     def forward(self, signal: Signal, frame_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Estimate:

@@ -184,6 +184,7 @@ class EffectiveVelocity(Stage):
             )
         # in a list, so that torch does not register the focuser of the chain as a submodule twice
         self._focuser = [focuser]
+        self.neutral = {"velocity_m_s": focuser.radar.velocity_m_s}
         self.reach_m_s, self.lines, self.refine, self.tolerance_m_s = reach_m_s, lines, refine, tolerance_m_s
 
     def group(self, raw: Tensor) -> tuple[RangeGroup, float]:

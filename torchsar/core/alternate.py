@@ -38,7 +38,8 @@ class Alternate(Stage):
     signal, so that errors of an early round do not remain in the data. An estimator also receives,
     as arguments, the latest values (its own included) whose names are parameters of its `forward`.
     A value that no turn has estimated yet is not passed, so that the default of the parameter
-    applies.
+    applies. Inside a round the estimated values count whether they are ok or not, since an estimate
+    is often not ok before the other effects are corrected.
 
         Alternate(rounds=3, phase=Turn(autofocus, corrector), rotation=Turn(estimator))
 
@@ -67,6 +68,9 @@ class Alternate(Stage):
         self.provides = tuple(
             dict.fromkeys(key for turn in turns.values() for key in getattr(turn.estimator, "provides", ()))
         )
+        self.neutral = {
+            key: number for turn in turns.values() for key, number in getattr(turn.estimator, "neutral", {}).items()
+        }
         self._check()
 
     def _check(self) -> None:

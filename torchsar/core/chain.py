@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -12,6 +12,8 @@ from torch import Tensor, nn
 
 from torchsar.core.estimate import Estimate
 from torchsar.core.signal import Recording, Signal
+
+Given = Mapping[str, Tensor | Estimate]
 
 
 class Use(nn.Module):
@@ -22,23 +24,32 @@ class Use(nn.Module):
         names: Source of each parameter of `forward`: "STAGE.VALUE" for the value VALUE that the
             stage named STAGE of the chain estimates, "aux.NAME" for side data of the recording, or
             "given.NAME" for a value that the caller of the chain gives.
+        in_doubt: What the stage does in trials whose estimates are not ok, see `use`.
     """
 
-    def __init__(self, stage: nn.Module, names: Mapping[str, str]) -> None:
+    def __init__(self, stage: nn.Module, names: Mapping[str, str], in_doubt: str = "neutral") -> None:
         super().__init__()
         self.stage = stage
         self.names = dict(names)
+        self.in_doubt = in_doubt
 
 
-def use(stage: nn.Module, **names: str) -> Use:
+def use(stage: nn.Module, *, in_doubt: str = "neutral", **names: str) -> Use:
     """Connect parameters of a stage to values of earlier stages or to recorded side data.
 
     In the following example the values come from the stages named "doppler" and "velocity".
 
         use(OmegaK(radar), doppler_hz="doppler", velocity_m_s="velocity")
 
+    Where `ok` of an estimate is False, the stage gets the neutral value of the estimator in place
+    of the estimated one, for example no phase error or the nominal velocity. A stage that both
+    estimates and corrects an error leaves the signal unchanged there. With `in_doubt="apply"` the
+    stage uses all estimates, whether they are ok or not.
+
     Args:
         stage: Stage whose `forward` takes the values.
+        in_doubt: What the stage does in trials whose estimates are not ok: "neutral" takes neutral
+            values, "apply" the estimated ones.
         **names: Source of each parameter: "STAGE.VALUE", or "STAGE" alone if the value has the name
             of the parameter, or "aux.NAME" for side data of the recording, or "given.NAME" for a
             value that the caller of the chain gives.
@@ -48,16 +59,21 @@ def use(stage: nn.Module, **names: str) -> Use:
 
     Raises:
         TypeError: If a source is not a name; a constant belongs in the constructor of the stage.
+        ValueError: If `in_doubt` is neither "neutral" nor "apply".
     """
+    if in_doubt not in ("neutral", "apply"):
+        raise ValueError(
+            f"in_doubt must be 'neutral' (neutral values where an estimate is not ok) or 'apply' (the estimated ones), "
+            f"got {in_doubt!r}"
+        )
     for parameter, source in names.items():
         if not isinstance(source, str):
             raise TypeError(
                 f"{parameter}={source!r}: `use` connects values by name, such as "
                 f"{parameter}='doppler'; pass a constant to the constructor of the stage instead"
             )
-    return Use(
-        stage, {parameter: source if "." in source else f"{source}.{parameter}" for parameter, source in names.items()}
-    )
+    sources = {key: source if "." in source else f"{source}.{key}" for key, source in names.items()}
+    return Use(stage, sources, in_doubt)
 
 
 @dataclass(frozen=True)
@@ -71,6 +87,12 @@ class Trace:
         values: Estimated and given values under "STAGE.VALUE", side data under "aux.NAME".
         seconds: Wall time of each stage, in seconds.
         bytes: Size of the samples after each stage, in bytes.
+        neutral: Trials in which a stage did not use an estimate because it is not ok, bool with the
+            shape of `ok`: under "STAGE.PARAMETER" those in which this parameter of the stage got a
+            neutral value, and under "STAGE" those in which a stage that both estimates and corrects
+            left the signal unchanged.
+        arguments: Values that each stage received from its connections, by its name and parameter;
+            neutral where the estimate is not ok.
     """
 
     inputs: Mapping[str, Signal]
@@ -79,6 +101,8 @@ class Trace:
     values: Mapping[str, Tensor]
     seconds: Mapping[str, float]
     bytes: Mapping[str, int]
+    neutral: Mapping[str, Tensor] = field(default_factory=dict)
+    arguments: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
 
     @property
     def signal(self) -> Signal:
@@ -87,14 +111,57 @@ class Trace:
 
 
 @dataclass
+class _Known:
+    """Values of a run by name, with the estimates that they come from.
+
+    Those in `held`, and the estimates of the stages in `stages`, were given by the caller.
+    """
+
+    values: dict[str, Tensor]
+    estimates: dict[str, Estimate]
+    held: frozenset[str] = frozenset()
+    stages: frozenset[str] = frozenset()
+
+    def with_given(self, given: Given) -> _Known:
+        """These values, replaced by those that the caller gives."""
+        values = {name: value for name, value in given.items() if not isinstance(value, Estimate)}
+        estimates = {name: value for name, value in given.items() if isinstance(value, Estimate)}
+        known = _Known({**self.values, **values}, dict(self.estimates), frozenset(values), frozenset(estimates))
+        for name, estimate in estimates.items():
+            known.add(name, estimate)
+        return known
+
+    def add(self, name: str, estimate: Estimate) -> None:
+        """Add the estimate of a stage, without values that the caller gives."""
+        self.estimates[name] = estimate
+        self.values |= {f"{name}.{key}": v for key, v in estimate.value.items() if f"{name}.{key}" not in self.held}
+
+    def trusted(self, source: str) -> tuple[Tensor, Tensor] | None:
+        """An estimated value that is neutral where it is not ok, and these trials; None if the
+        value is not estimated or has no neutral one.
+        """
+        name, _, key = source.partition(".")
+        estimate = self.estimates.get(name)
+        if estimate is None or key not in estimate.neutral or self.values[source] is not estimate.value[key]:
+            return None
+        return estimate.trusted(key), ~estimate.ok
+
+
+@dataclass
 class _Log:
     """Record of a run that becomes its Trace."""
 
     inputs: dict[str, Signal] = field(default_factory=dict)
     outputs: dict[str, Signal] = field(default_factory=dict)
-    estimates: dict[str, Estimate] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     bytes: dict[str, int] = field(default_factory=dict)
+    neutral: dict[str, Tensor] = field(default_factory=dict)
+    arguments: dict[str, Mapping[str, Tensor]] = field(default_factory=dict)
+
+    def trace(self, known: _Known) -> Trace:
+        """The trace of the run, with these values and estimates."""
+        parts = {name: getattr(self, name) for name in ("seconds", "bytes", "neutral", "arguments")}
+        return Trace(self.inputs, self.outputs, known.estimates, known.values, **parts)
 
 
 class Chain(nn.Module):
@@ -106,6 +173,11 @@ class Chain(nn.Module):
     the trace holds before `start`, and it is differentiable, so that it can serve as the objective
     of a minimum-entropy search. A stage that returns only an Estimate leaves the signal unchanged.
     Connections made by `use` are checked when the chain is built.
+
+    An estimate is used only in the trials in which it is ok. In the others, later stages get the
+    neutral value of the estimator (see `Stage`), and a stage that both estimates and corrects
+    leaves the signal unchanged, unless `use` says otherwise. The Trace holds the estimates
+    themselves, and tells in `neutral` where they were not used.
 
     Args:
         **stages: Stages by name, in the order in which they run; `use` connects their parameters.
@@ -128,6 +200,7 @@ class Chain(nn.Module):
             _check_member(name, stage)
         self.stages = nn.ModuleDict(members)
         self.uses = {name: item.names if isinstance(item, Use) else {} for name, item in stages.items()}
+        self.in_doubt = {name: item.in_doubt if isinstance(item, Use) else "neutral" for name, item in stages.items()}
         self._check()
 
     def _check(self) -> None:
@@ -159,9 +232,9 @@ class Chain(nn.Module):
                         f"stage {name!r} ({type(stage).__name__}) needs the value {p.name!r}; connect it "
                         f"(`use`) with {choices}, or with 'aux.NAME' for recorded side data"
                     )
-            available |= {f"{name}.{key}" for key in getattr(stage, "provides", ())}
+            available |= {f"{name}.{key}" for key in _provided(stage)}
 
-    def forward(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Signal:
+    def forward(self, x: Recording | Signal, given: Given | None = None) -> Signal:
         """Run all stages of the chain on a recording or a signal.
 
         Args:
@@ -169,7 +242,8 @@ class Chain(nn.Module):
             given: Values by name. "STAGE.VALUE" and "aux.NAME" replace estimated and recorded
                 values; "given.NAME" sets a value that a stage takes from the caller. A stage for
                 which `given` holds every value that it provides does not run at all, even if it
-                would change the signal.
+                would change the signal. "STAGE" with an Estimate, such as that of an earlier trace,
+                has the same effect; its values count only where they are ok.
 
         Returns:
             Signal after the last stage.
@@ -180,16 +254,15 @@ class Chain(nn.Module):
             TypeError: If x is neither a Recording nor a Signal, or a stage returns anything else
                 than a Signal, an Estimate or a pair of both.
         """
-        signal, aux = _split(x)
-        self._refuse_unknown(given, aux)
-        return self._run(list(self.stages), signal, {**aux, **(given or {})}, set(given or {}), None)
+        return self._run(list(self.stages), *self._start(x, given))
 
-    def trace(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Trace:
+    def trace(self, x: Recording | Signal, given: Given | None = None) -> Trace:
         """Run all stages of the chain and return every intermediate result, with times and sizes.
 
         Args:
             x: Recording, whose side data are available as "aux.NAME", or a Signal.
-            given: Values by name that replace those estimated or recorded, as in `forward`.
+            given: Values and estimates by name that replace those estimated or recorded, as in
+                `forward`.
 
         Returns:
             Trace with the signals, estimates, values, wall times and sizes of all stages.
@@ -200,22 +273,19 @@ class Chain(nn.Module):
             TypeError: If x is neither a Recording nor a Signal, or a stage returns anything else
                 than a Signal, an Estimate or a pair of both.
         """
-        signal, aux = _split(x)
-        self._refuse_unknown(given, aux)
-        values, log = {**aux, **(given or {})}, _Log()
-        self._run(list(self.stages), signal, values, set(given or {}), log)
-        return Trace(log.inputs, log.outputs, log.estimates, values, log.seconds, log.bytes)
+        signal, known = self._start(x, given)
+        log = _Log()
+        self._run(list(self.stages), signal, known, log)
+        return log.trace(known)
 
-    def rerun(
-        self, trace: Trace, start: str, stop: str | None = None, given: Mapping[str, Tensor] | None = None
-    ) -> Signal:
+    def rerun(self, trace: Trace, start: str, stop: str | None = None, given: Given | None = None) -> Signal:
         """Repeat consecutive stages on the signal that a trace holds before the first of them.
 
         Args:
             trace: Result of an earlier call of the method `trace`.
             start: Name of the first stage to repeat.
             stop: Name of the last stage to repeat; by default the last one of the chain.
-            given: Values by name that replace those of the trace.
+            given: Values by name that replace those of the trace; they are used in all trials.
 
         Returns:
             Signal after the last repeated stage.
@@ -223,83 +293,106 @@ class Chain(nn.Module):
         Raises:
             KeyError: If a stage or a given value has an unknown name.
         """
-        part, values = self._part(trace, start, stop, given)
-        return self._run(part, trace.inputs[start], values, set(given or {}), None)
+        part, known = self._part(trace, start, stop, given)
+        return self._run(part, trace.inputs[start], known)
 
-    def retrace(self, trace: Trace, start: str, given: Mapping[str, Tensor] | None = None) -> Trace:
+    def retrace(self, trace: Trace, start: str, given: Given | None = None) -> Trace:
         """Repeat the last stages of the chain and return a new trace with their results.
 
         Args:
             trace: Result of an earlier call of the method `trace`.
             start: Name of the first stage to repeat.
-            given: Values by name that replace those of the trace.
+            given: Values by name that replace those of the trace; they are used in all trials.
 
         Returns:
             Trace with all results of the repeated stages. Of the stages before `start` it holds
-            the signals and values of `trace`, but neither estimates nor times nor sizes.
+            the signals, values, estimates and arguments of `trace`, but neither times nor sizes.
 
         Raises:
             KeyError: If a stage or a given value has an unknown name.
         """
-        part, values = self._part(trace, start, None, given)
+        part, known = self._part(trace, start, None, given)
         before = [name for name in trace.inputs if name not in part]
         log = _Log({name: trace.inputs[name] for name in before}, {name: trace.outputs[name] for name in before})
-        self._run(part, trace.inputs[start], values, set(given or {}), log)
-        return Trace(log.inputs, log.outputs, log.estimates, values, log.seconds, log.bytes)
+        log.arguments |= {name: trace.arguments[name] for name in before}
+        self._run(part, trace.inputs[start], known, log)
+        return log.trace(known)
 
-    def _part(
-        self, trace: Trace, start: str, stop: str | None, given: Mapping[str, Tensor] | None
-    ) -> tuple[list[str], dict[str, Tensor]]:
+    def _start(self, x: Recording | Signal, given: Given | None) -> tuple[Signal, _Known]:
+        """The signal of a run, and the values that are known before it."""
+        if not isinstance(x, Recording | Signal):
+            raise TypeError(f"a chain runs on a Recording or a Signal, got {type(x).__name__}")
+        aux = {f"aux.{name}": value for name, value in x.aux.items()} if isinstance(x, Recording) else {}
+        known = _Known({**aux}, {}).with_given(given or {})
+        available = {f"{name}.{key}" for name, stage in self.stages.items() for key in _provided(stage)} | set(aux)
+        available |= {source for names in self.uses.values() for source in names.values()}
+        unknown = (known.held - available) | (known.stages - set(self.stages))
+        if unknown:
+            raise KeyError(f"`given` has unknown names {sorted(unknown)}; the chain has the values {sorted(available)}")
+        return x.signal if isinstance(x, Recording) else x, known
+
+    def _part(self, trace: Trace, start: str, stop: str | None, given: Given | None) -> tuple[list[str], _Known]:
         """The stages that a rerun repeats, and the values that it starts with."""
         names = list(self.stages)
         for name in (start, stop or start):
             if name not in names:
                 raise KeyError(f"the chain has no stage {name!r}; its stages are {names}")
-        unknown = set(given or {}) - set(trace.values)
+        part = names[names.index(start) : names.index(stop) + 1 if stop else None]
+        before = {name: estimate for name, estimate in trace.estimates.items() if name not in part}
+        known = _Known(dict(trace.values), before).with_given(given or {})
+        unknown = (known.held - set(trace.values)) | (known.stages - set(names))
         if unknown:
             raise KeyError(
                 f"`given` has unknown names {sorted(unknown)}; the trace has the values {sorted(trace.values)}"
             )
-        part = names[names.index(start) : names.index(stop) + 1 if stop else None]
-        return part, {**trace.values, **(given or {})}
+        return part, known
 
-    def _refuse_unknown(self, given: Mapping[str, Tensor] | None, aux: Mapping[str, Tensor]) -> None:
-        """Reject given values that no stage provides or uses and no recording holds."""
-        available = {
-            f"{name}.{key}" for name, stage in self.stages.items() for key in getattr(stage, "provides", ())
-        } | set(aux)
-        available |= {source for names in self.uses.values() for source in names.values()}
-        unknown = set(given or {}) - available
-        if unknown:
-            raise KeyError(f"`given` has unknown names {sorted(unknown)}; the chain has the values {sorted(available)}")
-
-    def _run(
-        self, names: list[str], signal: Signal, values: dict[str, Tensor], held: set[str], log: _Log | None
-    ) -> Signal:
+    def _run(self, names: list[str], signal: Signal, known: _Known, log: _Log | None = None) -> Signal:
         for name in names:
             stage = self.stages[name]
-            provided = {f"{name}.{key}" for key in getattr(stage, "provides", ())}
+            provided = {f"{name}.{key}" for key in _provided(stage)}
+            held = name in known.stages or bool(provided and provided <= known.held)
             entered, began = signal, time.perf_counter()
-            if not (provided and provided <= held):
-                signal = self._step(name, stage, signal, values, held, log)
+            arguments, neutral = self._arguments(name, known, required=not held)
+            if not held:
+                signal = self._step(name, stage, signal, arguments, known, neutral)
             if log is not None:
                 _synchronise(signal.data)
                 log.inputs[name], log.outputs[name] = entered, signal
                 log.seconds[name] = time.perf_counter() - began
                 log.bytes[name] = signal.data.numel() * signal.data.element_size()
+                log.arguments[name] = arguments
+                log.neutral.update({} if held and name not in known.stages else neutral)
         return signal
 
-    def _step(
-        self, name: str, stage: nn.Module, signal: Signal, values: dict[str, Tensor], held: set[str], log: _Log | None
-    ) -> Signal:
-        arguments = {}
+    def _arguments(self, name: str, known: _Known, required: bool) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The connected values of a stage, and by "STAGE.PARAMETER" the trials in which one is
+        neutral.
+        """
+        arguments, neutral = {}, {}
         for parameter, source in self.uses[name].items():
-            if source not in values:
+            if source not in known.values and required:
                 raise KeyError(
                     f"stage {name!r} needs the value {source!r} for its parameter {parameter!r}, but the only values "
-                    f"of this run are {sorted(values)}"
+                    f"of this run are {sorted(known.values)}"
                 )
-            arguments[parameter] = values[source]
+            trusted = known.trusted(source) if self.in_doubt[name] == "neutral" else None
+            if trusted is not None:
+                arguments[parameter], neutral[f"{name}.{parameter}"] = trusted
+            elif source in known.values:
+                arguments[parameter] = known.values[source]
+        return arguments, neutral
+
+    def _step(
+        self,
+        name: str,
+        stage: nn.Module,
+        signal: Signal,
+        arguments: dict[str, Tensor],
+        known: _Known,
+        neutral: dict[str, Tensor],
+    ) -> Signal:
+        """The signal after a stage; its estimate joins `known`, and doubts join `neutral`."""
         result = stage(signal, **arguments)
         out, estimate = result if isinstance(result, tuple) else (result, None)
         if isinstance(out, Estimate):
@@ -310,12 +403,22 @@ class Chain(nn.Module):
                 "returns a Signal, an Estimate, or (Signal, Estimate)"
             )
         if estimate is not None:
-            values.update(
-                {f"{name}.{key}": value for key, value in estimate.value.items() if f"{name}.{key}" not in held}
-            )
-            if log is not None:
-                log.estimates[name] = estimate
+            known.add(name, estimate)
+            if self.in_doubt[name] == "neutral" and _corrected(signal, out, estimate):
+                ok = estimate.ok[(...,) + (None,) * len(out.axes)]
+                out, neutral[name] = out.with_data(torch.where(ok, out.data, signal.data)), ~estimate.ok
         return out
+
+
+def _corrected(signal: Signal, out: Signal, estimate: Estimate) -> bool:
+    """Whether a stage that estimates has also changed the samples, on the same axes."""
+    same = out.axes == signal.axes and out.data.shape == signal.data.shape and estimate.ok.shape == signal.trials
+    return same and out is not signal
+
+
+def _provided(stage: nn.Module) -> Collection[str]:
+    """Names of the values that a stage estimates."""
+    return getattr(stage, "provides", ())
 
 
 def _check_member(name: str, stage: object) -> None:
@@ -325,14 +428,6 @@ def _check_member(name: str, stage: object) -> None:
         raise TypeError(f"stage {name!r} must be a torch.nn.Module, such as a Stage, got {got}")
     if hasattr(nn.ModuleDict(), name) or "." in name:
         raise ValueError(f"a stage cannot be called {name!r}, which torch.nn.ModuleDict reserves; choose another name")
-
-
-def _split(x: Recording | Signal) -> tuple[Signal, dict[str, Tensor]]:
-    if isinstance(x, Recording):
-        return x.signal, {f"aux.{name}": value for name, value in x.aux.items()}
-    if isinstance(x, Signal):
-        return x, {}
-    raise TypeError(f"a chain runs on a Recording or a Signal, got {type(x).__name__}")
 
 
 def _synchronise(x: Tensor) -> None:

@@ -14,7 +14,8 @@ class Estimate:
     """Estimated values with their predicted accuracy and their reliability in each trial.
 
     All tensors begin with the trial dimensions (...). A trial in which the estimation fails raises
-    no error: `ok` is False there, and the values are finite.
+    no error: `ok` is False there, and the values are finite. A Chain then passes on a neutral value
+    in place of the estimated one, see `trusted`.
 
     Args:
         value: Estimated values by name. Names end in the unit, such as `doppler_hz` of shape (...,)
@@ -25,6 +26,9 @@ class Estimate:
         std: Predicted standard deviations, with the names, shapes and units of the values; only for
             those values whose standard deviation theory predicts.
         info: Further tensors by name, for reports.
+        neutral: Neutral values by name: what to assume where `ok` is False, such as no phase error
+            or the nominal velocity. Numbers, or tensors that broadcast to the value. A stage fills
+            it in, see `Stage`.
 
     Raises:
         ValueError: If `ok` is not a bool tensor with the shape of `quality`.
@@ -35,6 +39,7 @@ class Estimate:
     ok: Tensor
     std: Mapping[str, Tensor] = field(default_factory=dict)
     info: Mapping[str, Tensor] = field(default_factory=dict)
+    neutral: Mapping[str, Tensor | float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.ok.dtype != torch.bool or self.ok.shape != self.quality.shape:
@@ -48,6 +53,27 @@ class Estimate:
         if name not in self.value:
             raise KeyError(f"estimate holds {tuple(self.value)}, not {name!r}")
         return self.value[name]
+
+    def trusted(self, name: str) -> Tensor:
+        """Return a value with the neutral one in its place where `ok` is False.
+
+        Differentiable; the gradient is zero where `ok` is False.
+
+        Args:
+            name: Name of the value.
+
+        Returns:
+            Tensor of the shape and dtype of the value. It is the value itself if there is no
+            neutral value of this name.
+
+        Raises:
+            KeyError: If there is no value of this name.
+        """
+        value = self[name]
+        if name not in self.neutral:
+            return value
+        neutral = torch.as_tensor(self.neutral[name], dtype=value.dtype, device=value.device)
+        return torch.where(self.ok[(...,) + (None,) * (value.ndim - self.ok.ndim)], value, neutral)
 
     @staticmethod
     def joined(parts: Sequence[Estimate], trials: torch.Size) -> Estimate:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torchsar.core.check import refuse_non_finite
+from torchsar.core.estimate import Estimate
 from torchsar.core.signal import Signal
 
 
@@ -17,12 +21,18 @@ class Stage(nn.Module):
     `stage(signal, **values)` returns a Signal, an Estimate (the signal is then unchanged), or a
     pair of both. A Chain can connect keyword parameters of `forward` to values that earlier stages
     estimate. A subclass holds its constants as buffers and its tunable values as nn.Parameters (see
-    `hold`), and sets the following class attributes:
+    `hold`), and sets the following attributes:
 
     - `works_on`: names of the trailing axes that it needs.
     - `also_on`: further tuples of axes that it accepts.
     - `provides`: names of the values in its Estimate.
+    - `neutral`: for each of them the number to assume in trials that are not ok: one without effect
+      (a phase of 0, a gain of 1), or a nominal one. If there is none, a sentence that says why; the
+      estimated value is then used in all trials.
     - `takes_real`: True if it also accepts the real samples of a one-channel detector.
+
+    If a value that the stage provides is also one of the arguments of the call, such as a start or
+    a value known a priori, this argument is the neutral value.
 
     Raises:
         TypeError: On a call, if the argument is not a Signal, or if the samples are not complex
@@ -33,6 +43,7 @@ class Stage(nn.Module):
     works_on: tuple[str, ...] = ("pulse", "range")
     also_on: tuple[tuple[str, ...], ...] = ()
     provides: tuple[str, ...] = ()
+    neutral: Mapping[str, Tensor | float | str] = MappingProxyType({})
     takes_real: bool = False
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
@@ -49,7 +60,19 @@ class Stage(nn.Module):
         if not (signal.data.is_complex() or (self.takes_real and signal.data.is_floating_point())):
             raise TypeError(f"{name} works on complex samples, got {signal.data.dtype}; form the analytic signal first")
         refuse_non_finite(signal.data, name)
-        return super().__call__(signal, *args, **values)
+        result = super().__call__(signal, *args, **values)
+        if isinstance(result, Estimate):
+            return self._with_neutral(result, values)
+        if isinstance(result, tuple) and isinstance(result[-1], Estimate):
+            return (*result[:-1], self._with_neutral(result[-1], values))
+        return result
+
+    def _with_neutral(self, estimate: Estimate, given: Mapping[str, Any]) -> Estimate:
+        """The estimate with a neutral value for each value that has one."""
+        numbers = {key: value for key, value in self.neutral.items() if not isinstance(value, str)}
+        known = {key: value for key, value in given.items() if value is not None}
+        neutral = {**numbers, **known, **estimate.neutral}
+        return replace(estimate, neutral={key: neutral[key] for key in estimate.value if key in neutral})
 
     def hold(self, name: str, value: Tensor | float) -> None:
         """Register a value of the stage as its attribute, tunable or constant.

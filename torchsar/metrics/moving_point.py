@@ -154,7 +154,7 @@ class FocusedPoint:
 
 def _given(chain: Chain, stage: str, trace: Trace, radar: BistaticRadar) -> PointMotion:
     """The motion that a stage of a chain worked with, (row,)."""
-    values = {key: trace.values[source] for key, source in chain.uses[stage].items() if key in UNKNOWNS}
+    values = {key: value for key, value in trace.arguments[stage].items() if key in UNKNOWNS}
     data, rows = trace.inputs[stage].data, trace.inputs[stage].trials
     motion = PointMotion.of(radar, data, **values, range_m=getattr(chain.stages[stage], "range_m", None))
     return motion.each(lambda value: value.expand(rows))

@@ -265,9 +265,9 @@ def _summed(chain: Chain, trace: Trace, name: str, used_only: bool = False) -> T
     of it; None where there is none.
     """
     taken = [
-        trace.values[uses[name]].to(torch.float64)
+        trace.arguments[stage][name].to(torch.float64)
         for stage, uses in chain.uses.items()
-        if name in uses and stage in trace.outputs
+        if name in uses and stage in trace.arguments
     ]
     if not taken and not used_only:
         taken = [e.value[name].to(torch.float64) for e in trace.estimates.values() if name in e.value][-1:]

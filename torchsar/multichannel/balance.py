@@ -379,6 +379,7 @@ class EstimateBalance(Stage):
 
     works_on = ("channel", "pulse", "range")
     provides = ("phase_rad", "gain_db", "delay_s")
+    neutral = {"phase_rad": 0.0, "gain_db": 0.0, "delay_s": 0.0}
 
     def __init__(
         self, radar: BistaticRadar, prior: Prior | None = None, bands: int = 5, delays: bool = True, blocks: int = 16

@@ -372,6 +372,7 @@ class MoversImage(Stage):
     ) -> None:
         super().__init__()
         self.flow = ImageMovers(radar, extraction, detector, rebuild, removal, u_a_half_m_s=u_a_half_m_s)
+        self.neutral = {**dict.fromkeys(self.provides, 0.0), "range_m": radar.reference_range_m}
 
     def forward(
         self,

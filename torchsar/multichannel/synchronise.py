@@ -163,6 +163,7 @@ class EstimateSynchronisation(Stage):
     works_on = ("channel", "pulse")
     also_on = (("channel", "pulse", "range"),)
     provides = ("phase_rad", "delay_s")
+    neutral = {"phase_rad": 0.0, "delay_s": 0.0}
 
     def __init__(self, radar: BistaticRadar) -> None:
         super().__init__()

@@ -165,6 +165,7 @@ class EstimateImbalance(Stage):
     """
 
     provides = ("gain", "phase_rad")
+    neutral = {"gain": 1.0, "phase_rad": 0.0}
 
     def __init__(self, channels: int = 2) -> None:
         super().__init__()

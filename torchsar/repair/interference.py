@@ -233,6 +233,7 @@ class _InterferenceCorrection(Stage):
     """
 
     provides = ("missing",)
+    neutral = {"missing": False}
     repair: Callable[..., Repaired]
 
     def __init__(self, threshold: float = THRESHOLD) -> None:

@@ -226,6 +226,7 @@ class BlindJitter(Stage):
     """
 
     provides = ("offset_samples", "period")
+    neutral = {"offset_samples": 0.0, "period": 1}
 
     def __init__(self, max_period: int = 16, period: int | None = None) -> None:
         super().__init__()

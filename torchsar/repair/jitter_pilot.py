@@ -187,6 +187,7 @@ class PilotJitter(Stage):
     """
 
     provides = ("offset_samples", "period")
+    neutral = {"offset_samples": 0.0, "period": 1}
 
     def __init__(self, max_period: int = 16, period: int | None = None, origin: str = "mean") -> None:
         super().__init__()

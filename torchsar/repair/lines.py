@@ -308,6 +308,7 @@ class LineIntegrity(Stage):
     """
 
     provides = ("missing",)
+    neutral = {"missing": False}
 
     def __init__(self, first_number: int | None = None, n_lines: int | None = None, longest_gap: int = 1000) -> None:
         super().__init__()

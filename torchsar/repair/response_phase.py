@@ -426,6 +426,7 @@ class EstimateResponse(Stage):
 
     works_on = ("azimuth", "range")
     provides = ("phase_rad", "amplitude")
+    neutral = {"phase_rad": 0.0, "amplitude": 1.0}
 
     expected_power: Tensor | None
 

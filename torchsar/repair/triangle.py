@@ -343,6 +343,7 @@ class SplitSweeps(Stage):
             raise ValueError(f"trigger must be a finite number of seconds, got {trigger}")
         self.radar, self.trigger, self.nearer = radar, trigger, nearer
         self.provides = ("trigger_s",) if trigger == "search" else ()
+        self.neutral = {"trigger_s": "a record has no nominal start of the triangle"} if self.provides else {}
 
     def forward(self, signal: Signal, trigger_s: Tensor | None = None) -> Signal | tuple[Signal, Estimate]:
         """Separate a record into up and down sweeps; see `split_record`.

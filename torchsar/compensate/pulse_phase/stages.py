@@ -76,6 +76,7 @@ class Sca(Stage):
     """Phase per pulse by the spatial correlation algorithm; see `sca`."""
 
     provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -90,6 +91,7 @@ class LinkPhases(Stage):
     """Phase per pulse of a homogeneous scene by maximum likelihood; see `link_phases`."""
 
     provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -133,6 +135,7 @@ class Pga(Stage):
     """
 
     provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
 
     def __init__(
         self,
@@ -214,6 +217,7 @@ class EntropyFixedPoint(Stage):
     """
 
     provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
 
     def __init__(
         self,
@@ -259,6 +263,7 @@ class Autofocus(Stage):
     """
 
     provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
 
     def __init__(self, search: int = 120, polish: int = 20, imaging: Imaging | None = None) -> None:
         super().__init__()
@@ -325,6 +330,7 @@ class SharpestPhase(Stage):
     """
 
     provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
 
     def __init__(
         self,

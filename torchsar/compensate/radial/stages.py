@@ -38,6 +38,7 @@ class _OfSweeps(Stage):
 
     works_on = SWEEPS
     provides = ("velocity_m_s",)
+    neutral = {"velocity_m_s": 0.0}
     azimuth_m: Tensor
 
     def __init__(self, radar: TriangularLadar, window_m: Window, azimuth_m: float) -> None:
@@ -117,6 +118,7 @@ class RadialMotion(MirrorProduct):
     """
 
     provides = ("velocity_m_s", "phase_rad")
+    neutral = {"velocity_m_s": 0.0, "phase_rad": 0.0}
 
     def __init__(
         self,
@@ -317,6 +319,7 @@ class PhasePolish(Stage):
     """
 
     provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
 
     def __init__(self, iterations: int = 80, tolerance_rad: float = 0.005) -> None:
         super().__init__()
@@ -339,6 +342,7 @@ class PulseGain(Stage):
     """
 
     provides = ("gain",)
+    neutral = {"gain": 1.0}
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate `gain` of a signal of axes (pulse, range)."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
-from torchsar.compensate.rotation.unknowns import k_name
+from torchsar.compensate.rotation.unknowns import k_name, uniform_rotation
 from torchsar.core import Draws, Estimate, Signal, Stage, settle
 from torchsar.optim import Descent, Searched, differential_evolution, genetic, grid_search, lbfgs, newton
 from torchsar.radar import InverseRadar
@@ -304,6 +304,7 @@ class _Search(Stage):
             *(k_name(i) for i in range(1, objective.order)),
             *(("omega_rad_s", "yc_m") if objective.range_term else ()),
         )
+        self.neutral = uniform_rotation(radar, self.provides, objective.yc_m)
 
     def figure(self, signal: Signal, yc_m: Tensor | None) -> ImageEntropy:
         """Build the image entropy of a signal as a function of the unknowns of the rotation.

@@ -15,7 +15,7 @@ from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, in_tu
 from torchsar.compensate.rotation.motion import SEARCH_EPS
 from torchsar.compensate.rotation.recommended import coarse_rotation, phase_fit_rotation, uneven_rotation
 from torchsar.compensate.rotation.scatterers import ROUNDS
-from torchsar.compensate.rotation.unknowns import k_name
+from torchsar.compensate.rotation.unknowns import k_name, uniform_rotation
 from torchsar.core import Estimate, Signal, Stage
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import MatchedFourierOperator, range_phase
@@ -41,6 +41,7 @@ class _Rotation(Stage):
             raise ValueError(f"order of the rotation must be 1 (uniform rotation) or more, got {order}")
         self.radar, self.order, self.yc_m = radar, order, yc_m
         self.provides = ("omega_rad_s", "warp_k", "yc_m", *(k_name(i) for i in range(1, order)))
+        self.neutral = uniform_rotation(radar, self.provides, yc_m)
 
     def settings(self, signal: Signal, yc_m: Tensor | None) -> dict[str, Any]:
         """Collect the arguments of the estimating function from signal, radar and stage.
@@ -195,6 +196,7 @@ class RotationAutofocus(Stage):
     """
 
     provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
 
     def __init__(self, radar: InverseRadar, search: int = 60, polish: int = 20) -> None:
         super().__init__()

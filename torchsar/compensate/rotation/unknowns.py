@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchsar.core.warp import k_of_shape, least_rate, shape_of, warp
+from torchsar.radar import InverseRadar
 
 Variables = Literal["raw", "shape"]
 
@@ -213,6 +214,22 @@ def k_name(i: int) -> str:
         The name: k1_per_s, k2_per_s2, and so on.
     """
     return f"k{i}_per_s{i if i > 1 else ''}"
+
+
+def uniform_rotation(radar: InverseRadar, names: Iterable[str], yc_m: Tensor | float | None) -> Mapping[str, Any]:
+    """Return the rotation that is assumed where it cannot be estimated.
+
+    Args:
+        radar: Radar parameters.
+        names: Names of the parameters of the rotation.
+        yc_m: Range centre deviation in metres that is known a priori; None for an unknown one.
+
+    Returns:
+        Values by name: the nominal `omega_rad_s` of the radar (0 if there is none), the known
+        `yc_m` (0 if there is none), and 0 for all others.
+    """
+    known = {"omega_rad_s": radar.rotation_rad_s or 0.0, "yc_m": 0.0 if yc_m is None else yc_m}
+    return {name: known.get(name, 0.0) for name in names}
 
 
 def _grows_at_start(shape: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ class MigratingLines(Stage):
         super().__init__()
         self.estimator, self.one_line = estimator, one_line
         self.walk, self.correct = WalkAmbiguity(radar), CorrectMigration(radar, Keystone(whole_swath=False))
-        self.provides = estimator.provides
+        self.provides, self.neutral = estimator.provides, estimator.neutral
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the velocity from channels with the axes (channel, pulse[, range]).

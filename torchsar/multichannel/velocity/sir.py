@@ -189,6 +189,7 @@ class SignalIntensityRatio(Stage):
     works_on = ("channel", "pulse")
     also_on = (("channel", "pulse", "range"),)
     provides = ("u_r_m_s",)
+    neutral = {"u_r_m_s": 0.0}
 
     def __init__(
         self,

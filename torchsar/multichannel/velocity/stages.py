@@ -47,6 +47,7 @@ class _Velocity(Stage):
     works_on = ("channel", "pulse")
     also_on = (("channel", "pulse", "range"),)
     provides = UNKNOWNS
+    neutral = dict.fromkeys(UNKNOWNS, 0.0)  # a point at rest in the middle of the scene
 
     def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None) -> None:
         super().__init__()
@@ -139,6 +140,7 @@ class AlongTrackAutofocus(_Velocity):
     """
 
     provides = ("u_a_m_s",)
+    neutral = {"u_a_m_s": 0.0}
 
     def __init__(
         self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, half_m_s: float = 20.0
@@ -284,6 +286,7 @@ class MovingPointVelocity(_Velocity):
     ) -> None:
         super().__init__(radar, aperture, range_m)
         self.search, self.u_a_m_s = search, u_a_m_s
+        self.neutral = {**self.neutral, "u_a_m_s": u_a_m_s or 0.0}
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate velocity and position from channels with the axes (channel, pulse[, range]).

@@ -83,6 +83,7 @@ class WalkAmbiguity(Stage):
 
     works_on = ("channel", "pulse", "range")
     provides = ("ambiguity",)
+    neutral = {"ambiguity": 0.0}
 
     def __init__(self, radar: BistaticRadar, most: int = 2, range_m: float | None = None) -> None:
         super().__init__()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -107,6 +108,7 @@ def _case(bench: Bench, name: str) -> Result:
     targets: dict[str, dict[str, list[Mapping[str, Tensor]]]] = {}
     estimates: dict[str, list[Mapping[str, Found]]] = {}
     truth: list[Mapping[str, Tensor]] = []
+    neutral: dict[str, Counter[str]] = {}
     for chunk in _chunks(bench):
         keep = bench.chains if first is None else ()
         batch = bench.batch(Draws(bench.config.seed, system.address, chunk), keep=keep, detail=True)
@@ -115,13 +117,14 @@ def _case(bench: Bench, name: str) -> Result:
         for method, outcome in batch.outcomes.items():
             metrics.setdefault(method, []).append(outcome.metrics)
             estimates.setdefault(method, []).append(system.found(bench, outcome, batch.trials))
+            neutral.setdefault(method, Counter()).update({k: int(x.sum()) for k, x in outcome.neutral.items()})
             for target, found in outcome.judged.targets.items():
                 targets.setdefault(method, {}).setdefault(target, []).append(found)
     assert first is not None
     whole = {method: joined_metrics(parts) for method, parts in metrics.items()}
     of_targets = {method: {t: joined_metrics(parts) for t, parts in of.items()} for method, of in targets.items()}
     found = {method: joined_found(parts) for method, parts in estimates.items()}
-    result = Result(bench, first, whole, of_targets, found, joined_metrics(truth))
+    result = Result(bench, first, whole, of_targets, found, joined_metrics(truth), neutral)
     _warn_if_unreliable(name, result)
     log.info("%s: %.1f s", bench.loaded.name if name == ALL else name, time.perf_counter() - began)
     return result
@@ -129,15 +132,16 @@ def _case(bench: Bench, name: str) -> Result:
 
 def _warn_if_unreliable(case: str, result: Result) -> None:
     """Warn of unreliable estimates of the recommended method."""
-    unreliable = {
-        n: int((~e.ok.bool()).sum()) for n, e in result.first_of("recommended").estimates.items() if not e.ok.all()
-    }
     verdicts = result.metrics["recommended"].get(OK)
     if verdicts is not None and not bool((verdicts > 0).all()):
         count, where = int((verdicts == 0).sum()), "" if case == ALL else f"{case}: "
-        stages = f" ({', '.join(unreliable)})" if unreliable else ""
+        stages = ", ".join(n for n, e in result.first_of("recommended").estimates.items() if not e.ok.all())
         log.warning(
-            "warning: %srecommended: estimates unreliable in %d of %d trials%s", where, count, len(verdicts), stages
+            "warning: %srecommended: estimates unreliable in %d of %d trials%s",
+            where,
+            count,
+            len(verdicts),
+            f" ({stages})" if stages else "",
         )
 
 
@@ -179,6 +183,8 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any
         f"{next(iter(results))!r}; methods.NAME.cases has all cases, with standard deviations over trials as _sd",
         "estimates": f"an estimate of more than {_LISTED} numbers per trial is given by its mean and its rms standard "
         "deviation; arrays.zarr has all numbers",
+        "neutral": "methods.NAME.neutral: number of trials in which an estimate is not ok and was not used, by stage "
+        "and parameter: the stage got a neutral value, or left the signal unchanged",
         "ok": "whether all estimates of the method are reliable; its mean is the share of such trials",
         "seconds": "wall time of the chain of the method per trial; shared estimates count in every method",
         "targets_outside": "named targets outside the image, or never in the beam; a case has their number",
@@ -216,6 +222,7 @@ def _method_tree(title: str, name: str, results: Mapping[str, Result]) -> dict[s
         "targets_outside": [key_of(case, target) for case, names in outside.items() for target in names],
         "seconds_by_stage": dict(first.seconds),
         "failed": "; ".join(key_of(case, o.failed) for case, o in outcomes.items() if o.failed),
+        "neutral": {key_of(c, key): n for c, r in results.items() for key, n in r.neutral[name].items() if n},
     }
 
 

@@ -41,6 +41,10 @@ class Rerun(Strict):
     given: dict[str, float]
 
 
+# keys of a stage that concern its connections in the chain, not its constructor
+OF_CHAIN = ("uses", "in_doubt")
+
+
 class Method(Strict):
     """One processing chain.
 
@@ -276,8 +280,14 @@ def _method(method: Method, where: str, system: Any, file: str) -> Method:
         if old is not None:
             new = f"truth.{old.removeprefix(_OLD_TRUTH)}"
             raise ConfigError(f"{file}: {where}.stages.{name}.uses: {old!r} is now called {new!r}; rename it")
-        rest = {key: value for key, value in entry.items() if key != "uses"}
-        stages[name] = {**system.stages.check(rest, f"{where}.stages.{name}", file), **({"uses": uses} if uses else {})}
+        if entry.get("in_doubt", "apply") not in ("neutral", "apply"):
+            raise ConfigError(
+                f"{file}: {where}.stages.{name}.in_doubt must be 'neutral' (neutral values in trials where an estimate "
+                f"is not ok) or 'apply' (the estimated ones), got {entry['in_doubt']!r}"
+            )
+        rest = {key: value for key, value in entry.items() if key not in OF_CHAIN}
+        kept = {key: entry[key] for key in OF_CHAIN if entry.get(key)}
+        stages[name] = {**system.stages.check(rest, f"{where}.stages.{name}", file), **kept}
     return method.model_copy(update={"stages": stages or None})
 
 

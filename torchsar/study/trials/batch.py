@@ -66,6 +66,7 @@ class Outcome:
         trace: All intermediate signals; None if nothing needs them.
         reusable: Stages that return an estimate and leave the signal unchanged.
         failed: The reason of its failure; empty if it did not fail.
+        neutral: Trials in which its stages used neutral values in place of estimates, see `Trace`.
     """
 
     judged: Judged
@@ -75,6 +76,7 @@ class Outcome:
     trace: Trace | None = None
     reusable: Collection[str] = ()
     failed: str = ""
+    neutral: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
     def metrics(self) -> Metrics:
@@ -100,6 +102,7 @@ class Result:
         targets: Metrics by method, target and name, (trial,).
         estimates: Estimates by method and name.
         truth: True values by name, (trial, ...).
+        neutral: Number of trials in which a stage used neutral values, by method and stage.
     """
 
     bench: Any
@@ -108,6 +111,7 @@ class Result:
     targets: Mapping[str, Mapping[str, Metrics]]
     estimates: Mapping[str, Mapping[str, Found]]
     truth: Mapping[str, Tensor]
+    neutral: Mapping[str, Mapping[str, int]]
 
     @property
     def images(self) -> dict[str, Signal]:
@@ -169,12 +173,12 @@ def verdict(estimates: Mapping[str, Estimate], count: int) -> dict[str, Tensor]:
     """Return {"ok": whether all estimates of a trial are reliable, bool (trial,)}, or {} without
     estimates.
     """
-    found = [_rows(estimate.ok, count).flatten(1).all(1) for estimate in estimates.values()]
+    found = [rows(estimate.ok, count).flatten(1).all(1) for estimate in estimates.values()]
     return {OK: torch.stack(found).all(0)} if found else {}
 
 
-def _rows(x: Tensor, count: int) -> Tensor:
-    """A tensor as one row per trial; a value common to all trials is repeated."""
+def rows(x: Tensor, count: int) -> Tensor:
+    """Return a tensor as one row per trial; a value common to all trials is repeated."""
     return (
         x.reshape(count, -1) if x.numel() and x.numel() % count == 0 and x.ndim else x.reshape(1, -1).expand(count, -1)
     )

@@ -19,7 +19,7 @@ from torchsar.echo import apply_impairments
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded, Method
 from torchsar.study.trials.auto import resolved
-from torchsar.study.trials.batch import Batch, Judged, Outcome, Trials, fault_of_image, verdict
+from torchsar.study.trials.batch import Batch, Judged, Outcome, Trials, fault_of_image, rows, verdict
 from torchsar.study.trials.chains import build_chains, true_names, unknown_attribute
 
 log = logging.getLogger("torchsar")
@@ -192,7 +192,8 @@ class Bench:
         known = {"seconds": torch.full((trials.count,), spent, dtype=torch.float64), **verdict(estimates, trials.count)}
         judged = replace(judged, metrics={**known, **judged.metrics})
         left = [stage for stage in trace.inputs if trace.outputs[stage] is trace.inputs[stage]]
-        return Outcome(judged, estimates, trace.signal, seconds, trace, left)
+        neutral = {key: rows(mask, trials.count).any(1) for key, mask in trace.neutral.items()}
+        return Outcome(judged, estimates, trace.signal, seconds, trace, left, neutral=neutral)
 
     def _run(
         self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Outcome]
@@ -210,12 +211,11 @@ class Bench:
             again = chain.retrace(source, method.rerun.start, given)
             return again, {}, {"rerun": time.perf_counter() - began}
         shared = self._shared(method, earlier)
-        held = {f"{stage}.{key}": value for stage, e in shared.estimates.items() for key, value in e.value.items()}
         true = {f"given.{key}": trials.truth[key] for key in true_names(chain)}
         with self._announced(chain, name):
-            trace = chain.trace(recording, {**held, **true})
+            trace = chain.trace(recording, {**shared.estimates, **true})
         spent = {stage: shared.seconds[stage] for stage in shared.estimates}
-        return trace, {**shared.estimates, **trace.estimates}, {**trace.seconds, **spent}
+        return trace, trace.estimates, {**trace.seconds, **spent}
 
     def _shared(self, method: Method, earlier: Mapping[str, Outcome]) -> Outcome:
         """Reusable estimates of the earlier method with the most initial stages in common."""

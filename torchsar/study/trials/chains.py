@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
-
-from torch import nn
 
 from torchsar.core import Chain, use
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
-from torchsar.study.settings.sections import Loaded, Method
+from torchsar.study.settings.sections import OF_CHAIN, Loaded, Method
 
 # prefix of true values in a config, and prefix of input values in a chain
 _TRUTH, _GIVEN = "truth.", "given."
@@ -35,7 +33,9 @@ def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
             chains[name] = _chain(loaded, method, f"processor.{name}", context)
         else:
             chains[name] = chains[method.rerun.method]
-            offered = {f"{n}.{key}" for n, stage in chains[name].stages.items() for key in provides(stage)}
+            offered = {
+                f"{n}.{key}" for n, stage in chains[name].stages.items() for key in getattr(stage, "provides", ())
+            }
             unknown = next((value for value in method.rerun.given if value not in offered), None)
             if unknown is not None:
                 raise ConfigError(
@@ -44,11 +44,6 @@ def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
                     f"{did_you_mean(unknown, offered)}"
                 )
     return chains
-
-
-def provides(stage: nn.Module) -> Collection[str]:
-    """Return the names of the values that a stage estimates."""
-    return getattr(stage, "provides", ())
 
 
 def true_names(chain: Chain) -> set[str]:
@@ -65,12 +60,16 @@ def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any
             raise ConfigError(
                 f"{loaded.file}: {path}: a stage name has only letters, digits and '_', and does not begin with a digit"
             )
-        rest = {key: value for key, value in entry.items() if key != "uses"}
+        rest = {key: value for key, value in entry.items() if key not in OF_CHAIN}
         try:
             stage = loaded.system.stages.make(rest, path, loaded.file, **context)
         except AttributeError as error:
             raise ConfigError(f"{loaded.file}: {path}: {unknown_attribute(error, context)}") from None
-        built[name] = use(stage, **_sources(entry.get("uses", {}), method, loaded, path))
+        built[name] = use(
+            stage,
+            in_doubt=entry.get("in_doubt", "neutral"),
+            **_sources(entry.get("uses", {}), method, loaded, path),
+        )
     try:
         return Chain(**built)
     except (ValueError, TypeError) as error:

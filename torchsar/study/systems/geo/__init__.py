@@ -265,11 +265,10 @@ class Geo(System):
         return {"orders": bench.judging.orders, **levels, **transmit}
 
 
-def _held(chain: Chain, trace: Trace) -> dict[str, Tensor]:
+def _held(chain: Chain, trace: Trace) -> dict[str, Any]:
     """Values that a chain was given or has estimated."""
-    estimates = {f"{stage}.{key}": v for stage, e in trace.estimates.items() for key, v in e.value.items()}
     sources = {source for uses in chain.uses.values() for source in uses.values() if source.startswith("given.")}
-    return {**estimates, **{source: trace.values[source] for source in sources}}
+    return {**trace.estimates, **{source: trace.values[source] for source in sources}}
 
 
 def _seen(value: Tensor) -> bool:

@@ -79,9 +79,9 @@ def estimated_phase(chain: Chain, trace: Trace, like: Tensor) -> Tensor:
     estimator do not count.
     """
     taken = [
-        trace.values[uses["phase_rad"]]
+        trace.arguments[name]["phase_rad"]
         for name, uses in chain.uses.items()
-        if "phase_rad" in uses and name in trace.outputs
+        if "phase_rad" in uses and name in trace.arguments
     ]
     found = taken or [e.value["phase_rad"] for e in trace.estimates.values() if "phase_rad" in e.value][-1:]
     return sum((phase.to(torch.float64).reshape(like.shape) for phase in found), torch.zeros_like(like))

@@ -286,11 +286,11 @@ def _velocity(strip: Strip) -> Drawn:
     for name, stage in chain.stages.items():
         if not isinstance(stage, EffectiveVelocity) or first.trace is None:
             continue
-        estimate, source = first.estimates[name], chain.uses[name].get("doppler_hz")
+        estimate, doppler = first.estimates[name], first.trace.arguments[name].get("doppler_hz")
         value, grid = estimate.value["velocity_m_s"].reshape(-1)[:1], estimate.info["grid_velocity_m_s"]
         near = value + torch.linspace(-_NEAR_STEPS, _NEAR_STEPS, _NEAR_POINTS).to(grid) * (grid[1] - grid[0])
         velocity = torch.cat([grid, near]).sort().values
-        doppler = None if source is None else first.trace.values[source].reshape(-1)[0]
+        doppler = None if doppler is None else doppler.reshape(-1)[0]
         entropy = stage.entropy(strip.step(name, output=False), velocity, doppler)
         series, marks = {"entropy": (plot.array(velocity), plot.array(entropy))}, {"estimate": float(value)}
         figure = plot.curves(series, "effective velocity (m/s)", "entropy (nats)", f"{float(value):.2f} m/s", marks)

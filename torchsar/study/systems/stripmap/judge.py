@@ -111,10 +111,10 @@ class Used:
     @staticmethod
     def by(chain: Chain, trace: Trace, radar: StripmapRadar, count: int) -> Used:
         name = focus_name(chain)
-        stage, connected = focuser_of(chain.stages[name]), chain.uses[name]
+        stage, connected = focuser_of(chain.stages[name]), trace.arguments[name]
 
         def value(key: str, default: Any) -> Any:
-            found = trace.values[connected[key]] if key in connected else getattr(stage, key, default)
+            found = connected.get(key, getattr(stage, key, default))
             return None if found is None else torch.as_tensor(found, dtype=torch.float64).detach().expand(count)
 
         doppler = value("doppler_hz", None)

@@ -1,0 +1,146 @@
+"""Estimates that are not ok: neutral values by default, the estimated ones where `use` says so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsar.core import Alternate, Axis, Chain, Estimate, Signal, Stage, Turn, use
+
+F64 = torch.float64
+OK = torch.tensor([True, False, True])
+
+
+class Level(Stage):
+    """Estimator of one number a pulse, which is not ok in the trials of the constructor."""
+
+    provides = ("level", "count")
+    neutral = {"level": 0.0, "count": 1}
+
+    def __init__(self, ok: Tensor = OK) -> None:
+        super().__init__()
+        self.ok = ok
+
+    def forward(self, signal: Signal, level: Tensor | None = None) -> Estimate:
+        value = {"level": signal.data.real.mean(-1), "count": torch.full(signal.trials, 7)}
+        return Estimate(value, self.ok.double(), self.ok)
+
+
+class Free(Level):
+    """Estimator of a value that has no neutral one."""
+
+    neutral = {"level": "every level is as likely", "count": 1}
+
+
+class Subtract(Stage):
+    """Corrector that subtracts the number from every pulse."""
+
+    def forward(self, signal: Signal, level: Tensor, count: Tensor | None = None) -> Signal:
+        return signal.with_data(signal.data - level[..., None])
+
+
+class Double(Stage):
+    """Stage that estimates and corrects at once."""
+
+    provides = ("factor",)
+    neutral = {"factor": 1.0}
+
+    def forward(self, signal: Signal) -> tuple[Signal, Estimate]:
+        return signal.with_data(2 * signal.data), Estimate({"factor": 2.0 * OK.double() + 1}, OK.double(), OK)
+
+
+def pulses(**kwargs: bool) -> Signal:
+    data = torch.arange(24, dtype=F64).reshape(3, 4, 2).to(torch.complex128) + 1
+    return Signal(data.requires_grad_(**kwargs), (Axis("pulse", 4, 0.0, 1.0, "s"), Axis("range", 2, 0.0, 1.0, "m")))
+
+
+def test_a_value_that_is_not_ok_is_neutral_for_later_stages_and_the_trace_says_so() -> None:
+    x = pulses()
+    chain = Chain(level=Level(), correct=use(Subtract(), level="level", count="level"))
+    trace, applied = chain.trace(x), Subtract()(x, Level()(x)["level"])
+    assert torch.equal(trace.signal.data[OK], applied.data[OK]) and torch.equal(trace.signal.data[1], x.data[1])
+    assert torch.equal(chain(x).data, trace.signal.data)
+    assert torch.equal(trace.values["level.level"], Level()(x)["level"]), "the estimate itself is kept"
+    assert torch.equal(trace.estimates["level"]["level"], trace.values["level.level"])
+    assert {name: mask.tolist() for name, mask in trace.neutral.items()} == {
+        "correct.level": [False, True, False],
+        "correct.count": [False, True, False],
+    }
+    assert trace.arguments["correct"]["count"].tolist() == [7, 1, 7]
+    assert trace.arguments["correct"]["count"].dtype == torch.int64
+
+
+def test_apply_uses_every_estimate() -> None:
+    x = pulses()
+    trace = Chain(level=Level(), correct=use(Subtract(), in_doubt="apply", level="level")).trace(x)
+    assert torch.equal(trace.signal.data, Subtract()(x, Level()(x)["level"]).data) and not trace.neutral
+
+
+def test_gradients_flow_where_the_estimate_is_ok() -> None:
+    x = pulses(requires_grad=True)
+    chain = Chain(level=Level(), correct=use(Subtract(), level="level"))
+    (slope,) = torch.autograd.grad(chain(x).data.real.sum(), x.data)
+    # the mean is removed from a trial that is ok, so that its sum is constant
+    assert slope[OK].abs().max() < 1e-12 and torch.equal(slope[1], torch.ones_like(slope[1]))
+
+
+def test_a_stage_that_estimates_and_corrects_leaves_the_signal_unchanged_in_doubt() -> None:
+    x = pulses()
+    trace = Chain(twice=Double()).trace(x)
+    assert torch.equal(trace.signal.data[OK], 2 * x.data[OK]) and torch.equal(trace.signal.data[1], x.data[1])
+    assert trace.neutral["twice"].tolist() == [False, True, False]
+    assert torch.equal(Chain(twice=use(Double(), in_doubt="apply"))(x).data, 2 * x.data)
+
+
+def test_a_value_that_is_given_takes_the_place_of_the_neutral_one() -> None:
+    """Such as the start of a search, or what is known a priori."""
+    x = pulses()
+    first = Level(torch.ones(3, dtype=torch.bool))
+    chain = Chain(first=first, second=use(Level(), level="first"), correct=use(Subtract(), level="second"))
+    assert torch.equal(chain(x).data, Subtract()(x, first(x)["level"]).data)
+
+
+def test_without_a_neutral_value_the_estimate_is_used() -> None:
+    x = pulses()
+    trace = Chain(level=Free(), correct=use(Subtract(), level="level")).trace(x)
+    assert torch.equal(trace.signal.data, Subtract()(x, Level()(x)["level"]).data) and not trace.neutral
+
+
+def test_reruns_and_given_estimates_remain_in_doubt_and_given_values_do_not() -> None:
+    x = pulses()
+    chain = Chain(level=Level(), correct=use(Subtract(), level="level"), last=use(Subtract(), level="level"))
+    trace = chain.trace(x)
+    assert torch.equal(chain.rerun(trace, "correct").data, trace.signal.data)
+    again = chain.retrace(chain.retrace(trace, "correct"), "last")
+    assert torch.equal(again.signal.data, trace.signal.data) and again.arguments.keys() == trace.arguments.keys()
+    assert torch.equal(chain(x, given={"level": trace.estimates["level"]}).data, trace.signal.data)
+    value = trace.values["level.level"] + 0
+    given = Subtract()(Subtract()(x, value), value).data
+    assert torch.equal(chain.rerun(trace, "correct", given={"level.level": value}).data, given)
+    assert torch.equal(chain(x, given={"level.level": value, "level.count": OK}).data, given)
+    with pytest.raises(KeyError, match=r"unknown names \['lvel'\]"):
+        chain(x, given={"lvel": trace.estimates["level"]})
+
+
+def test_vmap_agrees_with_the_batch() -> None:
+    class Large(Level):
+        def forward(self, signal: Signal, level: Tensor | None = None) -> Estimate:
+            found = super().forward(signal)
+            return replace(found, ok=signal.data.real.amax((-2, -1)) > 10, quality=signal.data.real.amax((-2, -1)))
+
+    x, chain = pulses(), Chain(level=Large(), correct=use(Subtract(), level="level"))
+    mapped = torch.vmap(lambda data: chain(x.with_data(data)).data)(x.data)
+    assert torch.equal(mapped, chain(x).data) and torch.equal(mapped[0], x.data[0])
+
+
+def test_an_alternation_has_the_neutral_values_of_its_estimators() -> None:
+    stage = Alternate(2, level=Turn(Level(), Subtract()), other=Turn(Double()))
+    assert stage.neutral == {"level": 0.0, "count": 1, "factor": 1.0}
+
+
+def test_only_two_answers_are_accepted() -> None:
+    with pytest.raises(ValueError, match=r"in_doubt must be 'neutral' .* or 'apply' .*, got 'zero'"):
+        use(Subtract(), in_doubt="zero", level="level")  # pyright: ignore[reportArgumentType]
