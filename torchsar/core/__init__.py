@@ -17,9 +17,11 @@ from torchsar.core.fft import (
     to_frequency,
     transform_in_blocks,
 )
+from torchsar.core.fingerprint import fingerprint
 from torchsar.core.memory import PeakMemory, keep_freed_memory, machine_memory_bytes
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
+from torchsar.core.seal import SEAL, checksum, is_sealed, sealed
 from torchsar.core.select import best_of, per_trial, take
 from torchsar.core.signal import Recording, Signal, Truth
 from torchsar.core.spline import UniformSpline
@@ -27,6 +29,7 @@ from torchsar.core.stage import Stage
 from torchsar.core.stored import ArrayFile, StoredArray
 
 __all__ = [
+    "SEAL",
     "Alternate",
     "ArrayFile",
     "Axis",
@@ -47,9 +50,12 @@ __all__ = [
     "block_bytes_of",
     "centred_fft",
     "centred_ifft",
+    "checksum",
     "cis",
     "fft_lines",
+    "fingerprint",
     "from_frequency",
+    "is_sealed",
     "keep_freed_memory",
     "legendre",
     "linear_phasor",
@@ -61,6 +67,7 @@ __all__ = [
     "real_dtype",
     "reduced_turns",
     "refuse_non_finite",
+    "sealed",
     "settle",
     "spectrum_in_blocks",
     "take",
