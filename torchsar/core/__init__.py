@@ -18,15 +18,17 @@ from torchsar.core.fft import (
     transform_in_blocks,
 )
 from torchsar.core.fingerprint import fingerprint
-from torchsar.core.memory import PeakMemory, keep_freed_memory, machine_memory_bytes
+from torchsar.core.memory import LargestTensor, PeakMemory, is_out_of_memory, keep_freed_memory, machine_memory_bytes
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
-from torchsar.core.seal import SEAL, checksum, is_sealed, sealed
+from torchsar.core.replace import OwnFiles, remove_empty
+from torchsar.core.seal import SEAL, address, canonical, checksum, is_sealed, sealed
 from torchsar.core.select import best_of, per_trial, take
 from torchsar.core.signal import Recording, Signal, Truth
 from torchsar.core.spline import UniformSpline
 from torchsar.core.stage import Stage
 from torchsar.core.stored import ArrayFile, StoredArray
+from torchsar.core.stores import array_metadata, document, group_attributes
 
 __all__ = [
     "SEAL",
@@ -36,6 +38,8 @@ __all__ = [
     "Chain",
     "Draws",
     "Estimate",
+    "LargestTensor",
+    "OwnFiles",
     "PeakMemory",
     "Recording",
     "Signal",
@@ -46,15 +50,21 @@ __all__ = [
     "Turn",
     "UniformSpline",
     "Use",
+    "address",
+    "array_metadata",
     "best_of",
     "block_bytes_of",
+    "canonical",
     "centred_fft",
     "centred_ifft",
     "checksum",
     "cis",
+    "document",
     "fft_lines",
     "fingerprint",
     "from_frequency",
+    "group_attributes",
+    "is_out_of_memory",
     "is_sealed",
     "keep_freed_memory",
     "legendre",
@@ -67,6 +77,7 @@ __all__ = [
     "real_dtype",
     "reduced_turns",
     "refuse_non_finite",
+    "remove_empty",
     "sealed",
     "settle",
     "spectrum_in_blocks",

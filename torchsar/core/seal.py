@@ -1,4 +1,4 @@
-"""Checksums of arrays and of trees of plain values, by which damaged files are found."""
+"""Addresses of parameters, and checksums by which damaged files are found."""
 
 from __future__ import annotations
 
@@ -56,3 +56,43 @@ def is_sealed(tree: Mapping[str, Any]) -> bool:
         Whether the checksum is there and right.
     """
     return tree.get(SEAL) == checksum({}, {name: value for name, value in tree.items() if name != SEAL})
+
+
+def address(parameters: Mapping[str, Any]) -> str:
+    """Return a hash of the names and values of parameters, in whatever order they are given.
+
+    The random numbers of a grid point follow from this hash. A point therefore has the same random
+    numbers in every grid.
+
+    Args:
+        parameters: Values by name.
+
+    Returns:
+        24 hexadecimal digits.
+    """
+    return hashlib.blake2b(canonical(parameters).encode(), digest_size=12).hexdigest()
+
+
+def canonical(tree: Any) -> str:
+    """Return a text that is equal for equal content: keys are sorted, and 20 and 20.0 are alike.
+
+    Args:
+        tree: Plain values, or mappings and sequences of them; other objects count by their repr().
+
+    Returns:
+        The text, in JSON.
+    """
+    return json.dumps(_plain(tree), sort_keys=True, separators=(",", ":"))
+
+
+def _plain(x: Any) -> Any:
+    if isinstance(x, Mapping):
+        return {str(k): _plain(v) for k, v in x.items()}
+    if isinstance(x, (list, tuple)):
+        return [_plain(v) for v in x]
+    # beyond 2^53, a float would make neighbouring whole numbers alike
+    if x is None or isinstance(x, (bool, str)) or (isinstance(x, int) and abs(x) > 2**53):
+        return x
+    if isinstance(x, (int, float)):
+        return float(x) + 0.0  # the sum makes -0.0 and 0.0, which are equal, alike
+    return _plain(x.tolist()) if hasattr(x, "tolist") else repr(x)

@@ -6,15 +6,14 @@ Each point has an address, a hash of its parameters, from which its random numbe
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from torchsar.core import address, canonical
 from torchsar.study.settings.errors import ConfigError
 
 # names of dims and parts of results
@@ -93,33 +92,6 @@ class Grid:
     def labels_at(self, point: Point) -> dict[str, float | str]:
         """The labels of a point by parameter."""
         return {p.name: p.labels[i] for p, i in zip(self.parameters, point.index)}
-
-
-def address(parameters: Mapping[str, Any]) -> str:
-    """Return a hash of the names and values of parameters, in whatever order they are given.
-
-    The random numbers of a grid point follow from this hash. A point therefore has the same random
-    numbers in every grid.
-    """
-    return hashlib.blake2b(canonical(parameters).encode(), digest_size=12).hexdigest()
-
-
-def canonical(tree: Any) -> str:
-    """Return a text that is equal for equal content: keys are sorted, and 20 and 20.0 are alike."""
-    return json.dumps(_plain(tree), sort_keys=True, separators=(",", ":"))
-
-
-def _plain(x: Any) -> Any:
-    if isinstance(x, Mapping):
-        return {str(k): _plain(v) for k, v in x.items()}
-    if isinstance(x, (list, tuple)):
-        return [_plain(v) for v in x]
-    # beyond 2^53, a float would make neighbouring whole numbers alike
-    if x is None or isinstance(x, (bool, str)) or (isinstance(x, int) and abs(x) > 2**53):
-        return x
-    if isinstance(x, (int, float)):
-        return float(x) + 0.0  # the sum makes -0.0 and 0.0, which are equal, alike
-    return _plain(x.tolist()) if hasattr(x, "tolist") else repr(x)
 
 
 def make_grid(

@@ -23,8 +23,8 @@ import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec
 
-from torchsar.core import SEAL, checksum, is_sealed, sealed
-from torchsar.study.montecarlo.grid import Grid, address, canonical
+from torchsar.core import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
+from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.record import OK, Labels, Record
 from torchsar.study.settings.errors import ConfigError, one_line
 
@@ -173,7 +173,7 @@ class Store:
     def _mark(self) -> None:
         """Write the marks of finished trials, which are a single file."""
         names = (*self.record.variables(), *_coordinates(self.record))
-        self._marks["arrays"] = {name: _metadata(self.path, name) for name in names}
+        self._marks["arrays"] = {name: array_metadata(self.path / name) for name in names}
         self.root[_DONE].update_attributes(sealed(self._marks))
 
     def _write(self, name: str, variable: tuple[np.ndarray, Any, Any], first: int, last: int) -> None:
@@ -269,7 +269,7 @@ def _opened(path: Path, mode: Any, needed: Collection[str] = ("labels", "identit
     if not (path / "zarr.json").is_file():
         raise ConfigError(f"{path} holds no results of a sweep; choose another folder")
     with _undamaged(path):
-        root, held = zarr.open_group(str(path), mode=mode), _sealed(path)
+        root, held = zarr.open_group(str(path), mode=mode), group_attributes(path, {"format": FORMAT})
     if needed and (held.get("format") != FORMAT or not set(needed) <= set(held)):
         raise ConfigError(
             f"{path} was not written by a sweep of this version of torchsar; choose another folder, or move it"
@@ -312,12 +312,12 @@ def _loaded(root: zarr.Group, path: Path) -> Record:
         missing = [name for name in (_DONE, *held.get("arrays", [])) if name not in root]
         if missing:
             raise ValueError(f"{missing[0]!r} is missing")
-        marks = {"points": {}, _SAVED: {}, "arrays": {}, **_sealed(path / _DONE)}
+        marks = {"points": {}, _SAVED: {}, "arrays": {}, **group_attributes(path / _DONE)}
         record = _read(root, held, marks["points"])
         coordinates = {name: np.array(values) for name, values in _coordinates(record).items()}
         whole = coordinates | {name: variable[0] for name, variable in record.variables().items()}
         for name, (known, rest) in marks["arrays"].items():
-            shape, now = _metadata(path, name)
+            shape, now = array_metadata(path / name)
             # an array has its earlier shape where the sweep was killed while its arrays grew
             if now != rest or shape not in (known, list(whole[name].shape)):
                 raise ValueError(f"the metadata of {name!r} differ from their checksum")
@@ -362,31 +362,11 @@ def _coordinates(record: Record) -> dict[str, Sequence[Any]]:
     return {**record.labels, "trial": range(record.trials), **named}
 
 
-def _document(path: Path) -> dict[str, Any]:
-    return json.loads((path / "zarr.json").read_text("utf-8"))
-
-
-def _sealed(path: Path) -> dict[str, Any]:
-    """The attributes of a group after a check of their checksum; a new group has none."""
-    tree = _document(path)
-    held = tree.get("attributes", {})
-    ours = SEAL in held or held.get("format", FORMAT) == FORMAT
-    if (tree.get("zarr_format"), tree.get("node_type")) != (3, "group") or (held and ours and not is_sealed(held)):
-        raise ValueError("attributes differ from their checksum")
-    return held
-
-
-def _metadata(path: Path, name: str) -> list[Any]:
-    """The shape of an array, which may grow, and the checksum of all its other metadata."""
-    tree = _document(path / name)
-    return [tree.pop("shape"), checksum({}, tree)]
-
-
 def _of_saved(path: Path, place: str, arrays: Mapping[str, np.ndarray]) -> str:
     """The checksum of the saved arrays of a trial with the metadata of their groups."""
     folder = path / _SAVED / place
     groups = (folder.parents[1], folder.parent, folder, *(folder / name for name in sorted(arrays)))
-    return checksum(arrays, [_document(group) for group in groups])
+    return checksum(arrays, [document(group) for group in groups])
 
 
 def _attributes(node: Any) -> dict[str, Any]:
