@@ -210,15 +210,21 @@ def test_dying_at_any_moment_loses_nothing(out: Path) -> None:
     assert result(out) == whole(text)
 
 
-def failing_at(moment: int, out: Path, text: str) -> str:
-    """Write a result where the n-th call that changes the disk fails; the sentence, if it does."""
+def failing_at(moment: int, out: Path, text: str, full: bool) -> str:
+    """Write a result where the n-th call that changes the disk fails; the sentence, if it does.
+
+    full: nothing more is created from then on; files can be moved and read.
+    """
     left = moment
 
     def counting(call: Callable) -> Callable:
+        creates = call.__name__ in ("open", "mkdir")
+
         def counted(*given, **named):
             nonlocal left
             left -= 1
-            if left < 0:
+            reads = call.__name__ == "open" and "r" in (*given, "r")[1]
+            if (creates and not reads and left < 0) if full else left == -1:
                 raise OSError(errno.ENOSPC, "No space left on device")
             return call(*given, **named)
 
@@ -235,11 +241,12 @@ def failing_at(moment: int, out: Path, text: str) -> str:
     return ""
 
 
-def test_a_disk_that_fails_while_a_result_is_moved_loses_neither(out: Path) -> None:
+@pytest.mark.parametrize("full", [True, False])
+def test_a_disk_that_fails_while_a_result_is_moved_loses_neither(full: bool, out: Path) -> None:
     """The earlier result stays, or the new one is kept or moved by the next command."""
     earlier, moment, said = whole("first", 3), 0, "?"
     while said:
-        said = failing_at(moment, out, f"result {moment}")
+        said = failing_at(moment, out, f"result {moment}", full)
         assert_mine(out)
         with opened(out, "run", NAMES):
             pass
@@ -257,7 +264,7 @@ def test_a_disk_that_fails_while_a_result_is_moved_loses_neither(out: Path) -> N
             (out / name / "figures").rmdir()
             (out / name).rmdir()
         earlier, moment = there, moment + 1
-    assert moment > 20
+    assert moment > 15
 
 
 @pytest.mark.parametrize("content", ["", "[", "[]", '{"kind": "run"}', '{"format": 1, "files": 3}', "[" * 10**5])

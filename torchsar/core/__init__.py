@@ -28,7 +28,7 @@ from torchsar.core.signal import Recording, Signal, Truth
 from torchsar.core.spline import UniformSpline
 from torchsar.core.stage import Stage
 from torchsar.core.stored import ArrayFile, StoredArray
-from torchsar.core.stores import array_metadata, document, group_attributes
+from torchsar.core.stores import array_metadata, document, fault_of_name, group_attributes
 
 __all__ = [
     "SEAL",
@@ -60,6 +60,7 @@ __all__ = [
     "checksum",
     "cis",
     "document",
+    "fault_of_name",
     "fft_lines",
     "fingerprint",
     "from_frequency",

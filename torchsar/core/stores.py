@@ -3,11 +3,30 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from torchsar.core.seal import SEAL, checksum, is_sealed
+
+
+def fault_of_name(name: Any, longest: int) -> str:
+    """Decide whether a store can have an entry of some name, for which it makes a folder.
+
+    Args:
+        name: The name.
+        longest: Largest number of bytes; file systems allow 255, and names of files are longer.
+
+    Returns:
+        The reason why it cannot be used, as the end of a sentence; empty if it can.
+    """
+    if not isinstance(name, str) or name.strip() in ("", ".", "..", "zarr.json") or re.search("^__|/", name):
+        return "since names are words without '/' that do not begin with '__'"
+    if not name.isprintable():
+        return "since names have only printable characters"
+    size = len(name.encode())
+    return f"since it has {size} bytes; use {longest} at most" if size > longest else ""
 
 
 def document(path: Path) -> dict[str, Any]:

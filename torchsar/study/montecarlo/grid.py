@@ -7,13 +7,12 @@ Each point has an address, a hash of its parameters, from which its random numbe
 from __future__ import annotations
 
 import itertools
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from torchsar.core import address, canonical
+from torchsar.core import address, canonical, fault_of_name
 from torchsar.study.settings.errors import ConfigError
 
 # names of dims and parts of results
@@ -135,13 +134,9 @@ def check_name(name: Any, taken: Sequence[str], where: str, kind: str) -> None:
     Raises:
         ConfigError: If the name is taken, not a word, or too long.
     """
-    why = ""
+    why = fault_of_name(name, _LONGEST)
     if name in taken:
         why = "which names a dimension or a part of the results; choose another name"
-    elif not isinstance(name, str) or name in ("", ".", "..", "zarr.json") or re.search("^__|[/\0]", name):
-        why = "since names are words without '/' that do not begin with '__'"
-    elif len(name.encode()) > _LONGEST:
-        why = f"since it has {len(name.encode())} bytes; use {_LONGEST} at most"
     if why:
         raise ConfigError(
             f"{where}: a {kind} cannot be called {name if not isinstance(name, str) else name[:40]!r}, {why}"
