@@ -321,7 +321,8 @@ def _loaded(root: zarr.Group, path: Path) -> Record:
             # an array has its earlier shape where the sweep was killed while its arrays grew
             if now != rest or shape not in (known, list(whole[name].shape)):
                 raise ValueError(f"the metadata of {name!r} differ from their checksum")
-            if name in coordinates and list(root[name][: known[0]]) != list(whole[name][: known[0]]):
+            array: Any = root[name]
+            if name in coordinates and list(array[: known[0]]) != list(whole[name][: known[0]]):
                 raise ValueError(f"the coordinate {name!r} does not hold its values")
         for place, known in marks[_SAVED].items():
             group: Any = root[f"{_SAVED}/{place}"]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml.composer import ComposerError
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
 
@@ -37,16 +38,17 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         mark, self.depth = self.peek_event().start_mark, self.depth + 1
         if self.depth > _DEEPEST:
-            raise yaml.composer.ComposerError(None, None, f"more than {_DEEPEST} parts inside each other", mark)
-        again, node = self.check_event(yaml.AliasEvent), super().compose_node(parent, index)
+            raise ComposerError(None, None, f"more than {_DEEPEST} parts inside each other", mark)
+        again = self.check_event(yaml.AliasEvent)
+        node: Any = super().compose_node(parent, index)
         self.depth -= 1
-        if isinstance(node, yaml.ScalarNode):
-            node.value.encode()  # a ValueError for half of a pair of surrogates
+        parts = node.value
+        if isinstance(parts, str):
+            parts = parts.encode()[:0]  # a ValueError for half of a pair of surrogates
         if not again:
-            parts = [] if isinstance(node, yaml.ScalarNode) else node.value
             node.size = 1 + sum(one.size for part in parts for one in (part if isinstance(part, tuple) else [part]))
         if getattr(node, "size", math.inf) > _MOST_VALUES:  # infinite inside itself
-            raise yaml.composer.ComposerError(None, None, f"more than {_MOST_VALUES} values with all repetitions", mark)
+            raise ComposerError(None, None, f"more than {_MOST_VALUES} values with all repetitions", mark)
         return node
 
 
