@@ -42,7 +42,7 @@ class _Loader(yaml.SafeLoader):
         again = self.check_event(yaml.AliasEvent)
         node: Any = super().compose_node(parent, index)
         self.depth -= 1
-        parts = node.value
+        parts: Any = node.value
         if isinstance(parts, str):
             parts = parts.encode()[:0]  # a ValueError for half of a pair of surrogates
         if not again:
