@@ -136,6 +136,39 @@ def test_a_mistake_is_one_sentence_and_status_two(
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
+@pytest.mark.parametrize("words", [["--out", "a\0b"], ["--out", "a\udcffb"], ["seed=\udc80"], ["se\0d=3"]])
+@pytest.mark.parametrize("command", ["run", "sweep"])
+def test_arguments_that_are_no_text_are_a_sentence(
+    command: str, words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command, str(write_tiny(tmp_path)), *words]) == 2
+    (said,) = spoken(capsys)
+    assert "has characters that are no text" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+@pytest.mark.parametrize(
+    "error, said",
+    [
+        (MemoryError("Unable to allocate 3 GiB"), "memory is too short (Unable to allocate 3 GiB)"),
+        (
+            RuntimeError("DefaultCPUAllocator: can't allocate memory: 9 bytes\nin a stack"),
+            "memory is too short (Default",
+        ),
+        (OSError(28, "No space left on device"), "No space left on device"),
+    ],
+)
+def test_a_machine_that_is_too_small_is_a_sentence(
+    error: Exception, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("torchsar.study.trials.bench.Bench.batch", fail)
+    assert main(["run", str(write_tiny(tmp_path)), "--out", str(tmp_path / "out")]) == 2
+    assert said in spoken(capsys)[-1] and not (tmp_path / "out").exists()
+
+
 def recording(path: Path, **changes: object) -> Path:
     rng = np.random.default_rng(1)
     arrays: dict = {

@@ -75,6 +75,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         on stderr says why), 130 if the user interrupted the command.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
+    wrong = next((word for word in given if not _is_text(word)), None)
+    if wrong is not None:
+        return _fail(f"the argument {wrong!r} has characters that are no text; rename the file or folder, or retype it")
     options = _parse(given)
     try:
         if options.version:
@@ -84,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         if options.command != "list":  # before the import of torch, which takes seconds
             print(f"torchsar: {options.command} {options.config}", file=sys.stderr, flush=True)
-        with _log_to_stderr(), warnings.catch_warnings():
+        with _log_to_stderr(), warnings.catch_warnings(), _short_memory():
             warnings.showwarning = _show_warning
             status = _dispatch(options, "torchsar " + shlex.join(given))
             sys.stdout.flush()
@@ -95,12 +98,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(f"{error.name or error} is not installed; install the extra: pip install 'torchsar-lab[study]'")
     except ConfigError as error:
         return _fail(str(error))
+    except MemoryError as error:
+        return _fail(f"{error}; make the scene smaller, or take a larger machine")
     except BrokenPipeError:  # the reader of stdout, such as `head`, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:
+        return _fail(f"{error}; make room, or mend the file or folder")
     except KeyboardInterrupt as stopped:
         print(f"torchsar: interrupted, {stopped if stopped.args else 'nothing was written'}", file=sys.stderr)
         return 130
+
+
+def _is_text(word: str) -> bool:
+    """Whether a word can be printed and name a file: no NUL, and no byte that is not UTF-8."""
+    try:
+        return "\0" not in word and bool(word.encode() or True)
+    except UnicodeEncodeError:
+        return False
 
 
 def _parse(given: Sequence[str]) -> argparse.Namespace:
@@ -169,6 +184,21 @@ def _refuse_device(name: str, torch: Any) -> None:
 def _fail(sentence: str) -> int:
     print(f"torchsar: {' '.join(sentence.split())}", file=sys.stderr)
     return EXIT_BAD_INPUT
+
+
+@contextmanager
+def _short_memory() -> Iterator[None]:
+    """Turn the errors by which torch says that memory is short into a MemoryError."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        from torchsar.core import is_out_of_memory
+
+        if not is_out_of_memory(error):
+            raise
+        raise MemoryError(
+            f"memory is too short ({str(error).splitlines()[0] if str(error) else 'no message'})"
+        ) from error
 
 
 @contextmanager

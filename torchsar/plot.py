@@ -113,13 +113,15 @@ def decibel(x: Tensor | np.ndarray, reference: float | None = None) -> np.ndarra
 
     Args:
         x: Amplitudes, any shape, real or complex.
-        reference: Amplitude of 0 dB; by default the largest one.
+        reference: Amplitude of 0 dB; by default the largest finite one.
 
     Returns:
-        Levels in dB, same shape; lower levels than -300 dB are set to -300 dB.
+        Levels in dB, same shape; lower levels than -300 dB are set to -300 dB. NaN where the
+        amplitude is not finite.
     """
-    amplitude = np.abs(x.detach().cpu().numpy() if isinstance(x, Tensor) else x)
-    top = reference if reference is not None else float(amplitude.max(initial=0.0))
+    amplitude = np.abs(array(x) if isinstance(x, Tensor) else x).astype(np.float64)
+    amplitude = np.where(np.isfinite(amplitude), amplitude, np.nan)
+    top = reference if reference is not None else _largest(amplitude)
     return 20 * np.log10(np.maximum(amplitude, 1e-15 * (top or 1.0)) / (top or 1.0))
 
 
@@ -131,18 +133,25 @@ def quicklook(signal: Signal, largest: int = 900) -> Signal:
         largest: Largest number of samples of a side.
 
     Returns:
-        Root mean square amplitude of each block, on axes of the block centres. Samples at the end
-        that do not fill a block are dropped.
+        Root mean square amplitude of each block, on axes of the block centres; NaN for a block
+        with a sample that is not finite. Samples at the end that do not fill a block are dropped.
     """
-    data, axes = signal.data.detach(), []
+    data, axes = signal.data.detach().abs(), []
+    data = torch.where(torch.isfinite(data), data, torch.nan)
+    peak = torch.nan_to_num(data).amax()
+    data = data / torch.where(peak > 0, peak, 1)  # squares of the amplitudes themselves may overflow
     for dim, axis in zip((-2, -1), signal.axes, strict=True):
         step = math.ceil(axis.n / largest)
         count = axis.n // step
         data = data.narrow(dim, 0, count * step).unflatten(dim, (count, step))
-        power = data.real.square() + data.imag.square() if data.is_complex() else data.square()
-        data = power.mean(dim if dim == -1 else -2).sqrt()
+        data = data.square().mean(dim if dim == -1 else -2).sqrt()
         axes.append(Axis(axis.name, count, axis.start + (step - 1) / 2 * axis.step, axis.step * step, axis.unit))
-    return Signal(data, tuple(axes))
+    return Signal(data * peak, tuple(axes))
+
+
+def _largest(amplitude: np.ndarray) -> float:
+    """The largest finite amplitude; 0 if there is none."""
+    return float(np.max(amplitude, initial=0.0, where=np.isfinite(amplitude)))
 
 
 def span(positions: Tensor, margin: float) -> tuple[float, float]:
@@ -253,7 +262,8 @@ def level(signal: Signal, percentile: float = 100.0, width: float = _PANEL) -> f
         The amplitude; if the percentile is zero, the peak, and if that is zero, 1.
     """
     amplitude = quicklook(_first(signal), round(_BLOCKS_PER_INCH * width)).data.cpu().numpy()
-    return float(np.percentile(amplitude, percentile)) or float(amplitude.max(initial=0.0)) or 1.0
+    known = amplitude[np.isfinite(amplitude)]
+    return float(np.percentile(known, percentile) if len(known) else 0.0) or _largest(amplitude) or 1.0
 
 
 def _show(signal: Signal, width: float, dynamic_range_db: float, title: str, top: float, label: str) -> Figure:

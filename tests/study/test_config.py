@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -39,11 +40,61 @@ def refused(tmp_path: Path, *assignments: str, **changes: object) -> str:
         ("null", None),
         ("1.2.3", "1.2.3"),
         ("1e", "1e"),
+        ("1:30", "1:30"),
+        ("1:30:00.5", "1:30:00.5"),
+        ("017", 17),
+        ("0o17", 15),
+        ("0x1F", 31),
+        ("0b101", "0b101"),
+        ("1_000", 1000),
+        ("2024-01-31", "2024-01-31"),
+        ("2024-01-31 10:20:30", "2024-01-31 10:20:30"),
+        ("=", "="),
+        ("~", None),
+        ("no", "no"),
+        ("+1.", 1.0),
     ],
 )
 def test_yaml_reads_numbers_as_numbers(text: str, value: object) -> None:
     assert parse(text, "text") == value
     assert type(parse(text, "text")) is type(value)
+
+
+LARGE = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"{new}: &{new} [{', '.join([f'*{old}'] * 10)}]\n" for old, new in pairwise("abcdefgh")
+)
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("[" * 600 + "]" * 600, "line 1: .*more than 50 parts inside each other"),
+        ("\n".join("  " * i + "a:" for i in range(600)), "line 50: .*more than 50 parts"),
+        (LARGE, "more than 200000 values with all repetitions"),
+        ("a: &a [*a]", "more than 200000 values with all repetitions"),
+        ("a: &a {b: *a}", "more than 200000 values with all repetitions"),
+        ('a: "\\ud800"', "not readable as YAML"),
+        ("? [1, 2]\n: 3", "a key must be a word"),
+        ("'': 3", "a key must be a word"),
+        ("a: " + "9" * 5000, "not readable as YAML"),
+        ("a: !!python/object:os.system {}", "not readable as YAML"),
+    ],
+    ids=range(10),
+)
+def test_documents_that_no_step_could_use_are_refused(text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as error:
+        parse(text, "file.yaml")
+    assert "\n" not in str(error.value)
+
+
+def test_repetitions_may_be_used() -> None:
+    assert parse("a: &a [1, 2]\nb: [*a, *a]", "text") == {"a": [1, 2], "b": [[1, 2], [1, 2]]}
+    assert parse("010: 1\ntrue: 2\n~: 3", "text") == {"010": 1, "true": 2, "~": 3}
+
+
+@pytest.mark.parametrize("text", ["0o17", "017", "1:30", "1e-6", "yes", "no", "~", "2024-01-31", "0b1", "1_0", "null"])
+def test_texts_that_look_like_numbers_stay_texts(text: str) -> None:
+    assert parse(dump({"a": text}), "text") == {"a": text}
 
 
 def test_yaml_dump_comes_back() -> None:

@@ -208,3 +208,83 @@ def test_dying_at_any_moment_loses_nothing(out: Path) -> None:
         moment += 1
     assert moment > 50, moment
     assert result(out) == whole(text)
+
+
+def failing_at(moment: int, out: Path, text: str, full: bool) -> str:
+    """Write a result where the n-th call that changes the disk fails; the sentence, if it does.
+
+    full: nothing more is created from then on; files can be moved and read.
+    """
+    left = moment
+
+    def counting(call: Callable) -> Callable:
+        creates = call.__name__ in ("open", "mkdir")
+
+        def counted(*given, **named):
+            nonlocal left
+            left -= 1
+            reads = call.__name__ == "open" and "r" in (*given, "r")[1]
+            if (creates and not reads and left < 0) if full else left == -1:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return call(*given, **named)
+
+        return counted
+
+    with pytest.MonkeyPatch.context() as patch:
+        try:
+            with fresh_result(out, "run", NAMES) as folder:
+                write(folder, text)
+                for module, name in CALLS:  # the result is complete now
+                    patch.setattr(module, name, counting(getattr(module, name)))
+        except ConfigError as error:
+            return str(error)
+    return ""
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_a_disk_that_fails_while_a_result_is_moved_loses_neither(full: bool, out: Path) -> None:
+    """The earlier result stays, or the new one is kept or moved by the next command."""
+    earlier, moment, said = whole("first", 3), 0, "?"
+    while said:
+        said = failing_at(moment, out, f"result {moment}", full)
+        assert_mine(out)
+        with opened(out, "run", NAMES):
+            pass
+        there = result(out)
+        kept = {name: there.pop(name) for name in list(there) if name.startswith("kept-")}
+        new = whole(f"result {moment}")
+        if there != new:
+            assert there == earlier and f"kept in {out / 'kept-'}" in said, (moment, said)
+            assert {name.partition("/")[2]: text for name, text in kept.items()} == new
+        elif said:
+            assert "No space left on device" in said and "; the next command with this folder completes" in said
+        for name in kept:
+            (out / name).unlink()
+        for name in {name.partition("/")[0] for name in kept}:
+            (out / name / "figures").rmdir()
+            (out / name).rmdir()
+        earlier, moment = there, moment + 1
+    assert moment > 15
+
+
+@pytest.mark.parametrize("content", ["", "[", "[]", '{"kind": "run"}', '{"format": 1, "files": 3}', "[" * 10**5])
+@pytest.mark.parametrize("name", ["manifest", "journal"])
+def test_a_damaged_manifest_is_a_sentence(name: str, content: str, out: Path) -> None:
+    (out / STATE / f"{name}.json").write_text(content)
+    with pytest.raises(ConfigError, match=rf"{name}.json (cannot be read|is damaged)"), fresh_result(out, "run", NAMES):
+        pytest.fail("must not begin")
+    assert result(out) == whole("first", 3)
+
+
+def test_any_flipped_bit_of_a_manifest_is_found(out: Path) -> None:
+    path, source = out / STATE / "manifest.json", random.Random(0)
+    data = path.read_bytes()
+    for _ in range(50):
+        flipped = bytearray(data)
+        flipped[source.randrange(len(data))] ^= 1 << source.randrange(8)
+        path.write_bytes(flipped)
+        with pytest.raises(ConfigError, match="manifest.json"), opened(out, "run", NAMES):
+            pytest.fail("must not begin")
+    path.write_bytes(data)
+    with opened(out, "run", NAMES):
+        pass

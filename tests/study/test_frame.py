@@ -17,7 +17,7 @@ from tests.study.scenes import IMAGE, ISAL, SCENES, bench_of, loaded_as, run, wr
 from torchsar import plot
 from torchsar.cli import main
 from torchsar.compensate.pulse_phase import Sca
-from torchsar.core import Draws
+from torchsar.core import Axis, Draws, Signal
 from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError
@@ -285,6 +285,8 @@ CASE_MISTAKES = [
     ({"../": {"seed": 2}}, "'../' is not a valid name of a case"),
     ({"all": {"seed": 2}}, "'all' is not a valid name of a case"),
     ({"truth": {"seed": 2}}, "'truth' is not a valid name of a case"),
+    ({"x" * 61: {"seed": 2}}, "is not a valid name of a case"),
+    ({"a\tb": {"seed": 2}}, "is not a valid name of a case"),
     ({"a b": {"seed": 2}, "a_b": {"seed": 3}}, "would have the same names"),
 ]
 
@@ -302,6 +304,64 @@ def test_methods_cannot_take_the_names_of_groups_of_results(system: str, tmp_pat
     for name in ("truth", "estimate"):
         with pytest.raises(ConfigError, match=f"processor.{name}: a method cannot have this name"):
             loaded_as(tmp_path, system, processor={**processor, name: processor["recommended"]})
+
+
+BAD_NAMES = ["", " ", ".", "..", "zarr.json", "a/b", "__a", "a\nb", "x" * 61, "é" * 31, "\ud800"]
+
+
+@pytest.mark.parametrize("name", BAD_NAMES, ids=range(len(BAD_NAMES)))
+def test_methods_have_names_that_files_can_have(name: str, tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=r"a method cannot be called .*, since|a key must be a word|not readable"
+    ) as error:
+        loaded_as(tmp_path, "isal", processor={**SCENES["isal"]["processor"], name: {"stages": {"image": IMAGE}}})
+    assert "\n" not in str(error.value)
+
+
+def test_stages_have_names_that_files_can_have(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="has 60 characters at most"):
+        bench_of(tmp_path, "isal", processor={"recommended": {"stages": {"x" * 61: IMAGE}}}, metrics={})
+
+
+FAULTS = {
+    "division by zero": (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"),
+    "index": (IndexError("index 3 is out of range"), "IndexError: index 3 is out of range"),
+    "attribute": (AttributeError("'NoneType' object has no attribute 'x'"), "AttributeError: 'NoneType'"),
+    "assertion": (AssertionError(), "AssertionError: no message"),
+}
+
+
+@pytest.mark.parametrize("error, said", FAULTS.values(), ids=FAULTS)
+def test_a_method_may_fail_with_any_error(
+    error: Exception, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.delenv("TORCHSAR_DEBUG", raising=False)
+    bench = bench_of(tmp_path, "isal")
+    lost, other, *_ = bench.chains
+    list(bench.chains[lost].stages.values())[-1].register_forward_pre_hook(fail)
+    outcomes = batch_of(bench, [0], methods=[lost, other], detail=True).outcomes
+    assert outcomes[lost].failed.startswith(said) and not outcomes[other].failed
+    with pytest.raises(MemoryError):
+        error = MemoryError()
+        batch_of(bench, [0], methods=[lost])
+
+
+def test_an_image_with_infinite_cells_is_a_failed_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rate of rotation of one method may be estimated as zero."""
+    monkeypatch.delenv("TORCHSAR_DEBUG", raising=False)
+    bench = bench_of(tmp_path, "isal")
+    lost, other, *_ = bench.chains
+
+    def widened(stage: object, given: object, signal: Signal) -> Signal:
+        first, second = signal.axes
+        return Signal(signal.data, (Axis(first.name, first.n, 0.0, 1e308, first.unit), second))
+
+    list(bench.chains[lost].stages.values())[-1].register_forward_hook(widened)
+    outcomes = batch_of(bench, [0], methods=[lost, other], detail=True).outcomes
+    assert "cells of infinite size" in outcomes[lost].failed and not outcomes[other].failed
 
 
 def test_a_point_outside_the_image_of_a_strip_is_counted_and_named(tmp_path: Path) -> None:

@@ -11,6 +11,8 @@ import pytest
 import torch
 
 from torchsar.core import Stage
+from torchsar.study import table
+from torchsar.study.names import registry
 from torchsar.study.names.registry import GROUPS, WORLD, group_of, stages
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.signature import Catalogue, Section
@@ -74,6 +76,58 @@ def test_a_parameter_that_yaml_cannot_hold_is_a_fault_of_the_program() -> None:
 
     with pytest.raises(TypeError, match="'law'.*register a factory"):
         assert Section(takes_function).keys
+
+
+class Broken:
+    """An entry point whose package cannot be loaded."""
+
+    name, value, group = "louder", "louder:Louder", "torchsar.stages"
+
+    def __init__(self, found: object) -> None:
+        self.found = found
+
+    def load(self) -> object:
+        if isinstance(self.found, BaseException):
+            raise self.found
+        return self.found
+
+
+def unreadable(law: type) -> None: ...
+
+
+@pytest.mark.parametrize(
+    "found, said",
+    [
+        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"),
+        (ModuleNotFoundError("No module named 'mine'", name="mine"), "ModuleNotFoundError: No module named 'mine'"),
+        (SyntaxError("invalid syntax"), "SyntaxError: invalid syntax"),
+        (SystemExit(3), "SystemExit: 3"),
+        (unreadable, "TypeError: .*'law'"),
+        (3, "TypeError"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+@pytest.mark.parametrize("group", ["torchsar.stages", "torchsar.systems"])
+def test_a_plugin_that_cannot_be_loaded_is_a_sentence(
+    group: str, found: object, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    point = Broken(found)
+    for module in (registry, table):
+        monkeypatch.setattr(module, "entry_points", lambda group: [point] if group == wanted else [])
+    wanted = group
+    monkeypatch.setattr(table, "systems", table._Systems())
+    if group == "torchsar.systems":
+        if not isinstance(found, BaseException):
+            pytest.skip("the module of a system is imported, not its content")
+        monkeypatch.setattr(table, "import_module", lambda name: point.load() if name == point.value else None)
+    registry.stages.cache_clear()
+    try:
+        with pytest.raises(
+            ConfigError, match=rf"entry point 'louder' \(louder:Louder\) .*{said}.*uninstall the package"
+        ):
+            _ = table.systems["louder"] if group == "torchsar.systems" else registry.stages()
+    finally:
+        registry.stages.cache_clear()
 
 
 def test_own_stage_joins_through_the_entry_point(tmp_path: Path) -> None:

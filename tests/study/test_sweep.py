@@ -246,7 +246,7 @@ def test_xarray_reads_it(tmp_path: Path) -> None:
 
 
 def test_a_finished_sweep_is_not_overwritten_and_resuming_computes_nothing(tmp_path: Path) -> None:
-    toy.run(tmp_path / "s")
+    toy.run(tmp_path / "s", version=1)
     with pytest.raises(ConfigError, match="holds a sweep already; add --resume"):
         toy.run(tmp_path / "s")
 
@@ -254,7 +254,7 @@ def test_a_finished_sweep_is_not_overwritten_and_resuming_computes_nothing(tmp_p
         raise AssertionError("nothing is missing")
 
     never.__qualname__ = "trial"
-    assert toy.run(tmp_path / "s", trial=never, resume=True).done.all()
+    assert toy.run(tmp_path / "s", trial=never, resume=True, version=1).done.all()
 
 
 def test_resuming_an_empty_folder_starts(tmp_path: Path) -> None:
@@ -276,7 +276,7 @@ def test_folders_of_others_are_never_touched(tmp_path: Path) -> None:
 
 
 def test_trials_and_values_can_be_added(tmp_path: Path) -> None:
-    toy.run(tmp_path / "s", trials=20, grid={"snr_db": [0.0, 20.0], "law": ["flat"]}, chunk=7)
+    toy.run(tmp_path / "s", trials=20, grid={"snr_db": [0.0, 20.0], "law": ["flat"]}, chunk=7, version=1)
     seen: list[tuple[str, int]] = []
 
     def noting(parameters, draws):
@@ -284,12 +284,12 @@ def test_trials_and_values_can_be_added(tmp_path: Path) -> None:
         return toy.trial(parameters, draws)
 
     noting.__qualname__ = "trial"
-    grown = toy.run(tmp_path / "s", trial=noting, resume=True, chunk=7)
+    grown = toy.run(tmp_path / "s", trial=noting, resume=True, chunk=7, version=1)
     same(grown, toy.run(chunk=7), 1e-5)
     assert len(seen) == len(set(seen)) == 240 - 40
     # what was there stays where it was
     assert read_sweep(tmp_path / "s").labels["snr_db"] == (0.0, 20.0, 10.0)
-    part = toy.run(tmp_path / "s", resume=True, grid={"snr_db": [20.0], "law": ["flat"]}, trials=20)
+    part = toy.run(tmp_path / "s", resume=True, grid={"snr_db": [20.0], "law": ["flat"]}, trials=20, version=1)
     assert part.labels == {"snr_db": (20.0,), "law": ("flat",)}
 
 

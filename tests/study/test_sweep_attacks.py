@@ -262,13 +262,13 @@ def test_resuming_checks_what_is_asked_of_the_metrics(tmp_path: Path) -> None:
 
 
 def test_minus_zero_resumes_zero(tmp_path: Path) -> None:
-    run(tmp_path / "s", grid={"a": [0.0]})
+    run(tmp_path / "s", grid={"a": [0.0]}, version=1)
 
     def never(parameters: dict, draws) -> dict:
         raise AssertionError("nothing is missing")
 
     never.__qualname__ = "trial"
-    assert run(tmp_path / "s", never, grid={"a": [-0.0]}, resume=True).done.all()
+    assert run(tmp_path / "s", never, grid={"a": [-0.0]}, resume=True, version=1).done.all()
 
 
 def test_a_full_disk_loses_nothing_that_was_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,7 +30,14 @@ needs_dask = pytest.mark.skipif(
 
 def swept(out: Path, slow_s: float, log: Path | None, workers: int | None) -> None:
     """The program of a toy sweep, slowed down."""
-    toy.run(out, trial=toy.Logged(slow_s, None if log is None else str(log)), workers=workers, chunk=7, resume=True)
+    toy.run(
+        out,
+        trial=toy.Logged(slow_s, None if log is None else str(log)),
+        workers=workers,
+        chunk=7,
+        resume=True,
+        version=1,
+    )
 
 
 def start(out: Path, slow_s: float = 0.0, log: Path | None = None, workers: int | None = None) -> Program:

@@ -17,22 +17,29 @@ from torchsar.core.fft import (
     to_frequency,
     transform_in_blocks,
 )
-from torchsar.core.memory import PeakMemory, keep_freed_memory, machine_memory_bytes
+from torchsar.core.fingerprint import fingerprint
+from torchsar.core.memory import LargestTensor, PeakMemory, is_out_of_memory, keep_freed_memory, machine_memory_bytes
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
+from torchsar.core.replace import OwnFiles, remove_empty
+from torchsar.core.seal import SEAL, address, canonical, checksum, is_sealed, sealed
 from torchsar.core.select import best_of, per_trial, take
 from torchsar.core.signal import Recording, Signal, Truth
 from torchsar.core.spline import UniformSpline
 from torchsar.core.stage import Stage
 from torchsar.core.stored import ArrayFile, StoredArray
+from torchsar.core.stores import array_metadata, document, fault_of_name, group_attributes
 
 __all__ = [
+    "SEAL",
     "Alternate",
     "ArrayFile",
     "Axis",
     "Chain",
     "Draws",
     "Estimate",
+    "LargestTensor",
+    "OwnFiles",
     "PeakMemory",
     "Recording",
     "Signal",
@@ -43,13 +50,23 @@ __all__ = [
     "Turn",
     "UniformSpline",
     "Use",
+    "address",
+    "array_metadata",
     "best_of",
     "block_bytes_of",
+    "canonical",
     "centred_fft",
     "centred_ifft",
+    "checksum",
     "cis",
+    "document",
+    "fault_of_name",
     "fft_lines",
+    "fingerprint",
     "from_frequency",
+    "group_attributes",
+    "is_out_of_memory",
+    "is_sealed",
     "keep_freed_memory",
     "legendre",
     "linear_phasor",
@@ -61,6 +78,8 @@ __all__ = [
     "real_dtype",
     "reduced_turns",
     "refuse_non_finite",
+    "remove_empty",
+    "sealed",
     "settle",
     "spectrum_in_blocks",
     "take",

@@ -6,8 +6,12 @@ import ctypes
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 # parameters of mallopt in malloc.h of the GNU C library
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
@@ -103,3 +107,34 @@ def _resident(field: str, reset: bool = False) -> int | None:
     except OSError:
         return None
     return next((1024 * int(line.split()[1]) for line in text.splitlines() if line.startswith(f"{field}:")), None)
+
+
+class LargestTensor(TorchDispatchMode):
+    """Context manager that records the largest tensor that any operation of torch returns.
+
+    Attributes:
+        bytes: Size of its storage in bytes.
+    """
+
+    bytes = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        for leaf in tree_leaves(result):
+            if isinstance(leaf, Tensor):
+                self.bytes = max(self.bytes, leaf.untyped_storage().nbytes())
+        return result
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Decide whether an error says that memory is short.
+
+    Args:
+        error: An error. CUDA raises a class of its own, the CPU allocator of torch only a text.
+
+    Returns:
+        Whether a smaller batch may succeed.
+    """
+    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (
+        isinstance(error, RuntimeError) and "allocate memory" in str(error)
+    )

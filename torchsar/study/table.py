@@ -6,12 +6,13 @@ This is the only module that names the systems.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from torchsar.study.settings.errors import ConfigError, did_you_mean
+from torchsar.study.settings.errors import ConfigError, did_you_mean, loading
 from torchsar.study.settings.sections import Loaded, Sweep, checked
 from torchsar.study.settings.text import find_config, override, read_tree
 from torchsar.study.trials.system import System
@@ -28,12 +29,14 @@ class _Systems(Mapping[str, System]):
     def __init__(self) -> None:
         self._made: dict[str, System] = {}
 
-    def _modules(self) -> dict[str, str]:
-        return {**SYSTEMS, **{point.name: point.value for point in entry_points(group="torchsar.systems")}}
+    def _modules(self) -> dict[str, Any]:
+        return {**SYSTEMS, **{point.name: point for point in entry_points(group="torchsar.systems")}}
 
     def __getitem__(self, name: str) -> System:
         if name not in self._made:
-            self._made[name] = import_module(self._modules()[name]).SYSTEM()
+            found = self._modules()[name]
+            with nullcontext() if isinstance(found, str) else loading(found):
+                self._made[name] = import_module(getattr(found, "value", found)).SYSTEM()
         return self._made[name]
 
     def __iter__(self) -> Iterator[str]:

@@ -124,9 +124,9 @@ class Motion:
     def omega_rad_s(self) -> Tensor:
         """Rotation rate at the first pulse in rad/s, shape (trial,).
 
-        It is nearly 0 where the estimate of its square is negative.
+        It is 0 where the estimate of its square is negative.
         """
-        return self.w.clamp_min(torch.finfo(torch.float64).tiny).sqrt()
+        return torch.where(self.w > 0, torch.where(self.w > 0, self.w, 1).sqrt(), 0)
 
     @property
     def offset(self) -> Tensor:

@@ -116,7 +116,7 @@ def coarse_rotation(
 
     The ratio of the rotation rate at time t after the first pulse to that at the first pulse is
     modelled as 1 + k1 t + k2 t^2 / 2 and is found to about a percent. The rotation rate itself is
-    not estimated; `omega_rad_s` is nearly 0.
+    not estimated; `omega_rad_s` is 0.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.

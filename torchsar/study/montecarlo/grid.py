@@ -6,15 +6,13 @@ Each point has an address, a hash of its parameters, from which its random numbe
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from torchsar.core import address, canonical, fault_of_name
 from torchsar.study.settings.errors import ConfigError
 
 # names of dims and parts of results
@@ -95,33 +93,6 @@ class Grid:
         return {p.name: p.labels[i] for p, i in zip(self.parameters, point.index)}
 
 
-def address(parameters: Mapping[str, Any]) -> str:
-    """Return a hash of the names and values of parameters, in whatever order they are given.
-
-    The random numbers of a grid point follow from this hash. A point therefore has the same random
-    numbers in every grid.
-    """
-    return hashlib.blake2b(canonical(parameters).encode(), digest_size=12).hexdigest()
-
-
-def canonical(tree: Any) -> str:
-    """Return a text that is equal for equal content: keys are sorted, and 20 and 20.0 are alike."""
-    return json.dumps(_plain(tree), sort_keys=True, separators=(",", ":"))
-
-
-def _plain(x: Any) -> Any:
-    if isinstance(x, Mapping):
-        return {str(k): _plain(v) for k, v in x.items()}
-    if isinstance(x, (list, tuple)):
-        return [_plain(v) for v in x]
-    # beyond 2^53, a float would make neighbouring whole numbers alike
-    if x is None or isinstance(x, (bool, str)) or (isinstance(x, int) and abs(x) > 2**53):
-        return x
-    if isinstance(x, (int, float)):
-        return float(x) + 0.0  # the sum makes -0.0 and 0.0, which are equal, alike
-    return _plain(x.tolist()) if hasattr(x, "tolist") else repr(x)
-
-
 def make_grid(
     values: Mapping[str, Sequence[Any] | Mapping[str, Any]], batched: Sequence[str] = (), where: str = "grid"
 ) -> Grid:
@@ -163,13 +134,9 @@ def check_name(name: Any, taken: Sequence[str], where: str, kind: str) -> None:
     Raises:
         ConfigError: If the name is taken, not a word, or too long.
     """
-    why = ""
+    why = fault_of_name(name, _LONGEST)
     if name in taken:
         why = "which names a dimension or a part of the results; choose another name"
-    elif not isinstance(name, str) or name in ("", ".", "..", "zarr.json") or re.search("^__|[/\0]", name):
-        why = "since names are words without '/' that do not begin with '__'"
-    elif len(name.encode()) > _LONGEST:
-        why = f"since it has {len(name.encode())} bytes; use {_LONGEST} at most"
     if why:
         raise ConfigError(
             f"{where}: a {kind} cannot be called {name if not isinstance(name, str) else name[:40]!r}, {why}"

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from torchsar.core import fingerprint
 from torchsar.metrics.intervals import half_width_ratio
 from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import Grid, make_grid
@@ -162,6 +163,7 @@ def sweep(
     save: Iterable[int] = (),
     device: str = "cpu",
     config: Mapping[str, Any] | None = None,
+    version: str | int | None = None,
 ) -> Record:
     """Run a trial function over a grid of parameters, many trials at once.
 
@@ -193,6 +195,10 @@ def sweep(
         device: Device on which batches are computed.
         config: Everything else that the results depend on; a sweep is resumed only if it is
             unchanged.
+        version: Version of `trial`. A sweep is resumed only by the same version. Without a version,
+            it is resumed only if the code of `trial`, what it closes over and the global names that
+            it uses are unchanged; see `torchsar.core.fingerprint`. Give a version if these change
+            without an effect on the results, or if results depend on more than these.
 
     Returns:
         The results, with the dims (algorithm, *parameters, trial).
@@ -208,6 +214,7 @@ def sweep(
         ("stop", stop is None or isinstance(stop, Stop), "be a Stop, such as Stop('error_m', 0.05)", stop),
         ("save", isinstance(save, Iterable), "list the numbers of trials", save),
         ("config", isinstance(config or {}, Mapping), "be a mapping of what else results depend on", config),
+        ("version", version is None or isinstance(version, (str, int)), "be a word or a whole number", version),
     ):
         if not good:
             raise ConfigError(f"sweep: {name} must {expected}, got {given!r}")
@@ -216,8 +223,9 @@ def sweep(
     needs = () if stop is None else (("stop.metric", stop.metric),)
     plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device, needs)
     plan.refuse_missing(trial)
-    name = getattr(trial, "__qualname__", type(trial).__qualname__)
-    identity = {"seed": seed, "trial": name, "config": dict(config or {})}
+    made = fingerprint(trial)
+    about = made if version is None else {"name": made["name"], "version": version}
+    identity = {"seed": seed, "trial": about, "config": dict(config or {})}
     with nullcontext() if out is None else opened(Path(out), "sweep", SWEEP_FILES) as folder:
         store = None if folder is None else open_store(folder, plan, identity, resume)
         return run_plan(plan, trial, store, engine(workers, cluster, threads)).select(plan.grid.labels)
@@ -283,6 +291,13 @@ class _Run:
         self.fits: dict[int, int] = {}
         self.rows: dict[int, int] = {}
         self.warned: set[str] = set()
+        self.known = int(record.done.sum())
+
+    def _written(self) -> int:
+        """Number of trials written since the last call, or computed if there is no store."""
+        before, waiting = self.known, 0 if self.store is None else self.store.waiting
+        self.known = int(self.record.done.sum()) - waiting
+        return self.known - before
 
     def all_levels(self, engine: Engine) -> None:
         """Compute all trials in steps, after each of which points are checked for an early end.
@@ -300,9 +315,10 @@ class _Run:
                 for first, last in pairwise((0, *levels)):
                     for chunk, computed in engine.results(self.work, self._tasks(first, last)):
                         self._enter(chunk, computed)
-                        count.advance(len(chunk))
+                        count.advance(self._written())
                         log.debug("%s", count.say())
                     self.flush()
+                    count.advance(self._written())
                     # batches never reach across a level that all points got to, so that an
                     # extended sweep runs the same ones however often it is resumed
                     self._about(finished=sorted({*self.record.about.get("finished", []), last}))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from torchsar.core import checksum
 from torchsar.study.montecarlo.grid import RESERVED, check_name
 from torchsar.study.settings.errors import ConfigError
 
@@ -56,6 +57,16 @@ class Record:
     def index_of(self, labels: Mapping[str, float | str]) -> tuple[int, ...]:
         """Index of a point, from its labels by parameter."""
         return tuple(known.index(labels[name]) for name, known in self.labels.items())
+
+    def labels_at(self, point: tuple[int, ...]) -> dict[str, float | str]:
+        """The labels of a point by parameter."""
+        return {name: known[i] for (name, known), i in zip(self.labels.items(), point)}
+
+    def checksum(self, point: tuple[int, ...]) -> str:
+        """Checksum of all numbers of the trials that are done at a point."""
+        rows = {name: x[(..., *point, self.done[point])] for name, (x, _, _) in self.variables().items()}
+        # a metric that the trials of a point do not have may become known later
+        return checksum({name: x for name, x in rows.items() if (x if x.dtype == bool else ~np.isnan(x)).any()})
 
     def add(
         self,

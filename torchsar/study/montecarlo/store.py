@@ -3,6 +3,10 @@
 One process writes, every file of a zarr store is replaced as a whole, and the marks are written
 last. If a sweep is killed, its arrays may therefore hold more trials than are marked as done, but
 never fewer. Trials that are not marked are ignored and computed again.
+
+Everything that is read has a checksum: each chunk has that of zarr, and the marks hold those of the
+numbers of each point, so that a missing or an earlier chunk is found as well, of the saved arrays,
+of the metadata of all arrays, and of the attributes themselves.
 """
 
 from __future__ import annotations
@@ -10,24 +14,27 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zarr
+from zarr.codecs import Crc32cCodec
 
-from torchsar.study.montecarlo.grid import Grid, address, canonical
+from torchsar.core import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
+from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.record import OK, Labels, Record
 from torchsar.study.settings.errors import ConfigError, one_line
 
 # number of the layout of the store; another one is refused on resume
-FORMAT = 1
+FORMAT = 2
 # numbers in a zarr chunk at most: half a megabyte, which is written whole for every change
 _CHUNK_NUMBERS = 1 << 16
-# writing takes half a percent of the time at most
-_SHARE_FOR_WRITING = 0.005
+# results are written every so many seconds, or more often if writing takes half a percent of the
+# time at most, and less often if it would take a tenth
+_EVERY_S, _CHEAP, _DEAR = 4.0, 0.005, 0.1
 # trials whose arrays wait to be written at most, since they fill the memory meanwhile
 _WAITING = 64
 _DONE, _SAVED = "done", "saved"
@@ -39,7 +46,8 @@ class Store:
     Root attributes: format, identity and hash (what the results depend on), labels and values of
     the parameters, algorithms, trials, about, sessions. Arrays: one for each metric, `ok`, one for
     each bound, and the coordinates. Group `done`: for each point, by its index, the ranges of
-    trials that are recorded. Group `saved`: images and outputs of stages for chosen trials.
+    trials that are recorded with the checksum of their numbers, and the checksum of each entry of
+    `saved`. Group `saved`: images and outputs of stages for chosen trials.
 
     Args:
         root: The open zarr group.
@@ -49,7 +57,7 @@ class Store:
     def __init__(self, root: zarr.Group, record: Record) -> None:
         self.root, self.record = root, record
         self.path = Path(str(root.store_path).removeprefix("file://"))
-        self._marks = _attributes(root[_DONE])
+        self._marks: dict[str, Any] = {"points": {}, _SAVED: {}, **_attributes(root[_DONE])}
         self._dirty: set[tuple[tuple[int, ...], int]] = set()
         self._arrays: dict[str, zarr.Array] = {}
         self._pending: list[tuple[str, dict[str, Any], dict[str, np.ndarray]]] = []
@@ -86,12 +94,12 @@ class Store:
         known = _attributes(self.root).get("values", {})
         values = {name: {**known.get(name, {}), **named} for name, named in _values(grid).items()}
         about = {"format": FORMAT, "identity": _plain(identity), "hash": address(identity), "values": values}
-        self.root.update_attributes(about)
-        self.record.about = _about(self.root)
         labels = {name: list(known) for name, known in self.record.labels.items()}
-        self.root.update_attributes({"labels": labels, "trials": self.record.trials})
-        for name, values in (*labels.items(), ("trial", range(self.record.trials))):
-            self._put(name, np.array(values))
+        if self._marks["points"]:  # with the present shapes, which an earlier session may have left half grown
+            self._mark()
+        self.note(**about, labels=labels, trials=self.record.trials)
+        self._put_coordinates()
+        self.record.about = _about(self.root)
         for name, variable in self.record.variables().items() if self.record.algorithms else ():
             self._array(name, *variable)
         return self
@@ -99,17 +107,23 @@ class Store:
     def note(self, **about: Any) -> None:
         """Set root attributes that describe the run."""
         with _writing(self.path):
-            self.root.update_attributes(json.loads(json.dumps(about, default=str)))
+            self.root.update_attributes(sealed({**_attributes(self.root), **about}))
 
     @property
     def due(self) -> bool:
         """Whether results should be written now.
 
-        This is so if writing takes less than 0.5 % of the time since the results were last written,
-        or if the saved arrays of 64 trials wait to be written.
+        This is so 4 s after the results were last written, earlier if writing takes less than 0.5 %
+        of this time, later if it takes more than 10 %, or if the saved arrays of 64 trials wait to
+        be written.
         """
-        waited = time.perf_counter() - self._last
-        return waited > self._cost / _SHARE_FOR_WRITING or len(self._pending) >= _WAITING
+        interval = max(min(self._cost / _CHEAP, _EVERY_S), self._cost / _DEAR)
+        return time.perf_counter() - self._last > interval or len(self._pending) >= _WAITING
+
+    @property
+    def waiting(self) -> int:
+        """Number of trials that the next `flush` writes."""
+        return len(self._dirty)
 
     def entered(self, points: Iterable[tuple[int, ...]], trials: Iterable[int]) -> None:
         """Note trials whose results are new in the record; the next `flush` writes them.
@@ -141,18 +155,26 @@ class Store:
                 self._write(name, variable, min(trials), max(trials) + 1)
             names = {"algorithms": list(self.record.algorithms), "arrays": list(variables)}
             if any(self.root.attrs.get(key) != value for key, value in names.items()):
-                self._put("algorithm", np.array(self.record.algorithms))
-                self.root.update_attributes(names)
+                self._put_coordinates()
+                self.note(**names)
             for path, about, arrays in self._pending:
                 group = self.root.require_group(f"{_SAVED}/{path}")
                 group.attrs.put(about)
                 for name, data in arrays.items():
-                    group.create_array(name, data=data, overwrite=True)
-            points = {point for point, _ in self._dirty}
-            self._marks.update({",".join(map(str, point)): _spans(self.record.done[point]) for point in points})
-            self.root[_DONE].update_attributes(self._marks)
+                    group.create_array(name, data=data, overwrite=True, compressors=[Crc32cCodec()])
+                self._marks[_SAVED][path] = _of_saved(self.path, path, arrays)
+            for point in {point for point, _ in self._dirty}:
+                mark = {"spans": _spans(self.record.done[point]), SEAL: self.record.checksum(point)}
+                self._marks["points"][",".join(map(str, point))] = mark
+            self._mark()
         self._dirty, self._pending, self._last = set(), [], time.perf_counter()
         self._cost = self._last - began
+
+    def _mark(self) -> None:
+        """Write the marks of finished trials, which are a single file."""
+        names = (*self.record.variables(), *_coordinates(self.record))
+        self._marks["arrays"] = {name: array_metadata(self.path / name) for name in names}
+        self.root[_DONE].update_attributes(sealed(self._marks))
 
     def _write(self, name: str, variable: tuple[np.ndarray, Any, Any], first: int, last: int) -> None:
         """The trials first..last-1 of all points, widened to whole chunks of the array, so that
@@ -177,7 +199,7 @@ class Store:
                 "fill_value": False if data.dtype == bool else np.nan,
                 "dimension_names": dims,
                 "attributes": about,
-                "compressors": None,
+                "compressors": [Crc32cCodec()],
             }
             known: Any = self.root.get(name)
             self._arrays[name] = self.root.create_array(name, **made) if known is None else known
@@ -185,17 +207,23 @@ class Store:
             self._arrays[name].resize(data.shape)
         return self._arrays[name]
 
-    def _put(self, name: str, values: np.ndarray) -> None:
-        """A coordinate, whole."""
-        dtype: Any = values.dtype
-        if dtype.kind == "U":
-            dtype, values = str, values.astype(getattr(np.dtypes, "StringDType", lambda: object)())
-        with warnings.catch_warnings():
-            # zarr warns that texts are not in version 3 of the specification yet
-            warnings.simplefilter("ignore")
+    def _put_coordinates(self) -> None:
+        """Write the coordinates whole. Those that exist grow, and are never removed meanwhile."""
+        for name, values in ((name, np.array(values)) for name, values in _coordinates(self.record).items()):
+            known: Any = self.root.get(name)
+            dtype: Any = values.dtype
+            if dtype.kind == "U":
+                dtype, values = str, values.astype(getattr(np.dtypes, "StringDType", lambda: object)())
             made: dict[str, Any] = {"shape": values.shape, "dtype": dtype, "chunks": values.shape}
-            array = self.root.create_array(name, dimension_names=(name,), overwrite=True, **made)
-            array[...] = values
+            with warnings.catch_warnings():
+                # zarr warns that texts are not in version 3 of the specification yet
+                warnings.simplefilter("ignore")
+                known = known or self.root.create_array(
+                    name, dimension_names=(name,), compressors=[Crc32cCodec()], **made
+                )
+                if known.shape != values.shape:
+                    known.resize(values.shape)
+                known[...] = values
 
 
 def empty(labels: Labels, trials: int) -> Record:
@@ -224,7 +252,8 @@ def read_sweep(path: Path | str) -> Record:
         The results, with trials that have not run as NaN.
 
     Raises:
-        ConfigError: If there are no results, or they are damaged or of another version.
+        ConfigError: If there are no results, or they are of another version, or a file of the store
+            is missing or damaged, one of the arrays of saved trials included.
     """
     path = Path(path) / "results.zarr" if (Path(path) / "results.zarr").exists() else Path(path)
     return _loaded(_opened(path, "r"), path)
@@ -233,22 +262,31 @@ def read_sweep(path: Path | str) -> Record:
 def cut_off(path: Path) -> bool:
     """Return whether a sweep was killed while creating this store, which then holds no results."""
     made = {p.name for p in path.iterdir() if not p.name.endswith(".partial")} if path.is_dir() else {""}
-    root = path / "zarr.json"
-    if not made <= {root.name, _DONE}:
-        return False
-    return root.name not in made or "labels" not in json.loads(root.read_text("utf-8")).get("attributes", {})
+    return made <= {"zarr.json", _DONE} and ("zarr.json" not in made or not _attributes(_opened(path, "r", ())))
 
 
-def _opened(path: Path, mode: Any) -> zarr.Group:
-    try:
-        root = zarr.open_group(str(path), mode=mode)
-    except (FileNotFoundError, ValueError, OSError):
-        raise ConfigError(f"{path} holds no results of a sweep; choose another folder") from None
-    if root.attrs.get("format") != FORMAT or not {"labels", "identity"} <= set(root.attrs):
+def _opened(path: Path, mode: Any, needed: Collection[str] = ("labels", "identity")) -> zarr.Group:
+    if not (path / "zarr.json").is_file():
+        raise ConfigError(f"{path} holds no results of a sweep; choose another folder")
+    with _undamaged(path):
+        root, held = zarr.open_group(str(path), mode=mode), group_attributes(path, {"format": FORMAT})
+    if needed and (held.get("format") != FORMAT or not set(needed) <= set(held)):
         raise ConfigError(
-            f"{path} was not written by a sweep of this version of torchsar; remove it or choose another folder"
+            f"{path} was not written by a sweep of this version of torchsar; choose another folder, or move it"
         )
     return root
+
+
+@contextmanager
+def _undamaged(path: Path) -> Iterator[None]:
+    """Turn an error of a file that is missing or damaged into one sentence."""
+    try:
+        yield
+    except Exception as error:  # zarr raises errors of many kinds
+        text = f"{type(error).__name__}: {one_line(error)}"
+        raise ConfigError(
+            f"{path} is damaged ({text[:200]}); restore it from a copy, or start again in another folder"
+        ) from error
 
 
 @contextmanager
@@ -267,24 +305,38 @@ def _loaded(root: zarr.Group, path: Path) -> Record:
     """The trials on disk that are marked done.
 
     Raises:
-        ConfigError: If files are missing or broken.
+        ConfigError: If files are missing or damaged.
     """
-    advice = "restore it, or start again in another folder"
-    try:
-        missing = [name for name in (_DONE, *_attributes(root).get("arrays", [])) if name not in root]
-        if not missing:
-            return _read(root)
-    except (KeyError, ValueError, IndexError, TypeError, OSError) as error:
-        raise ConfigError(f"{path} is damaged ({type(error).__name__}: {one_line(error)}); {advice}") from error
-    raise ConfigError(f"{path} is damaged: {missing[0]!r} is missing; {advice}")
+    with _undamaged(path):
+        held = _attributes(root)
+        missing = [name for name in (_DONE, *held.get("arrays", [])) if name not in root]
+        if missing:
+            raise ValueError(f"{missing[0]!r} is missing")
+        marks = {"points": {}, _SAVED: {}, "arrays": {}, **group_attributes(path / _DONE)}
+        record = _read(root, held, marks["points"])
+        coordinates = {name: np.array(values) for name, values in _coordinates(record).items()}
+        whole = coordinates | {name: variable[0] for name, variable in record.variables().items()}
+        for name, (known, rest) in marks["arrays"].items():
+            shape, now = array_metadata(path / name)
+            # an array has its earlier shape where the sweep was killed while its arrays grew
+            if now != rest or shape not in (known, list(whole[name].shape)):
+                raise ValueError(f"the metadata of {name!r} differ from their checksum")
+            array: Any = root[name]
+            if name in coordinates and list(array[: known[0]]) != list(whole[name][: known[0]]):
+                raise ValueError(f"the coordinate {name!r} does not hold its values")
+        for place, known in marks[_SAVED].items():
+            group: Any = root[f"{_SAVED}/{place}"]
+            if _of_saved(path, place, {name: array[...] for name, array in group.arrays()}) != known:
+                raise ValueError(f"the saved arrays {place} differ from their checksum")
+        return record
 
 
-def _read(root: zarr.Group) -> Record:
-    held = _attributes(root)
+def _read(root: zarr.Group, held: Mapping[str, Any], marks: Mapping[str, Any]) -> Record:
     record = empty({name: tuple(labels) for name, labels in held["labels"].items()}, held["trials"])
-    for index, spans in _attributes(root[_DONE]).items():
-        for first, last in spans:
-            record.done[(*map(int, filter(None, index.split(","))), slice(first, last))] = True
+    points = {index: tuple(map(int, filter(None, index.split(",")))) for index in marks}
+    for index, point in points.items():
+        for first, last in marks[index]["spans"]:
+            record.done[(*point, slice(first, last))] = True
     record.algorithms = tuple(held.get("algorithms", ()))
     record.ok = np.zeros((len(record.algorithms), *record.done.shape), bool)
     for name in held.get("arrays", ()):
@@ -299,8 +351,23 @@ def _read(root: zarr.Group) -> Record:
         # the array is smaller where the sweep was killed while its arrays grew
         part = tuple(map(slice, array.shape))
         target[part] = np.where(record.done[part[-record.done.ndim :]], np.asarray(array[...]), target[part])
+    wrong = next((point for index, point in points.items() if marks[index][SEAL] != record.checksum(point)), None)
+    if wrong is not None:
+        raise ValueError(f"the numbers of the point {record.labels_at(wrong)} differ from their checksum")
     record.about = _about(root)
     return record
+
+
+def _coordinates(record: Record) -> dict[str, Sequence[Any]]:
+    named = {"algorithm": record.algorithms} if record.algorithms else {}
+    return {**record.labels, "trial": range(record.trials), **named}
+
+
+def _of_saved(path: Path, place: str, arrays: Mapping[str, np.ndarray]) -> str:
+    """The checksum of the saved arrays of a trial with the metadata of their groups."""
+    folder = path / _SAVED / place
+    groups = (folder.parents[1], folder.parent, folder, *(folder / name for name in sorted(arrays)))
+    return checksum(arrays, [document(group) for group in groups])
 
 
 def _attributes(node: Any) -> dict[str, Any]:
@@ -308,7 +375,7 @@ def _attributes(node: Any) -> dict[str, Any]:
 
 
 def _about(root: zarr.Group) -> dict[str, Any]:
-    own = ("labels", "values", "trials", "algorithms", "arrays", "format")
+    own = ("labels", "values", "trials", "algorithms", "arrays", "format", SEAL)
     return {key: value for key, value in _attributes(root).items() if key not in own}
 
 
@@ -340,8 +407,9 @@ def _refuse_another(
     if differing:
         more = f", and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise ConfigError(
-            f"{path} holds a sweep of another config (hash {address(held['identity'])}, now {address(identity)}): "
-            f"{', '.join(differing[:3])}{more}; choose another folder, or give these keys their earlier values"
+            f"{path} holds a sweep of another config or trial function (hash {address(held['identity'])}, now "
+            f"{address(identity)}): {', '.join(differing[:3])}{more}; choose another folder, or give these keys their "
+            "earlier values"
         )
 
 

@@ -14,10 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
-from torchsar.core import Draws
+from torchsar.core import Draws, LargestTensor, is_out_of_memory
 from torchsar.study.montecarlo.grid import Case, Grid
 from torchsar.study.montecarlo.record import OK
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -128,7 +126,7 @@ class Work:
         points = ", ".join(f"{k}={v}" for k, v in self.cases[chunk.case].fixed.items())
         of = f" of {points}" if points else ""
         where = f"the trial function failed in trials {min(chunk.trials)} to {max(chunk.trials)}{of}"
-        if not _out_of_memory(error):
+        if not is_out_of_memory(error):
             raise ConfigError(
                 f"{where}: {'' if isinstance(error, ConfigError) else type(error).__name__ + ': '}"
                 f"{one_line(error) or 'no message'}"
@@ -248,26 +246,6 @@ def _rows(value: Any, rows: int, what: str) -> list[float]:
     return x.tolist() if x.ndim else [x.item()] * rows
 
 
-def _out_of_memory(error: Exception) -> bool:
-    """CUDA raises a class of its own, the CPU allocator of torch only a text."""
-    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (
-        isinstance(error, RuntimeError) and "allocate memory" in str(error)
-    )
-
-
-class _Largest(TorchDispatchMode):
-    """Records the bytes of the largest tensor that any operation returns."""
-
-    bytes = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
-        for leaf in tree_leaves(result):
-            if isinstance(leaf, Tensor):
-                self.bytes = max(self.bytes, leaf.untyped_storage().nbytes())
-        return result
-
-
 def probed_bytes(work: Work, case: int) -> int:
     """Return the size in bytes of the largest tensor of one trial, found by running one trial.
 
@@ -276,7 +254,7 @@ def probed_bytes(work: Work, case: int) -> int:
     known = getattr(work.trial, "bytes_per_trial", None)
     if known is not None:
         return max(1, int(known(work.cases[case].fixed)))
-    with _Largest() as largest:
+    with LargestTensor() as largest:
         work.compute(Chunk(case, (0,), (0,)))
     return max(1, largest.bytes)
 

@@ -13,7 +13,8 @@ from typing import Any
 
 from torchsar import compensate, echo, focus, multichannel, repair, scene
 from torchsar.study.names import channels, factories
-from torchsar.study.settings.signature import Catalogue
+from torchsar.study.settings.errors import loading
+from torchsar.study.settings.signature import Catalogue, Section
 
 SCENES = Catalogue(
     "scene",
@@ -232,6 +233,7 @@ _AUTOMATIC = (
     "rotation.order",
     "matched_fourier.transform",
 )
+_GIVEN = ("radar", "geometry", "expected_power")
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 
 
@@ -240,16 +242,16 @@ def stages() -> Catalogue:
     """Return the catalogue of all stages, including those of the user.
 
     Raises:
-        ValueError: If a stage of the user has a name that is in use.
+        ConfigError: If a stage of the user cannot be loaded, or has a name that is in use.
     """
     entries = {name: target for group in GROUPS.values() for name, target in group.items()}
     for point in entry_points(group="torchsar.stages"):
-        if point.name in entries:
-            raise ValueError(
-                f"the entry point {point.value!r} takes the stage name {point.name!r}, which is in use; rename it"
-            )
-        entries[point.name] = point.load()
-    return Catalogue("stage", "stage", entries, given=("radar", "geometry", "expected_power"), automatic=_AUTOMATIC)
+        with loading(point):
+            if point.name in entries:
+                raise ValueError(f"the stage name {point.name!r} is in use; rename it")
+            entries[point.name] = point.load()
+            assert Section(entries[point.name], _GIVEN).keys is not None  # its parameters can be read
+    return Catalogue("stage", "stage", entries, given=_GIVEN, automatic=_AUTOMATIC)
 
 
 def group_of(name: str) -> str:

@@ -3,23 +3,22 @@
 A result folder has a directory `.torchsar` with a lock, the manifest of the files that the program
 wrote, and, while a command runs, its incomplete result. The program replaces and removes only files
 of the manifest that were not changed since. A complete result is moved to its final path; if the
-move is interrupted, the next command completes it according to a journal.
+move is interrupted or fails, the next command completes it according to a journal.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
+import itertools
 import logging
 import os
 import shutil
-import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchsar.core import OwnFiles, remove_empty
 from torchsar.study.settings.errors import ConfigError
 
 try:
@@ -29,8 +28,6 @@ except ImportError:  # not available on every operating system; there is then no
 
 log = logging.getLogger("torchsar")
 STATE = ".torchsar"
-# larger files are compared by their size alone: reading gigabytes would take as long as a run
-_HASHED_BYTES = 1 << 22
 # files whose presence means that a result is complete: they are removed first and moved last
 _LAST = ("report.html", "metrics.json", "summary.json", "trade.json", "requires.json")
 
@@ -47,33 +44,40 @@ class ResultFolder:
     path: Path
     kind: str
 
+    @property
+    def files(self) -> OwnFiles:
+        """The files that the program wrote."""
+        return OwnFiles(self.path, self.path / STATE, _LAST)
+
     @contextmanager
     def staged(self) -> Iterator[Path]:
         """Provide an empty folder for a new result.
 
         Its content replaces the earlier result at the end of the block, and is removed if the block
-        raises an error.
+        raises an error. A complete result is never removed: if it cannot replace the earlier one,
+        it is kept in a new folder or, if the replacement had begun, completed by the next command.
 
         Raises:
-            ConfigError: If a file of the user has the path of a file of the result; the result is
-                then kept in a new folder, which the message names.
+            ConfigError: If the result cannot replace the earlier one, for example because a file of
+                the user has the path of one of its files; the message says where it is.
         """
-        new = self.path / STATE / "new"
+        new = self.files.new
         new.mkdir()
         try:
             yield new
-            self._publish(new)
-        finally:
+        except BaseException:
             shutil.rmtree(new, ignore_errors=True)
+            raise
+        self._publish(new)
 
     @property
     def claimed(self) -> bool:
         """Whether the folder is reserved for, or holds, a result of this kind."""
-        return _manifest(self.path)["kind"] == self.kind
+        return self.files.manifest()["kind"] == self.kind
 
     def claim(self) -> None:
         """Reserve the folder for a result of this kind."""
-        _write_whole(self.path / STATE / "manifest.json", {**_manifest(self.path), "kind": self.kind})
+        self.files.claim(self.kind)
 
     def refuse_conflicts(self, names: Sequence[str]) -> None:
         """Check that no file of the user has the name of a file of the result.
@@ -84,32 +88,38 @@ class ResultFolder:
         Raises:
             ConfigError: If there is such a file, or the result of another command.
         """
-        held = _manifest(self.path)
-        if held["kind"] not in (None, self.kind):
+        kind = self.files.manifest()["kind"]
+        if kind not in (None, self.kind):
+            raise ConfigError(f"--out {self.path} holds the result of another command, {kind}; choose another folder")
+        name = self.files.foreign(names)
+        if name:
             raise ConfigError(
-                f"--out {self.path} holds the result of another command, {held['kind']}; choose another folder"
+                f"--out {self.path}: torchsar did not write {name}, or it was changed since; move it, or choose "
+                "another folder"
             )
-        for path in (path for name in names for path in _files_below(self.path / name)):
-            name = path.relative_to(self.path).as_posix()
-            if not _is_as_written(path, held["files"].get(name)):
-                raise ConfigError(
-                    f"--out {self.path}: torchsar did not write {name}, or it was changed since; move it, or choose "
-                    "another folder"
-                )
+
+    def finish(self) -> None:
+        """Complete an interrupted replacement."""
+        for name in self.files.finish():
+            _say_kept(self.path, name)
 
     def _publish(self, new: Path) -> None:
-        """Write the journal of the new result, and then execute it."""
-        files = {path.relative_to(new).as_posix(): _print_of(path) for path in _files_below(new)}
         try:
-            self.refuse_conflicts(sorted({name.split("/")[0] for name in files}))
-        except ConfigError as error:
-            kept = tempfile.mkdtemp(prefix=f"{self.path.name}-", dir=self.path.parent)
-            for path in new.iterdir():
-                shutil.move(path, kept)
-            raise ConfigError(f"{error}; this result was kept in {kept}") from None
-        manifest = {"format": 1, "kind": self.kind, "files": files}
-        _write_whole(self.path / STATE / "journal.json", {"new": manifest, "old": _manifest(self.path)["files"]})
-        _finish(self.path)
+            self.refuse_conflicts(sorted(path.name for path in new.iterdir()))
+            for name in self.files.replace(self.kind):
+                _say_kept(self.path, name)
+        except (ValueError, OSError) as error:
+            why = getattr(error, "strerror", None)
+            text = f"--out {self.path}: the result could not be moved to its place ({why})" if why else str(error)
+            if self.files.pending:
+                raise ConfigError(f"{text}; the next command with this folder completes the move") from error
+            places = (self.path / f"kept-{i}" for i in itertools.count(1))
+            kept = new.rename(next(path for path in places if not os.path.lexists(path)))
+            raise ConfigError(f"{text}; this result was kept in {kept}") from error
+
+
+def _say_kept(out: Path, name: str) -> None:
+    log.warning("warning: %s: %s is a file of the user and was kept; the new one was removed", out, name)
 
 
 @contextmanager
@@ -131,9 +141,12 @@ def opened(out: Path, kind: str, names: Sequence[str] = ()) -> Iterator[ResultFo
     made = [folder for folder in (out, *out.parents) if not os.path.exists(folder)]
     with _locked(out):
         try:
-            _finish(out)
             folder = ResultFolder(out, kind)
-            folder.refuse_conflicts(names)
+            try:
+                folder.finish()
+                folder.refuse_conflicts(names)
+            except ValueError as error:  # a manifest or a journal that is damaged
+                raise ConfigError(str(error)) from None
             yield folder
         finally:
             _tidy(out, made)
@@ -185,94 +198,9 @@ def _locked(out: Path) -> Any:
         file.close()
 
 
-def _finish(out: Path) -> None:
-    """Execute the remaining steps of the journal, and remove incomplete results."""
-    state = out / STATE
-    journal = _read(state / "journal.json")
-    if journal is not None:
-        files = journal["new"]["files"]
-        for name in sorted(journal["old"], key=_rank, reverse=True):
-            there = name in files and not (state / "new" / name).exists()
-            if not there and _is_as_written(out / name, journal["old"][name]):
-                _move(out / name, state / "old" / name)
-        _remove_empty(out, journal["old"])
-        for name in sorted(files, key=_rank):
-            if (state / "new" / name).is_file() and not _move(state / "new" / name, out / name):
-                log.warning("warning: %s: %s is a file of the user and was kept; the new one was removed", out, name)
-        _write_whole(state / "manifest.json", journal["new"])
-        (state / "journal.json").unlink()
-    for name in ("new", "old"):
-        shutil.rmtree(state / name, ignore_errors=True)
-
-
-def _rank(name: str) -> tuple[int, str]:
-    return len(_LAST) - _LAST.index(name) if name in _LAST else 0, name
-
-
-def _move(source: Path, target: Path) -> bool:
-    """Move a file to a free path; return False if the path is not free."""
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if target.exists() or target.is_symlink():
-            return False
-        source.rename(target)
-    except (FileExistsError, NotADirectoryError):
-        return False
-    return True
-
-
-def _remove_empty(out: Path, files: Mapping[str, Any]) -> None:
-    """Remove the empty folders of a replaced result."""
-    _remove_if_empty({folder for name in files for folder in (out / name).parents if out in folder.parents})
-
-
 def _tidy(out: Path, made: Sequence[Path]) -> None:
     """Remove a state directory with only the lock, and then those of `made` that are empty."""
     state = out / STATE
     if {path.name for path in state.iterdir()} <= {"lock"}:
         shutil.rmtree(state, ignore_errors=True)
-        _remove_if_empty(made)
-
-
-def _remove_if_empty(folders: Collection[Path]) -> None:
-    """Remove those folders that are empty, the innermost ones first."""
-    for folder in sorted(folders, key=lambda path: -len(path.parts)):
-        if folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-
-
-def _files_below(path: Path) -> list[Path]:
-    """The file itself, or all files below a folder; a symbolic link counts as a file."""
-    if path.is_symlink() or path.is_file():
-        return [path]
-    return sorted(p for p in path.rglob("*") if p.is_symlink() or not p.is_dir())
-
-
-def _print_of(path: Path) -> list[Any]:
-    """Size of a file and, unless it is large, a digest of its content."""
-    size = path.stat().st_size
-    return [size, hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() if size <= _HASHED_BYTES else None]
-
-
-def _is_as_written(path: Path, known: list[Any] | None) -> bool:
-    return known is not None and path.is_file() and not path.is_symlink() and _print_of(path) == known
-
-
-def _manifest(out: Path) -> dict[str, Any]:
-    return _read(out / STATE / "manifest.json") or {"format": 1, "kind": None, "files": {}}
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}); choose another folder") from None
-
-
-def _write_whole(path: Path, tree: Mapping[str, Any]) -> None:
-    """Write a JSON file atomically."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(tree), encoding="utf-8")
-    part.replace(path)
+        remove_empty(made)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import torch
 from torchsar import plot
 from torchsar.core import Signal
 
+log = logging.getLogger("torchsar")
 # ratio of the largest and the least value above which a comparison has a logarithmic axis
 _DECADES = 100.0
 Drawn = Iterator[tuple[str, str, str, Any]]
@@ -37,19 +39,31 @@ def draw_all(makers: Iterable[Callable[[], Drawn]], folder: Path) -> list[Pictur
         folder: Folder of the files; it is made if it does not exist.
 
     Returns:
-        The pictures in their order.
+        The pictures in their order; one that cannot be drawn has no files, and a caption says why.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures: list[Picture] = []
-    for name, title, caption, drawn in (one for make in makers for one in make()):
-        stem = f"{len(pictures) + 1:02d}_{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)}"
-        panels = drawn if isinstance(drawn, list) else [drawn]
+    for name, title, caption, drawn in (one for make in makers for one in _drawn(make)):
+        stem = f"{len(pictures) + 1:02d}_{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)[:80]}"
+        panels = drawn if isinstance(drawn, list) else [drawn] * (drawn is not None)
         files = tuple(f"{stem}_{i}.png" if len(panels) > 1 else f"{stem}.png" for i in range(1, len(panels) + 1))
         for file, figure in zip(files, panels, strict=True):
             plot.save(figure, folder / file)
-        if files:
+        if files or drawn is None:
             pictures.append(Picture(files, title[:1].upper() + title[1:], caption))
     return pictures
+
+
+def _drawn(make: Callable[[], Drawn]) -> Drawn:
+    """The pictures of one function, the last of which may say that the next one failed."""
+    try:
+        yield from make()
+    except OSError:  # of the disk
+        raise
+    except Exception as error:  # results are more important than their pictures
+        text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        log.warning("warning: a picture could not be drawn (%s)", text)
+        yield "failed", "a picture is missing", f"It could not be drawn ({text}). All numbers are in the tables.", None
 
 
 def comparisons(results: Mapping[str, Any], columns: Mapping[str, Any], without: str = "ideal") -> Drawn:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from torchsar.core import fault_of_name
 from torchsar.study.settings.errors import ConfigError
-from torchsar.study.settings.sections import RESERVED, Loaded
+from torchsar.study.settings.sections import LONGEST_NAME, RESERVED, Loaded
 
 # name of the only case of a config that lists none
 ALL = "all"
@@ -65,10 +66,12 @@ def titled(title: str, case: str) -> str:
 
 def _check_case(name: str, values: Mapping[str, Any], loaded: Loaded) -> None:
     """Raise ConfigError if the name of a case is not valid, or it changes a common key."""
-    if not word_of(name).strip("_") or name.startswith("__") or name in (*RESERVED, ALL):
+    unusable = fault_of_name(name.replace("/", "_"), LONGEST_NAME)
+    if not word_of(name).strip("_") or unusable or name in (*RESERVED, ALL):
         raise ConfigError(
-            f"{loaded.file}: {name!r} is not a valid name of a case; it must contain letters or digits, must not begin "
-            f"with '__', and must be none of {', '.join((*RESERVED, ALL))}"
+            f"{loaded.file}: {name[:40]!r} is not a valid name of a case; it must contain letters or digits, must not "
+            f"begin with '__', must be printable with {LONGEST_NAME} bytes at most, and must be none of "
+            f"{', '.join((*RESERVED, ALL))}"
         )
     if not values:
         raise ConfigError(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 
 class ConfigError(ValueError):
@@ -33,3 +35,15 @@ def one_line(error: BaseException) -> str:
     """Return the text of an error as one line; that of a KeyError has no quotes around it."""
     text = error.args[0] if isinstance(error, KeyError) and error.args else error
     return " ".join(str(text).split())
+
+
+@contextmanager
+def loading(point: Any) -> Iterator[None]:
+    """Turn any error of loading an entry point of another package into one sentence."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        raise ConfigError(
+            f"the entry point {point.name!r} ({point.value}) of an installed package cannot be loaded "
+            f"({type(error).__name__}: {one_line(error)}); mend or uninstall the package"
+        ) from error

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
+from torchsar.core import fault_of_name
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.settings.plausible import refuse_implausible
 from torchsar.study.settings.sentences import Strict, sentence
@@ -18,6 +19,8 @@ from torchsar.study.settings.text import dump
 _OLD_TRUTH = "aux.true_"
 # names of groups in the results, which methods and cases cannot have
 RESERVED = ("truth", "estimate")
+# bytes in the name of a method, a stage or a case at most: names of files hold all three
+LONGEST_NAME = 60
 
 
 class Data(Strict):
@@ -168,6 +171,10 @@ class Config(Strict):
             raise ValueError("processor needs a method called 'recommended'")
         if self.processor["recommended"].stages is None:
             raise ValueError("processor.recommended needs stages of its own")
+        for name in self.processor:
+            why = fault_of_name(name, LONGEST_NAME)
+            if why:
+                raise ValueError(f"processor: a method cannot be called {name[:40]!r}, {why}")
         taken = next((name for name in RESERVED if name in self.processor), None)
         if taken is not None:
             raise ValueError(

@@ -2,50 +2,74 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml.composer import ComposerError
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
 
+# tags and their values by the rules of YAML 1.2, also with '_' between digits: 1e-6 is a number and
+# 017 is 17, while 1:30, 2024-01-31, yes and 0b1 are texts
+_RULES = {
+    "int": (r"[-+]?[0-9][0-9_]*|0o[0-7]+|0x[0-9a-fA-F]+", "-+0123456789"),
+    "float": (
+        r"[-+]?(?:(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?|[0-9][0-9_]*[eE][-+]?[0-9]+|\.(?:inf|Inf|INF))|\.(?:nan|NaN|NAN)",
+        "-+0123456789.",
+    ),
+    "bool": (r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    "null": (r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+}
+# sections and lists inside each other, and values of a document with all its repetitions: far more
+# than configs have, and few enough for any later step
+_DEEPEST, _MOST_VALUES = 50, 200_000
+
 
 class _Loader(yaml.SafeLoader):
-    """Loader of safe YAML. It reads 1e-6 as a number (YAML 1.2) and only true and false as
-    booleans, and it rejects duplicate keys.
-    """
+    """Loader of safe YAML 1.2. It rejects duplicate keys, and documents that are too large."""
 
+    yaml_implicit_resolvers: dict[Any, Any] = {}
+    depth = 0
 
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, rule) for tag, rule in rules if not tag.endswith((":float", ":bool"))]
-    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"^[-+]?(?:(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?|[0-9][0-9_]*[eE][-+]?[0-9]+|\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-    ),
-    list("-+0123456789."),
-)
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")
-)
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        mark, self.depth = self.peek_event().start_mark, self.depth + 1
+        if self.depth > _DEEPEST:
+            raise ComposerError(None, None, f"more than {_DEEPEST} parts inside each other", mark)
+        again = self.check_event(yaml.AliasEvent)
+        node: Any = super().compose_node(parent, index)
+        self.depth -= 1
+        parts: Any = node.value
+        if isinstance(parts, str):
+            parts = parts.encode()[:0]  # a ValueError for half of a pair of surrogates
+        if not again:
+            node.size = 1 + sum(one.size for part in parts for one in (part if isinstance(part, tuple) else [part]))
+        if getattr(node, "size", math.inf) > _MOST_VALUES:  # infinite inside itself
+            raise ComposerError(None, None, f"more than {_MOST_VALUES} values with all repetitions", mark)
+        return node
 
 
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[str, Any]:
     seen: dict[str, Any] = {}
     for key_node, value_node in node.value:
-        key = loader.construct_object(key_node, deep=True)
-        key = key if isinstance(key, str) else str(key)
-        if key in seen:
-            raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is given twice", key_node.start_mark)
+        key = key_node.value if isinstance(key_node, yaml.ScalarNode) else ""
+        if not key or key in seen:
+            what = f"the key {key!r} is given twice" if key in seen else "a key must be a word"
+            raise yaml.constructor.ConstructorError(None, None, what, key_node.start_mark)
         seen[key] = loader.construct_object(value_node, deep=True)
     return seen
 
 
+def _whole(loader: _Loader, node: yaml.ScalarNode) -> int:
+    text = node.value
+    return int(text, 0 if text[:2] in ("0o", "0x") else 10)
+
+
 _Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -58,6 +82,9 @@ _Dumper.add_representer(
         "tag:yaml.org,2002:seq", items, flow_style=all(not isinstance(i, (dict, list)) for i in items)
     ),
 )
+for _tag, (_rule, _first) in _RULES.items():
+    for _kind in (_Loader, _Dumper):  # texts that look like a number are written with quotes
+        _kind.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_rule})$"), list(_first))
 _Dumper.add_representer(tuple, lambda dumper, items: dumper.represent_list(list(items)))
 
 

@@ -14,13 +14,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Chain, Draws, Estimate, Recording, Trace, machine_memory_bytes
+from torchsar.core import Chain, Draws, Estimate, Recording, Trace, is_out_of_memory, machine_memory_bytes
 from torchsar.echo import apply_impairments
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded, Method
 from torchsar.study.trials.auto import resolved
 from torchsar.study.trials.batch import Batch, Judged, Outcome, Trials, fault_of_image, rows, verdict
-from torchsar.study.trials.chains import build_chains, true_names, unknown_attribute
+from torchsar.study.trials.chains import build_chains, reason_of, true_names
 
 log = logging.getLogger("torchsar")
 Announce = Callable[[str, str], Any]
@@ -173,21 +173,20 @@ class Bench:
             trace, estimates, seconds = self._run(name, method, trials, earlier)
             system = self.system
             fault = fault_of_image(trace.signal, system.images, system.ending) if detail and system.ending else ""
-            if fault:
-                raise ConfigError(f"processor.{name}, {fault}")
+            if fault:  # a chain that ends without an image is a mistake of the config
+                raise (ValueError if trace.signal.names in system.images else ConfigError)(f"processor.{name}, {fault}")
             judged = self.system.judge(self, name, replace(trace, estimates=estimates), trials, detail)
-        except AttributeError as error:
-            raise ConfigError(
-                f"{self.file}: processor.{name}: {unknown_attribute(error, {'radar': self.radar})}"
-            ) from None
         except ConfigError as error:
             raise ConfigError(str(error) if str(error).startswith(self.file) else f"{self.file}: {error}") from error
-        except _FAILURES as error:
+        except Exception as error:  # a stage of the user may raise any error
+            if is_out_of_memory(error):  # a smaller batch may succeed
+                raise
+            text = reason_of(error, self.radar)
             if name == "recommended" or os.environ.get("TORCHSAR_DEBUG"):
-                raise ConfigError(f"{self.file}: processor.{name}: {one_line(error)}") from error
-            log.warning("warning: %s failed: %s", name, one_line(error))
+                raise ConfigError(f"{self.file}: processor.{name}: {text}") from error
+            log.warning("warning: %s failed: %s", name, text)
             no = torch.zeros(trials.count, dtype=torch.bool)
-            return Outcome(Judged({"ok": no}), failed=one_line(error))
+            return Outcome(Judged({"ok": no}), failed=text)
         spent = sum(seconds.values()) / trials.count
         known = {"seconds": torch.full((trials.count,), spent, dtype=torch.float64), **verdict(estimates, trials.count)}
         judged = replace(judged, metrics={**known, **judged.metrics})

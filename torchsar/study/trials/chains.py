@@ -7,8 +7,10 @@ from typing import Any
 
 from torchsar.core import Chain, use
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
-from torchsar.study.settings.sections import OF_CHAIN, Loaded, Method
+from torchsar.study.settings.sections import LONGEST_NAME, OF_CHAIN, Loaded, Method
 
+# errors whose text says what is wrong; torch itself raises RuntimeError
+_PLAIN = (ValueError, TypeError, KeyError, RuntimeError)
 # prefix of true values in a config, and prefix of input values in a chain
 _TRUTH, _GIVEN = "truth.", "given."
 
@@ -56,15 +58,18 @@ def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any
     built = {}
     for name, entry in (method.stages or {}).items():
         path = f"{where}.stages.{name}"
-        if not name.isidentifier():
+        if not name.isidentifier() or len(name) > LONGEST_NAME:
             raise ConfigError(
-                f"{loaded.file}: {path}: a stage name has only letters, digits and '_', and does not begin with a digit"
+                f"{loaded.file}: {path}: a stage name has only letters, digits and '_', does not begin with a digit, "
+                f"and has {LONGEST_NAME} characters at most"
             )
         rest = {key: value for key, value in entry.items() if key not in OF_CHAIN}
         try:
             stage = loaded.system.stages.make(rest, path, loaded.file, **context)
-        except AttributeError as error:
-            raise ConfigError(f"{loaded.file}: {path}: {unknown_attribute(error, context)}") from None
+        except ConfigError:
+            raise
+        except Exception as error:  # a stage of the user may raise any error
+            raise ConfigError(f"{loaded.file}: {path}: {reason_of(error, context.get('radar'))}") from error
         built[name] = use(
             stage,
             in_doubt=entry.get("in_doubt", "neutral"),
@@ -94,19 +99,20 @@ def _sources(uses: Mapping[str, str], method: Method, loaded: Loaded, where: str
     return found
 
 
-def unknown_attribute(error: AttributeError, context: Mapping[str, Any]) -> str:
-    """Return the message about a stage that needs an attribute which the radar does not have.
+def reason_of(error: Exception, radar: Any) -> str:
+    """Return the reason why a stage failed.
 
     Args:
-        error: The error of the stage. Any other AttributeError is a fault of the program and is
-            raised again.
-        context: Parameters of the constructor of the stage, with `radar`.
+        error: The error of the stage.
+        radar: The radar that it was given.
 
     Returns:
-        The message.
+        The text of the error in one line, with its kind where the text alone may say too little.
     """
-    if error.obj is not context.get("radar") or error.obj is None:
-        raise error
-    return (
-        f"this stage needs radar.{error.name}, which a radar of this system does not have; use a stage of this system"
-    )
+    if isinstance(error, AttributeError) and radar is not None and error.obj is radar:
+        return (
+            f"this stage needs radar.{error.name}, which a radar of this system does not have; use a stage of this "
+            "system"
+        )
+    text = one_line(error)
+    return text if text and isinstance(error, _PLAIN) else f"{type(error).__name__}: {text or 'no message'}"
