@@ -25,6 +25,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -36,7 +37,7 @@ SMALL = 4
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the audit and write its rows."""
     sys.path.insert(0, str(ROOT))  # the worlds stand beside the tests
-    from tests.audit.frame import NOTHING, SURE, judge, verdict
+    from tests.audit.frame import NOTHING, SURE, Entry, World, audit, verdict
     from tests.audit.table import entries
 
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -46,19 +47,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", default="", help="estimators whose name contains this")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    chosen = [entry for entry in entries() if options.only in entry.name]
+    if options.small:
+        chosen = [replace(entry, worlds=[*entry.worlds[:2], *entry.worlds[-1:]]) for entry in chosen]
+
+    def trials(entry: Entry, world: World) -> int:
+        many = options.trials * (1.5 if world.name in NOTHING else 1.0) * entry.share
+        return SMALL if options.small else max(20, round(many))
+
     rows = []
-    for entry in entries():
-        if options.only not in entry.name:
-            continue
-        worlds = [*entry.worlds[:2], *entry.worlds[-1:]] if options.small else entry.worlds
-        for world in worlds:
-            many = options.trials * (1.5 if world.name in NOTHING else 1.0) * entry.share
-            row = judge(entry, world, SMALL if options.small else max(20, round(many)))
-            rows.append(row)
-            missed = verdict(row)
-            if missed:
-                print(f"{entry.name:40s} {world.name:20s} {world.snr_db!s:>6s}  {'; '.join(missed)}", flush=True)
-        write(options.out, rows, SURE)
+    for row in audit(chosen, trials):
+        rows.append(row)
+        if missed := verdict(row):
+            where = f"{row['estimator']:40s} {row['world']:20s} {row['snr_db']!s:>6s}"
+            print(f"{where}  {'; '.join(missed)}", flush=True)
+            write(options.out, rows, SURE)
+    write(options.out, sorted(rows, key=lambda row: row["estimator"]), SURE)
     print(f"{len(rows)} rows, {sum(bool(verdict(row)) for row in rows)} of them miss a bar: {options.out}")
 
 

@@ -90,7 +90,8 @@ def line(
         for k in range(points):
             here = move if k == 0 else moves(trials, seed + 31 * k)
             for i in range(trials):
-                clean[i] += azimuth_echo(radar, PULSES, *(float(x[i]) for x in here), gate_s=gate_s)
+                level = 1.0 if k == 0 else 0.3
+                clean[i] += level * azimuth_echo(radar, PULSES, *(float(x[i]) for x in here), gate_s=gate_s)
         data = 10 ** (snr_db / 20) * clean + noise(trials, seed, radar.channels, PULSES)
         truth = named(move)
         return Batch(Signal(data, radar.axes(PULSES)), truth, {name: truth[name] for name in given})
@@ -212,7 +213,7 @@ def seen_in_sea(snr_db: float) -> Callable[[int, int], Batch]:
 def clutter(
     power: Callable[[Tensor], Tensor], snr_db: float, cells: int = 96, pulses: int = 256
 ) -> Callable[[int, int], Batch]:
-    """Draw Gaussian clutter of a Doppler spectrum, with phases, gains and delays of the channels."""
+    """Draw Gaussian clutter of a Doppler spectrum, with errors of the channels."""
 
     def draw(trials: int, seed: int) -> Batch:
         long, factor = 4096, 8
@@ -283,10 +284,10 @@ def circular(found: Tensor, truth: Tensor) -> Tensor:
     return rms(torch.remainder(found - truth + math.pi, 2 * math.pi) - math.pi)
 
 
-DEFOCUS_M_S = 1.0  # u_r displaces by 17 m per m/s; u_a of 1 m/s defocuses by a quarter of a cycle
+DEFOCUS_M_S = 3.0  # u_r displaces by 17 m per m/s, here by the length of a small ship
 U_R = Quantity("u_r_m_s", DEFOCUS_M_S, floor=0.002)
-U_A = Quantity("u_a_m_s", 2.0, floor=0.01)
-Y0 = Quantity("y0_m", 17.0, floor=0.05)
+U_A = Quantity("u_a_m_s", 3.0, floor=0.01)
+Y0 = Quantity("y0_m", 50.0, floor=0.05)
 
 
 def bare_interferometry(x: Signal) -> Estimate:

@@ -6,6 +6,7 @@ gives the truth, or says that there is nothing to be found; then every `ok` is f
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
 import math
@@ -101,6 +102,24 @@ class Entry:
 def estimate_of(out: Any) -> Estimate:
     """Return the estimate that a stage gives alone or beside a signal."""
     return next(part for part in (out if isinstance(out, tuple) else (out,)) if isinstance(part, Estimate))
+
+
+def audit(entries: Sequence[Entry], trials: Callable[[Entry, World], int]) -> Iterator[dict[str, Any]]:
+    """Give the rows of entries, world by world, since several entries share the data of a world.
+
+    Args:
+        entries: Estimators.
+        trials: Number of trials of an estimator in a world.
+
+    Yields:
+        Rows, see `judge`.
+    """
+    worlds = {id(world): world for entry in entries for world in entry.worlds}
+    for world in worlds.values():
+        drawn = World(world.name, functools.cache(world.draw), world.snr_db)
+        for entry in entries:
+            if any(world is own for own in entry.worlds):
+                yield judge(entry, drawn, trials(entry, world))
 
 
 def judge(entry: Entry, world: World, trials: int, seed: int = 1, block: int = 25) -> dict[str, Any]:
