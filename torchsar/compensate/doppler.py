@@ -21,8 +21,8 @@ from torchsar.core import Estimate, Signal, Stage, fft_lines, legendre, settle
 from torchsar.radar import StripmapRadar
 
 OVER = ("mean", "median")  # how `combine_blocks` combines the blocks
-# Largest standard deviation of an estimate that is ok, in PRF. In pure noise the increment has a
-# random phase, and one draw in 4e9 has a predicted standard deviation below this.
+# Largest standard deviation of an estimate that is ok, in PRF. Noise alone has a predicted standard
+# deviation about ten times as large, since the sum of its products is no larger than their scatter.
 _MOST_STD = 0.015
 # Least extent of the energy along the record, as a share of its length: targets seen for less are
 # cut by the end of the record, or nearly as short as their own drift of Doppler.

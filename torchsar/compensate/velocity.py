@@ -34,7 +34,7 @@ from torchsar.radar import StripmapRadar
 Refine = Callable[..., tuple[Tensor, Tensor]]
 
 # Variance of the entropy of n independent pixels of pure noise, times n: with the exponential
-# distribution of their intensity, 0.290 (Monte Carlo: 0.291).
+# distribution of their intensity, 0.290.
 _NOISE_ENTROPY = 0.29
 # Depth of a significant minimum in standard deviations of noise. On noise the depth is below 3; of
 # 24 points at an SNR of -20 dB it is 4 to 8, at -10 dB above 60.

@@ -31,8 +31,8 @@ _TOLERANCE_M_S = 1e-4  # of the maximum, well below the 0.06 m/s of error withou
 # Half step of the derivatives for the standard deviation, found by trial: at 17 dB per sample 0.5
 # m/s predicts 0.065 m/s where 0.051 m/s is measured; 0.25 and 1 m/s predict 0.12 and 0.036 m/s.
 _CURVE_M_S = 0.5
-# Systematic error without noise, from echoes beyond the reconstructed bands: 0.03 m/s rms and up to
-# 0.06 m/s over velocities and positions.
+# Systematic error without noise, from echoes beyond the reconstructed bands: 0.035 m/s rms over
+# velocities and positions, up to 0.06 m/s.
 _REST_M_S = 0.035
 _GROUPS = 16  # of the jackknife: 8 and 32 groups give the same standard deviation within 6 %
 
