@@ -34,7 +34,7 @@ from torchsar.repair import (
     estimate_response_sharpest,
     find_trigger,
 )
-from torchsar.repair.response import band_grid, without_line
+from torchsar.repair.response import band_grid
 from torchsar.scene import Dwell, Points, RandomPoints, Scene, Speckle, StripmapWorld
 
 F64, C128 = torch.float64, torch.complex128
@@ -130,7 +130,8 @@ def same_offsets(found: Tensor, truth: Tensor) -> Tensor:
 
 def curve(u: Tensor) -> Tensor:
     """Phase response with a cubic part and ripple, without a straight line."""
-    return without_line(1.2 * u**3 + 0.5 * torch.sin(6 * math.pi * u))
+    slope = 3 * (1.2 / 5 + 0.5 / (3 * math.pi))  # 3 times the mean of u times the curve
+    return 1.2 * u**3 + 0.5 * torch.sin(3 * math.pi * u) - slope * u
 
 
 def response(
