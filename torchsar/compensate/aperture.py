@@ -50,8 +50,8 @@ def complete_aperture_centroid(
 
     Returns:
         The refined centroid and its standard deviation in Hz, shape (...,) each. Where the new
-        standard deviation is twice `std_hz` or more, `doppler_hz` and `std_hz` are returned
-        instead.
+        standard deviation is twice `std_hz` or more, or the targets migrate out of the swath in
+        more than half of the range cells, `doppler_hz` and `std_hz` are returned instead.
     """
     if radar.integration_s is None:
         return doppler_hz, std_hz
@@ -131,9 +131,9 @@ def _tiles(
     group = RangeGroup(lines, torch.zeros(lines.shape[:-2], device=raw.device), radar)
     image = full_spectrum(group, doppler_hz).image(doppler_hz, radar.velocity_m_s)
     tiles = (max(1, image.shape[-2] // _TILE_LINES), max(1, image.shape[-1] // _TILE_COLUMNS))
-    image = image * stays_inside(image.shape[-1], radar, doppler_hz, radar.integration_s or 0.0)[..., None, :].to(
-        image.real.dtype
-    )
+    image = image * stays_inside(image.shape[-1], radar, doppler_hz, radar.integration_s or 0.0, always=False)[
+        ..., None, :
+    ].to(image.real.dtype)
     products, power = lag_products(image, tiles)
     scale = (
         image.abs().amax((-2, -1)).to(torch.float64).square()[..., None, None]

@@ -22,6 +22,12 @@ from torchsar.core import Estimate, Signal, Stage, fft_lines, legendre, settle
 from torchsar.radar import StripmapRadar
 
 OVER = ("mean", "median")  # how `combine_blocks` combines the blocks
+# Largest standard deviation of an estimate that is ok, in PRF. Noise alone has a predicted standard
+# deviation about ten times as large, since the sum of its products is no larger than their scatter.
+_MOST_STD = 0.015
+# Least extent of the energy along the record, as a share of its length: targets seen for less are
+# cut by the end of the record, or nearly as short as their own drift of Doppler.
+_LEAST_EXTENT = 0.3
 
 
 def wrap_hz(frequency_hz: Tensor, prf_hz: float) -> Tensor:
@@ -214,6 +220,30 @@ def increment_std_rad(products: Tensor, phase_rad: Tensor) -> Tensor:
     ).clamp_max(math.pi)
 
 
+def reliable_increment(products: Tensor, phase_rad: Tensor, std_rad: Tensor) -> Tensor:
+    """Decide whether a phase increment between adjacent lines shows the Doppler centroid.
+
+    The standard deviation must be below 1.5 % of the PRF. If the record is divided into four blocks
+    or more along pulses, the energy must also fill 0.3 of the record: the increment of targets that
+    are seen only at an end of the record differs from that of the centre of the beam, and nothing
+    in the increments shows by how much. Targets that are cut, but fill more of the record, are not
+    recognised; `DopplerCentroid` avoids them where the dwell of the beam is known.
+
+    Args:
+        products: Products of adjacent lines, summed over range, shape (..., a), complex, for a
+            blocks of pulses.
+        phase_rad: Phase increment in rad, shape (...,).
+        std_rad: Its predicted standard deviation in rad, shape (...,).
+
+    Returns:
+        Bool, shape (...,).
+    """
+    real = (products * torch.polar(torch.ones_like(phase_rad), -phase_rad)[..., None]).real.clamp_min(0)
+    square = real.square().sum(-1)
+    extent = real.sum(-1).square() / torch.where(square > 0, square, 1) / products.shape[-1]
+    return (std_rad < 2 * math.pi * _MOST_STD) & (square > 0) & ((extent >= _LEAST_EXTENT) | (products.shape[-1] < 4))
+
+
 def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz: float, **info: Tensor) -> Estimate:
     """Convert a phase increment between adjacent lines to a baseband Doppler centroid.
 
@@ -230,8 +260,9 @@ def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz
 
     Returns:
         `doppler_baseband_hz` of shape (...,), positive when closing, with its standard deviation in
-        Hz. `quality` is the coherence of adjacent lines. `ok` is False where there is no energy, or
-        where the standard deviation of the increment is a tenth of a turn or more. `info` holds
+        Hz. `quality` is the coherence of adjacent lines. `ok` is False where there is no energy,
+        where the standard deviation is 1.5 % of the PRF or more, or where the energy fills less
+        than 0.3 of the record, see `reliable_increment`. `info` holds
         "block_hz" (centroid of each block) and "block_power", both of shape (..., a, b), and the
         entries given.
     """
@@ -242,7 +273,7 @@ def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz
     return Estimate(
         {"doppler_baseband_hz": wrap_hz(scale * phase_rad, prf_hz)},
         quality,
-        (total > 0) & (std < 0.2 * math.pi),
+        reliable_increment(products.sum(-1), phase_rad, std),
         {"doppler_baseband_hz": scale * std},
         {"block_hz": scale * torch.angle(products), "block_power": power, **info},
     )
@@ -314,7 +345,7 @@ def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) ->
     )
 
 
-def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12) -> tuple[Tensor, Tensor]:
+def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12) -> tuple[Tensor, Tensor, Tensor]:
     """Fit a robust polynomial to the phase increment over range blocks.
 
     The polynomial is a sum of Legendre polynomials of the position of the block, which runs from -1
@@ -329,8 +360,9 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
         rounds: Number of reweighted least-squares rounds.
 
     Returns:
-        The coefficients of the Legendre polynomials in rad, shape (..., order + 1), and the
-        residuals of the blocks in rad, shape (..., b).
+        The coefficients of the Legendre polynomials in rad, shape (..., order + 1); their
+        covariance in rad^2, shape (..., order + 1, order + 1), from the residuals of the blocks
+        with their weights; and the residuals in rad, shape (..., b).
 
     Raises:
         ValueError: If the order is negative or not below the number of range blocks.
@@ -344,12 +376,30 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
     coherence = products.abs() / torch.where(power > 0, power, 1)
     weight = coherence.square()
     coefficients, residual = _weighted_fit(basis, angle, weight)
+    final = weight
     for _ in range(rounds):
         scale = 1.5 * residual.abs().median(-1, keepdim=True).values.clamp_min(1e-6)
-        coefficients, residual = _weighted_fit(basis, angle, weight / (1 + (residual / (2 * scale)).square()))
+        final = weight / (1 + (residual / (2 * scale)).square())
+        coefficients, residual = _weighted_fit(basis, angle, final)
     constant = torch.zeros_like(coefficients)
     constant[..., 0] = mean
-    return coefficients + constant, residual
+    return coefficients + constant, _fit_covariance(basis, final, residual), residual
+
+
+def _fit_covariance(basis: Tensor, weight: Tensor, residual: Tensor) -> Tensor:
+    """Covariance of the coefficients of `_weighted_fit` from its residuals, whatever their spread.
+
+    Each residual is divided by 1 minus its leverage, the share that the block has in its own fit.
+    """
+    normal = (basis * weight[..., None]).mT @ basis
+    size = normal.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None] + 1e-30
+    inverse = (
+        torch.linalg.inv(normal / size + 1e-12 * torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device))
+        / size
+    )
+    leverage = weight * ((basis @ inverse) * basis).sum(-1)
+    influence = (basis @ inverse) * (weight * residual / (1 - leverage).clamp_min(0.1))[..., None]
+    return influence.mT @ influence
 
 
 def _weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -487,25 +537,26 @@ class RangeDependentCentroid(Stage):
         Returns:
             `doppler_range_hz` of every range cell, shape (..., range), and `doppler_baseband_hz` in
             the middle of the swath, shape (...,), in Hz. The latter has a standard deviation. `ok`
-            is False where there is no energy, or where that standard deviation is a tenth of the
-            PRF or more. `info` holds "block_hz" (centroid of each of the b range blocks), shape
+            is False where there is no energy, where that standard deviation is 1.5 % of the PRF or
+            more, or where the energy fills less than 0.3 of the record, see `reliable_increment`.
+            `info` holds "block_hz" (centroid of each of the b range blocks), shape
             (..., b), and "coefficients_hz" (of the Legendre polynomials), shape (..., order + 1).
 
         Raises:
             ValueError: If there are too few lines or range cells for the blocks, or too few blocks
                 for the order.
         """
-        products, power = (part.sum(-2) for part in lag_products(signal.data, self.blocks))
-        coefficients, residual = fit_over_range(products, power, self.order)
+        all_products, all_power = lag_products(signal.data, self.blocks)
+        products, power = all_products.sum(-2), all_power.sum(-2)
+        coefficients, covariance, _ = fit_over_range(products, power, self.order)
         scale = self.prf_hz / (2 * math.pi)
-        n = products.shape[-1]
-        std = scale * residual.square().mean(-1).sqrt() / math.sqrt(max(1, n - self.order - 1))
-        middle = (
-            scale
-            * (coefficients @ legendre(torch.zeros(1, dtype=torch.float64, device=products.device), self.order).mT)[
-                ..., 0
-            ]
-        )
+        at_middle = legendre(torch.zeros(1, dtype=torch.float64, device=products.device), self.order)[0]
+        middle = coefficients @ at_middle
+        # blocks share targets, by which the residuals of neighbours are alike
+        std = ((covariance @ at_middle) @ at_middle).clamp_min(0).sqrt()
+        std = torch.maximum(std, increment_std_rad(all_products, middle))
+        ok = reliable_increment(all_products.sum(-1), middle, std)
+        middle, std = scale * middle, scale * std
         curve = scale * coefficients @ legendre(block_centres(signal.data.shape[-1], products.device), self.order).mT
         if doppler_hz is not None:
             curve = curve + (self.prf_hz * torch.round((doppler_hz - middle) / self.prf_hz))[..., None]
@@ -514,7 +565,7 @@ class RangeDependentCentroid(Stage):
         return Estimate(
             {"doppler_range_hz": curve, "doppler_baseband_hz": wrap_hz(middle, self.prf_hz)},
             quality,
-            (total > 0) & (std < 0.1 * self.prf_hz),
+            ok,
             {"doppler_baseband_hz": std},
             {"block_hz": scale * torch.angle(products), "coefficients_hz": scale * coefficients},
             {} if doppler_hz is None else {"doppler_range_hz": doppler_hz[..., None]},

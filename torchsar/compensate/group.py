@@ -261,23 +261,24 @@ def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
     return RangeGroup(lines.gather(-1, columns[..., None, :].expand(*lines.shape[:-1], width)), start, radar)
 
 
-def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
+def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float, always: bool = True) -> Tensor:
     """Mark the columns of a group of range cells whose targets stay in the group as they migrate.
-
-    The middle half of the columns is always marked.
 
     Args:
         width: Number of columns of the group.
         radar: Radar parameters.
         doppler_hz: Absolute centroid in Hz, shape (...,).
         dwell_s: Time that a target stays in the beam, in seconds.
+        always: Whether the middle half of the columns is marked in any case. Otherwise no column is
+            marked if the targets of fewer than half of the columns stay in the group.
 
     Returns:
         1 where the targets stay in the group, else 0; shape (..., width), float64.
     """
     curvature_m = (radar.velocity_m_s * dwell_s / 2) ** 2 / (2 * radar.near_range_m)
     half_walk = (0.25 * radar.wavelength_m * doppler_hz.abs() * dwell_s + curvature_m) / radar.range_step_m
-    reach = (width / 2 - half_walk - 2).clamp_min(width / 4)
+    reach = width / 2 - half_walk - 2
+    reach = reach.clamp_min(width / 4) if always else torch.where(reach >= width / 4, reach, -1.0)
     column = torch.arange(width, dtype=torch.float64, device=doppler_hz.device) - (width - 1) / 2
     return (column.abs() <= reach[..., None]).to(torch.float64)
 

@@ -24,6 +24,9 @@ from torchsar.metrics.bounds import tone_frequency_bound_hz
 from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import StripmapRadar
 
+# What remains without noise, from the interpolation of the response, in cycles per dwell.
+_REST_CYCLES = 2e-4
+
 
 def doppler_at(
     radar: StripmapRadar,
@@ -200,7 +203,7 @@ class PointDoppler(Stage):
         visible = max(seen[1] - seen[0], 1 / radar.prf_hz)
         # the image contains the noise of the whole PRF, not only that of the band of the point
         q = peak_to_noise * (radar.prf_hz / (rate * visible)).clamp_min(1)
-        std = tone_frequency_bound_hz(q.clamp_min(1e-12), visible)
+        std = torch.hypot(tone_frequency_bound_hz(q.clamp_min(1e-12), visible), q.new_tensor(_REST_CYCLES / visible))
         return Estimate(
             {"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)},
             1 - 1 / (1 + q),

@@ -154,9 +154,12 @@ def estimate_balance(
                 models.solve(products.movedim(-3, 0), _COARSE_DB)[0].movedim(0, -2), centres, reference
             )
             products = _products(lines * unit_phasor(delay[..., None, None] * frequency, lines.dtype), blocks, no_power)
-        weights, hessian, snr_db = models.best(products.mean(-3))
+        weights, hessian, snr_db, by_snr = models.best(products.mean(-3))
         looks = data.shape[-2] * frequency.numel() * _HANN_LOOKS
-        return _estimate_of(weights, hessian, delay, snr_db, no_power, reference, looks, centres if delays else None)
+        by_snr = by_snr / math.sqrt(2 * looks)
+        return _estimate_of(
+            weights, hessian, delay, snr_db, no_power, reference, looks, centres if delays else None, by_snr
+        )
 
 
 def _check_data(data: Tensor, radar: BistaticRadar, blocks: int, bands: int) -> None:
@@ -246,21 +249,33 @@ class _Models:
         weights, hessian, cost = _solved(matrix, self._start(products))
         return weights, hessian, 2 * cost + torch.linalg.slogdet(model)[1].mean()
 
-    def best(self, products: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def best(self, products: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Fit the channel gains and the SNR by maximum likelihood in each trial.
 
         Returns:
             Complex weights that balance the channels (..., channel), half the Hessian of the
-            negative log-likelihood and the SNR in dB.
+            negative log-likelihood, the SNR in dB, and what the error of the SNR adds to the
+            standard deviations of the logarithms of the gains (..., channel), for one look.
         """
         found = [self.solve(products, level) for level in _LEVELS_DB]
         weights, hessian, cost = (torch.stack(parts, -1) for parts in zip(*found))
         best = cost.argmin(-1)
+        around = best.clamp(1, cost.shape[-1] - 2)
+        low, middle, high = (take(cost, around + i, -1) for i in (-1, 0, 1))
+        bend = low - 2 * middle + high
+        # the gains depend smoothly on the SNR: they are interpolated to the minimum of the cost
+        step = torch.where(bend > 0, 0.5 * (low - high) / torch.where(bend > 0, bend, 1), 0).clamp(-1.5, 1.5)
+        left, centre, right = (take(weights.movedim(-1, best.ndim), around + i, best.ndim) for i in (-1, 0, 1))
+        ratios = (torch.log(side / centre) for side in (left, right))
+        before, after = (torch.view_as_real(ratio) for ratio in ratios)
+        at, slope = step[..., None, None], (after - before) / 2
+        moved = torch.view_as_complex((at * slope + at.square() * (after + before) / 2).contiguous())
         levels = torch.tensor(_LEVELS_DB, dtype=torch.float64, device=best.device)
         return (
-            take(weights.movedim(-1, best.ndim), best, best.ndim),
+            centre * torch.exp(moved),
             take(hessian.movedim(-1, best.ndim), best, best.ndim),
-            levels[best],
+            levels[around] + step * (levels[1] - levels[0]),
+            torch.where(bend > 0, torch.where(bend > 0, bend, 1).rsqrt(), 0)[..., None] * slope[..., 0],
         )
 
     def _start(self, products: Tensor) -> Tensor:
@@ -336,6 +351,7 @@ def _estimate_of(
     reference: int,
     looks: float,
     centres: Tensor | None,
+    by_snr: Tensor,
 ) -> Estimate:
     """Form the estimate relative to the reference channel and judge it."""
     value = {
@@ -344,6 +360,7 @@ def _estimate_of(
         "delay_s": delay_s - delay_s[..., reference, None],
     }
     log_std, phase_std = _standard_deviations(hessian, reference, looks)
+    log_std = torch.hypot(log_std, by_snr - by_snr[..., reference, None])
     per_hz = 0.0 if centres is None else 1 / (2 * math.pi * float(centres.square().mean().sqrt()))
     std = {"phase_rad": phase_std, "gain_db": log_std * (20 / math.log(10)), "delay_s": phase_std * per_hz}
     worst = phase_std.amax(-1)

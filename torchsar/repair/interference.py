@@ -256,13 +256,14 @@ class _InterferenceCorrection(Stage):
             The corrected signal, and an Estimate with `missing` of shape (..., pulse), bool: lines
             that were missing before, or that this stage could not correct and set to zero.
             `quality` is the share of lines that this stage did not set to zero; `ok` is False where
-            it is below one half. `info` holds, for each trial, the numbers of corrected lines,
-            `lines_touched`, and of contaminated frequency cells, `cells_touched`; and for each line
-            whether it was corrected, `touched`, and the frequency of its strongest tone,
-            `tone_cycles_per_sample`.
+            it is below one half, and for data that are all zero. `info` holds, for each trial, the
+            numbers of corrected lines, `lines_touched`, and of contaminated frequency cells,
+            `cells_touched`; and for each line whether it was corrected, `touched`, and the
+            frequency of its strongest tone, `tone_cycles_per_sample`.
         """
         result = type(self).repair(signal.data, self.threshold)
         quality = 1 - result.missing.to(torch.float64).mean(-1)
+        ok = (quality >= 0.5) & (signal.data != 0).any(-1).any(-1)
         given_up = result.missing if missing is None else result.missing | missing.bool()
         info = {
             "lines_touched": result.touched.sum(-1),
@@ -270,7 +271,7 @@ class _InterferenceCorrection(Stage):
             "touched": result.touched,
             "tone_cycles_per_sample": result.tone_cycles,
         }
-        return signal.with_data(result.data), Estimate({"missing": given_up}, quality, quality >= 0.5, info=info)
+        return signal.with_data(result.data), Estimate({"missing": given_up}, quality, ok, info=info)
 
 
 class SubtractInterference(_InterferenceCorrection):

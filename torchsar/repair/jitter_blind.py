@@ -24,6 +24,12 @@ from torch import Tensor
 from torchsar.core import Estimate, Signal, Stage
 from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap
 
+# Largest standard deviation of an offset that is ok, in samples (-24 dB of the signal).
+_MOST_STD = 0.01
+# Systematic errors as shares of the rms offset, found by trial with lines of 512 samples: without
+# noise, and for each unit of noise over signal.
+_REST_SHARE, _NOISE_SHARE = 0.005, 0.1
+
 
 @dataclass(frozen=True)
 class CyclicFit:
@@ -85,6 +91,7 @@ def cyclic_fit(y: Tensor, period: int) -> CyclicFit:
     lines = y.shape[-2]
     power = _smooth(spectrum.abs().square().mean(-2), max(1, 256 // lines))
     power = power / power.mean(-1, keepdim=True).clamp_min(1e-300)
+    signal = (power - noise_floor(power)[..., None]).clamp_min(0)  # noise of the converter has no jitter
     scale = spectrum.abs().square().mean((-2, -1)).clamp_min(1e-300)
     frequency = torch.fft.fftfreq(n, dtype=torch.float64, device=y.device)
     coefficient, variance = [], []
@@ -92,7 +99,7 @@ def cyclic_fit(y: Tensor, period: int) -> CyclicFit:
         step = k * (n // period)
         cross = (spectrum * torch.roll(spectrum, step, -1).conj()).mean(-2) / scale[..., None]
         other = torch.roll(power, step, -1)
-        slope = 2j * math.pi * (torch.roll(frequency, step, -1) * other - frequency * power)
+        slope = 2j * math.pi * (torch.roll(frequency * signal, step, -1) - frequency * signal)
         weight = 1 / (power * other).clamp_min(1e-6)
         information = (weight * slope.abs().square()).sum(-1).clamp_min(1e-300)
         value = (weight * slope.conj() * cross).sum(-1) / information
@@ -104,6 +111,19 @@ def cyclic_fit(y: Tensor, period: int) -> CyclicFit:
         torch.stack(coefficient + mirrored, -1),
         torch.stack(variance + list(reversed(variance[: (period - 1) // 2])), -1),
     )
+
+
+def noise_floor(power: Tensor) -> Tensor:
+    """Estimate the noise level of a range spectrum: the power that a twentieth of the bins do not
+    exceed.
+
+    Args:
+        power: Smoothed power spectrum, shape (..., n).
+
+    Returns:
+        Noise level, shape (...,).
+    """
+    return power.kthvalue(max(1, power.shape[-1] // 20), dim=-1).values
 
 
 def _smooth(power: Tensor, width: int) -> Tensor:
@@ -142,8 +162,9 @@ def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> T
 def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = None, passes: int = 3) -> Estimate:
     """Estimate the period and the offsets of periodic timing jitter from clutter, without a pilot.
 
-    The signal must fill most of the sampled band. A periodic gain that accompanies the jitter is
-    not modelled. Not differentiable.
+    The signal must fill most of the sampled band, but leave a twentieth of it to noise alone: noise
+    that the converter adds has no jitter, and its power is measured there. A periodic gain that
+    accompanies the jitter is not modelled. Not differentiable.
 
     Args:
         y: Raw or range-compressed lines, shape (..., pulse, range), complex, in any order.
@@ -156,8 +177,9 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
         standard deviations; and `period` of shape (...,), int64. P is the known period or
         `max_period`; beyond the period of a trial its offsets repeat. `quality` is m / (m + v),
         with the mean square m of the offsets and the variance v of their errors, or 1 where there
-        is no jitter. `ok` is False, and the offsets are zero, where a trial is all zero or sample
-        instants would coincide or cross.
+        is no jitter. `ok` is False, and the offsets are zero, where a trial is all zero, the
+        standard deviation is 0.01 samples or more (for `max_period` where no jitter is found),
+        less than half of the power is above the noise, or sample instants would coincide or cross.
 
     Raises:
         ValueError: If the period is less than 2, or lines are shorter than 8 periods.
@@ -175,15 +197,21 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
         else torch.full(rows.shape[:1], period, device=y.device)
     )
     offsets, std = (torch.zeros((rows.shape[0], longest), dtype=torch.float64, device=y.device) for _ in range(2))
-    ok = rows.abs().amax((-2, -1)) > 0
+    share = _signal_share(rows)
+    ok = (rows.abs().amax((-2, -1)) > 0) & (share >= 0.5)
     tiled = torch.arange(longest, device=y.device)
     for m in torch.unique(periods).tolist():
-        if m > 1:
-            chosen = (periods == m).nonzero()[:, 0]
+        chosen = (periods == m).nonzero()[:, 0]
+        if m == 1:
+            std[chosen] = cyclic_fit(rows[chosen], longest).std_samples[..., None].expand(-1, longest)
+        else:
             fit, total = refine_offsets(rows[chosen], m, passes)
             offsets[chosen] = total[..., tiled % m]
-            std[chosen] = fit.std_samples[..., None].expand(-1, longest)
-    ok = ok & torch.isfinite(offsets).all(-1) & (smallest_gap(offsets) >= MIN_GAP)
+            # the terms of higher order that remain, and the error of the noise level
+            share_of_noise = (1 - share[chosen]) / share[chosen].clamp_min(0.1)
+            rest = (_REST_SHARE + _NOISE_SHARE * share_of_noise) * total.square().mean(-1).sqrt()
+            std[chosen] = torch.hypot(fit.std_samples, rest)[..., None].expand(-1, longest)
+    ok = ok & (std[:, 0] < _MOST_STD) & torch.isfinite(offsets).all(-1) & (smallest_gap(offsets) >= MIN_GAP)
     offsets = torch.where(ok[..., None], offsets, 0)
     size, chance = offsets.square().mean(-1), std.square().mean(-1)
     quality = torch.where(ok, size / (size + chance).clamp_min(1e-300), 0) + (ok & (periods == 1)).to(torch.float64)
@@ -192,6 +220,14 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
     return Estimate(
         value, quality.clamp(0, 1).reshape(shape), ok.reshape(shape), {"offset_samples": std.reshape(*shape, longest)}
     )
+
+
+def _signal_share(y: Tensor) -> Tensor:
+    """Share of the power of lines (trial, pulse, range) that lies above the noise, (trial,)."""
+    unit = y / y.abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(y.real.dtype).tiny)
+    power = torch.fft.fft(unit).abs().square().mean(-2).to(torch.float64)
+    power = _smooth(power, max(1, 256 // y.shape[-2]))
+    return 1 - noise_floor(power) / power.mean(-1).clamp_min(1e-300)
 
 
 def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[CyclicFit, Tensor]:

@@ -21,6 +21,9 @@ from torchsar.core import Estimate, Signal, Stage, linear_phasor
 from torchsar.repair.jitter import MIN_GAP, smallest_gap
 
 # conventions for the offset that no pilot can determine
+# Largest standard deviation of an offset that is ok, in samples: jitter below the threshold of
+# detection, about three standard deviations, then stays below -15 dB of the signal.
+_MOST_STD = 0.01
 ORIGINS = ("mean", "first")
 
 
@@ -40,10 +43,12 @@ def estimate_jitter_pilot(
     Returns:
         Estimate with `offset_samples` of shape (..., P), in samples, and `period` of shape (...,),
         int64. P is the known period or `max_period`; beyond the period of a trial its offsets
-        repeat. The standard deviation is the Cramer-Rao bound at the measured noise. `quality` is
-        the share of the record's power that belongs to the tone. `ok` is False, and the offsets are
-        zero, where the record is not finite or all zero, where no tone exceeds the noise or the
-        tone is too close to zero frequency, and where sample instants would coincide or cross.
+        repeat. The standard deviation is the Cramer-Rao bound at the measured noise, where no
+        jitter is found for the longest period. `quality` is the share of the record's power that
+        belongs to the tone. `ok` is False, and the offsets are zero, where the record is not finite
+        or all zero, where no tone exceeds the noise or the tone is too close to zero frequency,
+        where the bound for the longest period tested is 0.01 samples or more, so that jitter may be
+        missed, and where sample instants would coincide or cross.
         `info` has the frequency of the tone in cycles per sample, `frequency_cycles`.
 
     Raises:
@@ -159,10 +164,13 @@ def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: st
     offsets = phase / radians[..., None]
     std = torch.sqrt(noise * m / (2 * n * power.clamp_min(1e-300))) / radians.abs()
     std = (std * torch.sqrt((m - 1) / m))[..., None].expand(offsets.shape)
+    tested = (torch.sqrt(noise * (longest - 1) / (2 * n * power.clamp_min(1e-300))) / radians.abs())[..., None]
+    std = torch.where((m == 1)[..., None], tested, std)
     if origin == "first":
         offsets = offsets - offsets[..., :1]
         std = std * math.sqrt(2) * torch.sqrt(m / (m - 1).clamp_min(1))[..., None] * (tiled % m[..., None] != 0)
-    ok = finite & (power * n > 50 * noise) & (power > 0) & torch.isfinite(radians) & (smallest_gap(offsets) >= MIN_GAP)
+    detected = finite & (power * n > 50 * noise) & (power > 0) & torch.isfinite(radians)
+    ok = detected & (tested[..., 0] < _MOST_STD) & (smallest_gap(offsets) >= MIN_GAP)
     offsets, m = torch.where(ok[..., None], offsets, 0), torch.where(ok, m, 1 if len(fits) > 1 else longest)
     quality = torch.where(ok, power / (power + noise).clamp_min(1e-300), 0)
     return Estimate(

@@ -25,6 +25,9 @@ from torchsar.radar import BistaticRadar
 
 # Zero padding: the parabola then errs by at most 0.004 of a Doppler cell, without padding by 0.23.
 _PAD = 4
+# Variance over that of the joint least-squares fit, since tone and slope are measured in turn: 1.3
+# squared in u_r and y0, from -10 to 60 dB per sample, with direct echoes and simulated ones.
+_LOSS = 1.7
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 # Detection threshold over all samples, -15 dB per sample with three channels and 810 pulses: below
 # it the strongest tone is often one of noise.
@@ -152,4 +155,4 @@ def _fit_at(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Ten
         slopes - weight[..., None, :, :] * (slopes * weight[..., None, :, :]).sum((-2, -1), keepdim=True) / total
     ).flatten(-2)
     normal = amplitude.abs().square()[..., None, None] * (flat @ flat.mT)
-    return Found(motion, amplitude, noise, covariance_of(normal, noise), energy, ("u_r_m_s", "y0_m"))
+    return Found(motion, amplitude, noise, _LOSS * covariance_of(normal, noise), energy, ("u_r_m_s", "y0_m"))

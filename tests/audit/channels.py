@@ -1,0 +1,414 @@
+"""Estimators of several azimuth channels: velocities of moving points, and errors of channels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
+from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar
+from torchsar.core import Draws, Estimate, Signal
+from torchsar.echo import simulate_bistatic
+from torchsar.multichannel import (
+    AlongTrackAutofocus,
+    Detector,
+    Dwell,
+    ElementBeam,
+    ElementPattern,
+    EstimateBalance,
+    EstimateSynchronisation,
+    Extraction,
+    FlatBand,
+    GradientVelocity,
+    Interferometry,
+    LeastSquares,
+    LikelihoodVelocity,
+    MigratingLines,
+    MoversImage,
+    MovingPointVelocity,
+    PointMotion,
+    Search,
+    SignalIntensityRatio,
+    WalkAmbiguity,
+    correct_balance,
+    interferometry,
+)
+from torchsar.radar import BistaticRadar
+from torchsar.scene import BandLimited, BistaticWorld, KSea, MovingPoints, Pattern
+
+F64, C128 = torch.float64, torch.complex128
+RADAR, PULSES, GATE_S = published_radar(), 900, 4.5
+GATE, SEARCH = Dwell(GATE_S), Search(u_r_m_s=15.0, u_a_m_s=6.0, y0_m=100.0, u_a_step_m_s=1.0)
+LONE = published_radar(channel_m=(0.0,))
+SMALL = (360, 64)  # pulses and cells of data with a range axis
+SPAN = RADAR.ambiguous_velocity_m_s
+LEVELS_DB = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 40.0, 60.0)
+
+Move = tuple[Tensor, Tensor, Tensor]
+
+
+def moves(trials: int, seed: int, u_r: tuple[float, float] = (-12, 12), u_a: float = 4.0, y0: float = 60.0) -> Move:
+    """Draw slant-range speeds, along-track speeds and positions, one per trial."""
+    draws = Draws(seed + 5, trials=range(trials))
+    return (
+        draws.uniform("u_r", (), *u_r),
+        draws.uniform("u_a", (), -u_a, u_a),
+        draws.uniform("y0", (), -y0, y0),
+    )
+
+
+def named(move: Move) -> dict[str, Tensor]:
+    """Values by their names."""
+    return dict(zip(("u_r_m_s", "u_a_m_s", "y0_m"), move, strict=True))
+
+
+def noise(trials: int, seed: int, *shape: int) -> Tensor:
+    """Circular noise of unit power."""
+    return Draws(seed, trials=range(trials)).normal("channels", shape, C128)
+
+
+def line(
+    snr_db: float,
+    radar: BistaticRadar = RADAR,
+    given: tuple[str, ...] = (),
+    gate_s: float = GATE_S,
+    points: int = 1,
+    known_u_a: bool = False,
+    **ranges: object,
+) -> Callable[[int, int], Batch]:
+    """Draw azimuth lines of one or more moving points by direct sums."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        move = moves(trials, seed, **ranges)
+        if known_u_a:
+            move = (move[0], torch.zeros(trials, dtype=F64), move[2])
+        clean = torch.zeros(trials, radar.channels, PULSES, dtype=C128)
+        for k in range(points):
+            here = move if k == 0 else moves(trials, seed + 31 * k)
+            for i in range(trials):
+                level = 1.0 if k == 0 else 0.3
+                clean[i] += level * azimuth_echo(radar, PULSES, *(float(x[i]) for x in here), gate_s=gate_s)
+        data = 10 ** (snr_db / 20) * clean + noise(trials, seed, radar.channels, PULSES)
+        truth = named(move)
+        return Batch(Signal(data, radar.axes(PULSES)), truth, {name: truth[name] for name in given})
+
+    return draw
+
+
+def own(
+    snr_db: float, given: tuple[str, ...] = (), known_u_a: bool = False, **ranges: object
+) -> Callable[[int, int], Batch]:
+    """Draw azimuth lines of one moving point with our own simulator."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        move = moves(trials, seed, **ranges)
+        if known_u_a:
+            move = (move[0], torch.zeros(trials, dtype=F64), move[2])
+        scene = MovingPoints(*(x[:, None] for x in move), torch.zeros(trials, 1, dtype=F64), random_phase=True)
+        world = BistaticWorld(scene, BandLimited(GATE_S), snr_db=snr_db)
+        signal = simulate_bistatic(RADAR, world, PULSES, None, Draws(seed, trials=range(trials)), dtype=C128)[0].signal
+        truth = named(move)
+        return Batch(signal, truth, {name: truth[name] for name in given})
+
+    return draw
+
+
+def sea(given: tuple[str, ...] = ()) -> Callable[[int, int], Batch]:
+    """Draw azimuth lines of homogeneous stationary clutter, without a moving point."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        generator = torch.Generator().manual_seed(seed)
+        long, factor = 4 * 8 * 1024, 8
+        f = torch.fft.fftfreq(long, 1 / (factor * RADAR.prf_hz), dtype=F64)
+        white = torch.view_as_complex(torch.randn(trials, long, 2, generator=generator, dtype=F64))
+        spectrum = white * torch.sinc(0.8 * f / 300).abs()
+        dx = torch.tensor(RADAR.channel_m, dtype=F64)[:, None]
+        delayed = spectrum[:, None] * torch.exp(-2j * math.pi * f * dx / RADAR.speed_m_s)
+        data = torch.fft.ifft(delayed, norm="ortho")[..., : factor * PULSES : factor]
+        data = data / data.abs().square().mean().sqrt() + 0.1 * noise(trials, seed, 3, PULSES)
+        zero = torch.zeros(trials, dtype=F64)
+        return Batch(Signal(data, RADAR.axes(PULSES)), None, dict.fromkeys(given, zero))
+
+    return draw
+
+
+def lines(
+    snr_db: float, given: tuple[str, ...] = (), u_r: tuple[float, float] = (-12.0, 12.0), number: int = 0
+) -> Callable[[int, int], Batch]:
+    """Draw range-compressed channels of one moving point by direct sums over frequency."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        move = moves(trials, seed, u_r, 2.0, 20.0)
+        data = torch.stack(
+            [
+                compressed_echo(
+                    RADAR,
+                    *SMALL,
+                    [{"u_r": float(move[0][i]) + number * SPAN, "u_a": float(move[1][i]), "y0": float(move[2][i])}],
+                    1.8,
+                ).data
+                for i in range(trials)
+            ]
+        )
+        noisy = 10 ** (snr_db / 20) * data + noise(trials, seed, 3, *SMALL)
+        truth = {**named(move), "ambiguity": torch.full((trials,), float(number), dtype=F64)}
+        truth["u_r_m_s"] = truth["u_r_m_s"] + number * SPAN
+        values = {name: truth[name] - (number * SPAN if name == "u_r_m_s" else 0) for name in given}
+        return Batch(Signal(noisy.to(torch.complex64), RADAR.axes(*SMALL)), truth, values)
+
+    return draw
+
+
+def ship(snr_db: float, points: int = 1) -> Callable[[int, int], Batch]:
+    """Draw a sea with moving points, as the first of eight targets of an image."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        data, speed = [], 6.0 + 3 * Draws(seed, trials=range(trials)).uniform("speed", ())
+        for i in range(trials):
+            point = {"u_r": float(speed[i]), "r0": 5000.0, "amplitude": 10 ** (snr_db / 20)}
+            data.append(compressed_echo(RADAR, 540, 120, [point] * points, 2.0).data)
+        noisy = torch.stack(data) + noise(trials, seed, 3, 540, 120)
+        return Batch(Signal(noisy.to(torch.complex64), RADAR.axes(540, 120)), {"u_r_m_s": speed})
+
+    return draw
+
+
+def first_target(found: Tensor, truth: Tensor) -> Tensor:
+    """Error of the strongest target."""
+    return (found[..., 0] - truth).abs()
+
+
+def worlds(given: tuple[str, ...] = (), known_u_a: bool = False) -> list[World]:
+    """Worlds of a velocity estimator on azimuth lines, with these true values given."""
+    at_zero = {name: lambda x: torch.zeros(len(x), dtype=F64) for name in given}
+    line_of, own_of = (partial(f, given=given, known_u_a=known_u_a) for f in (line, own))
+    return [
+        *nothing((3, PULSES), lambda x: Signal(x, RADAR.axes(PULSES)), **at_zero),
+        *(World("own", own_of(snr), snr) for snr in LEVELS_DB),
+        *(World("direct", line_of(snr), snr) for snr in (-20.0, -10.0, 0.0, 17.0)),
+        World("clutter", sea(given)),
+        World("two points", line_of(10.0, points=2), 10.0),
+        World("partly lit", line_of(10.0, gate_s=1.0), 10.0),
+        World("aliased", line_of(10.0, u_r=(SPAN - 4, SPAN + 4)), 10.0),
+    ]
+
+
+def seen_in_sea(snr_db: float) -> Callable[[int, int], Batch]:
+    """Draw a moving point in the echo of a sea through the element's pattern."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        move = moves(trials, seed, (3.0, 12.0))
+        scene = MovingPoints(*(x[:, None] for x in move), torch.zeros(trials, 1, dtype=F64), random_phase=True)
+        world = BistaticWorld(scene, Pattern(), KSea(shape=1.5), snr_db=snr_db)
+        signal = simulate_bistatic(RADAR, world, PULSES, None, Draws(seed, trials=range(trials)), dtype=C128)[0].signal
+        return Batch(signal, named(move))
+
+    return draw
+
+
+def clutter(
+    power: Callable[[Tensor], Tensor], snr_db: float, cells: int = 96, pulses: int = 256
+) -> Callable[[int, int], Batch]:
+    """Draw Gaussian clutter of a Doppler spectrum, with errors of the channels."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        long, factor = 4096, 8
+        draws = Draws(seed, trials=range(trials))
+        f = torch.fft.fftfreq(long, 1 / (factor * RADAR.prf_hz), dtype=F64)
+        level = power(f)
+        spectrum = draws.normal("white", (long, cells), C128) * (level / level.mean()).sqrt()[:, None]
+        dx = torch.tensor(RADAR.channel_m, dtype=F64)[:, None]
+        delayed = spectrum[:, None] * torch.exp(-2j * math.pi * f * dx / RADAR.speed_m_s)[..., None]
+        data = torch.fft.ifft(delayed, dim=-2, norm="ortho")[..., : pulses * factor : factor, :]
+        data = data + 10 ** (-snr_db / 20) * draws.normal("noise", tuple(data.shape[1:]), C128)
+        band = torch.fft.fftfreq(cells, 1 / RADAR.sampling_hz, dtype=F64).abs() < RADAR.pulse.bandwidth_hz / 2
+        data = torch.fft.ifft(torch.fft.fft(data) * band)
+        move = torch.tensor([1.0, 0.0, 1.0], dtype=F64)
+        truth = {
+            "phase_rad": move * draws.uniform("phase", (3,), -1.0, 1.0),
+            "gain_db": move * draws.uniform("gain", (3,), -1.0, 1.0),
+            "delay_s": move * draws.uniform("delay", (3,), -1e-8, 1e-8),
+        }
+        data = correct_balance(data, RADAR, *(-x for x in truth.values()))
+        return Batch(Signal(data, RADAR.axes(pulses, cells)), truth)
+
+    return draw
+
+
+def flat(f: Tensor) -> Tensor:
+    """Clutter over 320 Hz."""
+    return (f.abs() < 160).to(F64)
+
+
+def narrow(f: Tensor) -> Tensor:
+    """Clutter over 60 Hz."""
+    return (f.abs() < 30).to(F64)
+
+
+def beam(f: Tensor) -> Tensor:
+    """Clutter through the pattern of an element of 0.8 m."""
+    return torch.sinc(0.8 * f / 300).square()
+
+
+def moving_only(trials: int, seed: int) -> Batch:
+    """Draw one moving point without clutter, which says nothing about the channels alone."""
+    batch = lines(20.0, u_r=(4.0, 12.0))(trials, seed)
+    return Batch(batch.data, {"phase_rad": torch.zeros(trials, 3, dtype=F64)})
+
+
+def direct_path(snr_db: float, drift_s: float = 2e-8) -> Callable[[int, int], Batch]:
+    """Draw direct paths of a random phase and a drifting delay, summed over frequency."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        draws, n, pulses = Draws(seed, trials=range(trials)), 64, 60
+        t = torch.linspace(-1, 1, pulses, dtype=F64)
+        phase = math.pi * (2 * draws.uniform("phase", (pulses,)) - 1)
+        delay = drift_s * (draws.uniform("drift", (), -1, 1)[:, None] * t + draws.uniform("at", (), -1, 1)[:, None])
+        f = torch.fft.fftfreq(n, 1 / RADAR.sampling_hz, dtype=F64)
+        f = f[f.abs() < RADAR.pulse.bandwidth_hz / 2]
+        at = (torch.arange(n, dtype=F64) - n // 2) / RADAR.sampling_hz
+        clean = torch.exp(2j * math.pi * f * (at[:, None] - delay[..., None, None])).mean(-1)
+        data = clean * torch.exp(1j * phase)[..., None]
+        data = data + 10 ** (-snr_db / 20) * draws.normal("n", (pulses, n), C128)
+        return Batch(data, {"phase_rad": phase, "delay_s": delay})
+
+    return draw
+
+
+def circular(found: Tensor, truth: Tensor) -> Tensor:
+    """Rms difference of angles."""
+    return rms(torch.remainder(found - truth + math.pi, 2 * math.pi) - math.pi)
+
+
+DEFOCUS_M_S = 3.0  # u_r displaces by 17 m per m/s, here by the length of a small ship
+U_R = Quantity("u_r_m_s", DEFOCUS_M_S, floor=0.002)
+U_A = Quantity("u_a_m_s", 3.0, floor=0.01)
+Y0 = Quantity("y0_m", 50.0, floor=0.05)
+
+
+def bare_interferometry(x: Signal) -> Estimate:
+    """The function without its stage."""
+    return interferometry(x.data, RADAR, PointMotion.of(RADAR, x.data), GATE)
+
+
+def entries() -> list[Entry]:
+    """Entries of the estimators of several channels."""
+    sync = EstimateSynchronisation(RADAR)
+    dummy = Signal(torch.zeros(3, 60, dtype=C128), RADAR.axes(60))
+    start = ("u_r_m_s", "u_a_m_s", "y0_m")
+    near = worlds(start)
+    in_range = nothing(
+        (3, *SMALL),
+        lambda x: Signal(x, RADAR.axes(*SMALL)),
+    )
+    image = MoversImage(
+        RADAR,
+        LeastSquares(),
+        "subtract",
+        Extraction(along_m=60.0, range_m=30.0, integration_s=2.0, segment_s=0.4),
+        Detector(suppressed_m_s=()),
+        u_a_half_m_s=12.0,
+    )
+    known = worlds(known_u_a=True)
+    moving = MovingPointVelocity(RADAR, GATE, search=SEARCH)
+    lone = MovingPointVelocity(LONE, GATE, search=SEARCH)
+    ranged = [World("direct", lines(snr), snr) for snr in (-40.0, -30.0, -20.0, -10.0, 10.0)]
+    return [
+        Entry("multichannel.MovingPointVelocity", moving, worlds(), [U_R, U_A, Y0], 0.5),
+        Entry(
+            "multichannel.MovingPointVelocity:one channel",
+            lone,
+            [World("direct", line(snr, LONE), snr) for snr in (0.0, 20.0)],
+            [U_R, U_A, Y0],
+            0.5,
+        ),
+        Entry(
+            "multichannel.MovingPointVelocity:beam",
+            MovingPointVelocity(RADAR, ElementBeam(), search=SEARCH),
+            [World("sea and point", seen_in_sea(snr), snr) for snr in (10.0, 30.0)],
+            [U_R, U_A, Y0],
+            0.2,
+        ),
+        Entry("multichannel.interferometry", bare_interferometry, known, [U_R, Y0]),
+        Entry("multichannel.Interferometry", Interferometry(RADAR, GATE), known, [U_R, Y0]),
+        Entry(
+            "multichannel.AlongTrackAutofocus",
+            AlongTrackAutofocus(RADAR, GATE, half_m_s=8.0),
+            worlds(("u_r_m_s", "y0_m")),
+            [U_A],
+        ),
+        Entry("multichannel.LikelihoodVelocity", LikelihoodVelocity(RADAR, GATE), near, [U_R, U_A, Y0]),
+        Entry("multichannel.GradientVelocity", GradientVelocity(RADAR, GATE), near, [U_R, U_A, Y0], 0.3),
+        Entry("multichannel.SignalIntensityRatio", SignalIntensityRatio(RADAR, 337.5), known, [U_R], 0.5),
+        Entry(
+            "multichannel.WalkAmbiguity",
+            WalkAmbiguity(RADAR),
+            [
+                *in_range,
+                *ranged,
+                *(World("aliased", lines(snr, number=1), snr) for snr in (-30.0, -20.0, 10.0)),
+            ],
+            [Quantity("ambiguity", 0.5)],
+            0.3,
+        ),
+        Entry(
+            "multichannel.MigratingLines",
+            MigratingLines(RADAR, MovingPointVelocity(RADAR, Dwell(1.8), search=SEARCH), one_line=True),
+            [*in_range, *ranged],
+            [U_R, U_A, Y0],
+            0.2,
+        ),
+        Entry(
+            "multichannel.MoversImage",
+            image,
+            [
+                *nothing((3, 540, 120), lambda x: Signal(x, RADAR.axes(540, 120))),
+                *(World("direct", ship(snr), snr) for snr in (-10.0, 0.0, 10.0, 20.0)),
+            ],
+            [Quantity("u_r_m_s", DEFOCUS_M_S, first_target, 0.01, predicted=False)],
+            0.05,
+        ),
+        Entry(
+            "multichannel.EstimateBalance",
+            EstimateBalance(RADAR, FlatBand(360.0), 2),
+            [
+                *nothing((3, 256, 96), lambda x: Signal(x, RADAR.axes(256, 96))),
+                *(World("own", clutter(flat, snr), snr) for snr in SNR_DB),
+                World("narrow clutter", clutter(narrow, 20.0), 20.0),
+                World("other beam", clutter(beam, 20.0), 20.0),
+                World("moving point", moving_only, 20.0),
+                World("few cells", clutter(flat, 10.0, 24, 64), 10.0),
+            ],
+            [
+                Quantity("phase_rad", 0.1, circular, 1e-3),
+                Quantity("gain_db", 1.0, floor=0.02),
+                Quantity("delay_s", 3e-9, floor=2e-11),
+            ],
+            0.3,
+        ),
+        Entry(
+            "multichannel.EstimateBalance:pattern",
+            EstimateBalance(RADAR, ElementPattern(), 5),
+            [
+                *nothing((3, 256, 96), lambda x: Signal(x, RADAR.axes(256, 96))),
+                *(World("own", clutter(beam, snr), snr) for snr in (-20.0, 0.0, 20.0, 40.0)),
+                World("other beam", clutter(flat, 20.0), 20.0),
+            ],
+            [
+                Quantity("phase_rad", 0.1, circular, 1e-3),
+                Quantity("gain_db", 1.0, floor=0.02),
+                Quantity("delay_s", 3e-9, floor=2e-11),
+            ],
+            0.3,
+        ),
+        Entry(
+            "multichannel.EstimateSynchronisation",
+            lambda x: sync(dummy.with_data(x[:, None, :, 0].expand(-1, 3, -1)), direct_path=x),
+            [*nothing((60, 64)), *(World("direct", direct_path(snr), snr) for snr in SNR_DB)],
+            [Quantity("phase_rad", 0.5, circular, 1e-4), Quantity("delay_s", 5e-9, floor=1e-13)],
+        ),
+    ]

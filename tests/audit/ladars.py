@@ -1,0 +1,109 @@
+"""Estimators of the radial motion of a triangular ladar's target."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
+from tests.repair.triangles import sweeps
+from torchsar.compensate import (
+    MirrorProduct,
+    MlPeak,
+    RadialMotion,
+    SegmentedInterference,
+    SpectrumCorrelation,
+)
+from torchsar.core import Draws, Signal
+from torchsar.echo import simulate_ladar
+from torchsar.radar import LIGHT_M_S, TriangularLadar
+from torchsar.scene import LadarWorld, LetterE, Points, Polynomial, Scene, Sinusoid, Speckle
+
+F64 = torch.float64
+PERIODS = 96
+RADAR = TriangularLadar(LIGHT_M_S / 1.55e-6, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+MOTION = (Polynomial([0.3, 20.0]), Sinusoid(3e-6, 2000.0, 20.0))
+FASTER = (Polynomial([0.3, 20.0]), Sinusoid(60e-6, 3000.0, 20.0))
+
+
+def own(
+    scene: Scene | None = None, snr_db: float | None = 10.0, motion=MOTION, gate: bool = False
+) -> Callable[[int, int], Batch]:
+    """Draw sweeps of a scene in radial motion with our own simulator."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        scatterers = scene or Points([0.0, 0.03, -0.05], [0.4, 0.9, 1.3], [1.0, 0.7, 0.5], random_phase=True)
+        world = LadarWorld(scatterers, motion=motion, snr_db=snr_db)
+        recording, truth = simulate_ladar(RADAR, world, PERIODS, Draws(seed, trials=range(trials)))
+        found = {name: truth.values[name] for name in ("velocity_m_s", "range_error_up_m")}
+        named = {
+            "velocity_m_s": found["velocity_m_s"].expand(trials, PERIODS),
+            "displacement_m": found["range_error_up_m"].expand(trials, PERIODS),
+        }
+        return Batch(recording.signal, named)
+
+    return draw
+
+
+def direct(snr_db: float, scatterers=((0.5, 1.0), (0.9, 0.5))) -> Callable[[int, int], Batch]:
+    """Draw sweeps by direct evaluation of the beat, with its transients."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        clean = sweeps(RADAR, PERIODS, motion=swing, scatterers=scatterers)
+        noise = Draws(seed, trials=range(trials)).normal("direct", tuple(clean.shape), torch.complex128)
+        data = clean + noise * (clean.abs().square().mean() * 10 ** (-snr_db / 10)).sqrt()
+        middle = torch.arange(PERIODS, dtype=F64) * RADAR.pulse_step_s + RADAR.sweep_s / 2
+        truth = {"displacement_m": swing(middle).expand(trials, -1)}
+        return Batch(signal(data), truth)
+
+    return draw
+
+
+def swing(t: Tensor) -> Tensor:
+    """Radial motion in metres."""
+    return 0.3 * t + 10 * t.square() + 3e-6 * torch.sin(2 * torch.pi * 2000 * t + 0.3)
+
+
+def signal(x: Tensor) -> Signal:
+    """Sweeps with the axes of the ladar."""
+    return Signal(x.to(torch.complex64), RADAR.sweep_axes(PERIODS))
+
+
+def detrended(found: Tensor, truth: Tensor) -> Tensor:
+    """Rms phase error in rad of a range without its straight line, which displaces the image."""
+    k = torch.arange(found.shape[-1], dtype=F64) - (found.shape[-1] - 1) / 2
+    x = found - truth
+    x = x - x.mean(-1, keepdim=True)
+    x = x - (x * k).sum(-1, keepdim=True) / k.square().sum() * k
+    return 4 * torch.pi / RADAR.wavelength_m * rms(x)
+
+
+def slow(found: Tensor, truth: Tensor) -> Tensor:
+    """Rms error of the velocity in m/s."""
+    return rms(found - truth)
+
+
+JUDGED = [Quantity("velocity_m_s", 0.01, slow, 1e-5)]
+WORLDS = (
+    *nothing((2, PERIODS, RADAR.sweep_samples), signal),
+    *(World("own", own(snr_db=snr), snr) for snr in SNR_DB),
+    World("clutter", own(Speckle(300, 0.1, 1.2, range_m=0.9)), 10.0),
+    World("one point", own(Points([0.0], [0.4], random_phase=True)), 10.0),
+    World("letter", own(LetterE()), 10.0),
+    World("aliased", own(motion=FASTER), 10.0),
+)
+
+
+def entries() -> list[Entry]:
+    """Entries of the radial-motion estimators."""
+    stages = {
+        "SegmentedInterference": SegmentedInterference(RADAR),
+        "SegmentedInterference:sum": SegmentedInterference(RADAR, "sum", "per_pulse"),
+        "MirrorProduct": MirrorProduct(RADAR),
+        "MlPeak": MlPeak(RADAR),
+        "SpectrumCorrelation": SpectrumCorrelation(RADAR),
+        "RadialMotion": RadialMotion(RADAR),
+    }
+    return [*(Entry(f"compensate.{name}", stage, WORLDS, JUDGED) for name, stage in stages.items())]

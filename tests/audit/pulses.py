@@ -1,0 +1,213 @@
+"""Estimators of pulse phases, range shifts and gains of a target that turns uniformly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
+from tests.compensate.scenes import noisy, still, turned, white
+from torchsar.compensate import (
+    AlignEnvelopes,
+    Autofocus,
+    EntropyFixedPoint,
+    LinkPhases,
+    Pga,
+    PgaSca,
+    PhasePolish,
+    Sca,
+    SharpestPhase,
+    TargetAutofocus,
+    align_envelopes,
+    align_mean,
+    align_running,
+    maximum_contrast,
+    pulse_gain,
+    refine_alignment,
+    shift_range,
+)
+from torchsar.core import Draws, Estimate, Signal
+from torchsar.echo import simulate_turntable
+from torchsar.metrics import phase_rmse
+from torchsar.radar import InverseRadar
+from torchsar.scene import Aircraft, Points, TurntableWorld, UniformStartPhase
+
+F64, SINGLE = torch.float64, torch.complex64
+PULSES, CELLS = 128, 48
+LADAR = InverseRadar(193.4e12, 150e9, 2000.0, 0.016)
+
+
+def signal(x: Tensor) -> Signal:
+    """Pulses with the axes of the ladar."""
+    return Signal(x.to(SINGLE), LADAR.raw_axes(*x.shape[-2:]))
+
+
+def aircraft(snr_db: float | None) -> Callable[[int, int], Batch]:
+    """Draw aircraft with a white phase error."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        world = TurntableWorld(Aircraft(), start_phase=[UniformStartPhase()], snr_db=snr_db)
+        recording, truth = simulate_turntable(LADAR, world, PULSES, 192, Draws(seed, trials=range(trials)))
+        return Batch(recording.signal, {"phase_rad": truth.values["phase_rad"]})
+
+    return draw
+
+
+def one_point(trials: int, seed: int) -> Batch:
+    """Draw a single point with a white phase error."""
+    scene = Points([0.01], [0.0], random_phase=True)
+    world = TurntableWorld(scene, start_phase=[UniformStartPhase()], snr_db=-5.0)
+    recording, truth = simulate_turntable(LADAR, world, PULSES, CELLS, Draws(seed, trials=range(trials)))
+    return Batch(recording.signal, {"phase_rad": truth.values["phase_rad"]})
+
+
+def direct(
+    snr_db: float, per_row: int = 3, width: float = 0.5, cells: int = CELLS, lit: float = 1.0
+) -> Callable[[int, int], Batch]:
+    """Draw sums of points in every cell, with white phases, by plain formulas."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        clean = still(trials, PULSES, cells, per_row, width, seed)
+        clean = clean * (torch.arange(PULSES, dtype=F64) < lit * PULSES)[:, None]
+        phase = white(trials, PULSES, seed + 1)
+        return Batch(signal(turned(noisy(clean, snr_db, seed + 2), phase)), {"phase_rad": phase})
+
+    return draw
+
+
+def clutter(snr_db: float, width: float) -> Callable[[int, int], Batch]:
+    """Draw homogeneous clutter over a share of the Doppler band, with white phases."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        generator = torch.Generator().manual_seed(seed)
+        long = 4 * PULSES
+        spectrum = torch.view_as_complex(torch.randn(trials, long, CELLS, 2, generator=generator, dtype=F64))
+        inside = torch.fft.fftfreq(long, dtype=F64).abs() < width / 2
+        clean = torch.fft.ifft(spectrum * inside[:, None], dim=-2)[:, :PULSES]
+        phase = white(trials, PULSES, seed + 1)
+        return Batch(signal(turned(noisy(clean, snr_db, seed + 2), phase)), {"phase_rad": phase})
+
+    return draw
+
+
+def aligned(snr_db: float, size: float) -> Callable[[int, int], Batch]:
+    """Draw direct scenes whose pulses drift in range along a parabola of `size` cells."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        draws = Draws(seed + 9, trials=range(trials))
+        u = torch.linspace(-1, 1, PULSES, dtype=F64)
+        curve = size * (
+            draws.uniform("slope", (), -1, 1)[:, None] * u + draws.uniform("bend", (), -1, 1)[:, None] * u**2
+        )
+        phase = white(trials, PULSES, seed + 1)
+        few = still(trials, PULSES, 64, 2, 0.5, seed)
+        few = few * (torch.arange(64) % 8 == 4)  # separate rows, which show the shift
+        pad = torch.zeros(trials, PULSES, 32, dtype=few.dtype)
+        data = shift_range(turned(torch.cat([pad, few, pad], -1), phase), curve)
+        return Batch(noisy(data, snr_db, seed + 2).to(SINGLE), {"shift_cells": curve})
+
+    return draw
+
+
+def gains(snr_db: float) -> Callable[[int, int], Batch]:
+    """Draw focused scenes whose pulses have random gains of 2 dB."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        gain = 10 ** (0.1 * Draws(seed, trials=range(trials)).normal("gain", (PULSES,)))
+        data = still(trials, PULSES, CELLS, 1, 0.5, seed) * gain[..., None]
+        return Batch(noisy(data, snr_db, seed + 2).to(SINGLE), {"gain": gain})
+
+    return draw
+
+
+def phase_error(found: Tensor, truth: Tensor) -> Tensor:
+    """Rms error without constant and linear phase, which only displace the image."""
+    return phase_rmse(found, truth)
+
+
+def shift_error(found: Tensor, truth: Tensor) -> Tensor:
+    """Rms error of shifts without their mean, which displaces the whole image."""
+    off = found - truth
+    return rms(off - off.mean(-1, keepdim=True))
+
+
+def gain_error(found: Tensor, truth: Tensor) -> Tensor:
+    """Rms error of the logarithm of gains without its mean."""
+    off = torch.log(found.double().clamp_min(1e-9) / truth)
+    return rms(off - off.mean(-1, keepdim=True))
+
+
+PHASES = [Quantity("phase_rad", 0.5, phase_error, 0.005)]
+WORLDS = (
+    *nothing((PULSES, CELLS), signal),
+    *(World("own", aircraft(snr), snr) for snr in (-30.0, -20.0, -10.0, 0.0, 20.0, 60.0)),
+    World("clutter 60 %", clutter(5.0, 0.6), 5.0),
+    World("clutter 90 %", clutter(10.0, 0.9), 10.0),
+    World("one point", one_point, -5.0),
+    World("one row", direct(10.0, cells=1), 10.0),
+    World("few points", direct(10.0, 1, cells=4), 10.0),
+    World("many points", direct(10.0, 40), 10.0),
+    World("partly lit", direct(10.0, lit=0.6), 10.0),
+    World("aliased", direct(10.0, 3, 1.5), 10.0),
+    World("direct", direct(10.0), 10.0),
+    World("direct", direct(-10.0), -10.0),
+)
+ALIGN_WORLDS = (
+    *nothing((PULSES, 128)),
+    *(World("direct", aligned(snr, 3.0), snr) for snr in SNR_DB),
+    World("clutter", lambda trials, seed: Batch(clutter(10.0, 0.6)(trials, seed).data.data, None), 10.0),
+    World("far", aligned(10.0, 40.0), 10.0),
+)
+
+
+def entries() -> list[Entry]:
+    """Entries of the pulse-phase and alignment estimators."""
+    phases = {
+        "Sca": Sca(),
+        "Pga": Pga(),
+        "PgaSca": PgaSca(),
+        "PgaSca:synchronised": PgaSca("synchronised", "measured"),
+        "EntropyFixedPoint": EntropyFixedPoint(),
+        "LinkPhases": LinkPhases(),
+        "SharpestPhase": SharpestPhase(steps=60),
+        "maximum_contrast": lambda x: maximum_contrast(x.data, steps=60),
+        "Autofocus": Autofocus(),
+        "TargetAutofocus": TargetAutofocus(LADAR),
+        "PhasePolish": PhasePolish(),
+    }
+    heavy = ("SharpestPhase", "maximum_contrast", "Autofocus", "TargetAutofocus", "LinkPhases")
+    shifts = [Quantity("shift_cells", 0.5, shift_error, 0.02)]
+    aligners = {
+        "align_envelopes": align_envelopes,
+        "align_envelopes:single": partial(align_envelopes, degree=None),
+        "align_mean": align_mean,
+        "align_running": align_running,
+        "refine_alignment": lambda x: refine_alignment(x, align_envelopes(x)["shift_cells"]),
+        "AlignEnvelopes": lambda x: _in_cells(x),
+    }
+    return [
+        *(Entry(f"compensate.{n}", f, WORLDS, PHASES, 0.3 if n in heavy else 1.0) for n, f in phases.items()),
+        *(Entry(f"compensate.{n}", f, ALIGN_WORLDS, shifts) for n, f in aligners.items()),
+        Entry(
+            "compensate.pulse_gain",
+            pulse_gain,
+            (*nothing((PULSES, CELLS)), *(World("direct", gains(snr), snr) for snr in SNR_DB)),
+            [Quantity("gain", math.log(10) / 20, gain_error, 0.02)],  # 1 dB
+        ),
+    ]
+
+
+def _in_cells(x: Tensor) -> Estimate:
+    """The alignment stage with its shifts in cells."""
+    found = AlignEnvelopes()(signal(x))
+    cell = LADAR.raw_axes(*x.shape[-2:])[1].step
+    return replace(
+        found,
+        value={"shift_cells": found["shift_m"] / cell},
+        std={"shift_cells": found.std["shift_m"] / cell},
+    )

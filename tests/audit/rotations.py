@@ -1,0 +1,155 @@
+"""Estimators of a non-uniform rotation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing
+from tests.compensate.turning import BINS, OMEGA, PRF, PULSES, RADAR, K, echo, noise, noise_std, points
+from torchsar.compensate import (
+    Autofocus,
+    CoarseRotation,
+    CorrectPulsePhase,
+    EntropyObjective,
+    PhaseFitRotation,
+    RotationAutofocus,
+    RotationDescent,
+    RotationEvolution,
+    RotationGenetic,
+    RotationNewton,
+    RotationSearch,
+    UnevenRotation,
+)
+from torchsar.core import Alternate, Draws, Signal, Turn
+from torchsar.echo import simulate_turntable
+from torchsar.metrics import phase_rmse
+from torchsar.radar import InverseRadar
+from torchsar.scene import Aircraft, PolynomialRotation, Satellite, TurntableWorld, UniformStartPhase
+
+F64 = torch.float64
+ORDER = EntropyObjective(order=3, range_term=False, oversampling=2.0)
+LOW, HIGH = [2.0, 200.0], [20.0, 2000.0]
+WIDTH_M = 0.6
+
+
+def signal(x: Tensor) -> Signal:
+    """Pulses with the axes of the radar, in single precision."""
+    return Signal(x.to(torch.complex64), RADAR.raw_axes(*x.shape[-2:]))
+
+
+def truth_of(trials: int, **more: Tensor) -> dict[str, Tensor]:
+    """True rotation of every trial."""
+    return {
+        "omega_rad_s": torch.full((trials,), OMEGA, dtype=F64),
+        "warp_k": K.expand(trials, -1),
+        "k1_per_s": K[0].expand(trials),
+        "k2_per_s2": K[1].expand(trials),
+        **more,
+    }
+
+
+def direct(snr_db: float, count: int = 30, row: bool = False, lit: float = 1.0) -> Callable[[int, int], Batch]:
+    """Draw points by plain formulas with exact sines."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        data = []
+        for i in range(trials):
+            x, y, amplitude = points(seed + i, count)
+            clean = echo(x, 0.0 * y if row else y, amplitude)
+            clean = clean * (torch.arange(PULSES) < lit * PULSES)[:, None]
+            data.append(clean + noise_std(clean, snr_db) * noise(seed + i, *clean.shape))
+        return Batch(signal(torch.stack(data)), truth_of(trials))
+
+    return draw
+
+
+def clutter(trials: int, seed: int) -> Batch:
+    """Draw many weak scatterers over the whole Doppler band in every cell."""
+    return direct(10.0, 800)(trials, seed)
+
+
+def satellite(snr_db: float, phases: bool = False) -> Callable[[int, int], Batch]:
+    """Draw satellites with our own simulator."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        world = TurntableWorld(
+            Satellite(60, 0.3, 2.6),
+            rotation=PolynomialRotation(OMEGA, K.tolist()),
+            snr_db=snr_db,
+            start_phase=[UniformStartPhase()] if phases else [],
+        )
+        recording, truth = simulate_turntable(RADAR, world, PULSES, BINS, Draws(seed, trials=range(trials)))
+        more = {"phase_rad": truth.values["phase_rad"]} if phases else {}
+        return Batch(recording.signal, truth_of(trials, **more), {"warp_k": K.expand(trials, -1)} if phases else {})
+
+    return draw
+
+
+def aircraft(trials: int, seed: int) -> Batch:
+    """Draw aircraft that turn uniformly, of a quite different ladar."""
+    ladar = InverseRadar(193.4e12, 150e9, 2000.0, 0.005)
+    world = TurntableWorld(Aircraft(), start_phase=[UniformStartPhase()], snr_db=10.0)
+    data = simulate_turntable(ladar, world, 400, 192, Draws(seed, trials=range(trials)))[0].signal.data
+    return Batch(signal(data[..., 84 : 84 + BINS]), None)
+
+
+def warp_error(found: Tensor, truth: Tensor) -> Tensor:
+    """Phase error in rad that wrong derivatives leave at the edge of the target, rms over time."""
+    t = torch.arange(PULSES, dtype=F64) / PRF
+    d = found - truth
+    angle = OMEGA * (d[..., :1] * t**2 / 2 + d[..., 1:2] * t**3 / 6)
+    angle = angle - angle.mean(-1, keepdim=True)
+    k = t - t.mean()
+    angle = angle - (angle * k).sum(-1, keepdim=True) / k.square().sum() * k
+    return 4 * math.pi / RADAR.wavelength_m * WIDTH_M / 2 * angle.square().mean(-1).sqrt()
+
+
+WARP = [Quantity("warp_k", 0.5, warp_error, predicted=False)]
+PARTS = [Quantity("k1_per_s", 4.0, floor=0.01), Quantity("k2_per_s2", 400.0, floor=1.0)]
+RATE = [Quantity("omega_rad_s", 0.1 * OMEGA, floor=1e-6)]
+PHASES = [Quantity("phase_rad", 0.5, phase_rmse, 0.01)]
+WORLDS = (
+    *nothing((PULSES, BINS), signal),
+    *(World("own", satellite(snr), snr) for snr in SNR_DB),
+    World("clutter", clutter, 10.0),
+    World("one point", direct(10.0, 1), 10.0),
+    World("one row", direct(10.0, 12, row=True), 10.0),
+    World("few points", direct(10.0, 3), 10.0),
+    World("partly lit", direct(10.0, lit=0.5), 10.0),
+    World("turntable", aircraft),
+    World("direct", direct(20.0), 20.0),
+    World("direct", direct(0.0), 0.0),
+    World("direct", direct(-10.0), -10.0),
+)
+PHASE_WORLDS = (
+    *nothing((PULSES, BINS), signal, warp_k=lambda x: K.expand(len(x), -1)),
+    *(World("own", satellite(snr, True), snr) for snr in (-20.0, -10.0, 0.0, 20.0, 60.0)),
+)
+
+
+def entries() -> list[Entry]:
+    """Entries of the rotation estimators."""
+    shape = replace(ORDER, variables="shape")
+    small = {"population": 16, "objective": ORDER}
+    start = [9.0, 900.0]
+    searches = {
+        "RotationSearch": RotationSearch(RADAR, LOW, HIGH, [7, 7], objective=ORDER),
+        "RotationGenetic": RotationGenetic(RADAR, LOW, HIGH, generations=12, **small),
+        "RotationEvolution": RotationEvolution(RADAR, LOW, HIGH, generations=12, **small),
+        "RotationNewton": RotationNewton(RADAR, start, objective=replace(ORDER, taps=6)),
+        "RotationDescent": RotationDescent(RADAR, start, objective=shape),
+    }
+    pair = Alternate(2, phase=Turn(Autofocus(), CorrectPulsePhase()), rotation=Turn(CoarseRotation(RADAR)))
+    return [
+        Entry("compensate.UnevenRotation", UnevenRotation(RADAR), WORLDS, [*PARTS, *WARP, *RATE]),
+        Entry("compensate.CoarseRotation", CoarseRotation(RADAR), WORLDS, WARP),
+        Entry("compensate.PhaseFitRotation", PhaseFitRotation(RADAR), WORLDS, WARP),
+        *(Entry(f"compensate.{name}", stage, WORLDS, WARP, 0.1) for name, stage in searches.items()),
+        Entry("compensate.RotationAutofocus", RotationAutofocus(RADAR), PHASE_WORLDS, PHASES, 0.3),
+        Entry("core.Alternate", lambda x, warp_k: pair(x), PHASE_WORLDS, [*PHASES, *WARP], 0.3),
+    ]

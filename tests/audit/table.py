@@ -1,0 +1,57 @@
+"""The table of all estimators, and those that need no entry of their own, with the reason."""
+
+from __future__ import annotations
+
+from tests.audit import channels, ladars, pulses, repairs, rotations, strips
+from tests.audit.frame import Entry
+
+# Functions that a stage with an entry calls with the same data and settings, and stages whose
+# function has one: the verdict is formed once, in the function.
+SAME = {
+    "compensate.phase_increment": "compensate.PhaseIncrement",
+    "compensate.energy_centre": "compensate.EnergyCentre",
+    "compensate.sca": "compensate.Sca",
+    "compensate.pga": "compensate.Pga",
+    "compensate.pga_sca": "compensate.PgaSca",
+    "compensate.entropy_fixed_point": "compensate.EntropyFixedPoint",
+    "compensate.link_phases": "compensate.LinkPhases",
+    "compensate.sharpest_phase": "compensate.SharpestPhase",
+    "compensate.minimum_entropy": "compensate.SharpestPhase",
+    "compensate.autofocus": "compensate.Autofocus",
+    "compensate.phase_polish": "compensate.PhasePolish",
+    "compensate.PulseGain": "compensate.pulse_gain",
+    "compensate.uneven_rotation": "compensate.UnevenRotation",
+    "compensate.coarse_rotation": "compensate.CoarseRotation",
+    "compensate.phase_fit_rotation": "compensate.PhaseFitRotation",
+    "compensate.rotating_autofocus": "compensate.RotationAutofocus",
+    "compensate.search_rotation": "compensate.RotationSearch",
+    "compensate.genetic_rotation": "compensate.RotationGenetic",
+    "compensate.evolve_rotation": "compensate.RotationEvolution",
+    "compensate.newton_rotation": "compensate.RotationNewton",
+    "compensate.descend_rotation": "compensate.RotationDescent",
+    "compensate.segmented_interference": "compensate.SegmentedInterference",
+    "compensate.mirror_product": "compensate.MirrorProduct",
+    "compensate.ml_peak": "compensate.MlPeak",
+    "compensate.spectrum_correlation": "compensate.SpectrumCorrelation",
+    "compensate.radial_motion": "compensate.RadialMotion",
+    "multichannel.moving_point_velocity": "multichannel.MovingPointVelocity",
+    "multichannel.along_track_velocity": "multichannel.AlongTrackAutofocus",
+    "multichannel.gradient_likelihood": "multichannel.GradientVelocity",
+    "multichannel.estimate_balance": "multichannel.EstimateBalance",
+    "repair.estimate_imbalance": "repair.EstimateImbalance",
+    "repair.estimate_jitter_blind": "repair.BlindJitter",
+    "repair.estimate_jitter_pilot": "repair.PilotJitter",
+    "repair.estimate_response_sharpest": "repair.EstimateResponse",
+}
+
+
+def entries() -> list[Entry]:
+    """All entries of the audit."""
+    parts = (strips, pulses, rotations, ladars, channels, repairs)
+    return [entry for part in parts for entry in part.entries()]
+
+
+def covered(names: list[Entry]) -> set[str]:
+    """Public names that an entry, or the entry of the stage or function they share, tries."""
+    tried = {entry.name.split(":")[0] for entry in names}
+    return tried | {name for name, other in SAME.items() if other in tried}
