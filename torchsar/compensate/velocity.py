@@ -14,7 +14,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchsar.compensate.doppler import unit_peak
 from torchsar.compensate.group import (
     RangeGroup,
     aperture_s,
@@ -25,7 +24,7 @@ from torchsar.compensate.group import (
     compress,
     pick_group,
 )
-from torchsar.core import Estimate, Signal, Stage, settle
+from torchsar.core import Estimate, Signal, Stage, checked_samples, settle, unit_level
 from torchsar.optim.scalar import gradient_minimum, grid_minimum
 from torchsar.radar import StripmapRadar
 
@@ -72,6 +71,8 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
         weights in nats, shape (..., block). Their sum over the last dimension is the objective.
     """
     radar = group.radar
+    lines = checked_samples(group.data, "velocity_objective", "pulse, range")
+    group = RangeGroup(unit_level(lines), group.start, radar)
     spectrum = beam_spectrum(group, doppler_hz)
     with torch.no_grad():
         weight = block_weights(spectrum.image(doppler_hz, radar.velocity_m_s), radar, doppler_hz, dwell_s)
@@ -199,7 +200,7 @@ class EffectiveVelocity(Stage):
         radar, n = focuser.radar, raw.shape[-1]
         dwell = aperture_s(radar, n)
         lines = compress(
-            unit_peak(central_lines(raw, max(1024, round(4 * dwell * radar.prf_hz)))),
+            unit_level(central_lines(raw, max(1024, round(4 * dwell * radar.prf_hz)))),
             radar,
             focuser.spectrum(n, raw.device),
         )

@@ -3,7 +3,7 @@
 from torchsar.core.alternate import Alternate, Turn
 from torchsar.core.axis import Axis
 from torchsar.core.chain import Chain, Trace, Use, use
-from torchsar.core.check import refuse_non_finite
+from torchsar.core.check import checked_samples, level_of, refuse_non_finite, refuse_non_finite_values, unit_level
 from torchsar.core.draws import Draws
 from torchsar.core.estimate import Estimate, settle
 from torchsar.core.fft import (
@@ -47,11 +47,13 @@ __all__ = [
     "block_bytes_of",
     "centred_fft",
     "centred_ifft",
+    "checked_samples",
     "cis",
     "fft_lines",
     "from_frequency",
     "keep_freed_memory",
     "legendre",
+    "level_of",
     "linear_phasor",
     "machine_memory_bytes",
     "outer_phasor",
@@ -61,11 +63,13 @@ __all__ = [
     "real_dtype",
     "reduced_turns",
     "refuse_non_finite",
+    "refuse_non_finite_values",
     "settle",
     "spectrum_in_blocks",
     "take",
     "to_frequency",
     "transform_in_blocks",
+    "unit_level",
     "unit_phasor",
     "use",
 ]

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchsar.core.check import refuse_non_finite
+from torchsar.core.check import checked_samples, refuse_non_finite_values
 from torchsar.core.signal import Signal
 
 
@@ -23,17 +23,21 @@ class Stage(nn.Module):
     - `also_on`: further tuples of axes that it accepts.
     - `provides`: names of the values in its Estimate.
     - `takes_real`: True if it also accepts the real samples of a one-channel detector.
+    - `takes_empty`: False if it refuses a batch without trials. Otherwise the result is empty, or a
+      function that it calls refuses the batch.
 
     Raises:
-        TypeError: On a call, if the argument is not a Signal, or if the samples are not complex
-            and, with `takes_real`, not real floating-point numbers either.
-        ValueError: On a call, if the axes do not fit or a sample is not finite.
+        TypeError: On a call, if the argument is not a Signal, or if the samples are neither
+            complex64 or complex128 nor, with `takes_real`, float32 or float64.
+        ValueError: On a call, if the axes do not fit, the signal has no samples, or a sample or a
+            value is not finite; of many stages, also if it has no trials.
     """
 
     works_on: tuple[str, ...] = ("pulse", "range")
     also_on: tuple[tuple[str, ...], ...] = ()
     provides: tuple[str, ...] = ()
     takes_real: bool = False
+    takes_empty: bool = True
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
         name = type(self).__name__
@@ -46,10 +50,9 @@ class Stage(nn.Module):
             raise ValueError(
                 f"{name} works on the axes {' or '.join(map(str, (self.works_on, *self.also_on)))}, got {signal.names}"
             )
-        if not (signal.data.is_complex() or (self.takes_real and signal.data.is_floating_point())):
-            raise TypeError(f"{name} works on complex samples, got {signal.data.dtype}; form the analytic signal first")
-        refuse_non_finite(signal.data, name)
-        return super().__call__(signal, *args, **values)
+        data = checked_samples(signal.data, name, ", ".join(signal.names), real=self.takes_real, empty=self.takes_empty)
+        refuse_non_finite_values(name, **{f"argument {i}": value for i, value in enumerate(args, 2)}, **values)
+        return super().__call__(signal if data is signal.data else signal.with_data(data), *args, **values)
 
     def hold(self, name: str, value: Tensor | float) -> None:
         """Register a value of the stage as its attribute, tunable or constant.

@@ -163,6 +163,7 @@ class EstimateSynchronisation(Stage):
     works_on = ("channel", "pulse")
     also_on = (("channel", "pulse", "range"),)
     provides = ("phase_rad", "delay_s")
+    takes_empty = False
 
     def __init__(self, radar: BistaticRadar) -> None:
         super().__init__()

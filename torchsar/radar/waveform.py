@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -41,7 +42,13 @@ class LinearFM:
         return self.direction * self.bandwidth_hz / self.duration_s
 
     def n_samples(self, sampling_hz: float) -> int:
-        """Return the number of samples of the pulse at a sampling rate, at least 1."""
+        """Return the number of samples of the pulse at a sampling rate, at least 1.
+
+        Raises:
+            ValueError: If the rate is not positive and finite.
+        """
+        if not 0 < sampling_hz < math.inf:
+            raise ValueError(f"sampling_hz must be positive and finite, got {sampling_hz}")
         return max(1, round(self.duration_s * sampling_hz))
 
     def samples(

@@ -73,7 +73,7 @@ def link_phases(data: Tensor) -> Estimate:
     Reference:
         Guarnieri and Tebaldini, IEEE Trans. Geosci. Remote Sens. 46(11), 2008 (phase linking).
     """
-    pulses = prepare(data, "link_phases")
+    pulses = prepare(data, "link_phases", empty=False)
     rows, n = pulses.rows.detach(), pulses.n
     size = max(1, _BLOCK_BYTES // (16 * n * (6 * n + 2 * rows.shape[1] + 8 * _KINKS)))
     parts = [slice(first, first + size) for first in range(0, len(rows), size)]
@@ -105,6 +105,9 @@ def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor) -> Estim
 
 def _linked(rows: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Phase and standard deviation (trial, pulse) in rad, and gain (trial,) in nats, of a block."""
+    if rows.shape[-1] < 3:  # nothing to distinguish a phase error from a shift of the image
+        zero = torch.zeros(present.shape, dtype=torch.float64, device=rows.device)
+        return zero, zero + torch.inf, zero[:, 0]
     scene = _Scene.of(rows, present)
     u = scene.start(torch.where(present, pair_phase(rows, present), 0).to(torch.float64))
     active = torch.arange(len(u), device=u.device)

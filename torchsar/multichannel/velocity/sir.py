@@ -189,6 +189,7 @@ class SignalIntensityRatio(Stage):
     works_on = ("channel", "pulse")
     also_on = (("channel", "pulse", "range"),)
     provides = ("u_r_m_s",)
+    takes_empty = False
 
     def __init__(
         self,
