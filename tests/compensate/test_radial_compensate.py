@@ -174,5 +174,5 @@ def test_invalid_input_is_rejected() -> None:
         compensate_motion(sweeps, v[:3], RADAR, pulse)
     with pytest.raises(ValueError, match="1 velocities are NaN or Inf"):
         compensate_motion(sweeps, torch.where(v == v[1], torch.nan, v), RADAR, pulse)
-    with pytest.raises(TypeError, match="complex sweeps"):
+    with pytest.raises(TypeError, match="complex samples"):
         compensate_motion(sweeps.real, v, RADAR, pulse)

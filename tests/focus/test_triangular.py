@@ -146,7 +146,7 @@ def test_window_and_invalid_arguments() -> None:
         CompressSweeps(MOVING, window_m=(3.0, 0.0))(sweeps)
     with pytest.raises(ValueError, match="up before down, got shape"):
         compress_sweeps(sweeps.data[..., :100], MOVING)
-    with pytest.raises(TypeError, match="complex sweeps"):
+    with pytest.raises(TypeError, match="complex samples"):
         compress_sweeps(sweeps.data.real, MOVING)
     with pytest.raises(ValueError, match="that match their axes"):
         deramp_azimuth(out.data[..., :5], MOVING, *out.axes)

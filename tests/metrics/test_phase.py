@@ -104,7 +104,7 @@ def test_one_or_two_pulses_leave_no_residual(n):
 
 
 def test_non_finite_phases_raise():
-    with pytest.raises(ValueError, match="nan turns"):
+    with pytest.raises(ValueError, match="1 of 3 phases are NaN"):
         residual_phase(torch.tensor([0.0, torch.nan, 0.0]), torch.zeros(3))
 
 

@@ -159,7 +159,7 @@ def test_invalid_arguments_raise():
     profile = sinc_profile(256, [128.0], [1.0])
     with pytest.raises(ValueError, match="record longer"):
         replica_level(profile, 1.0, torch.tensor([[700.0, 740.0]], dtype=F64))
-    with pytest.raises(ValueError, match="complex profiles"):
+    with pytest.raises(TypeError, match="complex samples"):
         replica_level(profile.real, 1.0, torch.tensor([[70.0, 74.0]], dtype=F64))
     with pytest.raises(ValueError, match="orders from 1 on"):
         replica_zones(RADAR, 2, orders=(0,))

@@ -90,7 +90,7 @@ def test_exact_correction_is_differentiable():
 @pytest.mark.parametrize("bad", [[0.0, -1.0], [0.6, -0.5], [0.0, math.nan]])
 @pytest.mark.parametrize("method", [Exact(), Lagrange(8), BandLimited(8)])
 def test_coinciding_instants_raise(bad, method):
-    with pytest.raises(ValueError, match="instants"):
+    with pytest.raises(ValueError, match="instants|offset_samples: 1 of 2 values are NaN"):
         method(clutter(1, 64), torch.tensor(bad, dtype=torch.float64))
 
 

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.aperture import complete_aperture_centroid
-from torchsar.compensate.doppler import phase_increment, unit_peak, wrap_hz
+from torchsar.compensate.doppler import phase_increment, wrap_hz
 from torchsar.compensate.group import (
     RangeGroup,
     aperture_s,
@@ -39,7 +39,7 @@ from torchsar.compensate.group import (
     pick_group,
     student_log_likelihood,
 )
-from torchsar.core import Estimate, Signal, Stage, fft_lines, settle, take
+from torchsar.core import Estimate, Signal, Stage, checked_samples, fft_lines, settle, take, unit_level
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -142,7 +142,12 @@ def line_doppler(lines: Tensor, radar: StripmapRadar) -> tuple[Tensor, Tensor]:
     Returns:
         The Doppler, positive when closing, and its predicted standard deviation (jackknife over
         blocks of lines), both in Hz, shape (...,).
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite.
     """
+    lines = unit_level(checked_samples(lines, "line_doppler", "pulse, range"))
     modulus = lines.abs()
     level = 3 * modulus.mean((-2, -1), keepdim=True)
     limited = lines * (level / torch.where(modulus > 0, modulus, 1)).clamp_max(1)
@@ -220,11 +225,13 @@ def ambiguity_evidence(
         shape (...,), hold the two results of `line_doppler`.
 
     Raises:
-        ValueError: If `reach` is negative.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if `reach` is negative.
     """
+    raw = checked_samples(raw, "ambiguity_evidence", "pulse, range")
     turns = candidate_turns(reach, raw.device)
     dwell = aperture_s(radar, raw.shape[-1])
-    lines = compress(unit_peak(central_lines(raw, max(1024, round(4 * dwell * radar.prf_hz)))), radar, reference)
+    lines = compress(unit_level(central_lines(raw, max(1024, round(4 * dwell * radar.prf_hz)))), radar, reference)
     wide = pick_group(lines, radar, 4096)
     narrow = pick_group(lines, radar, 512)
     value, std = line_doppler(lines, radar)
@@ -267,7 +274,7 @@ def coherent_lines(raw: Tensor) -> Tensor:
     Returns:
         True where they do, shape (...,), bool.
     """
-    x = unit_peak(raw)
+    x = unit_level(raw)
     step = torch.linalg.vecdot(x[..., :-1, :], x[..., 1:, :]).to(torch.complex128)
     change = step[..., :-1].conj() * step[..., 1:]
 

@@ -16,9 +16,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchsar.compensate.doppler import lag_products, unit_peak, wrap_hz
+from torchsar.compensate.doppler import lag_products, wrap_hz
 from torchsar.compensate.group import RangeGroup, compress, full_columns, full_spectrum, stays_inside
-from torchsar.core import settle
+from torchsar.core import checked_samples, settle, unit_level
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -52,13 +52,18 @@ def complete_aperture_centroid(
         The refined centroid and its standard deviation in Hz, shape (...,) each. Where the new
         standard deviation is twice `std_hz` or more, or the targets migrate out of the swath in
         more than half of the range cells, `doppler_hz` and `std_hz` are returned instead.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite.
     """
+    raw = checked_samples(raw, "complete_aperture_centroid", "pulse, range")
     if radar.integration_s is None:
         return doppler_hz, std_hz
     dwell = math.ceil((1 + 2 * _GUARD) * radar.integration_s * radar.prf_hz)
     if raw.shape[-2] < 1.1 * dwell:
         return doppler_hz, std_hz
-    raw, value, std = unit_peak(raw), doppler_hz, std_hz
+    raw, value, std = unit_level(raw), doppler_hz, std_hz
     for _ in range(rounds):
         found, found_std = _refined(raw, radar, value, dwell, reference)
         # the standard deviation of the first estimate does not include the effect of cut apertures

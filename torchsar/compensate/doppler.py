@@ -18,7 +18,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, fft_lines, legendre, settle
+from torchsar.core import Estimate, Signal, Stage, checked_samples, fft_lines, legendre, settle, unit_level
 from torchsar.radar import StripmapRadar
 
 OVER = ("mean", "median")  # how `combine_blocks` combines the blocks
@@ -41,21 +41,6 @@ def wrap_hz(frequency_hz: Tensor, prf_hz: float) -> Tensor:
         The wrapped frequencies in Hz, same shape.
     """
     return frequency_hz - prf_hz * torch.round(frequency_hz / prf_hz)
-
-
-def unit_peak(x: Tensor) -> Tensor:
-    """Divide each trial by its peak modulus, so that squares neither underflow nor overflow.
-
-    The peak is detached: gradients do not pass through it.
-
-    Args:
-        x: Lines, shape (..., pulse, range), complex.
-
-    Returns:
-        The scaled lines, same shape; a trial of zeros is returned as it is.
-    """
-    peak = x.detach().abs().amax((-2, -1), keepdim=True)
-    return x / torch.where(peak > 0, peak, 1)
 
 
 def _bounds(n: int, parts: int, what: str) -> list[tuple[int, int]]:
@@ -83,9 +68,13 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
         product never exceeds its power; their ratio is the coherence.
 
     Raises:
-        ValueError: If there are fewer pairs of lines or range cells than blocks.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if there are fewer pairs of lines or range cells
+            than blocks.
     """
-    x = unit_peak(x)
+    x = unit_level(checked_samples(x, "lag_products", "pulse, range", finite=False))
+    peak = x.detach().abs().amax((-2, -1), keepdim=True)
+    x = x / torch.where(peak > 0, peak, 1)
     columns = [last - first for first, last in _bounds(x.shape[-1], blocks[1], "range samples")]
     products, powers = [], []
     for first, last in _bounds(x.shape[-2] - 1, blocks[0], "pairs of lines"):
@@ -123,7 +112,7 @@ def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
     Raises:
         ValueError: If there are fewer pairs of lines or range cells than blocks.
     """
-    x = unit_peak(x)
+    x = unit_level(x)
     segments = _bounds(x.shape[-2] - 1, blocks[0], "pairs of lines")
     columns = [last - first for first, last in _bounds(x.shape[-1], blocks[1], "range samples")]
     n = 2 * (max(last - first for first, last in segments) // 2 + 1)
@@ -298,12 +287,14 @@ def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), 
         range.
 
     Raises:
-        ValueError: If there are fewer pairs of lines or range cells than blocks, or `over` is
-            unknown.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if there are fewer pairs
+            of lines or range cells than blocks, or `over` is unknown.
 
     Reference:
         Tsvetkov 2017, text before Fig. 5.
     """
+    x = checked_samples(x, "phase_increment", "pulse, range")
     products, power = lag_products(x, blocks)
     return baseband_estimate(products, power, combine_blocks(products, over), prf_hz)
 
@@ -327,11 +318,14 @@ def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) ->
         spectrum wraps.
 
     Raises:
-        ValueError: If there are fewer pairs of lines or range cells than blocks.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if there are fewer pairs
+            of lines or range cells than blocks.
 
     Reference:
         Tsvetkov 2017, energy centre of the azimuth spectrum.
     """
+    x = checked_samples(x, "energy_centre", "pulse, range")
     spectra = block_spectra(x, blocks)
     products, power = circular_centre(spectra), spectra.mean(-1)
     spectrum = spectra.sum((-3, -2))
@@ -365,8 +359,11 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
         with their weights; and the residuals in rad, shape (..., b).
 
     Raises:
-        ValueError: If the order is negative or not below the number of range blocks.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if the order is negative
+            or not below the number of range blocks.
     """
+    products = checked_samples(products, "fit_over_range", "block")
     count = products.shape[-1]
     if not 0 <= order < count:
         raise ValueError(f"order of the polynomial must be 0 or more and below the {count} range blocks, got {order}")
@@ -594,11 +591,16 @@ def point_doppler(
 
     Returns:
         The Doppler in Hz, shape (...,), float64, positive when closing.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite.
     """
+    x = checked_samples(x, "point_doppler", "pulse")
     n = x.shape[-1]
     t = (torch.arange(n, dtype=torch.float64, device=x.device) - (n - 1) / 2) / prf_hz
     rate = torch.as_tensor(rate_hz_s, dtype=torch.float64, device=x.device)[..., None]
-    signal = x.to(torch.complex128) / x.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(x.real.dtype).tiny)
+    signal = unit_level(x.to(torch.complex128), 1)
     signal = signal * torch.polar(torch.ones_like(t), math.pi * torch.remainder(rate * t.square(), 2))
     size = 4 * n
     peak = torch.fft.fft(signal, size).abs().argmax(-1)

@@ -35,7 +35,17 @@ from torchsar.compensate.envelope_fit import (
 )
 from torchsar.compensate.pulse_phase import autofocus, correct_pulse_phase
 from torchsar.compensate.pulse_phase.data import checked
-from torchsar.core import Estimate, Signal, Stage, block_bytes_of, fft_lines, legendre, linear_phasor, refuse_non_finite
+from torchsar.core import (
+    Estimate,
+    Signal,
+    Stage,
+    block_bytes_of,
+    checked_samples,
+    fft_lines,
+    legendre,
+    linear_phasor,
+    refuse_non_finite,
+)
 from torchsar.metrics.image import entropy
 from torchsar.optim.descent import lbfgs
 
@@ -59,8 +69,10 @@ def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
         The shifted pulses, shape (..., pulse, range), complex.
 
     Raises:
-        ValueError: If the shifts have another shape or are not finite.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if the shifts have another shape or are not finite.
     """
+    data = checked_samples(data, "shift_range", "pulse, range", finite=False)
     n = data.shape[-1]
     shift = torch.as_tensor(shift_cells, dtype=torch.float64, device=data.device)
     if shift.ndim and shift.shape[-1] != data.shape[-2]:
@@ -222,7 +234,7 @@ def refine_alignment(
         TypeError: If the data are not complex.
         ValueError: If the data are empty or not finite, or degree or rounds are below 1.
     """
-    flat, _ = checked(data, "refine_alignment")
+    flat, _ = checked(data, "refine_alignment", empty=False)
     if degree < 1 or rounds < 1:
         raise ValueError(f"refine_alignment: degree and rounds must be 1 or more, got {degree} and {rounds}")
     flat, shift = flat.detach(), shift_cells.detach().to(torch.float64).expand(data.shape[:-1]).reshape(flat.shape[:-1])
@@ -262,7 +274,15 @@ def drift_cells(shift_cells: Tensor) -> Tensor:
 
     Returns:
         The drift in cells per pulse, shape (...,); 0 for a single pulse.
+
+    Raises:
+        ValueError: If the shifts are not real floating-point numbers, or there are none.
     """
+    if not shift_cells.is_floating_point() or not shift_cells.ndim or not shift_cells.shape[-1]:
+        raise ValueError(
+            f"drift_cells needs shifts (..., pulse) in real numbers, got {shift_cells.dtype} of shape "
+            f"{tuple(shift_cells.shape)}"
+        )
     n = shift_cells.shape[-1]
     k = torch.arange(n, dtype=shift_cells.dtype, device=shift_cells.device) - (n - 1) / 2
     return (shift_cells * k).sum(-1) / k.square().sum().clamp_min(1)

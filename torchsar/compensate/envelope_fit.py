@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import legendre, linear_phasor
+from torchsar.core import legendre, linear_phasor, unit_level
 
 Match = Literal["likelihood", "amplitude"]
 
@@ -67,9 +67,7 @@ class Envelopes:
         """
         n = lines.shape[-1]
         present = (lines != 0).any(-1)
-        real, imag = lines.real.abs().amax(-1, keepdim=True), lines.imag.abs().amax(-1, keepdim=True)
-        peak = torch.maximum(real, imag)
-        power = _half_cells(lines / torch.where(peak > 0, peak, 1)).abs().square()
+        power = _half_cells(unit_level(lines, 1)).abs().square()
         mean = power.mean(-1, keepdim=True)
         return Envelopes(torch.fft.rfft(power / torch.where(mean > 0, mean, 1)), present, n)
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.doppler import nominal_doppler, point_doppler, wrap_hz
-from torchsar.core import Estimate, Signal, Stage, cis, settle
+from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, settle, unit_level
 from torchsar.metrics.bounds import tone_frequency_bound_hz
 from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import StripmapRadar
@@ -51,7 +51,8 @@ def doppler_at(
         crossing_s: Slow time in seconds at which the Doppler is wanted.
 
     Returns:
-        The Doppler in Hz, positive when closing.
+        The Doppler in Hz, positive when closing; NaN where no point has the frame Doppler, since it
+        exceeds 2 velocity / wavelength.
     """
     sin = radar.sin_squint(frame_hz, velocity_m_s)
     closest = slant_m * torch.sqrt(1 - sin.square())
@@ -88,7 +89,12 @@ def peak_time_s(
 
     Returns:
         The refined slow time in seconds, shape (...,).
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite.
     """
+    image = checked_samples(image, "peak_time_s", "azimuth, range")
     n = image.shape[-2]
     weights = torch.sinc(torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - sample[..., None])
     spectrum = torch.fft.fft((image * weights[..., None, :].to(image.real.dtype)).sum(-1).to(torch.complex128))
@@ -162,6 +168,7 @@ class PointDoppler(Stage):
         Raises:
             ValueError: If neither `frame_hz` nor radar.pointing_doppler_hz gives the frame Doppler.
         """
+        signal = signal.with_data(unit_level(signal.data))
         radar, image, (azimuth, slant) = self.radar, signal.data, signal.axes
         frame = radar.pointing_doppler_hz if frame_hz is None else frame_hz
         if frame is None:

@@ -15,7 +15,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchsar.compensate.doppler import unit_peak
 from torchsar.compensate.group import (
     BeamSpectrum,
     RangeGroup,
@@ -27,7 +26,7 @@ from torchsar.compensate.group import (
     compress,
     pick_group,
 )
-from torchsar.core import Estimate, Signal, Stage, settle
+from torchsar.core import Estimate, Signal, Stage, checked_samples, settle, unit_level
 from torchsar.optim.scalar import gradient_minimum, grid_minimum
 from torchsar.radar import StripmapRadar
 
@@ -84,6 +83,8 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
         A function of the velocity in m/s, shape (...,), that returns the entropies times their
         weights in nats, shape (..., block). Their sum over the last dimension is the objective.
     """
+    lines = checked_samples(group.data, "velocity_objective", "pulse, range")
+    group = RangeGroup(unit_level(lines), group.start, group.radar)
     spectrum = beam_spectrum(group, doppler_hz)
     return _objective(spectrum, doppler_hz, _weights(spectrum, doppler_hz, dwell_s))
 
@@ -261,7 +262,7 @@ class EffectiveVelocity(Stage):
         radar, n = focuser.radar, raw.shape[-1]
         dwell = aperture_s(radar, n)
         lines = compress(
-            unit_peak(central_lines(raw, max(1024, round(4 * dwell * radar.prf_hz)))),
+            unit_level(central_lines(raw, max(1024, round(4 * dwell * radar.prf_hz)))),
             radar,
             focuser.spectrum(n, raw.device),
         )

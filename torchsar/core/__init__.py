@@ -3,7 +3,7 @@
 from torchsar.core.alternate import Alternate, Turn
 from torchsar.core.axis import Axis
 from torchsar.core.chain import Chain, Trace, Use, use
-from torchsar.core.check import refuse_non_finite
+from torchsar.core.check import checked_samples, level_of, refuse_non_finite, refuse_non_finite_values, unit_level
 from torchsar.core.draws import Draws
 from torchsar.core.estimate import Estimate, settle
 from torchsar.core.fft import (
@@ -57,6 +57,7 @@ __all__ = [
     "canonical",
     "centred_fft",
     "centred_ifft",
+    "checked_samples",
     "checksum",
     "cis",
     "document",
@@ -69,6 +70,7 @@ __all__ = [
     "is_sealed",
     "keep_freed_memory",
     "legendre",
+    "level_of",
     "linear_phasor",
     "machine_memory_bytes",
     "outer_phasor",
@@ -78,6 +80,7 @@ __all__ = [
     "real_dtype",
     "reduced_turns",
     "refuse_non_finite",
+    "refuse_non_finite_values",
     "remove_empty",
     "sealed",
     "settle",
@@ -85,6 +88,7 @@ __all__ = [
     "take",
     "to_frequency",
     "transform_in_blocks",
+    "unit_level",
     "unit_phasor",
     "use",
 ]

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchsar.core.check import checked_samples
 from torchsar.core.signal import Signal
 
 
@@ -23,7 +24,12 @@ def centred_fft(x: Tensor, dim: int = -1) -> Tensor:
 
     Returns:
         Spectrum of the same shape, frequencies rising from -(n // 2) / n cycles per sample.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128, float32 or float64.
+        ValueError: If there are no samples.
     """
+    x = checked_samples(x, "centred_fft", "sample", real=True, finite=False)
     return torch.fft.fftshift(torch.fft.fft(torch.fft.ifftshift(x, dim=dim), dim=dim), dim=dim)
 
 
@@ -38,7 +44,12 @@ def centred_ifft(x: Tensor, dim: int = -1) -> Tensor:
 
     Returns:
         Samples of the same shape.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128, float32 or float64.
+        ValueError: If there are no samples.
     """
+    x = checked_samples(x, "centred_ifft", "sample", real=True, finite=False)
     return torch.fft.fftshift(torch.fft.ifft(torch.fft.ifftshift(x, dim=dim), dim=dim), dim=dim)
 
 
@@ -55,7 +66,12 @@ def fft_lines(x: Tensor, inverse: bool = False, n: int | None = None) -> Tensor:
 
     Returns:
         Spectrum in FFT order, shape (..., n, range).
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128, float32 or float64.
+        ValueError: If there are no samples.
     """
+    x = checked_samples(x, "fft_lines", "range", real=True, finite=False)
     transform = torch.fft.ifft if inverse else torch.fft.fft
     return _ContiguousGradient.apply(transform(_ContiguousGradient.apply(x).mT.contiguous(), n)).mT
 
@@ -191,7 +207,12 @@ def transform_in_blocks(
 
     Returns:
         `out`, in FFT order.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
     """
+    x = checked_samples(x, "transform_in_blocks", "pulse, range", finite=False)
     out = x if out is None else out
     transform = torch.fft.ifft if inverse else torch.fft.fft
     if not out.is_contiguous():
@@ -221,7 +242,12 @@ def spectrum_in_blocks(x: Tensor) -> Tensor:
 
     Returns:
         Spectrum in FFT order, a new array of the same shape.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
     """
+    x = checked_samples(x, "spectrum_in_blocks", "pulse, range", finite=False)
     out = torch.empty_like(x, memory_format=torch.contiguous_format)
     if x.shape[-2] * x.shape[-1] * x.element_size() > 4 * block_bytes_of(x.device):
         return transform_in_blocks(transform_in_blocks(x, -1, out=out), -2)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchsar.core.check import refuse_non_finite
+from torchsar.core.check import checked_samples, refuse_non_finite_values
 from torchsar.core.estimate import Estimate
 from torchsar.core.signal import Signal
 
@@ -30,14 +30,17 @@ class Stage(nn.Module):
       (a phase of 0, a gain of 1), or a nominal one. If there is none, a sentence that says why; the
       estimated value is then used in all trials.
     - `takes_real`: True if it also accepts the real samples of a one-channel detector.
+    - `takes_empty`: False if it refuses a batch without trials. Otherwise the result is empty, or a
+      function that it calls refuses the batch.
 
     If a value that the stage provides is also one of the arguments of the call, such as a start or
     a value known a priori, this argument is the neutral value.
 
     Raises:
-        TypeError: On a call, if the argument is not a Signal, or if the samples are not complex
-            and, with `takes_real`, not real floating-point numbers either.
-        ValueError: On a call, if the axes do not fit or a sample is not finite.
+        TypeError: On a call, if the argument is not a Signal, or if the samples are neither
+            complex64 or complex128 nor, with `takes_real`, float32 or float64.
+        ValueError: On a call, if the axes do not fit, the signal has no samples, or a sample or a
+            value is not finite; of many stages, also if it has no trials.
     """
 
     works_on: tuple[str, ...] = ("pulse", "range")
@@ -45,6 +48,7 @@ class Stage(nn.Module):
     provides: tuple[str, ...] = ()
     neutral: Mapping[str, Tensor | float | str] = MappingProxyType({})
     takes_real: bool = False
+    takes_empty: bool = True
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
         name = type(self).__name__
@@ -57,10 +61,9 @@ class Stage(nn.Module):
             raise ValueError(
                 f"{name} works on the axes {' or '.join(map(str, (self.works_on, *self.also_on)))}, got {signal.names}"
             )
-        if not (signal.data.is_complex() or (self.takes_real and signal.data.is_floating_point())):
-            raise TypeError(f"{name} works on complex samples, got {signal.data.dtype}; form the analytic signal first")
-        refuse_non_finite(signal.data, name)
-        result = super().__call__(signal, *args, **values)
+        data = checked_samples(signal.data, name, ", ".join(signal.names), real=self.takes_real, empty=self.takes_empty)
+        refuse_non_finite_values(name, **{f"argument {i}": value for i, value in enumerate(args, 2)}, **values)
+        result = super().__call__(signal if data is signal.data else signal.with_data(data), *args, **values)
         if isinstance(result, Estimate):
             return self._with_neutral(result, values)
         if isinstance(result, tuple) and isinstance(result[-1], Estimate):

@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, per_trial, real_dtype, unit_phasor
+from torchsar.core import Signal, checked_samples, per_trial, real_dtype, unit_phasor
 from torchsar.focus.nufft import Nufft, Points, interpolate
 from torchsar.focus.omega_k import Focuser, FrameGeometry
 from torchsar.radar import StripmapRadar
@@ -140,10 +140,13 @@ def backproject(
         coordinates.
 
     Raises:
-        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
-            of the leading dims of the data, the velocity is not positive, or the magnitude of
-            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if `doppler_hz` or `velocity_m_s` is neither a
+            number nor a tensor in the shape of the leading dims of the data, the velocity is not
+            positive, or the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
+            wavelength.
     """
+    raw = checked_samples(raw, "backproject", "pulse, range", finite=False)
     at = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
     x, r = torch.broadcast_tensors(
         *(torch.as_tensor(v, dtype=torch.float64, device=raw.device) for v in (azimuth_m, range_m))

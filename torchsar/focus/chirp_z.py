@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import centred_fft, linear_phasor, per_trial, unit_phasor
+from torchsar.core import centred_fft, checked_samples, linear_phasor, per_trial, unit_phasor
 from torchsar.focus.nufft import smooth_length
 
 
@@ -40,8 +40,10 @@ def chirp_z(
         Spectrum, shape (..., n) along `dim`, complex.
 
     Raises:
-        ValueError: If `n` is below 1.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if `n` is below 1.
     """
+    x = checked_samples(x, "chirp_z", "sample", finite=False)
     if n < 1:
         raise ValueError(f"n, the number of frequencies of a chirp-z transform, must be at least 1, got n={n}")
     if dim % x.ndim != x.ndim - 1:
@@ -85,12 +87,14 @@ def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: T
         Pulses of the same shape.
 
     Raises:
-        ValueError: If the number of frequencies does not fit the data, the carrier is not positive,
-            or a frequency is at or below minus the carrier.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if the number of frequencies does not fit the data,
+            the carrier is not positive, or a frequency is at or below minus the carrier.
 
     Reference:
         Perry, DiPietro and Fante 1999, IEEE Trans. AES 35(1).
     """
+    data = checked_samples(data, "keystone", "pulse, range frequency", finite=False)
     n, frequency_hz = data.shape[-2], frequency_hz.to(device=data.device, dtype=torch.float64)
     if frequency_hz.shape != data.shape[-1:]:
         raise ValueError(

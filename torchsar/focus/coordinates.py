@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import Signal, Stage, real_dtype
+from torchsar.core import Signal, Stage, checked_samples, real_dtype
 from torchsar.core.select import per_trial
 from torchsar.focus.nufft import Nufft
 from torchsar.focus.omega_k import Focuser
@@ -37,7 +37,12 @@ def closest_range(
 
     Returns:
         Image of the same shape on the same range axis, which now is the range of closest approach.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
     """
+    image = checked_samples(image, "closest_range", "azimuth, range", finite=False)
     n = image.shape[-1]
     sin = radar.sin_squint(
         per_trial(frame_hz, 2, image), per_trial(radar.velocity_m_s if velocity_m_s is None else velocity_m_s, 2, image)

@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, centred_ifft, fft_lines, real_dtype, unit_phasor
+from torchsar.core import Axis, Signal, Stage, centred_ifft, checked_samples, fft_lines, real_dtype, unit_phasor
 from torchsar.radar import InverseRadar
 
 # windows over the pulses that `AzimuthTransform` accepts
@@ -45,8 +45,11 @@ def compress_dechirped(
         peak.
 
     Raises:
-        ValueError: If a velocity is given and the radar has no pulse length.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if a velocity is given and the radar has no pulse
+            length.
     """
+    raw = checked_samples(raw, "compress_dechirped", "pulse, fast time", finite=False)
     n = raw.shape[-1]
     cell = torch.arange(n, dtype=torch.float64, device=raw.device) - n // 2
     if velocity_m_s is not None:
@@ -79,7 +82,12 @@ def azimuth_transform(pulses: Tensor, window: str = "none", oversampling: int = 
 
     Returns:
         Image, shape (..., oversampling * pulse, range).
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
     """
+    pulses = checked_samples(pulses, "azimuth_transform", "pulse, range", finite=False)
     k = pulses.shape[-2]
     n = oversampling * k
     if window == "hann":

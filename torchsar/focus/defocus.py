@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import outer_phasor, phasor_tables
+from torchsar.core import checked_samples, outer_phasor, phasor_tables
 from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, refocus_turns_per_sample
 from torchsar.radar import StripmapRadar
 
@@ -154,10 +154,13 @@ def defocus_omega_k(
         Raw lines, same shape.
 
     Raises:
-        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
-            of the leading dims of the image, the velocity is not positive, or the magnitude of
-            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if `doppler_hz` or `velocity_m_s` is neither a
+            number nor a tensor in the shape of the leading dims of the image, the velocity is not
+            positive, or the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
+            wavelength.
     """
+    image = checked_samples(image, "defocus_omega_k", "azimuth, range", finite=False)
     operator = InvertibleOmegaK(
         radar, image, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, frame_hz=frame_hz, reference=reference
     )

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torchsar.core import Axis, Signal, Stage
+from torchsar.core import Axis, Signal, Stage, checked_samples, level_of
 
 
 def power(image: Tensor) -> Tensor:
@@ -34,24 +34,45 @@ def multilook(image: Tensor, looks: tuple[int, int]) -> Tensor:
         Mean power, shape (..., azimuth // a, range // r), real.
 
     Raises:
-        ValueError: If a block exceeds the image.
+        TypeError: If the samples are not complex64 or complex128, float32 or float64.
+        ValueError: If there are no samples, a block exceeds the image, or the power overflows or
+            underflows.
     """
+    image = checked_samples(image, "multilook", "azimuth, range", real=True, finite=False)
     azimuth, range_ = looks
     if not (1 <= azimuth <= image.shape[-2] and 1 <= range_ <= image.shape[-1]):
         raise ValueError(
             f"looks (azimuth, range) must be at least 1 and at most the {tuple(image.shape[-2:])} samples of the "
             f"image, got {looks}"
         )
+    _refuse_unsquarable(image)
     x = power(image)
     return avg_pool2d(x.reshape(-1, 1, *x.shape[-2:]), looks).reshape(
         *x.shape[:-2], x.shape[-2] // azimuth, x.shape[-1] // range_
     )
 
 
+def _refuse_unsquarable(image: Tensor) -> None:
+    """Raise ValueError if the power of complex samples overflows or underflows as a whole."""
+    if not image.is_complex():
+        return
+    level = level_of(image)
+    peak, limits = level.double().square() * 2, torch.finfo(level.dtype)
+    try:
+        outside = bool(((peak > limits.max / 4) | (peak < limits.tiny)).any())
+    except RuntimeError:  # inside vmap values cannot be read
+        return
+    if outside:
+        raise ValueError(
+            f"multilook: the power of samples of about {float(level.max()):.3g} does not fit {level.dtype}; divide the "
+            "image by its peak, convert it to complex128, or use `amplitude`"
+        )
+
+
 def amplitude(image: Tensor, looks: tuple[int, int] = (1, 1)) -> Tensor:
     """Compute the amplitude of an image: the square root of the mean power of blocks of samples.
 
-    Complex images are divided by their peak before squaring and multiplied by it afterwards, so
+    Complex images are divided by their level before squaring and multiplied by it afterwards, so
     that very large or small values neither overflow nor underflow.
 
     Args:
@@ -62,12 +83,14 @@ def amplitude(image: Tensor, looks: tuple[int, int] = (1, 1)) -> Tensor:
         Amplitude, shape (..., azimuth // a, range // r), real.
 
     Raises:
-        ValueError: If a block exceeds the image.
+        TypeError: If the samples are not complex64 or complex128, float32 or float64.
+        ValueError: If there are no samples, or if a block exceeds the image.
     """
-    peak = image.detach().abs().amax((-2, -1), keepdim=True)
-    mean = multilook(image / torch.where(peak > 0, peak, 1), looks) if image.is_complex() else multilook(image, looks)
-    root = torch.where(mean > 0, torch.sqrt(mean.clamp_min(torch.finfo(mean.dtype).tiny)), 0)
-    return root * peak if image.is_complex() else root
+    image = checked_samples(image, "amplitude", "azimuth, range", real=True, finite=False)
+    level = level_of(image)
+    mean = multilook(image / level, looks) if image.is_complex() else multilook(image, looks)
+    root = torch.where(mean <= 0, 0, torch.sqrt(mean.clamp_min(torch.finfo(mean.dtype).tiny)))
+    return root * level if image.is_complex() else root
 
 
 def to_db(power_: Tensor, floor_db: float = -120.0, reference: Tensor | None = None) -> Tensor:
@@ -80,7 +103,13 @@ def to_db(power_: Tensor, floor_db: float = -120.0, reference: Tensor | None = N
 
     Returns:
         Power in dB, same shape.
+
+    Raises:
+        ValueError: If the power is no tensor of real floating-point numbers, or empty.
     """
+    if not isinstance(power_, Tensor) or not power_.is_floating_point() or power_.ndim < 2 or not power_.numel():
+        got = f"{power_.dtype} of shape {tuple(power_.shape)}" if isinstance(power_, Tensor) else type(power_).__name__
+        raise ValueError(f"to_db converts real power (..., azimuth, range) with at least one sample, got {got}")
     top = power_.detach().amax((-2, -1)) if reference is None else reference
     top = top[..., None, None]
     ratio = power_ / torch.where(top > 0, top, 1)

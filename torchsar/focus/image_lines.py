@@ -21,6 +21,9 @@ from torchsar.core import per_trial
 from torchsar.focus.nufft import smooth_length
 from torchsar.focus.warped_sums import whole_warp
 
+# far more lines than fit any memory; the search of a fast length would take seconds
+_MOST_LINES = 1e7
+
 
 def lines_for(cells: float, oversampling: float = 2.0) -> int:
     """Return the number of image lines that cover the Doppler band of a target.
@@ -36,12 +39,17 @@ def lines_for(cells: float, oversampling: float = 2.0) -> int:
         An even number of lines, with a fast FFT.
 
     Raises:
-        ValueError: If `cells` or `oversampling` is not positive.
+        ValueError: If `cells` or `oversampling` is not positive, or there are too many lines.
     """
     if not (math.isfinite(cells) and cells > 0 and oversampling > 0):
         raise ValueError(
             f"image lines need a positive number of cells and a positive oversampling, got cells={cells} and "
             f"oversampling={oversampling}"
+        )
+    if not cells * oversampling < _MOST_LINES:
+        raise ValueError(
+            f"an image has at most {_MOST_LINES:g} lines, got cells={cells} and oversampling={oversampling}; "
+            "check their units"
         )
     return 2 * smooth_length(math.ceil(cells * oversampling) + 1)
 
@@ -60,7 +68,12 @@ def mean_rate(omega_rad_s: Tensor | float, k: Tensor, duration_s: float) -> Tens
 
     Returns:
         Mean rotation rate in rad/s, shape (...,), float64.
+
+    Raises:
+        ValueError: If the duration is not positive and finite.
     """
+    if not 0 < duration_s < math.inf:
+        raise ValueError(f"duration_s of an aperture must be positive and finite, got {duration_s}")
     total = whole_warp(k.to(torch.float64), duration_s)[..., 0]
     return per_trial(omega_rad_s, 0, total) * total / duration_s
 
@@ -84,6 +97,9 @@ def cross_range_of(
 
     Returns:
         Cross range in metres, shape (..., f), or (...,) for a single frequency.
+
+    Raises:
+        ValueError: If the duration is not positive and finite.
     """
     rate = mean_rate(omega_rad_s, k, duration_s)
     doppler = torch.as_tensor(doppler_hz, dtype=torch.float64, device=rate.device)

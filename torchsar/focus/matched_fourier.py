@@ -30,7 +30,17 @@ import warnings
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, outer_phasor, per_trial, phasor_tables, real_dtype, unit_phasor
+from torchsar.core import (
+    Axis,
+    Signal,
+    Stage,
+    checked_samples,
+    outer_phasor,
+    per_trial,
+    phasor_tables,
+    real_dtype,
+    unit_phasor,
+)
 from torchsar.core.warp import least_rate, warp, warp_rate
 from torchsar.focus.image_lines import CrossRangeLines, DopplerLines
 from torchsar.focus.transforms import Gridding, PulsesToLines, Transform
@@ -73,9 +83,14 @@ def range_phase(
     Returns:
         Pulses of the same shape.
 
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
+
     Reference:
         Remote Sens. 2025, 17, 3447, Eqs. (7)-(8).
     """
+    data = checked_samples(data, "range_phase", "pulse, range", finite=False)
     n_pulse, n_range = data.shape[-2:]
     phi = warp(slow_times(n_pulse, prf_hz, data.device), k.to(torch.float64))
     # turns per metre of range
@@ -119,11 +134,14 @@ def matched_fourier(
         in every pulse has a peak of a sqrt(pulses) with weight "matched".
 
     Raises:
-        ValueError: If there are fewer than 8 pulses, or `weight` is not known.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if there are fewer than 8 pulses, or `weight` is not
+            known.
 
     Reference:
         Remote Sens. 2025, 17, 3447, Eqs. (9)-(10).
     """
+    data = checked_samples(data, "matched_fourier", "pulse, range", finite=False)
     operator = MatchedFourierOperator(
         warp_k.to(data.device),
         data.shape[-2],
@@ -338,6 +356,8 @@ class MatchedFourier(Stage):
             a Doppler above the pulse rate. The stage warns if this Doppler exceeds 0.95 times half
             the pulse rate.
     """
+
+    takes_empty = False
 
     omega_rad_s: Tensor | None
     warp_k: Tensor | None

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import real_dtype
+from torchsar.core import checked_samples, real_dtype
 
 # fineness of the FFT grid relative to the samples, the usual choice in gridding
 OVERSAMPLING = 2
@@ -354,8 +354,9 @@ def nufft_type2(x: Tensor, points: Tensor, eps: float = 1e-6) -> Tensor:
 
     Raises:
         TypeError: If the points are not float64; float32 does not resolve positions in a long row.
-        ValueError: If `eps` lies outside 1e-13..0.1.
+        ValueError: If there are no samples, or if `eps` lies outside 1e-13..0.1.
     """
+    x = checked_samples(x, "nufft_type2", "mode", finite=False)
     plan = Nufft(x.shape[-1], eps, x.dtype, x.device)
     return plan.type2(x, plan.points(_as_points(points)))
 
@@ -377,8 +378,9 @@ def nufft_type1(y: Tensor, points: Tensor, n: int, eps: float = 1e-6) -> Tensor:
 
     Raises:
         TypeError: If the points are not float64.
-        ValueError: If `eps` lies outside 1e-13..0.1.
+        ValueError: If there are no samples, or if `eps` lies outside 1e-13..0.1.
     """
+    y = checked_samples(y, "nufft_type1", "point", finite=False)
     plan = Nufft(n, eps, y.dtype, y.device)
     return plan.type1(y, plan.points(_as_points(points)))
 

@@ -32,6 +32,7 @@ from torchsar.core import (
     Signal,
     Stage,
     block_bytes_of,
+    checked_samples,
     cis,
     linear_phasor,
     outer_phasor,
@@ -482,14 +483,16 @@ def omega_k(
         Image, shape (..., azimuth, range), complex.
 
     Raises:
-        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
-            of the leading dims of the data, the velocity is not positive, the magnitude of
-            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, or `band_hz` is not
-            positive.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if `doppler_hz` or `velocity_m_s` is neither a
+            number nor a tensor in the shape of the leading dims of the data, the velocity is not
+            positive, the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
+            wavelength, or `band_hz` is not positive.
 
     Reference:
         Tsvetkov 2017, focusing steps 1 to 5 after Eq. (2).
     """
+    raw = checked_samples(raw, "omega_k", "pulse, range", finite=False)
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2
     basis = FrequencyBasis(radar, n, raw.device, geometry.sin_reach)

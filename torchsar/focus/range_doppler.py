@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_phasor, real_dtype, unit_phasor
+from torchsar.core import checked_samples, linear_phasor, real_dtype, unit_phasor
 from torchsar.focus.nufft import Nufft, Points
 from torchsar.focus.omega_k import STATIONARY_TURNS, Focuser, FrameGeometry, refocus_turns_per_sample, through_doppler
 from torchsar.radar import StripmapRadar
@@ -67,11 +67,13 @@ def range_doppler(
         Image, shape (..., azimuth, range), complex, with coordinates and phases as in `omega_k`.
 
     Raises:
-        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
-            of the leading dims of the data, the velocity is not positive, the magnitude of
-            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, or `band_hz` is not
-            positive.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if `doppler_hz` or `velocity_m_s` is neither a
+            number nor a tensor in the shape of the leading dims of the data, the velocity is not
+            positive, the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
+            wavelength, or `band_hz` is not positive.
     """
+    raw = checked_samples(raw, "range_doppler", "pulse, range", finite=False)
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre, real = raw.shape[-1], raw.shape[-1] // 2, real_dtype(raw.dtype)
     plan = Nufft(n, eps, raw.dtype, raw.device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, Stage, real_dtype
+from torchsar.core import Signal, Stage, checked_samples, real_dtype
 from torchsar.radar import LinearFM, StripmapRadar
 
 
@@ -85,7 +85,12 @@ def range_compress(raw: Tensor, reference: Tensor) -> Tensor:
 
     Returns:
         Range-compressed data, same shape.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
     """
+    raw = checked_samples(raw, "range_compress", "range", finite=False)
     return torch.fft.ifft(torch.fft.fft(raw) * reference.to(raw.dtype))
 
 

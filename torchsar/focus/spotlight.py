@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, real_dtype, unit_phasor
+from torchsar.core import Axis, Signal, Stage, checked_samples, real_dtype, unit_phasor
 from torchsar.focus.nufft import Nufft, Points, interpolate
 from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, frequency_step_hz, geometry_of
 
@@ -109,9 +109,10 @@ def backproject_spotlight(
 
     Raises:
         TypeError: If the profiles are not complex.
-        ValueError: If the size of the profiles is not that of the geometry, there is no pixel, or
-            the window is not known.
+        ValueError: If there are no samples, or if the size of the profiles is not that of the
+            geometry, there is no pixel, or the window is not known.
     """
+    profiles = checked_samples(profiles, "backproject_spotlight", "pulse, range", finite=False)
     refuse_other_size(profiles, geometry)
     x, y = torch.broadcast_tensors(
         *(torch.as_tensor(v, dtype=torch.float64, device=profiles.device) for v in (x_m, y_m))

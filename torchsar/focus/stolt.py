@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import real_dtype
+from torchsar.core import checked_samples, real_dtype
 from torchsar.focus.nufft import Nufft, Points
 from torchsar.focus.omega_k import (
     Focuser,
@@ -117,11 +117,14 @@ def omega_k_stolt(
         `azimuth_factor`.
 
     Raises:
-        ValueError: If `doppler_hz` or `velocity_m_s` is neither a number nor a tensor in the shape
-            of the leading dims of the data, the velocity is not positive, the magnitude of
-            `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, `band_hz` is not
-            positive, or the Doppler band of a squinted aperture does not fit the PRF.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if `doppler_hz` or `velocity_m_s` is neither a
+            number nor a tensor in the shape of the leading dims of the data, the velocity is not
+            positive, the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
+            wavelength, `band_hz` is not positive, or the Doppler band of a squinted aperture does
+            not fit the PRF.
     """
+    raw = checked_samples(raw, "omega_k_stolt", "pulse, range", finite=False)
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
     skew = DopplerSkew.of(radar, raw, doppler_hz, geometry.velocity_m_s, band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2

@@ -14,7 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, refuse_non_finite, unit_phasor
+from torchsar.core import Axis, Signal, Stage, checked_samples, refuse_non_finite, unit_phasor
 from torchsar.radar import TriangularLadar
 
 Ramp = Literal["up", "down"]
@@ -67,11 +67,13 @@ def compress_sweeps(sweeps: Tensor, radar: TriangularLadar, ramp: Ramp = "up", v
 
     Raises:
         TypeError: If the sweeps are not complex.
-        ValueError: If the sweeps have another shape or are not finite, or `ramp` is not known.
+        ValueError: If there are no samples or a sample is not finite, or if the sweeps have another
+            shape or are not finite, or `ramp` is not known.
 
     Reference:
         Remote Sens. 2024, 16, 793, Eq. (5), for the residual video phase.
     """
+    sweeps = checked_samples(sweeps, "compress_sweeps", "ramp, pulse, fast time")
     n = radar.sweep_samples
     if not (isinstance(sweeps, Tensor) and sweeps.is_complex()):
         raise TypeError(
@@ -175,9 +177,10 @@ def deramp_azimuth(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Ax
 
     Raises:
         TypeError: If the data are not complex.
-        ValueError: If the data are not finite or do not fit their axes, or the range axis reaches
-            the radar or lies behind it.
+        ValueError: If there are no samples, or if the data are not finite or do not fit their axes,
+            or the range axis reaches the radar or lies behind it.
     """
+    data = checked_samples(data, "deramp_azimuth", "pulse, range", finite=False)
     _check_profiles(data, pulse, range_, "deramp_azimuth")
     return data * unit_phasor(-azimuth_turns(pulse, range_, radar, data.device), data.dtype)
 
@@ -215,9 +218,11 @@ def azimuth_matched_filter(
 
     Raises:
         TypeError: If the data are not complex.
-        ValueError: If the data are not finite or do not fit their axes, the speed of the radar is
-            0, `beam_rad` is not positive, or `weighting` lies outside 0..0.5.
+        ValueError: If there are no samples, or if the data are not finite or do not fit their axes,
+            the speed of the radar is 0, `beam_rad` is not positive, or `weighting` lies outside
+            0..0.5.
     """
+    data = checked_samples(data, "azimuth_matched_filter", "pulse, range", finite=False)
     _check_profiles(data, pulse, range_, "azimuth_matched_filter")
     if not 0 <= weighting <= 0.5:
         raise ValueError(f"weighting must lie in 0..0.5, got {weighting}")

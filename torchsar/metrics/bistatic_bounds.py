@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import per_trial, unit_phasor
+from torchsar.core import per_trial, refuse_non_finite, unit_phasor
+from torchsar.metrics.bounds import nonnegative
 from torchsar.radar import BistaticRadar, receive_range
 
 # slant-range speed (closing positive), along-track speed, along-track position at t = 0
@@ -50,7 +51,7 @@ def radial_velocity_bound_m_s(radar: BistaticRadar, snr: Value, n_seen: Value, u
     along_m = radar.channels_at()
     spread = (along_m - along_m.mean()).square().sum()
     speed = radar.speed_m_s - torch.as_tensor(u_a_m_s, dtype=torch.float64)
-    energy = torch.as_tensor(n_seen, dtype=torch.float64) * torch.as_tensor(snr, dtype=torch.float64)
+    energy = nonnegative(n_seen) * nonnegative(snr)
     return speed * radar.wavelength_m / (2 * math.pi * torch.sqrt(2 * energy * spread))
 
 
@@ -130,7 +131,7 @@ def bistatic_bounds(
     samples = torch.cat([weight[..., None].to(columns.dtype).expand(*columns.shape[:-1], 1), columns], -1)
     if covariance is not None:
         samples = _whitened(samples * point.phasor()[..., None], covariance)
-    bounds = _standard_deviations(_information(samples.flatten(-3, -2))) / per_trial(snr, 1, like).sqrt()
+    bounds = _standard_deviations(_information(samples.flatten(-3, -2))) / per_trial(nonnegative(snr), 1, like).sqrt()
     return dict(zip(unknown, bounds.unbind(-1), strict=True))
 
 
@@ -226,6 +227,12 @@ def _standard_deviations(information: Tensor) -> Tensor:
     """Square roots of the diagonal of the inverse, (..., n, n) to (..., n); infinite for unknowns
     with a share in an unobservable direction.
     """
+    refuse_non_finite(
+        information,
+        "bistatic_bounds: the Fisher information",
+        "give finite parameters of a possible instrument",
+        "elements",
+    )
     size = information.diagonal(dim1=-2, dim2=-1)
     root = torch.where(size > 0, size, 1).rsqrt()
     value, vector = torch.linalg.eigh(information * root[..., :, None] * root[..., None, :])

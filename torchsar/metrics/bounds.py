@@ -17,9 +17,29 @@ from torchsar.radar import InverseRadar
 Value = Tensor | float
 
 
-def _double(value: Value) -> Tensor:
-    """Value as a float64 tensor."""
-    return torch.as_tensor(value, dtype=torch.float64)
+def nonnegative(value: Value) -> Tensor:
+    """Convert a parameter of a bound, such as an SNR, a duration or a wavelength, to float64.
+
+    Args:
+        value: Number or tensor.
+
+    Returns:
+        Tensor of the same shape.
+
+    Raises:
+        ValueError: If an element is negative.
+    """
+    value = torch.as_tensor(value, dtype=torch.float64)
+    try:
+        negative = bool((value.detach() < 0).any())
+    except RuntimeError:  # inside vmap values cannot be read
+        return value
+    if negative:
+        raise ValueError(
+            "the parameters of a bound (SNR as a power ratio, durations, wavelengths, counts) must not be negative, "
+            f"got {float(value.detach().min()):g}"
+        )
+    return value
 
 
 def tone_frequency_bound_hz(q: Value, duration_s: Value) -> Tensor:
@@ -36,7 +56,7 @@ def tone_frequency_bound_hz(q: Value, duration_s: Value) -> Tensor:
     Returns:
         Standard deviation in Hz.
     """
-    return math.sqrt(6) / (2 * math.pi * _double(duration_s) * torch.sqrt(_double(q)))
+    return math.sqrt(6) / (2 * math.pi * nonnegative(duration_s) * torch.sqrt(nonnegative(q)))
 
 
 def reference_doppler_std_hz(q: Value, duration_s: Value) -> Tensor:
@@ -56,7 +76,7 @@ def reference_doppler_std_hz(q: Value, duration_s: Value) -> Tensor:
     Reference:
         Tsvetkov 2017, text near Fig. 5.
     """
-    return 1 / (_double(duration_s) * torch.sqrt(_double(q)))
+    return 1 / (nonnegative(duration_s) * torch.sqrt(nonnegative(q)))
 
 
 def beam_centre_bound_hz(gain: Tensor, q: Value, rate_hz_s: Value, prf_hz: float) -> Tensor:
@@ -75,11 +95,17 @@ def beam_centre_bound_hz(gain: Tensor, q: Value, rate_hz_s: Value, prf_hz: float
         prf_hz: Pulse rate in Hz.
 
     Returns:
-        Standard deviation in Hz, shape (...,).
+        Standard deviation in Hz, shape (...,); infinite without gain.
+
+    Raises:
+        ValueError: If the pulse rate is not positive and finite.
     """
+    if not 0 < prf_hz < math.inf:
+        raise ValueError(f"beam_centre_bound_hz: prf_hz must be positive and finite, got {prf_hz}")
     slope = torch.gradient(gain.to(torch.float64), spacing=1 / prf_hz, dim=-1)[0]
-    information = slope.square().sum(-1) / gain.to(torch.float64).square().sum(-1)
-    return _double(rate_hz_s) / torch.sqrt(2 * _double(q) * information)
+    energy = gain.to(torch.float64).square().sum(-1)
+    information = slope.square().sum(-1) / torch.where(energy == 0, 1, energy)
+    return nonnegative(rate_hz_s) / torch.sqrt(2 * nonnegative(q) * information)
 
 
 def velocity_bound_m_s(q: Value, dwell_s: Value, velocity_m_s: Value, wavelength_m: Value, range_m: Value) -> Tensor:
@@ -100,8 +126,8 @@ def velocity_bound_m_s(q: Value, dwell_s: Value, velocity_m_s: Value, wavelength
     Returns:
         Standard deviation in m/s.
     """
-    curvature = math.sqrt(180) / (_double(dwell_s).square() * torch.sqrt(2 * _double(q)))
-    return curvature * wavelength_m * range_m / (4 * math.pi * _double(velocity_m_s))
+    curvature = math.sqrt(180) / (nonnegative(dwell_s).square() * torch.sqrt(2 * nonnegative(q)))
+    return curvature * nonnegative(wavelength_m) * nonnegative(range_m) / (4 * math.pi * nonnegative(velocity_m_s))
 
 
 def pulse_phase_bound_rad(snr: Value, n_range: int) -> Tensor:
@@ -114,7 +140,7 @@ def pulse_phase_bound_rad(snr: Value, n_range: int) -> Tensor:
     Returns:
         Standard deviation in rad.
     """
-    return 1 / torch.sqrt(2 * n_range * _double(snr))
+    return 1 / torch.sqrt(2 * n_range * nonnegative(snr))
 
 
 def pulse_phase_bound_of_scene_rad(azimuth: Tensor, range_: Tensor, amplitude: Tensor, noise_std: Value) -> Tensor:
@@ -149,7 +175,7 @@ def pulse_phase_bound_of_scene_rad(azimuth: Tensor, range_: Tensor, amplitude: T
     ridge = 1e-9 * scale * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     explained = (cross.conj() @ torch.linalg.solve(gram + ridge, cross.mT)).real
     known = echo.abs().square().sum(-1)
-    information = 2 * (torch.diag_embed(known) - explained) / _double(noise_std).square()[..., None, None]
+    information = 2 * (torch.diag_embed(known) - explained) / nonnegative(noise_std).square()[..., None, None]
     n = echo.shape[-2]
     k = torch.arange(n, dtype=torch.float64, device=echo.device)
     free = torch.linalg.qr(torch.stack([torch.ones_like(k), k - k.mean()], -1), mode="complete").Q[:, 2:]

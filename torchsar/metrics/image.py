@@ -5,10 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal
+from torchsar.core import Signal, level_of, unit_level
 
 # quantities that sharpness is defined for, with their power of the modulus |I|
 _OF = {"intensity": 2, "amplitude": 1}
+# precision in which images of half precision are evaluated
+_WORKING = {torch.float16: torch.float32, torch.bfloat16: torch.float32, torch.complex32: torch.complex64}
 
 
 def _tensor(image: Tensor | Signal) -> Tensor:
@@ -20,11 +22,11 @@ def _tensor(image: Tensor | Signal) -> Tensor:
         raise TypeError(
             f"an image is a Signal or a tensor of numbers, got {x.dtype if isinstance(x, Tensor) else type(x).__name__}"
         )
-    if x.ndim < 2 or not x.shape[-2] * x.shape[-1]:
+    if x.ndim < 2 or not x.numel():
         raise ValueError(
             f"an image has the dims (..., azimuth, range) and at least one pixel, got the shape {tuple(x.shape)}"
         )
-    return x
+    return x.to(_WORKING.get(x.dtype, x.dtype if x.is_floating_point() or x.is_complex() else torch.float64))
 
 
 def _pair(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor, Tensor]:
@@ -39,8 +41,8 @@ def _pair(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor, T
 
 
 def _power(image: Tensor) -> Tensor:
-    """Intensity |image|^2 relative to its peak."""
-    unit = _over_peak(image)
+    """Intensity |image|^2 relative to its level."""
+    unit = unit_level(image)
     return unit.real.square() + unit.imag.square() if unit.is_complex() else unit.square()
 
 
@@ -55,7 +57,7 @@ def _levels(image: Tensor | Signal, of: str, mask: Tensor | None, what: str) -> 
     if weight is not None:
         x = torch.where(weight > 0, x, 0)
     level = (
-        _power(x) if of == "intensity" else _over_peak(x).abs()
+        _power(x) if of == "intensity" else unit_level(x).abs()
     )  # abs has the gradient 0 at zero, where the square root of the power has none
     return level, None if weight is None else weight.to(level.dtype)
 
@@ -146,8 +148,8 @@ def contrast(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None 
     count = level.shape[-2] * level.shape[-1] if weight is None else torch.where(_sum(weight) > 0, _sum(weight), 1)
     mean = _sum(level, weight) / count
     spread = _sum((level - mean[..., None, None]).square(), weight) / count
-    varied = spread > torch.finfo(spread.dtype).tiny
-    return torch.where(varied, torch.where(varied, spread, 1).sqrt(), 0) / torch.where(mean > 0, mean, 1)
+    flat = spread <= torch.finfo(spread.dtype).tiny
+    return torch.where(flat, 0, torch.where(flat, 1, spread).sqrt()) / torch.where(mean == 0, 1, mean)
 
 
 def _sum(x: Tensor, weight: Tensor | None = None) -> Tensor:
@@ -157,17 +159,11 @@ def _sum(x: Tensor, weight: Tensor | None = None) -> Tensor:
 
 def _norm(x: Tensor) -> Tensor:
     """Square root of the energy of each image, summed in float64; in float32 the sum of a million
-    terms would lose the fourth digit.
+    terms would lose the fourth digit, and squares could overflow.
     """
-    return (x.real.square() + x.imag.square()).sum((-2, -1), dtype=torch.float64).sqrt()
-
-
-def _over_peak(x: Tensor) -> Tensor:
-    """Image divided by its detached peak per trial, so that squares neither underflow nor overflow;
-    zero images stay zero.
-    """
-    peak = x.detach().abs().amax((-2, -1), keepdim=True)
-    return x / torch.where(peak > 0, peak, 1)
+    level = level_of(x)
+    unit = x / level
+    return (unit.real.square() + unit.imag.square()).sum((-2, -1), dtype=torch.float64).sqrt() * level[..., 0, 0]
 
 
 def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
@@ -186,7 +182,7 @@ def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
         TypeError: If one of them is not a tensor of numbers.
         ValueError: If they are not complex images of equal size.
     """
-    a, b = (_over_peak(x) for x in _pair(image, reference))
+    a, b = (unit_level(x) for x in _pair(image, reference))
     product = (a * b.conj()).sum((-2, -1), dtype=torch.complex128).abs()
     norms = _norm(a) * _norm(b)
     return product / torch.where(norms > 0, norms, 1)
@@ -209,10 +205,8 @@ def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
         ValueError: If they are not complex images of equal size.
     """
     a, b = _pair(image, reference)
-    peak = b.detach().abs().amax((-2, -1), keepdim=True)
-    scale = torch.where(peak > 0, peak, 1)
-    norm = _norm(b / scale)
-    ratio = _norm((a - b) / scale) / torch.where(norm > 0, norm, 1)
+    norm = _norm(b)
+    ratio = _norm(a - b) / torch.where(norm == 0, 1, norm)
     return 20 * torch.log10(ratio.clamp_min(torch.finfo(ratio.dtype).tiny))
 
 
@@ -228,9 +222,17 @@ def error_after_gain_db(images: Tensor, references: Tensor) -> Tensor:
 
     Returns:
         Error |gain I - I0|^2 / |I0|^2 in dB, shape (...,), float64.
+
+    Raises:
+        TypeError: If one of them is not a tensor of numbers.
+        ValueError: If they are not complex images of equal size.
     """
-    gain = (images.conj() * references).sum() / images.abs().square().sum()
-    return error_db(images * gain, references)
+    a, b = _pair(images, references)
+    # one level for all images, so that the gain is common
+    a, b = (x / level_of(x, x.ndim) for x in (a, b))
+    energy = (a.real.square() + a.imag.square()).sum(dtype=torch.float64)
+    gain = (a.conj() * b).sum(dtype=torch.complex128) / torch.where(energy == 0, 1, energy)
+    return error_db(a * gain.to(a.dtype), b)
 
 
 def rolled_to(image: Signal, reference: Signal) -> Signal:

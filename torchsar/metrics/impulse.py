@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, cis, refuse_non_finite
+from torchsar.core import Signal, checked_samples, cis
 
 # chosen: samples per axis of the neighbourhood in which the maximum is interpolated
 _PATCH = 64
@@ -65,7 +65,7 @@ def impulse_response(
             "impulse_response needs sidelobe_nulls of 1 or more and search_m above 0, got "
             f"{sidelobe_nulls} nulls and search_m={search_m}"
         )
-    refuse_non_finite(signal.data, "impulse_response")
+    signal = signal.with_data(checked_samples(signal.data, "impulse_response", ", ".join(signal.names)))
     per_target = any(torch.as_tensor(a).ndim > len(signal.trials) for a in at_m)
     positions = torch.broadcast_tensors(
         *(torch.as_tensor(a, dtype=torch.float64, device=signal.data.device) for a in at_m)

@@ -13,18 +13,15 @@ import math
 import torch
 from torch import Tensor
 
+from torchsar.metrics.bounds import nonnegative
+
 Value = Tensor | float
-
-
-def _double(value: Value) -> Tensor:
-    """Value as a float64 tensor."""
-    return torch.as_tensor(value, dtype=torch.float64)
 
 
 def _velocity_m_s(c: float, snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value) -> Tensor:
     """Velocity bound with the factor c of the module docstring."""
-    energy = _double(samples_per_sweep) * _double(snr)
-    return _double(wavelength_m) / 2 * torch.sqrt(c / energy) / (2 * math.pi * _double(sweep_s))
+    energy = nonnegative(samples_per_sweep) * nonnegative(snr)
+    return nonnegative(wavelength_m) / 2 * torch.sqrt(c / energy) / (2 * math.pi * nonnegative(sweep_s))
 
 
 def velocity_free_offset_bound_m_s(snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value) -> Tensor:
@@ -103,7 +100,7 @@ def range_per_sweep_bound_m(snr: Value, samples_per_sweep: Value, wavelength_m: 
     Returns:
         Standard deviation in metres.
     """
-    return _double(wavelength_m) / (4 * math.pi) / torch.sqrt(2 * _double(samples_per_sweep) * _double(snr))
+    return nonnegative(wavelength_m) / (4 * math.pi) / torch.sqrt(2 * nonnegative(samples_per_sweep) * nonnegative(snr))
 
 
 def integrated_range_detrended_bound_m(velocity_std_m_s: Value, pulse_step_s: Value, n_period: Value) -> Tensor:
@@ -122,4 +119,4 @@ def integrated_range_detrended_bound_m(velocity_std_m_s: Value, pulse_step_s: Va
     Returns:
         Rms range error over the record in metres.
     """
-    return _double(velocity_std_m_s) * _double(pulse_step_s) * torch.sqrt(_double(n_period) / 15)
+    return nonnegative(velocity_std_m_s) * nonnegative(pulse_step_s) * torch.sqrt(nonnegative(n_period) / 15)

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import unit_phasor
+from torchsar.core import refuse_non_finite, unit_phasor
 
 # chosen: zero padding of the spectrum in which the linear term is searched; a Newton step is at
 # most one of its bins
@@ -32,8 +32,10 @@ def residual_phase(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor 
         Estimate minus reference in -pi..pi, shape (..., pulse), float64.
 
     Raises:
-        ValueError: If a phase is not finite.
+        TypeError: If the phases are no real tensors.
+        ValueError: If a phase is not finite, or there are no phases.
     """
+    _check("residual_phase", estimate_rad, reference_rad)
     difference = estimate_rad.to(torch.float64) - reference_rad.to(torch.float64)
     z = unit_phasor(difference / (2 * math.pi), torch.complex128)
     if present is not None:
@@ -47,6 +49,19 @@ def residual_phase(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor 
     total = flat.sum(-1, keepdim=True)
     turned = flat * torch.where(total == 0, 1, total).conj()
     return torch.where(z == 0, 0, torch.angle(torch.where(z == 0, 1, turned)))
+
+
+def _check(what: str, *phases: Tensor) -> None:
+    """Raise TypeError or ValueError unless phases are finite real tensors (..., pulse)."""
+    for phase in phases:
+        if not isinstance(phase, Tensor) or not phase.is_floating_point():
+            raise TypeError(
+                f"{what} compares phases (rad) in real tensors (..., pulse), got "
+                f"{phase.dtype if isinstance(phase, Tensor) else type(phase).__name__}"
+            )
+        if not phase.ndim or not phase.numel():
+            raise ValueError(f"{what} needs phases (..., pulse) of at least one pulse, got shape {tuple(phase.shape)}")
+        refuse_non_finite(phase, what, "leave out trials without an estimate", "phases")
 
 
 def _peak(z: Tensor) -> Tensor:
@@ -85,7 +100,8 @@ def phase_rmse(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor | No
         Rms error in rad, shape (...,), float64.
 
     Raises:
-        ValueError: If a phase is not finite.
+        TypeError: If the phases are no real tensors.
+        ValueError: If a phase is not finite, or there are no phases.
     """
     residual = residual_phase(estimate_rad, reference_rad, present)
     count = residual.shape[-1] if present is None else present.expand(residual.shape).sum(-1).clamp_min(1)
@@ -103,7 +119,12 @@ def strehl(residual_rad: Tensor, present: Tensor | None = None) -> Tensor:
     Returns:
         Strehl ratio, shape (...,), float64: 1 without error, 0.8 for about 0.47 rad rms; 0 where
         no pulse counts.
+
+    Raises:
+        TypeError: If the phases are no real tensor.
+        ValueError: If a phase is not finite, or there are no phases.
     """
+    _check("strehl", residual_rad)
     phasor = unit_phasor(residual_rad.to(torch.float64) / (2 * math.pi), torch.complex128)
     if present is None:
         return phasor.mean(-1).abs().square()

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_phasor, per_trial, refuse_non_finite
+from torchsar.core import checked_samples, linear_phasor, per_trial
 from torchsar.metrics.impulse import cut_figures, cut_offset
 from torchsar.radar import BistaticRadar
 
@@ -160,12 +160,8 @@ def _oversampled(data: Tensor, centre_turns: float) -> Tensor:
 
 
 def _check_profile(profile: Tensor, what: str) -> None:
-    """Raise ValueError for real, empty or non-finite profiles."""
-    if not profile.is_complex() or not profile.ndim or not profile.shape[-1]:
-        raise ValueError(
-            f"{what} needs complex profiles (..., azimuth), got {profile.dtype} of shape {tuple(profile.shape)}"
-        )
-    refuse_non_finite(profile, what)
+    """Raise TypeError or ValueError for real, empty or non-finite profiles."""
+    checked_samples(profile, what, "azimuth")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import per_trial
+from torchsar.core import per_trial, refuse_non_finite
 from torchsar.core.warp import warp
 
 # float64 rounding: eigenvalues of a correlation matrix below this count as zero
@@ -73,9 +73,12 @@ def rotation_bounds(
         (...,) each, float64; infinite where the data do not determine the unknown.
 
     Raises:
-        ValueError: If shapes do not fit.
+        ValueError: If shapes do not fit, wavelength or pulse rate are not positive, or the Fisher
+            information is not finite.
     """
     _check(cross_range_m, range_m, amplitude, warp_k)
+    if not (wavelength_m > 0 and prf_hz > 0):
+        raise ValueError(f"rotation_bounds: wavelength_m and prf_hz must be positive, got {wavelength_m} and {prf_hz}")
     x, k = cross_range_m.to(torch.float64), warp_k.to(torch.float64)
     lever = range_m.to(torch.float64) + per_trial(yc_m, 1, x)
     slopes = _slopes(x, lever, per_trial(omega_rad_s, 1, x), k.shape[-1], free_centre) * (4 * math.pi / wavelength_m)
@@ -141,6 +144,12 @@ def _standard_deviations(information: Tensor) -> Tensor:
     """Square roots of the diagonal of the inverse, (..., n, n) to (..., n); infinite for unknowns
     with a share in an unobservable direction.
     """
+    refuse_non_finite(
+        information,
+        "rotation_bounds: the Fisher information",
+        "give finite parameters of a possible instrument",
+        "elements",
+    )
     size = information.diagonal(dim1=-2, dim2=-1)
     root = torch.where(size > 0, size, 1).rsqrt()
     unit = information * root[..., :, None] * root[..., None, :]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, centred_ifft, per_trial, real_dtype, unit_phasor
+from torchsar.core import Axis, Signal, Stage, centred_ifft, checked_samples, per_trial, real_dtype, unit_phasor
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.response import doppler_centre_hz
 from torchsar.radar import BistaticRadar
@@ -66,7 +66,12 @@ def focus_azimuth(
     Returns:
         Images over slow time, shape (..., bin), complex, with time zero at bin n // 2. A point
         appears at the slow time `motion.image_s` at which its Doppler is zero.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
     """
+    spectrum = checked_samples(spectrum, "focus_azimuth", "doppler", finite=False)
     matched = azimuth_filter(offset_hz, radar, motion, spectrum.dtype)
     if bandwidth_hz is not None:
         matched = matched * (offset_hz.abs() <= bandwidth_hz / 2)

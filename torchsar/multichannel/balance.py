@@ -21,7 +21,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, fft_lines, linear_phasor, take, unit_phasor
+from torchsar.core import (
+    Estimate,
+    Signal,
+    Stage,
+    checked_samples,
+    fft_lines,
+    linear_phasor,
+    refuse_non_finite_values,
+    take,
+    unit_level,
+    unit_phasor,
+)
+from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.response import ElementPattern, Prior, clutter_covariance
 from torchsar.radar import BistaticRadar
 
@@ -68,9 +80,13 @@ def correct_balance(
         Balanced data, same shape.
 
     Raises:
-        ValueError: If there is not one value per channel, or data without a range axis have a
-            delay.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, the channels are not those of the radar, or if there is
+            not one value per channel, or data without a range axis have a delay.
     """
+    dims = "channel, pulse, range" if with_range else "channel, pulse"
+    data = checked_channels(data, radar, "correct_balance", dims, finite=False)
+    refuse_non_finite_values("correct_balance", phase_rad=phase_rad, gain_db=gain_db, delay_s=delay_s)
     for name, value in (("phase_rad", phase_rad), ("gain_db", gain_db), ("delay_s", delay_s)):
         if value is not None and value.shape[-1:] != (radar.channels,):
             raise ValueError(
@@ -133,10 +149,14 @@ def estimate_balance(
         has a standard deviation above 0.1 rad.
 
     Raises:
-        ValueError: If the radar has one channel, the shape of the data does not match it, `bands`
-            is below 1, or `blocks` does not fit the range band.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if the radar has one
+            channel, the shape of the data does not match it, `bands` is below 1, or `blocks` does
+            not fit the range band.
     """
+    data = checked_samples(data, "estimate_balance", "channel, pulse, range")
     _check_data(data, radar, blocks, bands)
+    data = unit_level(data, 3)
     with torch.no_grad():
         lines, frequency = _band_lines(data, radar, blocks)
         power = lines.abs().square().mean((-2, -1))

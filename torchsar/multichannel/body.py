@@ -26,8 +26,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_phasor, unit_phasor
+from torchsar.core import linear_phasor, unit_level, unit_phasor
 from torchsar.focus.nufft import smooth_length
+from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.migration import Frame, StaticBulk, correct_migration
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.model import point_phasor
@@ -40,6 +41,8 @@ _GUARD_CELLS = 6
 # Brightest lines used for the sharpness of an image, found by trial: 4 to 16 lines give the same
 # velocities, 16 take a quarter more time.
 _LINES_USED = 8
+# convention: two overlapping segments of two pulses
+_LEAST_PULSES = 4
 _LEAST_LINES = 12  # convention: fewest lines beside a body for the covariance of the sea
 _LOADING = 1e-5  # relative to the mean power: keeps the covariance of noise-free data invertible
 # Intensities in units of the residual sea and noise of a pixel, all found by trial. Pixels of a
@@ -437,8 +440,13 @@ def find_body(
         `Body`.
 
     Raises:
-        ValueError: If the data have no range cell of the body, or fewer than 12 beside it.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, the channels are not those of the radar, or a sample is
+            not finite, or if the data have no range cell of the body, or fewer than 12 beside it.
     """
+    data = checked_channels(data, frame.radar, "find_body", "channel, pulse, range")
+    if data.shape[-2] < _LEAST_PULSES:
+        raise ValueError(f"find_body needs at least {_LEAST_PULSES} pulses, got {data.shape[-2]}; give a longer record")
     half = frame.radar.ambiguous_velocity_m_s / 2 if u_r_half_m_s is None else u_r_half_m_s
     chip = chip_about(data, frame, _motion_imaged_at(frame.radar, data, 0.0, 0.0, image_s, image_m), extraction)
     for number in range(rounds):
@@ -539,7 +547,8 @@ def _along_speed(chip: Chip, extraction: Extraction, half_m_s: float) -> Tensor:
     echo = chip.echo(chip.cells)[:, chip.lit] * torch.hann_window(
         len(time_s), dtype=torch.float64, device=time_s.device
     )
-    echo = echo[echo.abs().square().sum(-1).topk(min(_LINES_USED, len(echo))).indices]
+    # squares of squares must fit into single precision
+    echo = unit_level(echo[echo.abs().square().sum(-1).topk(min(_LINES_USED, len(echo))).indices])
     back = point_phasor(radar, motion, time_s, torch.complex128)[0]
     middle, step = motion.u_a_m_s, half_m_s / _GRID_HALF
     for _ in range(_GRIDS):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torchsar.core import Signal
+from torchsar.core import Signal, checked_samples, unit_level
 
 
 @dataclass(frozen=True)
@@ -46,16 +46,16 @@ def contrast(image: Signal, extent_m: tuple[float, float] = (60.0, 10.0)) -> tup
         min(axis.n, max(2, 2 * round(extent / axis.step / 2)))
         for axis, extent in zip((azimuth, range_), extent_m, strict=True)
     )
-    intensity = image.data.detach().abs().square().to(torch.float64)
+    intensity = unit_level(image.data.detach()).abs().square().to(torch.float64)
     mean = avg_pool2d(
         intensity.flatten(0, -3)[:, None] if intensity.ndim > 2 else intensity[None, None],
         size,
-        stride=(size[0] // 2, size[1] // 2),
+        stride=(max(1, size[0] // 2), max(1, size[1] // 2)),
     )
     mean = mean[:, 0].unflatten(0, image.trials) if image.trials else mean[0, 0]
     typical = mean.flatten(-2).median(-1).values.clamp_min(torch.finfo(torch.float64).tiny)
     middles = [
-        axis.start + axis.step * ((n - 1) / 2 + n // 2 * torch.arange(count, dtype=torch.float64))
+        axis.start + axis.step * ((n - 1) / 2 + max(1, n // 2) * torch.arange(count, dtype=torch.float64))
         for axis, n, count in zip((azimuth, range_), size, mean.shape[-2:], strict=True)
     ]
     return mean / typical[..., None, None], (middles[0], middles[1])
@@ -87,13 +87,15 @@ def detect(
         The detections, strongest first.
 
     Raises:
-        ValueError: If the image has trials.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If the image has trials or no samples, or a sample is not finite.
     """
     if image.trials:
         raise ValueError(
             "detect works on one image at a time, got images with the trial dimensions "
             f"{tuple(image.trials)}; call it for each image separately"
         )
+    image = image.with_data(checked_samples(image.data, "detect", ", ".join(image.names)))
     level, (rows, columns) = contrast(image, extent_m)
     left, found = level.clone(), []
     while len(found) < most and float(left.max()) >= 10 ** (threshold_db / 10):

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import Signal, Stage, block_bytes_of, linear_phasor, per_trial, unit_phasor
+from torchsar.core import Signal, Stage, block_bytes_of, checked_samples, linear_phasor, per_trial, unit_phasor
 from torchsar.focus import keystone
 from torchsar.focus.nufft import nufft_type2
 from torchsar.multichannel.motion import Number, PointMotion
@@ -345,8 +345,10 @@ def correct_migration(
         Corrected data, same shape.
 
     Raises:
-        ValueError: If the shape of the data does not match the frame.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if the shape of the data does not match the frame.
     """
+    data = checked_samples(data, "correct_migration", "channel, pulse, range", finite=False)
     if data.ndim < 3 or data.shape[-3:] != (frame.radar.channels, frame.time_s.shape[0], frame.range_m.shape[0]):
         expected = (frame.radar.channels, frame.time_s.shape[0], frame.range_m.shape[0])
         raise ValueError(

@@ -152,6 +152,7 @@ class FocusPlan(Stage):
     """
 
     works_on = ("channel", "pulse")
+    takes_empty = False
 
     def __init__(
         self,

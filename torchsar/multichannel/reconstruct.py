@@ -15,7 +15,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, fft_lines, linear_phasor
+from torchsar.core import Axis, Signal, Stage, checked_samples, fft_lines, linear_phasor
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.response import (
     POOR,
@@ -54,9 +54,11 @@ def reconstruct(
         scale is that of the FFT of bands * pulse samples of a single channel.
 
     Raises:
-        ValueError: If the data do not have the channels of the radar, or there are too few channels
-            for the bands.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if the data do not have the channels of the radar,
+            or there are too few channels for the bands.
     """
+    data = checked_samples(data, "reconstruct", "channel, pulse", finite=False)
     return reconstruct_lines(data[..., None], radar, motion, rebuild, left_k1_m_s)[..., 0]
 
 
@@ -81,9 +83,11 @@ def reconstruct_lines(
         Spectra about the Doppler centre of the motion, shape (..., bands * pulse, range), complex.
 
     Raises:
-        ValueError: If the data do not have the channels of the radar, or there are too few channels
-            for the bands.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if the data do not have the channels of the radar,
+            or there are too few channels for the bands.
     """
+    data = checked_samples(data, "reconstruct_lines", "channel, pulse, range", finite=False)
     _check_channels(data, radar, rebuild)
     n, dtype = data.shape[-2], data.dtype
     spectrum = fft_lines(_demodulated(data, radar, motion, rebuild.bands, left_k1_m_s))
@@ -139,6 +143,7 @@ class Reconstruct(Stage):
 
     works_on = ("channel", "pulse")
     also_on = (("channel", "pulse", "range"),)
+    takes_empty = False
 
     def __init__(self, radar: BistaticRadar, rebuild: Rebuild | None = None, range_m: float | None = None) -> None:
         super().__init__()

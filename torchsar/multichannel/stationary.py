@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, centred_ifft
+from torchsar.core import Axis, Signal, Stage, centred_ifft, checked_samples
 from torchsar.focus import omega_k, omega_k_stolt
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Aperture, phase_error_db
@@ -90,9 +90,11 @@ def stationary_image(
         the closest range R0.
 
     Raises:
-        ValueError: If `form` is unknown, the data do not have the channels of the radar, or there
-            are fewer channels than the reconstruction needs.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if `form` is unknown, the data do not have the
+            channels of the radar, or there are fewer channels than the reconstruction needs.
     """
+    data = checked_samples(data, "stationary_image", "channel, pulse, range", finite=False)
     rebuild = LeastSquares() if rebuild is None else rebuild
     spectrum = reconstruct_lines(data, radar, PointMotion.of(radar, data.real), rebuild)
     return focus_stationary(spectrum, radar, near_range_m, rebuild.bands, form, band_hz)

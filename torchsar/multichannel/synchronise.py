@@ -164,6 +164,7 @@ class EstimateSynchronisation(Stage):
     also_on = (("channel", "pulse", "range"),)
     provides = ("phase_rad", "delay_s")
     neutral = {"phase_rad": 0.0, "delay_s": 0.0}
+    takes_empty = False
 
     def __init__(self, radar: BistaticRadar) -> None:
         super().__init__()

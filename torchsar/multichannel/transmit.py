@@ -15,7 +15,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, Stage, per_trial, unit_phasor
+from torchsar.core import Signal, Stage, checked_samples, per_trial, unit_phasor
+from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.radar import BistaticRadar, polynomial_range
 
@@ -61,8 +62,10 @@ def remove_transmit_range(
         Data of the same shape.
 
     Raises:
-        ValueError: If there is not one time per pulse.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if there is not one time per pulse.
     """
+    data = checked_samples(data, "remove_transmit_range", "pulse, range" if with_range else "pulse", finite=False)
     pulses = data.shape[-2] if with_range else data.shape[-1]
     if time_s.shape[-1:] != (pulses,):
         raise ValueError(
@@ -100,9 +103,15 @@ def scale_azimuth(
     Returns:
         Data of the same shape.
 
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or the channels are not those of the radar.
+
     Reference:
         Remote Sens. 2020, 12, 1703, Eqs. (25), (31), (34).
     """
+    dims = "channel, pulse, range" if with_range else "channel, pulse"
+    data = checked_channels(data, radar, "scale_azimuth", dims, finite=False)
     delay = radar.channels_at(data.device) / motion.effective_m_s[..., None]
     higher_orders = (0.0, *radar.transmit_range[1:order])
     return data * _over_range(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import centred_fft, centred_ifft
+from torchsar.core import centred_fft, centred_ifft, checked_samples
 from torchsar.radar.stripmap import LIGHT_M_S
 
 # Largest relative error of a frequency step: stored frequencies are rounded, by 6e-4 of a step in
@@ -29,7 +29,12 @@ def range_profiles(samples: Tensor) -> Tensor:
 
     Returns:
         Range profiles, same shape. Cell n // 2 lies at range zero; range grows away from the radar.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
     """
+    samples = checked_samples(samples, "range_profiles", "frequency", finite=False)
     return centred_ifft(samples) * math.sqrt(samples.shape[-1])
 
 
@@ -43,7 +48,12 @@ def frequency_samples(profiles: Tensor) -> Tensor:
 
     Returns:
         Frequency samples, shape (..., n), complex.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
     """
+    profiles = checked_samples(profiles, "frequency_samples", "range", finite=False)
     return centred_fft(profiles) / math.sqrt(profiles.shape[-1])
 
 

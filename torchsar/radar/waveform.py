@@ -58,7 +58,12 @@ class LinearFM:
         Returns:
             Number of samples i = 0, 1, ... with i / fs < duration: the product of duration and fs,
             rounded up.
+
+        Raises:
+            ValueError: If the rate is not positive and finite.
         """
+        if not 0 < sampling_hz < math.inf:
+            raise ValueError(f"sampling_hz must be positive and finite, got {sampling_hz}")
         return max(1, math.ceil(self.duration_s * sampling_hz * (1 - _ROUNDING)))
 
     def samples(

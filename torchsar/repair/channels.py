@@ -14,7 +14,16 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, cis, real_dtype
+from torchsar.core import (
+    Estimate,
+    Signal,
+    Stage,
+    checked_samples,
+    cis,
+    real_dtype,
+    refuse_non_finite_values,
+    unit_level,
+)
 
 
 def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
@@ -78,14 +87,17 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
         phases 0.
 
     Raises:
-        ValueError: If there are fewer than two channels or fewer than 2 C + 1 lines.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if there are fewer than
+            two channels or fewer than 2 C + 1 lines.
     """
+    x = checked_samples(x, "estimate_imbalance", "pulse, range")
     if channels < 2 or x.shape[-2] < 2 * channels + 1:
         raise ValueError(
             "estimate_imbalance needs 2 or more channels and more than twice as many lines as channels, "
             f"got {channels} channels and {x.shape[-2]} lines"
         )
-    x = x / x.detach().abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(real_dtype(x.dtype)).tiny)
+    x = unit_level(x)
     lag, log_power = lag_products(x, channels)
     angle = torch.angle(lag)
     turns = torch.arange(channels, dtype=torch.float64, device=x.device) / channels
@@ -142,13 +154,16 @@ def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
         Lines of the same shape.
 
     Raises:
-        ValueError: If gains and phases differ in shape.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if gains and phases differ in shape.
     """
+    x = checked_samples(x, "correct_imbalance", "pulse, range", finite=False)
     if gain.shape != phase_rad.shape:
         raise ValueError(
             "gain and phase_rad must have the same shape (..., channel), got the shapes "
             f"{tuple(gain.shape)} and {tuple(phase_rad.shape)}"
         )
+    refuse_non_finite_values("correct_imbalance", gain=gain, phase_rad=phase_rad)
     real = real_dtype(x.dtype)
     factor = cis(-phase_rad.to(real)) / gain.to(real)
     channel = torch.arange(x.shape[-2], device=x.device) % gain.shape[-1]

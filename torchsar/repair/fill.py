@@ -15,10 +15,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, Stage, per_trial, real_dtype, unit_phasor
+from torchsar.core import Signal, Stage, checked_samples, level_of, per_trial, real_dtype, unit_phasor
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
-from torchsar.repair.sparse import conjugate_fill, sparse_fill, unit_level
+from torchsar.repair.sparse import conjugate_fill, sparse_fill
 
 
 def _mask(lines: Tensor, missing: Tensor) -> Tensor:
@@ -50,8 +50,10 @@ def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:
         Lines of the same shape.
 
     Raises:
-        ValueError: If the mask does not have one entry per line.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if the mask does not have one entry per line.
     """
+    lines = checked_samples(lines, "zero_fill", "line, range", finite=False)
     return torch.where(_mask(lines, missing), 0, lines)
 
 
@@ -75,8 +77,10 @@ def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 
         Lines of the same shape.
 
     Raises:
-        ValueError: If the mask does not have one entry per line.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if the mask does not have one entry per line.
     """
+    lines = checked_samples(lines, "linear_fill", "line, range", finite=False)
     mask, n = _mask(lines, missing), lines.shape[-2]
     row = torch.arange(n, device=lines.device)
     received = ~missing.bool().expand(lines.shape[:-1])
@@ -136,11 +140,16 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
         Lines of the same shape.
 
     Raises:
-        ValueError: If the mask does not have one entry per line.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if the mask does not have
+            one entry per line.
     """
+    lines = checked_samples(lines, "band_limited_fill", "line, range")
     # azimuth last: its FFTs then run along contiguous samples
     mask = _mask(lines, missing).mT
-    filled, level = unit_level(zero_fill(lines, missing).mT.contiguous())
+    filled = zero_fill(lines, missing).mT.contiguous()
+    level = level_of(filled)
+    filled = filled / level
     spectrum = azimuth_spectrum(filled.detach(), ~mask.expand(filled.shape)[..., 0, :]).clamp_min(0.05)
     for _ in range(rounds):
         weight = (1 / spectrum)[..., None, :]

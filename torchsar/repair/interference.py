@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage
+from torchsar.core import Estimate, Signal, Stage, checked_samples, level_of, unit_level
 from torchsar.repair.interference_band import find_band, subtract_band
 from torchsar.repair.interference_detect import THRESHOLD, Level, clean_level, line_spectra, stands_out
 from torchsar.repair.interference_tone import Tone, anything, find_tones, subtract_tones
@@ -55,7 +55,8 @@ class Contamination:
 
     Args:
         level: Robust estimate of the power spectral density without interference, one value for
-            each cell of each line.
+            each cell of each line, for lines divided by the level of their trial
+            (`torchsar.core.level_of`).
         excess: Power spectra divided by the level, in FFT order, shape (..., pulse, range).
         cells: Cells whose excess is above the threshold, shape (..., pulse, range), bool.
         lines: Lines whose spectrum has a narrow peak above the threshold (see `stands_out`), shape
@@ -82,9 +83,14 @@ def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contaminati
 
     Returns:
         `Contamination`, which marks cells (..., pulse, range) and lines (..., pulse).
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite.
     """
+    raw = checked_samples(raw, "find_contamination", "pulse, range")
     with torch.no_grad():
-        power = line_spectra(raw)
+        power = line_spectra(unit_level(raw))
         level = clean_level(power)
         excess = level.excess(power)
         cells = excess > threshold
@@ -104,7 +110,14 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 
     Returns:
         `Repaired`: lines of the same shape, and masks of the changed and of the missing lines.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite.
     """
+    raw = checked_samples(raw, "notch_interference", "pulse, range")
+    level = level_of(raw)
+    raw = raw / level
     found = find_contamination(raw, threshold)
     touched = _contaminated(raw.detach(), found, threshold)
     spectrum = torch.fft.fft(raw)
@@ -113,7 +126,7 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
             found.level.excess((spectrum.real.square() + spectrum.imag.square()) / raw.shape[-1]) > threshold
         ) & touched[..., None]
     data = torch.where(touched[..., None], torch.fft.ifft(spectrum.masked_fill(hit, 0)), raw)
-    return Repaired(data, touched, torch.zeros_like(touched), hit.sum(-1), _no_tone(touched))
+    return Repaired(data * level, touched, torch.zeros_like(touched), hit.sum(-1), _no_tone(touched))
 
 
 def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
@@ -128,11 +141,18 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 
     Returns:
         `Repaired`: lines of the same shape, and masks of the changed and of the missing lines.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite.
     """
+    raw = checked_samples(raw, "drop_interference", "pulse, range")
+    level = level_of(raw)
+    raw = raw / level
     found = find_contamination(raw, threshold)
     touched = _contaminated(raw.detach(), found, threshold)
     data = raw.masked_fill(touched[..., None], 0)
-    return Repaired(data, touched, touched, torch.where(touched, raw.shape[-1], 0), _no_tone(touched))
+    return Repaired(data * level, touched, touched, torch.where(touched, raw.shape[-1], 0), _no_tone(touched))
 
 
 def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones: int = 4) -> Repaired:
@@ -154,11 +174,18 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
 
     Returns:
         `Repaired`: lines of the same shape, and masks of the changed and of the missing lines.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite.
     """
+    raw = checked_samples(raw, "subtract_interference", "pulse, range")
+    scale = level_of(raw)
+    raw = raw / scale
     found = find_contamination(raw, threshold)
     if not anything(found.lines):
         nothing = torch.zeros_like(found.lines)
-        return Repaired(raw, nothing, nothing, found.cells.sum(-1), _no_tone(nothing))
+        return Repaired(raw * scale, nothing, nothing, found.cells.sum(-1), _no_tone(nothing))
     index = _selection(found.lines)
     lines, level = _take_lines(raw, index), found.level.lines(index)
     with torch.no_grad():
@@ -176,7 +203,9 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
     touched_all = everywhere.scatter(-1, index, touched)
     data = raw.scatter(-2, index[..., None].expand_as(cleaned), cleaned)
     cycles = _no_tone(everywhere).scatter(-1, index, _strongest(tones, index))
-    return Repaired(data, touched_all, everywhere.scatter(-1, index, lost), found.cells.sum(-1) * touched_all, cycles)
+    return Repaired(
+        data * scale, touched_all, everywhere.scatter(-1, index, lost), found.cells.sum(-1) * touched_all, cycles
+    )
 
 
 def _contaminated(raw: Tensor, found: Contamination, threshold: float) -> Tensor:

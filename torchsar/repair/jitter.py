@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, Stage, cis, linear_phasor, real_dtype
+from torchsar.core import Signal, Stage, checked_samples, cis, linear_phasor, real_dtype, refuse_non_finite_values
 
 # Smallest distance of sample instants, in samples. Limit of conditioning, by choice: noise grows
 # about as 1 / gap.
@@ -164,8 +164,11 @@ def correct_jitter_lagrange(y: Tensor, offset_samples: Tensor, points: int = 8) 
         Lines of the same shape.
 
     Raises:
-        ValueError: If sample instants coincide or cross.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if sample instants coincide or cross.
     """
+    y = checked_samples(y, "correct_jitter_lagrange", "range", finite=False)
+    refuse_non_finite_values("correct_jitter_lagrange", offset_samples=offset_samples)
     refuse_crossing(offset_samples)
     instants, first = neighbours(offset_samples.to(torch.float64), points)
     return _combine(y, lagrange_weights(instants), first)
@@ -189,8 +192,11 @@ def correct_jitter_band_limited(y: Tensor, offset_samples: Tensor, points: int =
         Lines of the same shape.
 
     Raises:
-        ValueError: If sample instants coincide or cross.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if sample instants coincide or cross.
     """
+    y = checked_samples(y, "correct_jitter_band_limited", "range", finite=False)
+    refuse_non_finite_values("correct_jitter_band_limited", offset_samples=offset_samples)
     refuse_crossing(offset_samples)
     instants, first = neighbours(offset_samples.to(torch.float64), points)
     return _combine(y, band_limited_weights(instants, band), first)
@@ -215,8 +221,12 @@ def correct_jitter_exact(y: Tensor, offset_samples: Tensor, refinements: int | N
         Lines of the same shape.
 
     Raises:
-        ValueError: If sample instants coincide or cross, or a line is shorter than 2 M samples.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if sample instants coincide or cross, or a line is
+            shorter than 2 M samples.
     """
+    y = checked_samples(y, "correct_jitter_exact", "range", finite=False)
+    refuse_non_finite_values("correct_jitter_exact", offset_samples=offset_samples)
     refuse_crossing(offset_samples)
     offsets, n, m = offset_samples.to(torch.float64), y.shape[-1], offset_samples.shape[-1]
     if n < 2 * m:
@@ -363,9 +373,12 @@ def correct_jitter(
         Lines of the same shape.
 
     Raises:
-        ValueError: If the offsets do not fit the trials of the data, or sample instants coincide or
-            cross.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if the offsets do not fit the trials of the data, or
+            sample instants coincide or cross.
     """
+    y = checked_samples(y, "correct_jitter", "range", finite=False)
+    refuse_non_finite_values("correct_jitter", offset_samples=offset_samples)
     method = Exact() if method is None else method
     if offset_samples.ndim > 1 and offset_samples.shape[:-1] != y.shape[:-2]:
         raise ValueError(

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage
+from torchsar.core import Estimate, Signal, Stage, checked_samples
 from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap
 
 # Largest standard deviation of an offset that is ok, in samples (-24 dB of the signal).
@@ -182,8 +182,11 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
         less than half of the power is above the noise, or sample instants would coincide or cross.
 
     Raises:
-        ValueError: If the period is less than 2, or lines are shorter than 8 periods.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if the period is less than
+            2, or lines are shorter than 8 periods.
     """
+    y = checked_samples(y, "estimate_jitter_blind", "line, range")
     longest = max_period if period is None else period
     if longest < 2 or y.shape[-1] < 8 * longest:
         raise ValueError(

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, linear_phasor
+from torchsar.core import Estimate, Signal, Stage, checked_samples, linear_phasor, unit_level
 from torchsar.repair.jitter import MIN_GAP, smallest_gap
 
 # conventions for the offset that no pilot can determine
@@ -57,9 +57,10 @@ def estimate_jitter_pilot(
         TypeError: If the record is real.
     """
     _check(pilot, max_period, period, origin)
+    pilot = checked_samples(pilot, "estimate_jitter_pilot", "range", finite=False)
     finite = torch.isfinite(torch.view_as_real(pilot)).flatten(-2).all(-1)
     x = torch.where(finite[..., None], pilot, 0).to(torch.complex128)
-    x = x / x.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+    x = unit_level(x, 1)
     periods = range(1, max_period + 1) if period is None else [period]
     fits = [_fit(x, _peak_frequency(x), m) for m in periods]
     best = _choose(fits) if period is None else torch.zeros(x.shape[:-1], dtype=torch.int64, device=x.device)
@@ -73,8 +74,6 @@ def _check(pilot: Tensor, max_period: int, period: int | None, origin: str) -> N
         raise ValueError(f"a jitter period must be at least one sample, got {longest}")
     if origin not in ORIGINS:
         raise ValueError(f"origin {origin!r} is unknown; choose one of {ORIGINS}")
-    if not pilot.is_complex():
-        raise TypeError(f"pilot must hold complex samples (..., n), got {pilot.dtype}; form the analytic signal first")
     if pilot.ndim < 1 or pilot.shape[-1] < 4 * longest:
         length = pilot.shape[-1] if pilot.ndim else 0
         raise ValueError(

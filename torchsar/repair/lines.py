@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage
+from torchsar.core import Estimate, Signal, Stage, checked_samples
 
 # line number of padding at the end of a trial, by convention: no line has a negative number
 PADDING = -1
@@ -133,7 +133,7 @@ def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tens
 def _repeats(lines: Tensor, number: Tensor, present: Tensor) -> Tensor:
     """Lines with the samples of the line before, (..., line) bool; lines of zeros do not count."""
     same = (lines[..., 1:, :] == lines[..., :-1, :]).all(-1) & (lines[..., 1:, :] != 0).any(-1)
-    first = torch.zeros_like(same[..., :1])
+    first = same.new_zeros(*same.shape[:-1], 1)
     return torch.cat([first, same], -1) & present
 
 
@@ -174,9 +174,12 @@ def line_integrity(
         Plan that assigns the received lines to rows of the grid.
 
     Raises:
-        ValueError: If the numbers do not fit the lines or are not integers, the longest gap is less
-            than one, or fewer than half of the numbers are accepted in every trial.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if the numbers do not fit
+            the lines or are not integers, the longest gap is less than one, or fewer than half of
+            the numbers are accepted in every trial.
     """
+    lines = checked_samples(lines, "line_integrity", "line, range")
     _check(lines, line_number, longest_gap)
     n = lines.shape[-2]
     number = line_number.to(torch.int64).expand(lines.shape[:-1])
@@ -275,7 +278,12 @@ def place_lines(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
 
     Returns:
         Lines on the grid, shape (..., n, range).
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
     """
+    x = checked_samples(x, "place_lines", "line, range", real=True, finite=False)
     index = source.clamp_min(0)[..., None].expand(*source.shape, x.shape[-1])
     return torch.where(source[..., None] >= 0, x.expand(*source.shape[:-1], *x.shape[-2:]).gather(-2, index), fill)
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, Stage, cis, legendre, real_dtype
+from torchsar.core import Signal, Stage, checked_samples, cis, legendre, real_dtype, refuse_non_finite_values
 from torchsar.radar import StripmapRadar
 
 # Samples of a response, by choice: odd, so that u = 0 is one of them, and about 80 for each period
@@ -138,7 +138,13 @@ def correct_response(x: Tensor, phase_rad: Tensor, amplitude: Tensor | None, ban
 
     Returns:
         Corrected data, same shape.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples.
     """
+    x = checked_samples(x, "correct_response", "range", finite=False)
+    refuse_non_finite_values("correct_response", phase_rad=phase_rad, amplitude=amplitude)
     inverse = response_filter(phase_rad, amplitude, x.shape[-1], band, x.dtype)
     return torch.fft.ifft(torch.fft.fft(x) * inverse[..., None, :])
 
@@ -178,6 +184,7 @@ def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, or
     """
     bins = 4 * order
     u = (torch.arange(bins, dtype=torch.float64, device=power.device) + 0.5) * 2 / bins - 1
+    refuse_non_finite_values("estimate_amplitude_response", power=power, expected=expected)
     wanted = _binned(expected.to(torch.float64), band, bins)
     if not bool((wanted > 0).all()):
         raise ValueError(

@@ -20,7 +20,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, cis, linear_phasor
+from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, linear_phasor, unit_level
 from torchsar.radar import StripmapRadar
 from torchsar.repair.response import (
     GRID,
@@ -259,10 +259,13 @@ def estimate_response_sharpest(
         rad rms: the image has too few bright points.
 
     Raises:
-        ValueError: If there are fewer than 32 valid columns, or the width is below 16 samples.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if there are fewer than 32
+            valid columns, or the width is below 16 samples.
     """
+    image = checked_samples(image, "estimate_response_sharpest", "azimuth, range")
     used = image.detach()[..., :valid] if valid else image.detach()
-    rows = used.reshape(-1, *used.shape[-2:])
+    rows = unit_level(used.reshape(-1, *used.shape[-2:]))
     basis = unit_legendre(band_grid(image.device), orders[-1])[2:]
     total = torch.zeros((rows.shape[0], basis.shape[0]), dtype=torch.float64, device=image.device)
     for i in range(passes):
@@ -386,10 +389,13 @@ def estimate_response_points(
         where the results of two halves of the points differ by more than 0.25 rad rms.
 
     Raises:
-        ValueError: If there are fewer than 32 valid columns, or the width is below 16 samples.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite, or if there are fewer than 32
+            valid columns, or the width is below 16 samples.
     """
+    image = checked_samples(image, "estimate_response_points", "azimuth, range")
     used = image.detach()[..., :valid] if valid else image.detach()
-    rows = used.reshape(-1, *used.shape[-2:])
+    rows = unit_level(used.reshape(-1, *used.shape[-2:]))
     width = min(width, rows.shape[-1] // 4 * 2)
     basis = unit_legendre(band_grid(image.device), order)[2:]
     total = torch.zeros((rows.shape[0], basis.shape[0]), dtype=torch.float64, device=image.device)
@@ -456,7 +462,7 @@ class EstimateResponse(Stage):
         estimate = self.method(signal.data, band, valid=max(1, signal.data.shape[-1] - self.radar.pulse_samples))
         if self.expected_power is None:
             return estimate
-        amplitude = estimate_amplitude_response(band_power(signal.data), self.expected_power, band)
+        amplitude = estimate_amplitude_response(band_power(unit_level(signal.data)), self.expected_power, band)
         return Estimate(
             {**estimate.value, "amplitude": amplitude}, estimate.quality, estimate.ok, estimate.std, estimate.info
         )

@@ -23,22 +23,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv1d, pad
 
+from torchsar.core import checked_samples, level_of
 from torchsar.focus.defocus import InvertibleOmegaK, all_pass
 from torchsar.radar import StripmapRadar
-
-
-def unit_level(lines: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale lines to a peak of one in each trial, so that squares neither underflow nor overflow.
-
-    Args:
-        lines: Lines, shape (..., pulse, range), complex.
-
-    Returns:
-        Scaled lines of the same shape, and the peak, shape (..., 1, 1).
-    """
-    level = lines.detach().abs().amax((-2, -1), keepdim=True)
-    level = torch.where(level > 0, level, 1)
-    return lines / level, level
 
 
 def power_of(x: Tensor) -> Tensor:
@@ -273,9 +260,16 @@ def sparse_fill(
 
     Returns:
         Lines of the same shape.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples or a sample is not finite.
     """
+    lines = checked_samples(lines, "sparse_fill", "line, range")
     mask = missing.bool().expand(lines.shape[:-1])[..., None]
-    x, level = unit_level(torch.where(mask, 0, lines))
+    x = torch.where(mask, 0, lines)
+    level = level_of(x)
+    x = x / level
     flat = None if reference is None else all_pass(reference)
     operator = InvertibleOmegaK(radar, x, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, reference=flat)
     turns = torch.as_tensor(doppler_hz, dtype=torch.float64, device=x.device) / radar.prf_hz

@@ -38,7 +38,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Estimate, Signal, Stage
+from torchsar.core import Axis, Estimate, Signal, Stage, checked_samples
 from torchsar.radar import TriangularLadar
 from torchsar.repair.analytic import delayed
 from torchsar.repair.trigger import find_trigger
@@ -84,7 +84,7 @@ def split_record(
             not finite or not one per trial.
         TypeError: If the record is not a tensor of samples, or the trigger not a number.
     """
-    refuse_no_record(record, "split_record")
+    record = checked_samples(record, "split_record", "pulse, time", real=True, finite=False)
     trigger = _trigger_of(trigger_s, record)
     joined = is_contiguous(record.shape[-1], radar) if contiguous is None else contiguous
     lines = record.flatten(-2)[..., None, :] if joined else record
@@ -93,26 +93,6 @@ def split_record(
     periods = _cut_joined(whole, start, record.shape[-2], radar) if joined else _cut_inside(whole, start, radar)
     sweeps = periods.unflatten(-1, (2, radar.sweep_samples)).movedim(-2, -3)
     return sweeps if record.is_complex() else canonical_ramps(sweeps, radar, nearer)
-
-
-def refuse_no_record(record: Tensor, what: str) -> None:
-    """Raise an error unless a record is real or complex (..., pulse, time).
-
-    Args:
-        record: Object to test.
-        what: Name of the function for messages.
-
-    Raises:
-        TypeError: If it is not a tensor of real or complex samples.
-        ValueError: If it has no samples or fewer than two dimensions.
-    """
-    if not (isinstance(record, Tensor) and (record.is_complex() or record.is_floating_point())):
-        raise TypeError(
-            f"{what} needs a tensor of real or complex samples (..., pulse, time), got "
-            f"{getattr(record, 'dtype', type(record).__name__)}; convert the samples first"
-        )
-    if record.ndim < 2 or not record.numel():
-        raise ValueError(f"{what} needs a record (..., pulse, time) with samples, got the shape {tuple(record.shape)}")
 
 
 def _trigger_of(trigger_s: Trigger, record: Tensor) -> Tensor:
@@ -256,9 +236,14 @@ def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Te
     Returns:
         Record of the same shape.
 
+    Raises:
+        TypeError: If the samples are not complex64 or complex128, float32 or float64.
+        ValueError: If there are no samples.
+
     Reference:
         Remote Sens. 2024, 16, 793, Fig. 15b.
     """
+    record = checked_samples(record, "circular_shift", "pulse, time", real=True, finite=False)
     return torch.roll(record, -round(shift_s * radar.sample_rate_hz), -1)
 
 
@@ -283,14 +268,11 @@ def blank_turning_points(
         Sweeps of the same shape.
 
     Raises:
-        ValueError: If less than half a sweep remains, the ranges are not in order, or the margin is
-            negative.
-        TypeError: If the sweeps are not a tensor.
+        ValueError: If there are no samples, or if less than half a sweep remains, the ranges are
+            not in order, or the margin is negative.
+        TypeError: If the sweeps are not complex64, complex128, float32 or float64.
     """
-    if not isinstance(sweeps, Tensor):
-        raise TypeError(
-            f"blank_turning_points needs a tensor of sweeps (..., ramp, pulse, fast_time), got {type(sweeps).__name__}"
-        )
+    sweeps = checked_samples(sweeps, "blank_turning_points", "fast time", real=True, finite=False)
     if not (nearest_m <= farthest_m and margin >= 0):
         raise ValueError(
             "blanking of turning points needs nearest_m <= farthest_m and a margin of 0 samples or more, "

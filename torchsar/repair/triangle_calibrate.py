@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, Stage, refuse_non_finite, unit_phasor
+from torchsar.core import Signal, Stage, checked_samples, refuse_non_finite, unit_phasor
 from torchsar.radar import TriangularLadar
 from torchsar.repair.jitter import band_limited_weights
 
@@ -191,7 +191,8 @@ def calibrate_sweeps(
 
 def _check_sweeps(x: Tensor, what: str, periods: str, n: int) -> None:
     """Raise ValueError unless x is complex (..., 2, K, n); `periods` is the name of K."""
-    if not (x.is_complex() and x.ndim >= 3 and x.shape[-3] == 2 and x.shape[-1] == n):
+    checked_samples(x, what, f"2, {periods}, {n}", finite=False)
+    if not (x.ndim >= 3 and x.shape[-3] == 2 and x.shape[-1] == n):
         raise ValueError(
             f"{what} must be complex (..., 2, {periods}, {n}), up sweeps before down sweeps, with K periods, "
             f"got {x.dtype} of shape {tuple(x.shape)}"

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, real_dtype, refuse_non_finite, take, unit_phasor
+from torchsar.core import Estimate, checked_samples, real_dtype, take, unit_level, unit_phasor
 from torchsar.radar import TriangularLadar
 from torchsar.repair.analytic import delayed
 
@@ -85,28 +85,6 @@ class _Windows:
         return source.gather(-1, index).unflatten(-1, (j.numel(), n))
 
 
-def refuse_no_samples(record: Tensor) -> None:
-    """Raise an error unless a record is finite, real or complex (..., pulse, time).
-
-    Args:
-        record: Object to test.
-
-    Raises:
-        TypeError: If it is not a tensor of real or complex samples.
-        ValueError: If it has no samples, fewer than two dimensions, or a sample is not finite.
-    """
-    if not (isinstance(record, Tensor) and (record.is_complex() or record.is_floating_point())):
-        raise TypeError(
-            "find_trigger needs a tensor of real or complex samples (..., pulse, time), got "
-            f"{getattr(record, 'dtype', type(record).__name__)}; convert the samples first"
-        )
-    if record.ndim < 2 or not record.numel():
-        raise ValueError(
-            f"find_trigger needs a record (..., pulse, time) with samples, got the shape {tuple(record.shape)}"
-        )
-    refuse_non_finite(record, "find_trigger")
-
-
 def find_trigger(
     record: Tensor, radar: TriangularLadar, contiguous: bool | None = None, nearer: bool = False
 ) -> Estimate:
@@ -141,7 +119,7 @@ def find_trigger(
         TypeError: If the record is not a tensor of real or complex samples.
         ValueError: If the record is not finite or too short.
     """
-    refuse_no_samples(record)
+    record = checked_samples(record, "find_trigger", "pulse, time", real=True)
     n = radar.sweep_samples
     joined = (radar.keep_every == 1 and record.shape[-1] == 2 * n) if contiguous is None else contiguous
     lines = record.flatten(-2)[..., None, :] if joined else record
@@ -160,9 +138,8 @@ def find_trigger(
 
 
 def _scaled(lines: Tensor) -> Tensor:
-    """Complex lines with a peak of one; the analytic signal of real ones."""
-    peak = lines.abs().amax((-2, -1), keepdim=True)
-    lines = lines / torch.where(peak > 0, peak, 1)
+    """Complex lines of unit level; the analytic signal of real ones."""
+    lines = unit_level(lines)
     return (
         lines
         if lines.is_complex()

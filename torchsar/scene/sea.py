@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import ArrayFile, Draws, real_dtype
+from torchsar.core import ArrayFile, Draws, real_dtype, refuse_non_finite
 from torchsar.scene.trials import positive, refuse_unless, refuse_unless_finite, with_dims
 
 # limits of the shape of a gamma distribution, between which the table is checked
@@ -316,11 +316,12 @@ def gamma_from_normal(x: Tensor, shape: Tensor | float) -> Tensor:
         Gamma numbers of the shape of x, float64.
 
     Raises:
-        ValueError: If a shape is out of range.
+        ValueError: If a shape is out of range, or a number is not finite.
 
     Reference:
         Tough and Ward 1999 (memoryless non-linear transform).
     """
+    refuse_non_finite(x, "gamma_from_normal", "draw normal numbers", "numbers")
     if isinstance(shape, Tensor):
         known, which = shape.detach().to(x.device, torch.float64).unique(return_inverse=True)
         table = torch.cat([_gamma_table(one) if one < math.inf else torch.zeros(_NODES) for one in known.tolist()])

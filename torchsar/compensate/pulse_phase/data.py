@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import cis, real_dtype, refuse_non_finite
+from torchsar.core import checked_samples, cis, unit_level
 
 # largest rounding error of a start, far below the accuracy of any estimate
 _PHASE_ERROR_RAD = 1e-3
@@ -20,7 +20,7 @@ class Pulses:
     """Range-compressed pulses in the layout that the autofocus estimators use.
 
     Args:
-        rows: Samples, shape (trial, range, pulse), complex. Each trial is divided by its own peak,
+        rows: Samples, shape (trial, range, pulse), complex. Each trial is divided by its own level,
             so that squares neither underflow nor overflow.
         present: False where a pulse holds only zeros, shape (trial, pulse), bool.
         trials: The leading dimensions of the data that were folded into the dimension trial.
@@ -36,12 +36,13 @@ class Pulses:
         return self.rows.shape[-1]
 
 
-def checked(data: Tensor, name: str) -> tuple[Tensor, Tensor]:
+def checked(data: Tensor, name: str, empty: bool = True) -> tuple[Tensor, Tensor]:
     """Check range-compressed data and fold their leading dimensions into one.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
         name: Name of the calling function for the error message.
+        empty: Whether a batch without trials is accepted.
 
     Returns:
         The data, shape (trial, pulse, range), and whether each pulse has a sample other than zero,
@@ -56,18 +57,12 @@ def checked(data: Tensor, name: str) -> tuple[Tensor, Tensor]:
             f"{name} works on complex range-compressed samples (..., pulse, range), got "
             f"{data.dtype if isinstance(data, Tensor) else type(data).__name__}"
         )
-    real_dtype(data.dtype)
-    if data.ndim < 2 or not data.shape[-2] * data.shape[-1]:
-        raise ValueError(
-            f"{name} works on samples (..., pulse, range) with at least one pulse and one range "
-            f"cell, got the shape {tuple(data.shape)}"
-        )
-    refuse_non_finite(data, name)
+    data = checked_samples(data, name, "pulse, range", empty=empty)
     flat = data.reshape(-1, *data.shape[-2:])
     return flat, (flat.detach() != 0).any(-1)
 
 
-def prepare(data: Tensor, name: str) -> Pulses:
+def prepare(data: Tensor, name: str, empty: bool = True) -> Pulses:
     """Check range-compressed data and bring them to the layout of the autofocus estimators.
 
     Warns if the data hold fewer than three pulses or only one range cell, from which no phase error
@@ -76,15 +71,16 @@ def prepare(data: Tensor, name: str) -> Pulses:
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
         name: Name of the calling function for error messages and warnings.
+        empty: Whether a batch without trials is accepted.
 
     Returns:
-        The pulses, scaled to a peak of about one and transposed to shape (trial, range, pulse).
+        The pulses, scaled to a peak of one to two and transposed to shape (trial, range, pulse).
 
     Raises:
         TypeError: If the data are not a tensor of complex64 or complex128.
         ValueError: If the data are empty, have fewer than two dimensions, or are not finite.
     """
-    flat, present = checked(data, name)
+    flat, present = checked(data, name, empty)
     n_pulse, n_range = data.shape[-2:]
     if n_pulse < 3:
         warnings.warn(
@@ -98,11 +94,7 @@ def prepare(data: Tensor, name: str) -> Pulses:
             "estimate flattens the phase and is not ok; use several range cells",
             stacklevel=3,
         )
-    largest = torch.maximum(flat.detach().real.abs(), flat.detach().imag.abs()).amax(
-        (-2, -1), keepdim=True
-    )  # |z| itself may overflow
-    scale = torch.where(largest > 0, largest, 1)
-    return Pulses((flat / scale).mT.contiguous(), present, data.shape[:-2])
+    return Pulses(unit_level(flat).mT.contiguous(), present, data.shape[:-2])
 
 
 def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | None:

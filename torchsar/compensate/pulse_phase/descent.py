@@ -69,8 +69,8 @@ def sharpest_phase(
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
         objective: "power_entropy", "amplitude_entropy" or "contrast" (maximised), see
             `torchsar.metrics`; or a differentiable function that is given images of shape (trial,
-            azimuth, range), not necessarily of all trials, and returns one cost per image, shape
-            (trial,).
+            azimuth, range), not necessarily of all trials, of data divided by their level
+            (`torchsar.core.level_of`), and returns one cost per image, shape (trial,).
         mask: Weights of the pixels, shape (azimuth, range) or (..., azimuth, range).
         start: Phase to start from in rad, shape (..., pulse); by default that of the spatial
             correlation algorithm (function `sca`).

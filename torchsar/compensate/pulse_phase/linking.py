@@ -88,7 +88,7 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
     Reference:
         Guarnieri and Tebaldini, IEEE Trans. Geosci. Remote Sens. 46(11), 2008 (phase linking).
     """
-    pulses = prepare(data, "link_phases")
+    pulses = prepare(data, "link_phases", empty=False)
     found = linked(pulses, starting_phase(start, pulses, "link_phases"))
     if pulses.n < 3:
         return found
@@ -147,6 +147,9 @@ def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor) -> Estim
 
 def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Phase and standard deviation (trial, pulse) in rad, and gain (trial,) in nats, of a block."""
+    if rows.shape[-1] < 3:  # nothing to distinguish a phase error from a shift of the image
+        zero = torch.zeros(present.shape, dtype=torch.float64, device=rows.device)
+        return zero, zero + torch.inf, zero[:, 0]
     with torch.no_grad():
         scene = _Scene.of(rows.detach(), present)
         u, fit = _refined(scene, _search(scene) if start is None else cis(start.to(torch.float64)))

@@ -18,7 +18,7 @@ from torchsar.compensate.pulse_phase.linking import link_phases
 from torchsar.compensate.pulse_phase.pairs import sca
 from torchsar.compensate.pulse_phase.recommended import autofocus
 from torchsar.compensate.pulse_phase.sharpen import entropy_fixed_point
-from torchsar.core import Estimate, Signal, Stage, real_dtype, refuse_non_finite
+from torchsar.core import Estimate, Signal, Stage, checked_samples, real_dtype, refuse_non_finite
 from torchsar.focus import TargetImage
 from torchsar.radar import FarField, InverseRadar, Spotlight
 
@@ -48,7 +48,8 @@ def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
             f"correct_pulse_phase: phase_rad must be a tensor of one phase per pulse, (..., {data.shape[-2]}), "
             f"got {got}"
         )
-    refuse_non_finite(phase_rad, "correct_pulse_phase")
+    data = checked_samples(data, "correct_pulse_phase", "pulse, range", finite=False)
+    refuse_non_finite(phase_rad, "correct_pulse_phase: phase_rad", "in trials without an estimate, use zero", "values")
     return rotate(data.mT, on_the_circle(phase_rad.to(torch.float64)).to(real_dtype(data.dtype))).mT
 
 

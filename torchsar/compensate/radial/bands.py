@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, cis, real_dtype, refuse_non_finite
+from torchsar.core import Axis, checked_samples, cis, level_of, real_dtype
 from torchsar.radar import TriangularLadar
 
 # periods over which envelopes are averaged, found by trial: more raise the SNR, fewer follow
@@ -123,7 +123,7 @@ def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str, pulse
         ValueError: If the sweeps have another shape, are not finite, or do not match the axis.
     """
     n = radar.sweep_samples
-    if not (isinstance(sweeps, Tensor) and sweeps.is_complex()):
+    if not isinstance(sweeps, Tensor) or sweeps.is_floating_point():
         raise TypeError(
             f"{what} works on complex sweeps (..., 2, pulse, {n}), got "
             f"{getattr(sweeps, 'dtype', type(sweeps).__name__)}; pass the record of "
@@ -139,7 +139,7 @@ def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str, pulse
             f"{what}: pulse must be the axis of the {sweeps.shape[-2]} periods of the sweeps, got an axis of "
             f"{pulse.n} periods"
         )
-    refuse_non_finite(sweeps, what)
+    checked_samples(sweeps, what, f"2, pulse, {n}")
 
 
 def window_lines(radar: TriangularLadar, window_m: tuple[float, float] | None) -> tuple[int, int]:
@@ -370,8 +370,7 @@ def _scale(sweeps: Tensor) -> Tensor:
     Squares then neither underflow nor overflow. The level is measured in the middle of the sweeps.
     """
     middle = sweeps.shape[-1] // 2
-    level = torch.view_as_real(sweeps[..., middle - 4 : middle + 4]).abs().amax((-4, -3, -2, -1))[..., None, None, None]
-    return torch.where(level > 0, torch.exp2(-torch.round(torch.log2(torch.where(level > 0, level, 1)))), 1)
+    return 1 / level_of(sweeps[..., middle - 4 : middle + 4], 3)
 
 
 def _block_power(spectrum: Tensor, scale: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchsar.compensate.radial.bands import refuse_other_sweeps
 from torchsar.compensate.radial.trajectory import sweep_motion
-from torchsar.core import Axis, cis, linear_phasor, real_dtype, unit_phasor
+from torchsar.core import Axis, checked_samples, cis, linear_phasor, real_dtype, unit_phasor
 from torchsar.radar import TriangularLadar
 
 # phases in turns that are lost in the rounding of a phasor, by precision
@@ -42,11 +42,13 @@ def compensate_motion(
 
     Raises:
         TypeError: If the sweeps are not complex, or the velocity is not a real tensor.
-        ValueError: If the sweeps or the velocity have another shape or are not finite.
+        ValueError: If there are no samples, or if the sweeps or the velocity have another shape or
+            are not finite.
 
     Reference:
         Remote Sens. 2024, 16, 793, Eqs. (21) and (23), completed by the term K u.
     """
+    sweeps = checked_samples(sweeps, "compensate_motion", "ramp, pulse, fast time", finite=False)
     refuse_other_sweeps(sweeps, radar, "compensate_motion", pulse)
     refuse_other_velocity(velocity_m_s, sweeps, "compensate_motion")
     coefficients = sweep_motion(velocity_m_s, radar, pulse)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import prepare
-from torchsar.core import Estimate, cis
+from torchsar.core import Estimate, checked_samples, cis, refuse_non_finite_values
 
 LEAST_GAIN = 0.05  # least gain of a pulse: a lost pulse is not amplified more than 20 times
 _PAD = 4  # zero-padding of the transform: a peak is then found to an eighth of a cell
@@ -38,7 +38,7 @@ def pulse_gain(data: Tensor) -> Estimate:
         TypeError: If the data are not complex.
         ValueError: If the data are empty or not finite.
     """
-    pulses = prepare(data, "pulse_gain")
+    pulses = prepare(data, "pulse_gain", empty=False)
     rows, n = pulses.rows, pulses.n
     best = torch.fft.fft(rows.detach(), _PAD * n).abs().argmax(-1)
     index = torch.arange(n, dtype=torch.float64, device=rows.device)
@@ -76,8 +76,11 @@ def equalise_pulses(data: Tensor, gain: Tensor) -> Tensor:
         The equalised pulses, shape (..., pulse, range), complex.
 
     Raises:
-        ValueError: If a gain is not positive.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or if a gain is not positive.
     """
+    data = checked_samples(data, "equalise_pulses", "pulse, range", finite=False)
+    refuse_non_finite_values("equalise_pulses", gain=gain)
     if not bool((gain.detach() > 0).all()):
         raise ValueError(
             f"gain must be positive for every pulse, got {float(gain.detach().min()):g}; for a lost pulse, give a gain "

@@ -69,7 +69,7 @@ def phase_polish(
         ValueError: If the data are empty or not finite, the start does not have one phase per
             pulse, or the number of iterations is not a whole number of 1 or more.
     """
-    pulses = prepare(data, "phase_polish")
+    pulses = prepare(data, "phase_polish", empty=False)
     refuse_odd_counts("phase_polish", 1, iterations=iterations)
     along = AlongPulses()
     begin = starting_phase(start, pulses, "phase_polish")
@@ -80,7 +80,8 @@ def phase_polish(
     phase, taken = in_turn(pulses.rows, begin, [settle, search, finish])
     quality, std = _confidence(rotate(pulses.rows.detach(), phase.detach()))
     shape = pulses.trials
-    ok = (std < ENOUGH_STD_RAD) & pulses.present.any(-1)
+    # fewer than three pulses cannot distinguish a phase error from a shift of the image
+    ok = (std < ENOUGH_STD_RAD) & (pulses.present.sum(-1) > 2)
     return Estimate(
         {"phase_rad": phase.to(torch.float64).reshape(*shape, pulses.n)},
         quality=quality.reshape(shape),

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, per_trial
+from torchsar.core import Axis, per_trial, refuse_non_finite_values
 from torchsar.core.spline import UniformSpline
 from torchsar.radar import TriangularLadar, sweep_middles
 
@@ -72,6 +72,7 @@ def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, 
     Returns:
         The range error in metres, shape (..., *at_s.shape), float64.
     """
+    refuse_non_finite_values("integrated_range", velocity_m_s=velocity_m_s, at_s=at_s)
     grid = turning_points(radar, pulse)
     v = velocity_m_s.to(torch.float64)
     if pulse.n == 1:

@@ -12,7 +12,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, linear_phasor, real_dtype, refuse_non_finite, take, unit_phasor
+from torchsar.core import (
+    Axis,
+    Signal,
+    Stage,
+    checked_samples,
+    level_of,
+    linear_phasor,
+    real_dtype,
+    take,
+    unit_phasor,
+)
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.radar import InverseRadar
@@ -81,17 +91,20 @@ def chirplet_clean(
 
     Raises:
         TypeError: If the data are not complex.
-        ValueError: If the data are not finite or hold fewer than 16 pulses, or an option is
-            invalid.
+        ValueError: If there are no samples or a sample is not finite, or if the data are not finite
+            or hold fewer than 16 pulses, or an option is invalid.
 
     Reference:
         Remote Sens. 2025, 17, 3447, Fig. 6 (the adaptive chirplet algorithm, ACL). The search
         differs: rates are first found from segments without their phases, then on the whole
         aperture.
     """
+    data = checked_samples(data, "chirplet_clean", "pulse, range")
     _check(data, prf_hz, atoms, sweep, floor_db)
     n = data.shape[-2]
-    rows = data.detach().mT.contiguous()
+    data = data.detach()
+    level = level_of(data)
+    rows = (data / level).mT.contiguous()
     search = _Search.of(n, sweep, rows)
     energy, tones, found = _energy(rows), torch.zeros_like(rows), []
     peak = torch.zeros(rows.shape[:-2], dtype=real_dtype(rows.dtype), device=rows.device)
@@ -109,7 +122,11 @@ def chirplet_clean(
     even = torch.zeros(0, dtype=torch.float64, device=rows.device)
     image = matched_fourier(tones.mT.contiguous(), even, prf_hz, lines=DopplerLines(oversampling, lines))
     return Chirplets(
-        image, frequency * prf_hz, rate * prf_hz**2, amplitude, _energy(rows) / torch.where(energy > 0, energy, 1)
+        image * level,
+        frequency * prf_hz,
+        rate * prf_hz**2,
+        amplitude * level,
+        _energy(rows) / torch.where(energy > 0, energy, 1),
     )
 
 
@@ -236,9 +253,7 @@ def _energy(rows: Tensor) -> Tensor:
 
 def _check(data: Tensor, prf_hz: float, atoms: int, sweep: float, floor_db: float) -> None:
     """Raise TypeError or ValueError for invalid data or options."""
-    real_dtype(data.dtype)
-    refuse_non_finite(data, "chirplet_clean")
-    if data.ndim < 2 or data.shape[-2] < 16 or not data.shape[-1]:
+    if data.shape[-2] < 16:
         raise ValueError(
             "chirplet_clean: data must have at least 16 pulses and one range cell, shape (..., pulse, range), got "
             f"shape {tuple(data.shape)}"

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.unknowns import RotationParameters, Unknowns, Variables
-from torchsar.core import Signal, block_bytes_of, real_dtype, refuse_non_finite
+from torchsar.core import Signal, block_bytes_of, checked_samples, unit_level
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier, range_phase
 from torchsar.focus.transforms import Gridding
@@ -92,6 +92,7 @@ class ImageEntropy:
         prf_hz: float,
         range_m: Tensor,
     ) -> None:
+        data = checked_samples(data, "ImageEntropy", "pulse, range")
         _check(data, wavelength_m, prf_hz, range_m)
         self.wavelength_m, self.prf_hz, self.range_m = (
             wavelength_m,
@@ -298,21 +299,18 @@ def _value_and_gradient(cost: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Te
 
 def _normalised(data: Tensor) -> Tensor:
     """Each trial over its root mean square, so that squares neither underflow nor overflow."""
-    peak = data.abs().amax((-2, -1), keepdim=True)
-    unit = data / torch.where(peak > 0, peak, 1)
+    unit = unit_level(data)
     rms = (unit.real.square() + unit.imag.square()).mean((-2, -1), keepdim=True).sqrt()
     return unit / torch.where(rms > 0, rms, 1)
 
 
 def _check(data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) -> None:
     """Raise TypeError or ValueError for invalid input."""
-    real_dtype(data.dtype)
-    if data.ndim < 2 or data.shape[-2] < 8 or not data.shape[-1]:
+    if data.shape[-2] < 8:
         raise ValueError(
             "ImageEntropy: data must have at least 8 pulses and one range cell, shape (..., pulse, range), got "
             f"shape {tuple(data.shape)}"
         )
-    refuse_non_finite(data, "ImageEntropy")
     for name, value in (("wavelength_m", wavelength_m), ("prf_hz", prf_hz)):
         if not value > 0:
             raise ValueError(f"ImageEntropy: {name} must be positive, got {value}")

@@ -14,7 +14,7 @@ from torchsar.compensate.rotation.histories import refined_by_histories
 from torchsar.compensate.rotation.motion import LEAST_PULSES, Motion, Sampling, image_of
 from torchsar.compensate.rotation.scatterers import ROUNDS, Fit, fit_scatterers
 from torchsar.compensate.rotation.unknowns import k_name
-from torchsar.core import Estimate, block_bytes_of, over_blocks, refuse_non_finite, settle
+from torchsar.core import Estimate, block_bytes_of, checked_samples, level_of, over_blocks, refuse_non_finite, settle
 from torchsar.core.warp import k_of_shape, shape_of
 from torchsar.metrics import entropy
 
@@ -217,7 +217,8 @@ def _over_trials(
     range_m: Tensor,
     yc_m: Tensor | float | None,
 ) -> Estimate:
-    """find(rows, sampling, known centre) in blocks of trials, each over its largest sample."""
+    """find(rows, sampling, known centre) in blocks of trials, each divided by its level."""
+    data = checked_samples(data, name, "pulse, range")
     sampling = _checked(name, data, wavelength_m, prf_hz, range_m)
     trials, rows = data.shape[:-2], data.detach().reshape(-1, *data.shape[-2:])
     known = (
@@ -229,15 +230,15 @@ def _over_trials(
     @torch.no_grad()
     def work(first: int) -> None:
         part = slice(first, first + height)
-        # |z| itself may overflow
-        peak = torch.maximum(rows[part].real.abs(), rows[part].imag.abs()).amax((-2, -1), keepdim=True)
-        found = find(rows[part] / torch.where(peak > 0, peak, 1), sampling, None if known is None else known[part])
+        peak = level_of(rows[part])
+        found = find(rows[part] / peak, sampling, None if known is None else known[part])
         scaled = (
             {"noise_power": found.info["noise_power"] * peak[:, 0, 0].double().square()}
             if "noise_power" in found.info
             else {}
         )
-        parts[first] = replace(found, info={**found.info, **scaled})
+        seen = (rows[part] != 0).flatten(1).any(-1)
+        parts[first] = replace(found, ok=found.ok & seen, info={**found.info, **scaled})
 
     starts = range(0, rows.shape[0], height)
     over_blocks(work, starts, rows)
@@ -263,12 +264,7 @@ def _centre(name: str, yc_m: Tensor, trials: torch.Size) -> Tensor:
 
 def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) -> Sampling:
     """Sampling of the data; raises TypeError or ValueError for invalid input."""
-    if not isinstance(data, Tensor) or not data.is_complex():
-        raise TypeError(
-            f"{name} works on complex range-compressed samples (..., pulse, range), got "
-            f"{data.dtype if isinstance(data, Tensor) else type(data).__name__}"
-        )
-    if data.ndim < 2 or data.shape[-2] < LEAST_PULSES or not data.numel():
+    if data.shape[-2] < LEAST_PULSES:
         raise ValueError(
             f"{name} works on samples (..., pulse, range) of at least {LEAST_PULSES} pulses and "
             f"one range cell, got the shape {tuple(data.shape)}"
@@ -281,7 +277,6 @@ def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_
         raise ValueError(
             f"{name}: range_m must be a tensor of the {data.shape[-1]} coordinates of the range cells (m), got {got}"
         )
-    refuse_non_finite(data, name)
     refuse_non_finite(range_m, f"{name}: range_m")
     steps = torch.diff(range_m.to(torch.float64))
     step = float(steps.mean()) if len(steps) else 1.0

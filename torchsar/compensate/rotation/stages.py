@@ -267,14 +267,14 @@ def rotating_autofocus(
     Returns:
         `phase_rad` of shape (..., pulse), to be removed. quality is the relative decrease of
         exp(entropy), the number of cells that the image fills, due to the correction. `ok` is False
-        where this number increases.
+        where this number increases, and in a trial of zeros.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
         ValueError: If the data are empty or not finite, or the start does not have one phase per
             pulse.
     """
-    pulses = prepare(data, "rotating_autofocus")
+    pulses = prepare(data, "rotating_autofocus", empty=False)
     through = Through(
         MatchedFourierOperator(
             warp_k, pulses.n, prf_hz, dtype=data.dtype, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS)
@@ -294,6 +294,6 @@ def rotating_autofocus(
     return Estimate(
         value,
         quality.reshape(pulses.trials),
-        (after <= before).reshape(pulses.trials),
+        ((after <= before) & pulses.present.any(-1)).reshape(pulses.trials),
         info={"iterations": taken.reshape(pulses.trials)},
     )

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torchsar.core import Estimate
 from torchsar.focus.nufft import smooth_length
+from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
@@ -64,8 +65,12 @@ def along_track_velocity(
         of the search. `ok` is False where this SNR is below 19 dB, or where `at_the_end` is True.
 
     Raises:
-        ValueError: If `half_m_s` is not positive, or the search reaches the speed of the receiver.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, the channels are not those of the radar, or a sample is
+            not finite, or if `half_m_s` is not positive, or the search reaches the speed of the
+            receiver.
     """
+    data = checked_channels(data, radar, "along_track_velocity")
     if not half_m_s > 0:
         raise ValueError(
             f"half_m_s of a search along track must be positive, got {half_m_s}; omit the stage where u_a_m_s is known"

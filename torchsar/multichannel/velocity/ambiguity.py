@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate
+from torchsar.core import Estimate, unit_level
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.bank import tone_energy
@@ -52,9 +52,7 @@ def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, a
     offsets = torch.arange(
         -_U_A_HALF_M_S, _U_A_HALF_M_S + _U_A_STEP_M_S / 2, _U_A_STEP_M_S, dtype=torch.float64, device=data.device
     )
-    level = data.abs().amax((-2, -1), keepdim=True)
-    # scaled so that squares fit into single precision
-    data, energies = data / torch.where(level > 0, level, 1.0), []
+    data, energies = unit_level(data), []
     for number in (-1, 0, 1):
         u_r = begin.u_r_m_s + number * radar.ambiguous_velocity_m_s
         u_a = begin.speed_m_s - torch.sqrt((begin.square_m2_s2 - u_r.square()).clamp_min(1.0))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import per_trial, unit_phasor
+from torchsar.core import level_of, per_trial, unit_phasor
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
@@ -95,8 +95,8 @@ def bank_search(
     n = data.shape[-1]
     time_s = radar.pulse_axis(n).values(data.device)
     prepared = (data if whitening is None else whitening.backed(data)).to(torch.complex128)
-    level = prepared.abs().amax((-2, -1), keepdim=True)
-    prepared = (prepared / torch.where(level > 0, level, 1.0)).to(torch.complex64)
+    level = level_of(prepared)
+    prepared = (prepared / level).to(torch.complex64)
     best = PointMotion.of(radar, data, 0.0, u_a_m_s, 0.0, range_m)
     best = best.each(lambda value: value.expand(data.shape[:-2]))
     energy = torch.zeros(data.shape[:-2], dtype=torch.float64, device=data.device)

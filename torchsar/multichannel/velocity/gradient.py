@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate
+from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
@@ -32,7 +33,12 @@ def explained_energy(data: Tensor, radar: BistaticRadar, motion: PointMotion, we
 
     Returns:
         Energy, shape (...,).
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or the channels are not those of the radar.
     """
+    data = checked_channels(data, radar, "explained_energy", finite=False)
     time_s, weight = radar.pulse_axis(data.shape[-1]).values(data.device), weight[..., None, :]
     total = weight.square().expand(data.shape).sum((-2, -1)).clamp_min(_TINY)
     return (weight * data.to(torch.complex128) * point_phasor(radar, motion, time_s, torch.complex128).conj()).sum(
@@ -68,8 +74,11 @@ def gradient_likelihood(
         is False where the search failed or `snr_db` is below 19.
 
     Raises:
-        ValueError: If `unknowns` holds other names or a name twice.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, the channels are not those of the radar, or a sample is
+            not finite, or if `unknowns` holds other names or a name twice.
     """
+    data = checked_channels(data, radar, "gradient_likelihood")
     energy = data.abs().to(torch.float64).square().sum((-2, -1)).clamp_min(_TINY)
     at_start = maximum_likelihood(data, radar, start, aperture, unknowns, steps=0)
     # the phases of the unknowns are nearly alike: in whitened units the objective is isotropic

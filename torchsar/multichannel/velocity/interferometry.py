@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchsar.core import Estimate
 from torchsar.focus.nufft import smooth_length
+from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.model import Found, covariance_of, estimate_of, phase_slopes, point_phasor
@@ -57,8 +58,11 @@ def interferometry(
         `noise_power` (per sample). `ok` is False where `snr_db` is below 19.
 
     Raises:
-        ValueError: If the radar has a single channel.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, the channels are not those of the radar, or a sample is
+            not finite, or if the radar has a single channel.
     """
+    data = checked_channels(data, radar, "interferometry")
     if radar.channels < 2:
         raise ValueError(
             "interferometry needs two channels or more, got 1: one channel cannot separate position and "

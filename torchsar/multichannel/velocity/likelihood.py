@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.model import (
@@ -86,8 +87,11 @@ def maximum_likelihood(
         The fit with motion, amplitude, residual noise power and covariance of the unknowns.
 
     Raises:
-        ValueError: If `unknowns` holds other names or a name twice.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, the channels are not those of the radar, or a sample is
+            not finite, or if `unknowns` holds other names or a name twice.
     """
+    data = checked_channels(data, radar, "maximum_likelihood")
     problem = PointLikelihood.of(data, radar, start, aperture, unknowns, whitening)
     motion = start.each(lambda value: value.expand(data.shape[:-2]))
     fit = problem.fit(motion)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate
+from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell
 from torchsar.multichannel.velocity.bank import Search, bank_search
@@ -66,8 +67,11 @@ def moving_point_velocity(
         the search, as with a single channel.
 
     Raises:
-        ValueError: If the search reaches the speed of the receiver.
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, the channels are not those of the radar, or a sample is
+            not finite, or if the search reaches the speed of the receiver.
     """
+    data = checked_channels(data, radar, "moving_point_velocity")
     search = search or Search(u_r_m_s=1.5 * radar.ambiguous_velocity_m_s)
     unknowns = UNKNOWNS if u_a_m_s is None else ("u_r_m_s", "y0_m")
     if u_a_m_s is not None:

@@ -194,6 +194,7 @@ class SignalIntensityRatio(Stage):
     also_on = (("channel", "pulse", "range"),)
     provides = ("u_r_m_s",)
     neutral = {"u_r_m_s": 0.0}
+    takes_empty = False
 
     def __init__(
         self,

@@ -11,7 +11,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, take
+from torchsar.core import Estimate, Signal, Stage, take, unit_level
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import refuse_shifted
 from torchsar.multichannel.velocity.along_track import along_track_velocity, motion_from
@@ -37,7 +37,7 @@ def strongest_line(data: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         The line (..., channel, pulse) and its index (...,).
     """
-    index = data.detach().abs().square().sum((-3, -2)).argmax(-1)
+    index = unit_level(data.detach(), 3).abs().square().sum((-3, -2)).argmax(-1)
     return take(data.movedim(-1, -3), index, -3), index
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.response import shared_response
 from torchsar.radar import BistaticRadar
@@ -103,7 +104,13 @@ def sample_whitening(data: Tensor, radar: BistaticRadar, samples: int = _SAMPLES
     Returns:
         Whitening of each Doppler bin. Where the covariance shows no more structure than that of
         white noise by chance, the covariance of white noise is used.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, the channels are not those of the radar, or a sample is
+            not finite.
     """
+    data = checked_channels(data, radar, "sample_whitening")
     return line_whitening(data[..., None, :, :], radar, samples)
 
 
@@ -122,7 +129,13 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES)
 
     Returns:
         Whitening of each Doppler bin.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, the channels are not those of the radar, or a sample is
+            not finite.
     """
+    lines = checked_channels(lines, radar, "line_whitening", "line, channel, pulse")
     n, channels, count = lines.shape[-1], lines.shape[-2], lines.shape[-3]
     groups = max(1, n * count // max(samples, 4 * channels))
     group = torch.arange(n, device=lines.device) * min(groups, n) // n
