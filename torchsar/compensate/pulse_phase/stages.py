@@ -94,17 +94,18 @@ class LinkPhases(Stage):
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
 
-    def forward(self, signal: Signal) -> Estimate:
+    def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            start: Phase to start from in rad, shape (..., pulse), if it is known to about a radian.
 
         Returns:
             `Estimate` by the function `link_phases` with `phase_rad` of shape (..., pulse), to be
             removed.
         """
-        return link_phases(signal.data)
+        return link_phases(signal.data, start=start)
 
 
 def windows_of(windows: Literal["shrinking", "measured"] | list[float]) -> Windows:
