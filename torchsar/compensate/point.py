@@ -177,7 +177,8 @@ class PointDoppler(Stage):
                 "connect it with torchsar.use, or set radar.pointing_doppler_hz"
             )
         power = image.real.square() + image.imag.square()
-        line, sample = torch.unravel_index(power.flatten(-2).argmax(-1), power.shape[-2:])
+        peak, width = power.flatten(-2).argmax(-1), power.shape[-1]
+        line, sample = peak // width, peak % width
         found = impulse_response(
             signal,
             (azimuth.start + azimuth.step * line.double(), slant.start + slant.step * sample.double()),
