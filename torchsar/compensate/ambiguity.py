@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.aperture import complete_aperture_centroid
-from torchsar.compensate.doppler import phase_increment, wrap_hz
+from torchsar.compensate.doppler import MOST_STD, phase_increment, wrap_hz
 from torchsar.compensate.group import (
     RangeGroup,
     aperture_s,
@@ -372,15 +372,15 @@ class DopplerCentroid(Stage):
         """
         raw, radar = signal.data, self.radar
         first = phase_increment(raw, radar.prf_hz, self.blocks)
-        base, reliable = first["doppler_baseband_hz"], first.ok & coherent_lines(raw)
+        base, coarse_std = first["doppler_baseband_hz"], first.std["doppler_baseband_hz"]
         evidence = ambiguity_evidence(raw, radar, base, self.spectrum(raw.shape[-1], raw.device), self.reach)
         turns = candidate_turns(self.reach, raw.device)
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
         ranked = joint.sort(-1, descending=True)
         absolute = base + radar.prf_hz * turns[ranked.indices[..., 0]]
-        absolute, std = complete_aperture_centroid(
-            raw, radar, absolute, first.std["doppler_baseband_hz"], self.reference
-        )
+        absolute, std = complete_aperture_centroid(raw, radar, absolute, coarse_std, self.reference)
+        refined = (std < coarse_std) & (std < MOST_STD * radar.prf_hz)
+        reliable = (first.ok | refined) & coherent_lines(raw)
         probability = torch.softmax(joint, -1).amax(-1)
         info = {
             **first.info,

@@ -24,7 +24,7 @@ from torchsar.radar import StripmapRadar
 OVER = ("mean", "median")  # how `combine_blocks` combines the blocks
 # Largest standard deviation of an estimate that is ok, in PRF. Noise alone has a predicted standard
 # deviation about ten times as large, since the sum of its products is no larger than their scatter.
-_MOST_STD = 0.015
+MOST_STD = 0.015
 # Least extent of the energy along the record, as a share of its length: targets seen for less are
 # cut by the end of the record, or nearly as short as their own drift of Doppler.
 _LEAST_EXTENT = 0.3
@@ -230,7 +230,7 @@ def reliable_increment(products: Tensor, phase_rad: Tensor, std_rad: Tensor) -> 
     real = (products * torch.polar(torch.ones_like(phase_rad), -phase_rad)[..., None]).real.clamp_min(0)
     square = real.square().sum(-1)
     extent = real.sum(-1).square() / torch.where(square > 0, square, 1) / products.shape[-1]
-    return (std_rad < 2 * math.pi * _MOST_STD) & (square > 0) & ((extent >= _LEAST_EXTENT) | (products.shape[-1] < 4))
+    return (std_rad < 2 * math.pi * MOST_STD) & (square > 0) & ((extent >= _LEAST_EXTENT) | (products.shape[-1] < 4))
 
 
 def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz: float, **info: Tensor) -> Estimate:

@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import Pulses, prepare, starting_phase
-from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, SPECTRAL_FLOOR, describe, power_groups
+from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, describe, power_groups
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
-from torchsar.compensate.pulse_phase.verdict import LEAST_STREHL, occupied_band
+from torchsar.compensate.pulse_phase.verdict import LEAST_ROWS, LEAST_STREHL, occupied_band
 from torchsar.core import Estimate, cis, over_blocks
 
 # Bands of the first guess as shares of the pulse rate, and the share of its power in the band.
@@ -76,8 +76,9 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         left out of the standard deviation. `quality` is the predicted Strehl ratio times the share
         of the likelihood that noise does not explain. `ok` is False where the Strehl ratio for 1.4
         times the standard deviation is below 0.8, the gain in likelihood below twice that of noise,
-        fewer than ten independent range cells hold the energy, or a sparse description of the scene
-        with the phases that sharpen it is more likely. `info` holds "gain_nats" of shape
+        a single range cell holds nearly all of the energy, adjacent pulses are not coherent in any
+        ten range cells of similar power, or a sparse description of the scene with the phases that
+        sharpen it is more likely. `info` holds "gain_nats" of shape
         (...,): log likelihood minus that of white noise.
 
     Raises:
@@ -94,8 +95,9 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         return found
     with torch.no_grad():
         sharp = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
-        sparse = describe(pulses.rows, sharp, occupied_band(pulses.rows)).sparse.reshape(pulses.trials)
-    return replace(found, ok=found.ok & (found.info["gain_nats"] > sparse))
+        scene = describe(pulses.rows, sharp, occupied_band(pulses.rows))
+        likelier = (found.info["gain_nats"].flatten() > scene.sparse) & (scene.ratio > 0)
+    return replace(found, ok=found.ok & likelier.reshape(pulses.trials))
 
 
 def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
@@ -133,12 +135,12 @@ def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor) -> Estim
     std = torch.where(scene[:, None] > 0, std / _or_one(scene).sqrt()[:, None], torch.inf).clamp_max(_PRIOR**-0.5)
     strehl = torch.exp(-(std.square() * pulses.present).sum(-1) / pulses.present.sum(-1).clamp_min(1))
     row = (pulses.rows.detach().real.square() + pulses.rows.detach().imag.square()).sum(-1, dtype=torch.float64)
-    effective = row.sum(-1).square() / _or_one(row.square().sum(-1)) * occupied_band(pulses.rows.detach())
+    effective = row.sum(-1).square() / _or_one(row.square().sum(-1))
     return Estimate(
         value={"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
         std={"phase_rad": std.reshape(*trials, pulses.n).to(real)},
         quality=(strehl * scene).reshape(trials).to(real),
-        ok=((strehl ** (_SPREAD**2) > LEAST_STREHL) & (gain > _MARGIN * noise) & (effective > LEAST_LOOKS)).reshape(
+        ok=((strehl ** (_SPREAD**2) > LEAST_STREHL) & (gain > _MARGIN * noise) & (effective > LEAST_ROWS)).reshape(
             trials
         ),
         info={"gain_nats": gain.reshape(trials)},
