@@ -149,7 +149,13 @@ def minimum_entropy_velocity(
         focused image, bool (...,). It is where its depth is 8 standard deviations of the entropy of
         noise or more, and its width below that for the dwell: one step of `grid_step_m_s`. A wider
         minimum shows that the targets are seen for a shorter time.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no trials or no samples, or a sample is not finite.
     """
+    lines = checked_samples(group.data, "minimum_entropy_velocity", "pulse, range", empty=False)
+    group = RangeGroup(unit_level(lines), group.start, group.radar)
     spectrum = beam_spectrum(group, doppler_hz)
     weight = _weights(spectrum, doppler_hz, dwell_s)
     blocks = _objective(spectrum, doppler_hz, weight)
@@ -194,6 +200,8 @@ def _scatter_std(blocks: Callable[[Tensor], Tensor], velocity: Tensor, curvature
 
 def _comb_std(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, velocity: Tensor, half: float) -> Tensor:
     """Standard deviation (...,) in m/s from the slopes of interleaved sets of Doppler rows."""
+    if spectrum.data.shape[-2] < _COMBS:
+        return torch.full_like(velocity, 1e6)
     values = []
     for first in range(_COMBS):
         rows = replace(
@@ -229,6 +237,7 @@ class EffectiveVelocity(Stage):
     """
 
     provides = ("velocity_m_s",)
+    takes_empty = False
 
     def __init__(
         self,
