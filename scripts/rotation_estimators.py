@@ -1,6 +1,6 @@
 """Every estimator of uneven rotation on the same data: evaluations, CPU time and error.
 
-Table 2 and the times of Remote Sens. 2025, 17, 3447.
+Table 2, figures 10 to 12 and the times of Remote Sens. 2025, 17, 3447.
 
     python scripts/rotation_estimators.py [--out rotation_estimators] [--seed 1] [--snr-db 20]
     [--genetic-seeds 5] [--small]
@@ -37,8 +37,9 @@ from torchsar.compensate import (
     search_rotation,
     uneven_rotation,
 )
-from torchsar.core import Draws, Estimate, Signal
+from torchsar.core import Axis, Draws, Estimate, Signal
 from torchsar.echo import simulate_turntable
+from torchsar.focus import MatchedFourier, RangePhase
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
@@ -61,6 +62,7 @@ class Run:
     seconds: float
     error: tuple[float, float, float]
     ok: bool
+    found: Estimate
 
 
 def timed(find: Callable[[], Estimate], rounds: int) -> Run:
@@ -77,6 +79,7 @@ def timed(find: Callable[[], Estimate], rounds: int) -> Run:
         statistics.median(seconds),
         tuple(error.tolist()),
         bool(found.ok),
+        found,
     )
 
 
@@ -246,6 +249,24 @@ def draw(bench: Bench, path: Path) -> None:
     )
 
 
+def draw_starts(bench: Bench, path: Path) -> None:
+    """Figures 10 to 12: images after compensation with what Newton's method finds from its starts.
+
+    The middle of the target is drawn in Doppler, since a wrong rate gives a wrong scale.
+    """
+    shown = {}
+    for figure, factor in ((10, 0.9), (11, 1.0), (12, 1.1)):
+        found = bench.runs[f"Newton x{factor:g} raw"].found
+        omega, k, yc = (found[name] for name in ("omega_rad_s", "warp_k", "yc_m"))
+        image = MatchedFourier(bench.radar)(RangePhase(bench.radar)(bench.signal, omega, k, yc), k)
+        middle, part = image.axes[0].n // 2, image.axes[0].n // 8
+        lines = slice(middle - part, middle + part)
+        doppler = image.axes[0]
+        axis = Axis(doppler.name, 2 * part, doppler.start + (middle - part) * doppler.step, doppler.step, doppler.unit)
+        shown[f"figure {figure}: start x{factor:g}"] = Signal(image.data[lines], (axis, image.axes[1]))
+    plot.save(plot.images(shown, 40, percentile=100), path)
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("rotation_estimators"), help="folder of the figure")
@@ -268,6 +289,7 @@ def main(arguments: list[str] | None = None) -> None:
     )  # 162, 870 and 888 evaluations
     ratios(bench, on_grid(bench, (1, 2, 2) if options.small else PART))
     draw(bench, options.out / "time_and_error.png")
+    draw_starts(bench, options.out / "figure_10_12.png")
 
 
 if __name__ == "__main__":

@@ -6,9 +6,17 @@
 
 Monte Carlo on a small satellite (120 scatterers), a new scene and new noise in every trial: the
 recommended estimator, which gets the data alone, the genetic algorithm in a box of +-10 % about the
-truth, with image lines of one and of half a Doppler cell, and the Cramer-Rao bound. Then the full
-satellite: its images, and the error of the cross range of its tip, which is that of the rate. SNR:
-mean power of all samples over the variance of the noise.
+truth, with image lines of one, a half and a quarter of a Doppler cell, and the Cramer-Rao bound.
+Then the full satellite: its images, and the error of the cross range of its tip, which is that of
+the rate, beside that of a genetic algorithm with 170 images of one line per Doppler cell (the
+published run time allows 162) and the published one. SNR: mean power of all samples over the
+variance of the noise.
+
+The published errors fall with the SNR. With one line per Doppler cell those of the genetic
+algorithm do not, because the minimum of the entropy itself lies elsewhere (about 7 % off in Om at
+any SNR). They do with four lines per cell: 6.4 % rms at -10 dB and 1.8 % at 5 dB in three scenes,
+where 9.18 % and 1.56 % are published. The published trend thus agrees with the reading that the
+image is zero-padded or finely gridded in Doppler, which the paper does not state.
 """
 
 from __future__ import annotations
@@ -169,11 +177,11 @@ def spread(error: Tensor) -> Tensor:
     return torch.stack([1 + mean / 100, 1 + (mean - std) / 100, 1 + (mean + std) / 100, rms, rms - own, rms + own])
 
 
-def full_target(target: Target, seed: int, scenes: int, out: Path) -> None:
+def full_target(target: Target, search: Finder, seed: int, scenes: int, out: Path) -> None:
     """Table 4 and figures 14 to 17."""
     print(
         f"\n{'tip of the full target':30}{'scenes':>8}{'rms error (%)':>20}{'bound (%)':>20}"
-        f"{'seen, scene 1 (m)':>20}{'published (%)':>20}{'reliable':>9}"
+        f"{'seen, scene 1 (m)':>20}{'GA, scene 1 (%)':>20}{'published, GA (%)':>20}{'reliable':>9}"
     )
     shown = {}
     for snr in SNR_DB:
@@ -183,10 +191,12 @@ def full_target(target: Target, seed: int, scenes: int, out: Path) -> None:
         image = focused(signal, target.radar, found, 0)
         shown[f"{snr:g} dB"] = image
         rms, bound = 100 * (1 / scale - 1).square().mean().sqrt(), bounds(target, snr, seed, scenes)["omega_rad_s"]
+        searched = search(signal.with_data(signal.data[:1]), target.radar)["omega_rad_s"]
+        own = 100 * float((TRUE["omega_rad_s"] / searched - 1).abs())
         reliable = found.ok.double().mean()
         print(
             f"{f'{snr:g} dB':30}{scenes:>8}{float(rms):>20.3f}{float(bound):>20.3f}"
-            f"{tip(image, truth):>20.4f}{PUBLISHED_TIP.get(snr, '-'):>20}{float(reliable):>9.2f}",
+            f"{tip(image, truth):>20.4f}{own:>20.3f}{PUBLISHED_TIP.get(snr, '-'):>20}{float(reliable):>9.2f}",
             flush=True,
         )
     plot.save(plot.images(shown, 45, percentile=100), out / "figure_14_17.png")
@@ -233,6 +243,7 @@ def main(arguments: list[str] | None = None) -> None:
         "recommended": (recommended, trials),
         "GA, os 1": (genetic(1.0, generations), few),
         "GA, os 2": (genetic(2.0, generations), few),
+        "GA, os 4": (genetic(4.0, generations), few),
     }
     found: dict[tuple[str, float], dict[str, Tensor]] = {}
     least: dict[float, dict[str, Tensor]] = {}
@@ -244,7 +255,7 @@ def main(arguments: list[str] | None = None) -> None:
         least[snr] = bounds(target, snr, options.seed, trials)
         rows(snr, found, least[snr])
     draw_errors(found, least, options.out)
-    full_target(full, options.seed, scenes, options.out)
+    full_target(full, genetic(1.0, 1 if options.small else 5), options.seed, scenes, options.out)
 
 
 if __name__ == "__main__":

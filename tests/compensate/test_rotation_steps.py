@@ -23,9 +23,11 @@ from tests.compensate.turning import (
     response,
     target,
 )
+from torchsar.compensate.rotation.couplings import Pairs
 from torchsar.compensate.rotation.histories import refined_by_histories, solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of, without_range_term
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
+from torchsar.compensate.rotation.range_response import RangeResponse
 from torchsar.compensate.rotation.scatterers import _RIDGE, Fit, Scatterers, _Step, _Unknowns
 from torchsar.core.warp import warp
 
@@ -200,18 +202,16 @@ def model(unknown: Tensor, found: Scatterers, motion: Motion) -> Tensor:
     return torch.view_as_real((torch.exp(2j * math.pi * turns) * amplitude) @ profile)
 
 
+def fit_of(motion: Motion, found: Scatterers) -> Fit:
+    """State with the periodic range response of `model`."""
+    covariance, one = torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64)
+    never = torch.zeros(1, dtype=torch.bool)
+    return Fit(motion, found, RangeResponse(one, CELLS), covariance, covariance, one, never.long(), never, 0 * one)
+
+
 def step_of(data: Tensor, present: Tensor) -> tuple[Tensor, _Step]:
     found, motion = few()
-    none = torch.zeros(1, dtype=torch.bool)
-    fit = Fit(
-        motion,
-        found,
-        torch.zeros(1, 4, 4, dtype=F64),
-        torch.ones(1, dtype=F64),
-        none.long(),
-        none,
-        torch.zeros(1, dtype=F64),
-    )
+    fit = fit_of(motion, found)
     return _Step.of(data, SMALL, fit, present, _Unknowns(2, True), 8)
 
 
@@ -261,20 +261,18 @@ def test_steps_explain_all_energy_of_noise_free_data() -> None:
     near = torch.zeros(4 * FEW + 4, dtype=F64)
     near[: 2 * FEW], near[2 * FEW : 3 * FEW], near[3 * FEW : 4 * FEW] = 0.03, 0.02, -0.01
     data = torch.view_as_complex(model(near, found, motion))[None]
-    present, none = torch.ones(1, SHORT, dtype=torch.bool), torch.zeros(1, dtype=torch.bool)
+    present = torch.ones(1, SHORT, dtype=torch.bool)
     left = []
     for _ in range(5):
-        fit = Fit(
-            motion,
-            found,
-            torch.zeros(1, 4, 4, dtype=F64),
-            torch.ones(1, dtype=F64),
-            none.long(),
-            none,
-            torch.zeros(1, dtype=F64),
-        )
+        fit = fit_of(motion, found)
         residual, step = _Step.of(data, SMALL, fit, present, _Unknowns(2, True), 8)
         left.append(float(residual.abs().square().sum() / data.abs().square().sum()))
-        _, found, _, covariance = step.taken()
+        _, found, _, covariance, _ = step.taken()
         assert (covariance.diagonal(dim1=1, dim2=2) > 0).all()
     assert left[0] > 1e-4 and left[-1] < 1e-3 * left[0]
+
+
+def test_pairs_just_below_the_largest_separation() -> None:
+    cell = torch.tensor([[0.0, math.nextafter(64.0, 0.0)]], dtype=F64)
+    found = Pairs.find(SMALL, K[None], torch.ones_like(cell, dtype=torch.complex128), cell, torch.ones(1, 1, SHORT))
+    assert len(found.first) == 4

@@ -127,13 +127,7 @@ def test_a_batch_equals_single_trials(name: str) -> None:
         for key, value in alone.std.items():
             torch.testing.assert_close(together.std[key][i], value, rtol=1e-4, atol=1e-9)
         assert alone.ok == together.ok[i] and torch.allclose(alone.quality, together.quality[i], atol=1e-6)
-    assert together.ok.tolist() == [
-        True,
-        name != "uneven" or bool(together.ok[1]),
-        bool(together.ok[2]),
-        bool(together.ok[3]),
-        True,
-    ]
+    assert not together.ok[2:4].any() and (name == "coarse" or (together.ok[0] and together.ok[4]))
     grid = ESTIMATORS[name](data[:4].view(2, 2, PULSES, 24), **OPTIONS)
     assert grid["warp_k"].shape == (2, 2, 2) and torch.equal(
         grid["warp_k"].flatten(0, 1), ESTIMATORS[name](data[:4], **OPTIONS)["warp_k"]
@@ -212,7 +206,7 @@ def test_undetermined_rotations_are_finite_and_not_ok(kind: str) -> None:
         assert all(torch.isfinite(value).all() for value in (*found.value.values(), found.quality)), kind
         assert not any(value.isnan().any() for value in (*found.std.values(), *found.info.values()))
         assert 0 <= found.quality <= 1 and found["omega_rad_s"] >= 0
-    assert not uneven_rotation(data, **OPTIONS).ok
+        assert not found.ok or (kind == "one range cell" and estimator is not uneven_rotation)
 
 
 def test_results_are_reproducible() -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import Pulses, rotate
 from torchsar.compensate.pulse_phase.homogeneous import describe
+from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.core import Estimate, block_bytes_of, over_blocks
 from torchsar.metrics.phase import phase_rmse
 
@@ -97,7 +98,12 @@ def occupied_band(rows: Tensor) -> Tensor:
 
 
 def estimated(
-    pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = False, compare: bool = True
+    pulses: Pulses,
+    start: Tensor | None,
+    find: Find,
+    at_rest: bool = False,
+    compare: bool = True,
+    imaging: Imaging | None = None,
 ) -> Estimate:
     """Run an autofocus method on all trials and predict the accuracy of its phases.
 
@@ -120,6 +126,9 @@ def estimated(
             standard deviation is then left out.
         compare: False if the scene is not to be compared with a homogeneous one, because its image
             is not the Fourier transform along pulses.
+        imaging: Image formation of all trials, from rows (trial, range, pulse) to images (trial,
+            line, range), with which the sharpness is measured; by default a Fourier transform. All
+            trials are then processed at once.
 
     Returns:
         `phase_rad` of shape (..., pulse) with its standard deviation. Sharpness is the amount by
@@ -138,8 +147,8 @@ def estimated(
     rows, present = pulses.rows, pulses.present
     if not len(rows) or pulses.n < 3:
         return _gathered(pulses, [_no_estimate(rows)])
-    if len(rows) == 1 or (rows.requires_grad and torch.is_grad_enabled()):
-        return _gathered(pulses, [_assessed(rows, present, start, find, at_rest, compare)])
+    if imaging is not None or len(rows) == 1 or (rows.requires_grad and torch.is_grad_enabled()):
+        return _gathered(pulses, [_assessed(rows, present, start, find, at_rest, compare, imaging)])
     height = max(1, block_bytes_of(rows.device) // (rows[0].numel() * rows.element_size()))
     parts = [slice(first, first + height) for first in range(0, len(rows), height)]
     done: dict[int, tuple[Tensor, ...]] = {}
@@ -154,12 +163,20 @@ def estimated(
 
 
 def _assessed(
-    rows: Tensor, present: Tensor, start: Tensor | None, find: Find, at_rest: bool, compare: bool
+    rows: Tensor,
+    present: Tensor,
+    start: Tensor | None,
+    find: Find,
+    at_rest: bool,
+    compare: bool,
+    imaging: Imaging | None = None,
 ) -> tuple[Tensor, ...]:
     """Phase, iterations, sharpness, effective rows of both, std, and the descriptions per trial."""
     phase, taken, again = find(rows, present, start)
     with torch.no_grad():
-        sharp, effective, sharpness_rows = sharpness_beyond_speckle(torch.fft.fft(rotate(rows, phase), norm="ortho"))
+        focused = rotate(rows, phase)
+        image = torch.fft.fft(focused, norm="ortho") if imaging is None else imaging.image(focused).mT
+        sharp, effective, sharpness_rows = sharpness_beyond_speckle(image)
         occupied = occupied_band(rows)
         std = _half_difference(rows, present, phase, again) / occupied.sqrt()
         if not at_rest:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.motion import Sampling
-from torchsar.core import linear_phasor
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.focus.transforms import Gridding
@@ -66,7 +65,8 @@ class Pairs:
             as_tuple=True
         )
         position = separation[trial, first, second] * _TABLE + _NEAR_CELLS * _TABLE
-        whole = position.floor().long()
+        # a separation just below the limit rounds to the last entry
+        whole = position.floor().long().clamp_max(2 * _NEAR_CELLS * _TABLE - 1)
         weight = amplitude[trial, first].conj() * amplitude[trial, second]
         index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
         table = _product_tables(sampling, k, bases, index)
@@ -144,23 +144,3 @@ def _product_tables(sampling: Sampling, k: Tensor, bases: Tensor, index: list[tu
         products, k, sampling.prf_hz, lines=DopplerLines(_TABLE, lines), transform=Gridding(6)
     ) * math.sqrt(sampling.pulses)
     return table[:, 1:] * (scale[:, first] * scale[:, second]).mT
-
-
-def band_response(x: Tensor, cells: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the range response to a scatterer and its first two derivatives.
-
-    The response is that of a flat band of `cells` FFT frequencies: a sinc, made periodic over the
-    range window as range-compressed pulses are.
-
-    Args:
-        x: Distance from the scatterer in range cells, any shape, float64.
-        cells: Number of range cells.
-
-    Returns:
-        The response, of unit peak, and its first and second derivative with respect to `x`, same
-        shape, complex128.
-    """
-    cycles = (torch.arange(cells, dtype=torch.float64, device=x.device) - cells // 2) / cells
-    turn = 2j * math.pi * cycles
-    moments = torch.stack([torch.ones_like(turn), turn, turn.square()], -1) / cells
-    return tuple((linear_phasor(x / cells, -(cells // 2), cells, torch.complex128) @ moments).unbind(-1))  # pyright: ignore[reportReturnType]

@@ -37,6 +37,17 @@ _ROBUST_ROUNDS = 3  # reweighted fits, found by trial: enough to exclude outlier
 # eigenvalue of a normal matrix of unit diagonal below which its direction is not determined: above
 # the rounding of float64, below any real information
 _NO_INFORMATION = 1e-7
+# largest phase error, in rad rms, of a scatterer at the edge of the target: its double then still
+# has a Strehl ratio of 0.8, the convention of Marechal
+MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8)) / 2
+# power over that of the brightest pixel below which side lobes are to be expected more than 24
+# cells away
+_FAINTEST = 1e-3
+# least power of the scatterers in a quarter of the aperture over that in the quarter of most power:
+# noise at the detection threshold gives 0.25
+_LEAST_LIT = 0.35
+_LEAST_FREE = 0.1  # degrees of freedom of a fit that few scatterers could not contradict
+LEAST_SCATTERERS = 3  # fewer do not determine the rotation reliably, a convention
 _SHARE_LOST = 0.01  # share of an unknown in such a direction beyond which it is not determined
 
 
@@ -66,19 +77,88 @@ def refined_by_histories(
     Returns:
         The refined rotation, and the number of scatterers that were used, shape (trial,).
     """
+    _, used, change, _, _ = _fitted_to_peaks(data, sampling, motion, free_centre, count, half_cells)
+    order = motion.k.shape[-1]
+    v = change[:, -1] if free_centre else 0
+    found = used.sum(-1)
+    moved = replace(motion, k=motion.k + change[:, :order], w=motion.w + change[:, order], v=motion.v + v)
+    return moved.where((found > 0) & moved.possible(sampling), motion), found
+
+
+def warp_phase_error(data: Tensor, sampling: Sampling, motion: Motion, checks: int = 2) -> tuple[Tensor, Tensor]:
+    """Measure how well the relative derivatives of the rotation rate of a rotation fit the data.
+
+    The rotation is refined by the histories of bright scatterers. They show by how much the
+    derivatives k1, k2, ... should change, and by how much the histories disagree about it. Both
+    together are given as the phase error that they cause to the scatterer farthest from zero
+    Doppler among those used. A constant phase and a phase that is linear in the warped time only
+    displace a scatterer and are left out.
+
+    Args:
+        data: Range-compressed pulses, shape (trial, pulse, range), complex.
+        sampling: Sampling of the data.
+        motion: Rotation to be judged.
+        checks: Number of refinements; two are enough for an image that is still blurred, and none
+            are needed for a rotation that is a maximum of the likelihood.
+
+    Returns:
+        The phase error in rad, rms over the aperture, shape (trial,); and the number of scatterers,
+        shape (trial,). The error is infinite where there are fewer than 3 scatterers, where all of
+        them lie within a cell of zero Doppler, or where they are not seen in all quarters of the
+        aperture, so that the rotation is extrapolated.
+    """
+    refined = motion
+    for _ in range(checks):
+        refined, _ = refined_by_histories(data, sampling, refined)
+    cells, used, change, covariance, lit = _fitted_to_peaks(data, sampling, refined, True, 128, 24, strict=True)
+    order, count = motion.k.shape[-1], used.sum(-1)
+    warped = Warped.of(motion.k, sampling.times(data.device), sampling.duration_s)
+    line = torch.stack([torch.ones_like(warped.u), warped.u - warped.u.mean(-1, keepdim=True)], 1)
+    line = line / line.square().sum(-1, keepdim=True).sqrt()
+    curves = warped.slopes - (warped.slopes @ line.mT) @ line
+    size = curves @ curves.mT / sampling.pulses
+    k, spread = refined.k - motion.k + change[:, :order], covariance[:, :order, :order]
+    error = torch.einsum("bi,bij,bj->b", k, size, k) + (size * spread).sum((-2, -1))
+    edge = 2 * math.pi * torch.where(used, cells.abs(), 0).amax(-1)
+    error = torch.nan_to_num(edge * error.clamp_min(0).sqrt(), nan=math.inf)
+    seen = (count >= LEAST_SCATTERERS) & (lit > _LEAST_LIT) & (edge > 2 * math.pi)
+    return torch.where(seen, error, math.inf), count
+
+
+def _fitted_to_peaks(
+    data: Tensor,
+    sampling: Sampling,
+    motion: Motion,
+    free_centre: bool,
+    count: int,
+    half_cells: int,
+    strict: bool = False,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Doppler cells of bright scatterers and whether they exist, (trial, peak); the change of the
+    rotation, (trial, unknown), that fits their histories, with its covariance; and the least power
+    of the scatterers in a quarter of the aperture over the largest, (trial,).
+
+    strict: leave out what may be speckle of a bright range cell or a side lobe of the brightest
+    scatterer.
+    """
     image = image_of(data, sampling, motion, oversampling=_OVERSAMPLING)
     power = image.abs().square()
-    peaks = find_peaks(power, noise_power(power) * threshold(power), count, _ISOLATED, 2 * half_cells, 1)
+    noise = noise_power(power)
+    if strict:
+        speckle = power.median(1, keepdim=True).values / math.log(2) * threshold(power)
+        floor = torch.maximum(speckle, _FAINTEST * power.amax((-2, -1), keepdim=True))
+        power = torch.where(power > floor, power, power * 1e-30)
+    peaks = find_peaks(power, noise * threshold(power), count, _ISOLATED, 2 * half_cells, 1)
     cells = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING
     history, u = _histories(image, peaks, half_cells)
     bases = _bases(motion, sampling, cells, sampling.range_m(peaks.cell), u, free_centre)
     keep = slice(max(1, len(u) // _ENDS), -max(1, len(u) // _ENDS))
-    change = _fitted(history[..., keep], bases[..., keep], peaks.power > 0)
-    order = motion.k.shape[-1]
-    v = change[:, -1] if free_centre else 0
-    found = (peaks.power > 0).sum(-1)
-    moved = replace(motion, k=motion.k + change[:, :order], w=motion.w + change[:, order], v=motion.v + v)
-    return moved.where((found > 0) & moved.possible(sampling), motion), found
+    used = peaks.power > 0
+    history = history[..., keep]
+    seen = torch.stack([part.mean(-1).abs().square() for part in history.tensor_split(4, -1)], -1)
+    seen = torch.where(used[..., None], seen, 0).sum(1)
+    lit = seen.amin(-1) / seen.amax(-1).clamp_min(torch.finfo(torch.float64).tiny)
+    return cells, used, *_fitted(history, bases[..., keep], used), lit
 
 
 def _histories(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Tensor]:
@@ -118,8 +198,11 @@ def _times_at(u: Tensor, k: Tensor, duration_s: float) -> Tensor:
     return time
 
 
-def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> Tensor:
-    """Robust weighted least squares, (trial, unknown), on phases a sixth of the histories apart."""
+def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:
+    """Robust weighted least squares, (trial, unknown), on phases a sixth of the histories apart.
+
+    And its covariance (trial, unknown, unknown), from the differences between scatterers.
+    """
     lag = max(1, history.shape[-1] // 6)
     product = history[..., lag:] * history[..., :-lag].conj()
     whole = product.sum(-1, keepdim=True)
@@ -129,16 +212,38 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> Tensor:
     total = weight.sum(-1, keepdim=True).clamp_min(1e-300)
     angle = angle - (weight * angle).sum(-1, keepdim=True) / total
     difference = difference - (weight[..., None, :] * difference).sum(-1, keepdim=True) / total[..., None]
-    change = angle.new_zeros(bases.shape[0], bases.shape[2])
+    change, normal, rest = angle.new_zeros(bases.shape[0], bases.shape[2]), angle.new_zeros(0), angle.new_zeros(0)
     for _ in range(_ROBUST_ROUNDS):
         weighted = difference * weight[..., None, :]
-        change = solved(
-            torch.einsum("bpij,bpkj->bik", weighted, difference), torch.einsum("bpij,bpj->bi", weighted, angle)
-        )
+        normal = torch.einsum("bpij,bpkj->bik", weighted, difference)
+        change = solved(normal, torch.einsum("bpij,bpj->bi", weighted, angle))
         residual = angle - torch.einsum("bi,bpij->bpj", change, difference)
+        rest = weighted * residual[..., None, :]
         scale = 3 * residual.abs().flatten(1).median(-1).values[:, None, None].clamp_min(1e-12)
         weight = weight / (1 + (residual / scale).square())
-    return change
+    # few scatterers cannot disagree: what the samples of each show counts as well
+    inverse = inverted(normal)[0]
+    own = lag * inverse @ torch.einsum("bpij,bpkj->bik", rest, rest) @ inverse
+    return change, sandwich(normal, rest.sum(-1), used.sum(-1)) + own
+
+
+def sandwich(normal: Tensor, pull: Tensor, count: Tensor) -> Tensor:
+    """Compute a covariance from the differences between independent contributions to a fit.
+
+    The mean square of the contributions to the gradient is measured and not derived from the noise,
+    so that errors of the model count (the sandwich covariance of least squares).
+
+    Args:
+        normal: Normal matrices, shape (trial, n, n).
+        pull: Gradient that each scatterer contributes at the solution, shape (trial, scatterer, n).
+        count: Effective number of scatterers, shape (trial,).
+
+    Returns:
+        The covariance, shape (trial, n, n); zero along directions that the data do not determine.
+    """
+    free = count / (count - normal.shape[-1]).clamp_min(_LEAST_FREE)
+    inverse = inverted(normal)[0]
+    return inverse @ (pull.mT @ pull) @ inverse * free[:, None, None]
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsar.compensate.rotation.histories import warp_phase_error
+from torchsar.compensate.rotation.motion import Motion, Sampling
 from torchsar.compensate.rotation.unknowns import RotationParameters, Unknowns, Variables
 from torchsar.core import Signal, block_bytes_of, checked_samples, unit_level
 from torchsar.focus.image_lines import DopplerLines
@@ -239,6 +241,28 @@ class ImageEntropy:
         with torch.no_grad():
             costs = [self._entropy(self._data[part], flat[part]) for part in self._blocks(len(flat), 1)]
         return torch.cat(costs).reshape(self.trials)
+
+    def phase_error(self, rotation: RotationParameters) -> Tensor:
+        """Measure how well the relative derivatives of the rotation rate fit the data.
+
+        Bright scatterers of the image show it, not the entropy; see `warp_phase_error`.
+
+        Args:
+            rotation: Rotation of every trial.
+
+        Returns:
+            The phase error in rad of the scatterer farthest from zero Doppler, shape (...,);
+            infinite where fewer than 3 scatterers confirm the rotation.
+        """
+        step = float(self.range_m[1] - self.range_m[0]) if len(self.range_m) > 1 else 1.0
+        pulses, cells = self._data.shape[-2:]
+        sampling = Sampling(self.wavelength_m, self.prf_hz, pulses, cells, float(self.range_m[0]), step)
+        k, yc = rotation.warp_k.reshape(len(self._data), -1), rotation.yc_m.reshape(-1)
+        w = rotation.omega_rad_s.square().reshape(-1)
+        motion = Motion(k, w, w * yc, torch.zeros_like(w))
+        with torch.no_grad():
+            errors = [warp_phase_error(self._data[i], sampling, motion.part(i))[0] for i in self._blocks(len(k), 1)]
+        return torch.cat(errors).reshape(self.trials)
 
     def _blocks(self, rows: int, count: int) -> Iterator[slice]:
         """Rows of candidates that fit into the cache together, `count` of them for each trial.

@@ -161,6 +161,17 @@ class Motion:
         turns = sampling.turns_per_square * (self.w[:, None] * ends + self.offset[:, None]).abs() * whole.square()
         return torch.isfinite(self.k).all(-1) & (turns < sampling.pulses / 4).all(-1)
 
+    def part(self, trials: slice) -> Motion:
+        """Select trials.
+
+        Args:
+            trials: The trials.
+
+        Returns:
+            Their rotations.
+        """
+        return Motion(self.k[trials], self.w[trials], self.v[trials], self.centre_m[trials])
+
     def where(self, keep: Tensor, other: Motion) -> Motion:
         """Choose, for each trial, between this rotation and another.
 

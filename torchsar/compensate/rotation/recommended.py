@@ -10,7 +10,12 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.coarse import coarse_warp
-from torchsar.compensate.rotation.histories import refined_by_histories
+from torchsar.compensate.rotation.histories import (
+    LEAST_SCATTERERS,
+    MOST_PHASE_ERROR_RAD,
+    refined_by_histories,
+    warp_phase_error,
+)
 from torchsar.compensate.rotation.motion import LEAST_PULSES, Motion, Sampling, image_of
 from torchsar.compensate.rotation.scatterers import ROUNDS, Fit, fit_scatterers
 from torchsar.compensate.rotation.unknowns import k_name
@@ -18,7 +23,6 @@ from torchsar.core import Estimate, block_bytes_of, checked_samples, level_of, o
 from torchsar.core.warp import k_of_shape, shape_of
 from torchsar.metrics import entropy
 
-LEAST_SCATTERERS = 3  # fewer do not determine the rotation reliably, a convention
 # relative standard deviation of the rate beyond which images cannot be scaled, a convention
 MOST_RATE_ERROR = 0.05
 # least share of the energy above the noise that the scatterers explain, found by trial: a lower
@@ -30,6 +34,7 @@ _BLOCKS = 8
 # last step of a fit that has converged, in standard deviations or as a phase of the scatterers in
 # rad, found by trial
 _REST_STDS, _REST_RAD = 3.0, 0.02
+_WRONG_FOCUS = 4.0  # phase error over `MOST_PHASE_ERROR_RAD` of a wrong focus, found by trial
 _HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
 
 Part = Callable[[Tensor, Sampling, Tensor | None], Estimate]
@@ -67,7 +72,7 @@ def uneven_rotation(
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
             rotation centre), if known a priori, a number or shape (...,); None estimates it.
         scatterers: Largest number of scatterers; more are more accurate and take longer. By default
-            one for every 1450 samples of a trial, within 128..800.
+            one for every 1000 samples of a trial, within 128..800.
         rounds: Largest number of maximum-likelihood steps.
 
     Returns:
@@ -76,12 +81,13 @@ def uneven_rotation(
         `k1_per_s`, `k2_per_s2`, ...; and `yc_m`, the range centre deviation, shape (...,). The data
         do not show the sign of the rotation rate, so `omega_rad_s` is positive and the image may be
         mirrored in cross range. Standard deviations follow from the Fisher information of the
-        scatterers found. quality is the share of the energy above the noise that these scatterers
-        explain.
+        scatterers found, or from the differences between them where these are larger. quality is
+        the share of the energy above the noise that these scatterers explain.
 
         info["focused"] is True where the rotation is good enough to form an image: at least 3
-        scatterers are found, they explain 40 % of the energy or more, the entropy is not higher
-        than without compensation, and the fit has converged. `ok` is True where, in addition, the
+        scatterers are found, they explain 40 % of the energy or more, their phase histories agree
+        over the whole aperture, the entropy is not higher than without compensation, and the fit
+        has converged. `ok` is True where, in addition, the
         standard deviation of the rate is below 5 %. Where only `ok` is False, the cross-range scale
         of the image is unknown. Further info: scatterers (their number), noise_power, steps,
         entropy_nats, uncompensated_entropy_nats.
@@ -131,7 +137,11 @@ def coarse_rotation(
     Returns:
         `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
         standard deviations. quality is the relative decrease of exp(entropy) of the image due to
-        the compensation. `ok` is False where the entropy is higher than without compensation.
+        the compensation. `ok` is True where the entropy is not higher than without compensation and
+        the phase histories of at least 3 bright scatterers confirm k1, k2, ...: the phase error
+        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler is below
+        0.24 rad rms, so that its double still has a Strehl ratio of 0.8. `ok` does not refer to
+        `omega_rad_s` and `yc_m`.
 
     Raises:
         TypeError: If the data are not complex.
@@ -141,7 +151,7 @@ def coarse_rotation(
     _check_counts("coarse_rotation", 1, order=order)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
-        return _assessed(rows, sampling, _start(rows, sampling, order, known))
+        return _confirmed(rows, sampling, _start(rows, sampling, order, known))
 
     return _over_trials("coarse_rotation", find, data, wavelength_m, prf_hz, range_m, yc_m)
 
@@ -178,7 +188,11 @@ def phase_fit_rotation(
     Returns:
         `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
         standard deviations. quality is the relative decrease of exp(entropy) of the image due to
-        the compensation. `ok` is False where the entropy is higher than without compensation.
+        the compensation. `ok` is True where the entropy is not higher than without compensation and
+        the phase histories of at least 3 bright scatterers confirm k1, k2, ...: the phase error
+        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler is below
+        0.24 rad rms, so that its double still has a Strehl ratio of 0.8. `ok` does not refer to
+        `omega_rad_s` and `yc_m`.
 
     Raises:
         TypeError: If the data are not complex.
@@ -191,7 +205,7 @@ def phase_fit_rotation(
         motion = _start(rows, sampling, order, known)
         for _ in range(steps):
             motion, _ = refined_by_histories(rows, sampling, motion, free_centre=known is None, half_cells=half_cells)
-        return _assessed(rows, sampling, motion)
+        return _confirmed(rows, sampling, motion)
 
     return _over_trials("phase_fit_rotation", find, data, wavelength_m, prf_hz, range_m, yc_m)
 
@@ -301,7 +315,10 @@ def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> 
     )
     quality = settle(explained.clamp(0, 1), 0.0)[0]
     std = _standard_deviations(fit, free_centre)
-    focused = found.ok & (count >= LEAST_SCATTERERS) & (quality >= _LEAST_EXPLAINED) & converged
+    # histories are less accurate than the fit: they only exclude a wrong focus
+    error, _ = warp_phase_error(rows, sampling, fit.motion, checks=0)
+    confirmed = (count >= LEAST_SCATTERERS) & (error < _WRONG_FOCUS * MOST_PHASE_ERROR_RAD)
+    focused = found.ok & confirmed & (quality >= _LEAST_EXPLAINED) & converged
     scaled = (std["omega_rad_s"] < MOST_RATE_ERROR * fit.motion.omega_rad_s) & (fit.motion.w > 0)
     info = {**found.info, "focused": focused, "scatterers": count, "noise_power": fit.noise, "steps": fit.steps}
     return Estimate(found.value, quality, focused & scaled, std, info)
@@ -320,7 +337,10 @@ def _standard_deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
     """
     motion, order = fit.motion, fit.motion.k.shape[-1]
     known = (fit.scatterers.amplitude != 0).any(-1)
-    covariance = torch.where(known[:, None, None], fit.covariance * fit.noise[:, None, None], math.inf)
+    covariance = fit.covariance * fit.noise[:, None, None]
+    seen, predicted = (c.diagonal(dim1=-2, dim2=-1) for c in (fit.disagreement, covariance))
+    wider = (seen / predicted.clamp_min(torch.finfo(torch.float64).tiny)).clamp_min(1).sqrt()
+    covariance = torch.where(known[:, None, None], covariance * wider[:, :, None] * wider[:, None], math.inf)
     k = covariance.diagonal(dim1=-2, dim2=-1)[:, :order].clamp_min(0).sqrt()
     w = torch.where(motion.w > 0, motion.w, 0)
     ww = covariance[:, order, order]
@@ -338,6 +358,14 @@ def _standard_deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
         "yc_m": yc,
     }
     return {name: torch.where(torch.isnan(value), math.inf, value) for name, value in named.items()}
+
+
+def _confirmed(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
+    """A motion as an estimate; ok where the histories of bright scatterers confirm its warp."""
+    found = _assessed(rows, sampling, motion)
+    error, count = warp_phase_error(rows, sampling, motion)
+    ok = found.ok & (error < MOST_PHASE_ERROR_RAD)
+    return replace(found, ok=ok, info={**found.info, "phase_error_rad": error, "scatterers": count})
 
 
 def _assessed(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:

@@ -8,22 +8,26 @@ The Gauss-Newton matrix holds the inner products of the echoes of neighbouring s
 computed without the range-dependent phase, which changes them by a few percent. This slows the
 convergence, but leaves no error at the end, because the gradient follows from the exact residual.
 For the same reason side lobes leave no error. The echoes are assumed to be range-compressed with a
-flat spectrum that fills the whole band (`band_response`).
+flat spectrum that fills the whole band; whether their side lobes leave the window or return at its
+other end is found from the data (`RangeResponse`).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation.couplings import Pairs, band_response
-from torchsar.compensate.rotation.histories import inverted, solved
+from torchsar.compensate.rotation.couplings import Pairs
+from torchsar.compensate.rotation.histories import inverted, sandwich, solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
+from torchsar.compensate.rotation.range_response import Envelopes, RangeResponse
 from torchsar.core import real_dtype, reduced_turns
 from torchsar.core.warp import least_rate
 
@@ -31,10 +35,10 @@ _OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of p
 # a new scatterer has at least this share of the largest amplitude within so many lines and range
 # cells, found by trial: side lobes are excluded until their scatterer is subtracted
 _SHARE, _LINES, _CELLS = 0.5, 24, 2
-MOST, ROUNDS = 800, 6  # largest number of scatterers, number of steps; accuracy against time
+MOST, ROUNDS = 800, 8  # largest number of scatterers, number of steps; accuracy against time
 _FEWEST = 128  # default number of scatterers on small data, found by trial
-# samples of the data per scatterer, so that a fit costs as much as about twenty images
-_SAMPLES_EACH = 1450
+# samples of the data per scatterer, so that a fit costs as much as about thirty images
+_SAMPLES_EACH = 1000
 # rounds that search for further scatterers, and the share of their number up to which they do: the
 # brightest alone bring the motion near, and the rounds between let it converge
 _SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
@@ -45,13 +49,16 @@ _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it th
 # from the exact residual, converge all the same
 _RIDGE = 1e-3
 _LEAST_RATE = 0.05  # least rate over that at the start; slower motions would nearly reverse
-# standard deviations by which the curvature of a scatterer may differ before it loses weight, found
-# by trial
+# standard deviations by which the phase of a scatterer may differ before it loses weight, found by
+# trial
 _AGREES = 5.0
 # power of errors of the model over that of the brightest scatterer, found by trial: weaker noise
 # does not limit the fit, and residuals below it are no scatterers and no evidence against one
 _MODEL = 1e-4
 _SETTLED = 0.2  # steps of the motion below this share of its standard deviation end a trial
+
+
+_Taken: TypeAlias = "tuple[Motion, Scatterers, Tensor, Tensor, Tensor]"
 
 
 @dataclass(frozen=True)
@@ -125,9 +132,13 @@ class Fit:
     Args:
         motion: Rotation of the target.
         scatterers: Scatterers.
+        response: Range response.
         covariance: Covariance of the estimated parameters of the rotation for a noise power of 1,
             shape (trial, parameter, parameter); infinite variance where the data do not determine
             one.
+        disagreement: Covariance of the same parameters as the differences between scatterers show
+            it, in absolute units, same shape. Errors of the model, such as several scatterers in
+            one resolution cell, add to it.
         noise: Noise power per sample, shape (trial,).
         steps: Number of steps taken, shape (trial,).
         settled: True for trials that have ended, shape (trial,), bool.
@@ -137,7 +148,9 @@ class Fit:
 
     motion: Motion
     scatterers: Scatterers
+    response: RangeResponse
     covariance: Tensor
+    disagreement: Tensor
     noise: Tensor
     steps: Tensor
     settled: Tensor
@@ -165,7 +178,7 @@ def fit_scatterers(
         start: Rotation to start from.
         free_centre: True also estimates the range of the rotation centre; False keeps that of
             `start`.
-        count: Largest number of scatterers; by default one for every 1450 samples of a trial,
+        count: Largest number of scatterers; by default one for every 1000 samples of a trial,
             within 128..800.
         rounds: Largest number of steps.
 
@@ -179,7 +192,8 @@ def fit_scatterers(
     noise = torch.full((trials,), math.inf, dtype=torch.float64, device=device)
     covariance = torch.zeros(trials, unknowns.size, unknowns.size, dtype=torch.float64, device=device)
     never = torch.zeros(trials, dtype=torch.bool, device=device)
-    fit = Fit(start, Scatterers.none(data), covariance, noise, never.long(), never, noise)
+    response = RangeResponse.of_unknown_share(trials, sampling.cells, device)
+    fit = Fit(start, Scatterers.none(data), response, covariance, covariance, noise, never.long(), never, noise)
     residual, step = data, None
     for iteration in range(rounds + 1):
         new, noise = None, fit.noise
@@ -189,6 +203,7 @@ def fit_scatterers(
             fit = _after_step(
                 fit,
                 step.taken(fit.noise if iteration >= max(_SEARCHES) else None),
+                step.changed_response(),
                 noise,
                 sampling,
                 search_over=iteration > max(_SEARCHES),
@@ -243,14 +258,6 @@ def _new_scatterers(
     return Scatterers(torch.where(peaks.power > 0, value, 0), cell, row), noise
 
 
-def _envelopes(sampling: Sampling, row: Tensor) -> tuple[Tensor, Tensor]:
-    """Range responses to scatterers at `row` and derivatives, (trial, scatterer, range) each."""
-    value, slope, _ = band_response(
-        torch.arange(sampling.cells, dtype=row.dtype, device=row.device) - row[..., None], sampling.cells
-    )
-    return value, -slope
-
-
 def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
     """exp(2j pi left @ right), (trial, pulse, scatterer), for a short block of pulses.
 
@@ -296,6 +303,9 @@ class _Step:
     shift: Tensor
     pairs: Pairs
     gram: Tensor
+    response: RangeResponse
+    envelopes: Envelopes
+    share: Tensor
 
     @staticmethod
     def of(
@@ -325,7 +335,8 @@ class _Step:
         )
         back_turns = torch.stack([warped.u, -sampling.turns_per_square * warped.phi.square()], -1)
         right = torch.stack([found.cell, motion.w[:, None] * sampling.range_m(found.row) + motion.offset[:, None]], -2)
-        envelope, slope = _envelopes(sampling, found.row)
+        envelopes = fit.response.envelopes(found.row)
+        envelope = envelopes.value
         weighted, back = (
             (found.amplitude[..., None] * envelope).conj().to(data.dtype).resolve_conj(),
             envelope.mH.to(data.dtype).resolve_conj(),
@@ -342,7 +353,9 @@ class _Step:
             moments[some] += real_bases[some, :, part] @ projected
             shift[some] += turned_back.mT @ rest
         moments = torch.view_as_complex(moments.unflatten(-1, (-1, 2)).to(torch.float64))
-        shifts = (shift.to(torch.complex128) * slope.conj()).sum(-1)
+        shift = shift.to(torch.complex128)
+        shifts = (shift * envelopes.slope.conj()).sum(-1)
+        share = (found.amplitude.conj() * (shift * envelopes.difference.conj()).sum(-1)).real.sum(-1)
         return residual, _Step(
             sampling,
             motion,
@@ -352,44 +365,49 @@ class _Step:
             shifts,
             Pairs.find(sampling, motion.k, found.amplitude, found.cell, bases),
             bases @ bases.mT,
+            fit.response,
+            envelopes,
+            share,
         )
 
-    def taken(self, noise: Tensor | None = None) -> tuple[Motion, Scatterers, Tensor, Tensor]:
+    def taken(self, noise: Tensor | None = None) -> _Taken:
         """Take the Gauss-Newton step.
 
         Args:
             noise: Noise power per sample, shape (trial,). If it is given, a scatterer whose own
-                phase curvature disagrees with the common rotation, as that of several scatterers in
-                one resolution cell does, gets less weight in the rotation rate and the centre.
+                phase disagrees with the common rotation, as that of several scatterers in one
+                resolution cell does, gets less weight in the rotation.
 
         Returns:
             The rotation and the scatterers after the step; the change of the parameters of the
-            rotation, shape (trial, unknown); and their covariance per unit noise power, shape
-            (trial, unknown, unknown).
+            rotation, shape (trial, unknown); their covariance per unit noise power, and that from
+            the differences between scatterers, shape (trial, unknown, unknown) each.
         """
         slopes, factor = self._slopes(), _Factor.of(self._local())
         found = self._solved(slopes, factor)
         if noise is None:
             return found
-        slopes[..., self.unknowns.k :, -1] *= self._agreement(slopes, found[2], noise)[..., None]
-        return self._solved(slopes, factor)
+        return self._solved(slopes * self._agreement(slopes, found[2], noise)[..., None, None], factor)
 
     def _agreement(self, slopes: Tensor, change: Tensor, noise: Tensor) -> Tensor:
-        """Weights 0..1 (trial, scatterer) by how well the curvature of a scatterer fits the step.
+        """Weights 0..1 (trial, scatterer) by how well the phase of a scatterer fits the step.
 
-        The difference is measured in its standard deviations.
+        What the step and the unknowns of the scatterer itself leave of the phase is measured in its
+        standard deviations.
         """
         power = self.found.amplitude.abs().square()
         turned = (self.found.amplitude.conj()[..., None] * self.moments).imag
         project = inverted(self.gram[:, :2, :2])[0] @ self.gram[:, :2]
-        curvature = (self.gram - self.gram[:, :2].mT @ project)[:, -1, -1, None].clamp_min(
-            torch.finfo(torch.float64).tiny
-        )
-        own = (turned - turned[..., :2] @ project)[..., -1] / torch.where(power > 0, power, 1) / curvature
-        off = own - torch.einsum("bpi,bi->bp", slopes[..., self.unknowns.k :, -1], change[:, self.unknowns.k :])
-        return 1 / (1 + off.square() * 2 * power * curvature / noise[:, None] / _AGREES**2)
+        curved = (self.gram - self.gram[:, :2].mT @ project)[:, 2:, 2:]
+        wanted = torch.einsum("bpin,bi->bpn", slopes[..., 2:], change) @ curved * power[..., None]
+        off = (turned - turned[..., :2] @ project)[..., 2:] - wanted
+        size = (off @ inverted(curved)[0] * off).sum(-1) / torch.where(power > 0, power, 1)
+        size = torch.where(power > 0, 2 * size / noise[:, None], torch.nan)
+        # errors that all scatterers share, as those of pulse phases, must not favour weak ones
+        usual = (size.nanmedian(-1, keepdim=True).values / curved.shape[-1]).nan_to_num(1.0).clamp_min(1)
+        return 1 / (1 + (size / (usual * _AGREES**2)).nan_to_num(0.0))
 
-    def _solved(self, slopes: Tensor, factor: _Factor) -> tuple[Motion, Scatterers, Tensor, Tensor]:
+    def _solved(self, slopes: Tensor, factor: _Factor) -> _Taken:
         """The step for these coefficients of the common unknowns."""
         found = self.found
         cross, shared = self._shared(slopes)
@@ -398,7 +416,10 @@ class _Step:
         own = torch.cat([turned[..., 0].real, turned[..., 0].imag, -2 * math.pi * turned[..., 1].imag, moved], -1)
         joint = factor.solve(torch.cat([cross, own[..., None]], -1))
         schur = shared - cross.mT @ joint[..., :-1]
-        change = solved(schur, torch.einsum("bpin,bpn->bi", slopes, turned.imag) - (cross.mT @ joint[..., -1:])[..., 0])
+        # gradient of each scatterer, without the part that its own unknowns take up
+        taken_up = (joint[..., :-1] * own[..., None]).unflatten(1, (4, -1)).sum(1)
+        pull = torch.einsum("bpin,bpn->bpi", slopes, turned.imag) - taken_up
+        change = solved(schur, pull.sum(1))
         grow, turn, line, row = (
             (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
         )
@@ -409,6 +430,7 @@ class _Step:
             Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), position),
             change,
             _covariance(schur),
+            sandwich(schur, pull, _effective_number(found.amplitude)),
         )
 
     def _local(self) -> Tensor:
@@ -416,19 +438,19 @@ class _Step:
 
         The unknowns are relative amplitude, phase, Doppler cell and range cell.
         """
-        overlap, slope, bend = self._overlaps()
+        overlap, slope, back, bend = self._overlaps()
         pairs = self.pairs
         flat, line, bent = (
             pairs.products[(0, 0)],
             2 * math.pi * pairs.products[(0, 1)],
             4 * math.pi**2 * pairs.products[(1, 1)],
         )
-        a, u, s, us = flat * overlap, line * overlap, -flat * slope, -line * slope
+        a, u, s, us, b, ub = (x * y for x, y in itertools.product((overlap, slope, back), (flat, line)))
         rows = [
             [a.real, -a.imag, u.imag, s.real],
             [a.imag, a.real, -u.real, s.imag],
             [-u.imag, -u.real, (bent * overlap).real, -us.imag],
-            [-s.real, s.imag, -us.imag, -(flat * bend).real],
+            [b.real, -b.imag, ub.imag, (flat * bend).real],
         ]
         local = pairs.matrix(rows)
         diagonal = local.diagonal(dim1=-2, dim2=-1)
@@ -436,10 +458,26 @@ class _Step:
         diagonal += torch.where(diagonal > 0, _RIDGE * diagonal, 1.0)
         return local
 
-    def _overlaps(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Inner product over range cells of the envelopes of each pair, and its derivatives."""
-        row = self.found.row
-        return band_response(self.pairs.of(row, 0) - self.pairs.of(row, 1), self.sampling.cells)
+    def _overlaps(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Inner product over range cells of the envelopes of each pair, and its derivatives.
+
+        The derivatives are those with respect to the range of the second scatterer, of the first
+        one, and of both.
+        """
+        value, slope = self.envelopes.value, self.envelopes.slope
+        factors = ((value, value), (value, slope), (slope, value), (slope, slope))
+        return tuple(self._over_range(*pair) for pair in factors)  # pyright: ignore[reportReturnType]
+
+    def _over_range(self, first: Tensor, second: Tensor) -> Tensor:
+        """Inner product of functions (trial, scatterer, range) of the scatterers of each pair."""
+        return (first.conj() @ second.mT)[self.pairs.trial, self.pairs.first, self.pairs.second]
+
+    def changed_response(self) -> RangeResponse:
+        """Fit the share of the periodic range response to the residual by least squares."""
+        apart = self.envelopes.difference
+        energy = (self.pairs.products[(0, 0)] * self._over_range(apart, apart)).real[:, None, None]
+        total = self.pairs.per_trial(energy)[:, 0, 0]
+        return self.response.moved(self.share / total)
 
     def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
         """Curvature between scatterers and common unknowns, and of the common unknowns.
@@ -447,7 +485,7 @@ class _Step:
         (trial, 4 scatterer, unknown) and (trial, unknown, unknown).
         """
         pairs = self.pairs
-        overlap, slope, _ = self._overlaps()
+        overlap, _, back, _ = self._overlaps()
         size = slopes.shape[-1]
         # (pair, unknown, base)
         column, row = (slopes[pairs.trial, scatterer] for scatterer in (pairs.second, pairs.first))
@@ -458,7 +496,7 @@ class _Step:
             -(seen * overlap[:, None]).imag,
             (seen * overlap[:, None]).real,
             -2 * math.pi * (bowed * overlap[:, None]).real,
-            -(seen * slope[:, None]).imag,
+            -(seen * back[:, None]).imag,
         ]
         cross = torch.cat([pairs.per_scatterer(part) for part in parts], 1)
         shared = range(2, size)
@@ -521,15 +559,27 @@ def _covariance(normal: Tensor) -> Tensor:
     return inverse / 2 + torch.diag_embed(torch.where(lost, math.inf, 0.0))
 
 
+def _effective_number(amplitude: Tensor) -> Tensor:
+    """Number of scatterers over which the energy is spread, (trial,)."""
+    power = amplitude.abs().square()
+    tiny = torch.finfo(torch.float64).tiny
+    return power.sum(-1).square() / power.square().sum(-1).clamp_min(tiny)
+
+
 def _after_step(
-    fit: Fit, taken: tuple[Motion, Scatterers, Tensor, Tensor], noise: Tensor, sampling: Sampling, search_over: bool
+    fit: Fit,
+    taken: _Taken,
+    response: RangeResponse,
+    noise: Tensor,
+    sampling: Sampling,
+    search_over: bool,
 ) -> Fit:
     """The fit after a step.
 
     Trials that have ended, and steps to a motion that reverses its direction, leave the fit
     unchanged.
     """
-    motion, found, change, covariance = taken
+    motion, found, change, covariance, disagreement = taken
     valid = (
         torch.isfinite(change).all(-1)
         & motion.possible(sampling)
@@ -543,7 +593,9 @@ def _after_step(
     return Fit(
         motion=motion.where(active & valid, fit.motion),
         scatterers=Scatterers(*(torch.where(pick, new, before) for new, before in pairs)).apart(),
+        response=response.where(active & valid, fit.response),
         covariance=torch.where(active[:, None, None], covariance, fit.covariance),
+        disagreement=torch.where(active[:, None, None], disagreement, fit.disagreement),
         noise=torch.where(active, noise, fit.noise),
         steps=fit.steps + active,
         settled=fit.settled | ((step <= _SETTLED) & search_over),

@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase import autofocus
-from torchsar.compensate.pulse_phase.data import prepare, rotate, starting_phase
+from torchsar.compensate.pulse_phase.data import prepare, starting_phase
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, in_turn
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
+from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.compensate.rotation.motion import SEARCH_EPS
 from torchsar.compensate.rotation.recommended import coarse_rotation, phase_fit_rotation, uneven_rotation
 from torchsar.compensate.rotation.scatterers import ROUNDS
@@ -20,7 +21,6 @@ from torchsar.core import Estimate, Signal, Stage
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import MatchedFourierOperator, range_phase
 from torchsar.focus.transforms import Gridding
-from torchsar.metrics import entropy
 from torchsar.radar import InverseRadar
 
 # of the entropy fixed point: the relaxation of `autofocus`, and the last floor of
@@ -265,9 +265,10 @@ def rotating_autofocus(
             estimate of the scene.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed. quality is the relative decrease of
-        exp(entropy), the number of cells that the image fills, due to the correction. `ok` is False
-        where this number increases, and in a trial of zeros.
+        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation, quality, `ok`
+        and info as from `autofocus`: `ok` is False unless the image is 1.5 times as sharp as
+        autofocus can make pure noise, more than one range cell contributes to the sharpness, and
+        the Strehl ratio predicted from the standard deviation exceeds 0.8.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -280,20 +281,16 @@ def rotating_autofocus(
             warp_k, pulses.n, prf_hz, dtype=data.dtype, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS)
         )
     )
-    begin = starting_phase(start, pulses, "rotating_autofocus")
-    begin = pair_phase(pulses.rows, pulses.present) if begin is None else begin
     runs = [
         Run(LogAbove(_FLOOR), through, search, _RELAXATION, _SEARCH_TOLERANCE_RAD),
         Run(Wiener(), through, polish, 1.0, _TOLERANCE_RAD),
     ]
+    again = Run(Wiener(), through, 6, 1.0, _TOLERANCE_RAD)
+
+    def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:
+        phase, taken = in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
+        return phase, taken, lambda some, _, at: fixed_point(some, at, again)[0]
+
     with torch.no_grad():
-        phase, taken = in_turn(pulses.rows, begin, runs)
-        before, after = (entropy(through.image(x)) for x in (pulses.rows, rotate(pulses.rows, phase)))
-    quality = (1 - torch.exp(after - before)).clamp(0, 1)
-    value = {"phase_rad": phase.reshape(*pulses.trials, pulses.n)}
-    return Estimate(
-        value,
-        quality.reshape(pulses.trials),
-        ((after <= before) & pulses.present.any(-1)).reshape(pulses.trials),
-        info={"iterations": taken.reshape(pulses.trials)},
-    )
+        begin = starting_phase(start, pulses, "rotating_autofocus")
+        return estimated(pulses, begin, find, compare=False, imaging=through)
