@@ -15,10 +15,19 @@ from torchsar.study.table import load
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = sorted((ROOT / "docs" / "sweeps").glob("*.json"))
+# Recorded before the first sample of a pulse moved to its leading edge, which changes the speckle:
+# to be recorded again. Strict, so that a new record is noticed here.
+BEFORE_THE_EDGE = pytest.mark.xfail(strict=True, reason="recorded with the earlier convention of the pulse")
 
 
 @pytest.mark.filterwarnings("ignore:at a pulse rate")
-@pytest.mark.parametrize("file", RECORDS, ids=lambda file: file.stem)
+@pytest.mark.parametrize(
+    "file",
+    [
+        pytest.param(file, id=file.stem, marks=[BEFORE_THE_EDGE] if file.stem == "stripmap_doppler" else [])
+        for file in RECORDS
+    ],
+)
 def test_trials_of_a_record_come_out_again(file: Path) -> None:
     """One point of each; figures are of single precision, hence a per cent of the largest trial."""
     sample = json.loads(file.read_text(encoding="utf-8"))["sample"]
