@@ -13,7 +13,7 @@ from torchsar.study.settings.sections import Loaded
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
-CORRECT = {"stage": "pulse_phase_correct", "in_doubt": "apply", "uses": {"phase_rad": "phase"}}
+CORRECT = {"stage": "pulse_phase_correct", "uses": {"phase_rad": "phase"}}
 IMAGE = {"stage": "azimuth_transform"}
 
 _TRUE_FOCUS = {

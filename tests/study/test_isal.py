@@ -143,7 +143,7 @@ def test_all_corrections_of_a_chain_are_judged_together(tmp_path: Path) -> None:
     rest = {"stage": "pulse_phase_correct", "uses": {"phase_rad": "rest"}}
     again = {"phase": {"stage": "sca"}, "correct": CORRECT, "rest": {"stage": "autofocus"}, "remove": rest}
     pga = {"stage": "pga", "kernel": "ml", "uses": {"start": "first.phase_rad"}}
-    started = {"first": {"stage": "sca"}, "phase": pga, "correct": CORRECT}
+    started = {"first": {"stage": "sca"}, "phase": pga, "correct": {**CORRECT, "in_doubt": "apply"}}
     more = {"again": {"stages": {**again, "image": IMAGE}}, "started": {"stages": {**started, "image": IMAGE}}}
     found = metrics_of(tmp_path, processor={**ISAL["processor"], **more}, precision="complex128")
     error = {name: row["residual_phase_rms_rad"] for name, row in found.items()}
