@@ -310,8 +310,8 @@ def test_trials_of_different_velocities_share_batches_and_give_the_numbers_of_ca
         for name, value in alone.items():
             if name not in ("seconds", "ok"):
                 found = record.metrics[name].reshape(len(values))
-                # an error in percent is that of a value of which single precision keeps 5e-5
-                least = 5e-3 if name.endswith("_percent") else 0.0
+                # an error in percent: 2e-4 of the value, for estimates that are off by per cents
+                least = 2e-2 if name.endswith("_percent") else 0.0
                 same = max(SAME * np.abs(found).max(), least)
                 np.testing.assert_allclose(found[index], float(value[0]), rtol=0, atol=same, err_msg=name)
 
