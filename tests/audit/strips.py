@@ -153,7 +153,7 @@ SCENES: Sequence[World] = (
     World("direct", direct(-10.0), -10.0),
 )
 NOTHING = nothing((LINES, CELLS), lambda x: Signal(x, RADAR.raw_axes(LINES, CELLS)))
-FOREIGN = World("turntable", turntable)
+OTHER_SYSTEM = World("turntable", turntable)
 ALIASED = World("aliased", strip(doppler_hz=RADAR.prf_hz), 10.0)
 SHORT = World("short dwell", strip(beam_s=0.4), 10.0)
 
@@ -218,7 +218,7 @@ def entries() -> list[Entry]:
         Entry(
             "compensate.DopplerCentroid",
             dop,
-            (*NOTHING, *SCENES, ALIASED, FOREIGN, SHORT),
+            (*NOTHING, *SCENES, ALIASED, OTHER_SYSTEM, SHORT),
             [Quantity("doppler_hz", DOPPLER_HZ, floor=0.5)],
         ),
         Entry(
@@ -240,7 +240,7 @@ def entries() -> list[Entry]:
         Entry(
             "compensate.EffectiveVelocity",
             lambda x: velocity(x, baseband(x)["doppler_baseband_hz"]),
-            (*NOTHING, *SCENES, FOREIGN, SHORT, World("beyond the search", strip(velocity_m_s=40.0), 10.0)),
+            (*NOTHING, *SCENES, OTHER_SYSTEM, SHORT, World("beyond the search", strip(velocity_m_s=40.0), 10.0)),
             [Quantity("velocity_m_s", VELOCITY_M_S, floor=0.05)],
         ),
         Entry("compensate.PointDoppler", PointDoppler(FAST), POINT_WORLDS, [Quantity("doppler_hz", 60.0, floor=0.5)]),

@@ -1,7 +1,7 @@
 """Time-domain generator of raw stripmap data in float64, from the signal model of Tsvetkov 2017.
 
 It evaluates the transmitted pulse at the instant of every sample. The edges of an echo lie between
-samples, and the antenna moves between transmission and reception if it is told to. It shares no
+samples, and the antenna moves between transmission and reception if that is asked for. It shares no
 code with the simulator of the package.
 """
 

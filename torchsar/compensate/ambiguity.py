@@ -361,7 +361,7 @@ class DopplerCentroid(Stage):
             probability that the ambiguity is right. `ok` is False where that probability is 0.9 or
             less, or where the baseband centroid is unreliable or the phases of the lines are random
             (`coherent_lines`). A smooth phase error of the lines shifts the centroid and cannot be
-            told from motion. `info` holds
+            distinguished from motion. `info` holds
 
             - "block_hz" and "block_power", see `baseband_estimate`;
             - "looks", "lines", "entropy", "line_doppler_hz" and "line_doppler_std_hz", see

@@ -115,11 +115,7 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples or a sample is not finite.
     """
-    raw = checked_samples(raw, "notch_interference", "pulse, range")
-    level = level_of(raw)
-    raw = raw / level
-    found = find_contamination(raw, threshold)
-    touched = _contaminated(raw.detach(), found, threshold)
+    raw, level, found, touched = _searched(raw, "notch_interference", threshold)
     spectrum = torch.fft.fft(raw)
     with torch.no_grad():
         hit = (
@@ -146,11 +142,7 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples or a sample is not finite.
     """
-    raw = checked_samples(raw, "drop_interference", "pulse, range")
-    level = level_of(raw)
-    raw = raw / level
-    found = find_contamination(raw, threshold)
-    touched = _contaminated(raw.detach(), found, threshold)
+    raw, level, _, touched = _searched(raw, "drop_interference", threshold)
     data = raw.masked_fill(touched[..., None], 0)
     return Repaired(data * level, touched, touched, torch.where(touched, raw.shape[-1], 0), _no_tone(touched))
 
@@ -206,6 +198,15 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
     return Repaired(
         data * scale, touched_all, everywhere.scatter(-1, index, lost), found.cells.sum(-1) * touched_all, cycles
     )
+
+
+def _searched(raw: Tensor, name: str, threshold: float) -> tuple[Tensor, Tensor, Contamination, Tensor]:
+    """Lines of unit level, their level, where they are contaminated, and the lines to treat."""
+    raw = checked_samples(raw, name, "pulse, range")
+    level = level_of(raw)
+    raw = raw / level
+    found = find_contamination(raw, threshold)
+    return raw, level, found, _contaminated(raw.detach(), found, threshold)
 
 
 def _contaminated(raw: Tensor, found: Contamination, threshold: float) -> Tensor:

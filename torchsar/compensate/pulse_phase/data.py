@@ -213,3 +213,15 @@ def on_the_circle(phase_rad: Tensor) -> Tensor:
         The phases in rad, same shape.
     """
     return phase_rad - 2 * math.pi * torch.round(phase_rad.detach() / (2 * math.pi))
+
+
+def or_one(x: Tensor) -> Tensor:
+    """Replace values that are not positive by 1, so that they can divide.
+
+    Args:
+        x: Real values, any shape.
+
+    Returns:
+        x where it is positive, else 1, same shape.
+    """
+    return torch.where(x > 0, x, 1)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import rotate
+from torchsar.compensate.pulse_phase.data import or_one, rotate
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 
 # Range cells are grouped by power, because each group has its own spectrum: largest ratio of the
@@ -83,20 +83,20 @@ def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> Descriptio
     n = rows.shape[-1]
     energy = rows.real.square() + rows.imag.square()
     mean = energy.mean((-2, -1), dtype=torch.float64)
-    power = energy.mean(-1, dtype=torch.float64) / _or_one(mean)[:, None]
+    power = energy.mean(-1, dtype=torch.float64) / or_one(mean)[:, None]
     groups = power_groups(power).to(torch.float64)
     cells = groups.sum(-1)
-    of_group = (groups * power).sum(-1) / _or_one(cells)
-    by_power = -(n * cells * _or_one(of_group).log()).sum(0)
+    of_group = (groups * power).sum(-1) / or_one(cells)
+    by_power = -(n * cells * or_one(of_group).log()).sum(0)
 
     image = torch.fft.fft(rotate(rows, phase_rad), 2 * n)
-    power = (image.real.square() + image.imag.square()) / _or_one(n * mean).to(energy.dtype)[:, None, None]
+    power = (image.real.square() + image.imag.square()) / or_one(n * mean).to(energy.dtype)[:, None, None]
     sparse = sparse_gain_nats(power[..., ::2])
     spectra = torch.einsum("gtr,trk->gtk", groups.to(power.dtype), power).to(torch.float64)
-    by_spectra = -(cells * n * (_whittle(spectra / _or_one(cells)[..., None], cells * independent))).sum(0)
+    by_spectra = -(cells * n * (_whittle(spectra / or_one(cells)[..., None], cells * independent))).sum(0)
 
     gain, deviation = _coherence(rows, groups, cells, independent)
-    ratio = torch.maximum(by_spectra - by_power, gain) / _or_one(sparse - by_power)
+    ratio = torch.maximum(by_spectra - by_power, gain) / or_one(sparse - by_power)
     return Descriptions(sparse, torch.where(gain > _SURE * deviation, ratio, 0))
 
 
@@ -141,18 +141,13 @@ def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor)
     kinds = groups.to(energy.dtype)
     pulse = torch.einsum("gtr,trp->gtp", kinds, energy)
     row = kinds * energy.sum(-1)
-    looks = row.sum(-1).square() / _or_one(row.square().sum(-1)) * independent
+    looks = row.sum(-1).square() / or_one(row.square().sum(-1)) * independent
     excess = torch.zeros_like(cells)
     lags = min(_LAGS, n - 1)
     for lag in range(1, lags + 1):
         product = torch.einsum("gtr,trp->gtp", kinds.to(rows.dtype), rows[..., lag:] * rows[..., :-lag].conj())
         square = (product.real.square() + product.imag.square()).sum(-1)
-        excess = excess + square / _or_one((pulse[..., lag:] * pulse[..., :-lag]).sum(-1)) - 1 / looks.clamp_min(1)
+        excess = excess + square / or_one((pulse[..., lag:] * pulse[..., :-lag]).sum(-1)) - 1 / looks.clamp_min(1)
     weight = torch.where(looks >= LEAST_LOOKS, n * cells, 0)
     deviation = weight * math.sqrt(lags / n) / looks.clamp_min(1)
     return (weight * excess).sum(0).to(torch.float64), deviation.square().sum(0).sqrt().to(torch.float64)
-
-
-def _or_one(x: Tensor) -> Tensor:
-    """x where it is positive, else 1."""
-    return torch.where(x > 0, x, 1)

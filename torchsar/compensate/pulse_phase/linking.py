@@ -21,7 +21,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import Pulses, prepare, starting_phase
+from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare, starting_phase
 from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, describe, power_groups
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.pairs import pair_phase
@@ -131,11 +131,11 @@ def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
 def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor) -> Estimate:
     real, trials = pulses.rows.real.dtype, pulses.trials
     noise = _NOISE_NATS * pulses.present.sum(-1)
-    scene = (1 - noise / _or_one(gain)).clamp(0, 1)
-    std = torch.where(scene[:, None] > 0, std / _or_one(scene).sqrt()[:, None], torch.inf).clamp_max(_PRIOR**-0.5)
+    scene = (1 - noise / or_one(gain)).clamp(0, 1)
+    std = torch.where(scene[:, None] > 0, std / or_one(scene).sqrt()[:, None], torch.inf).clamp_max(_PRIOR**-0.5)
     strehl = torch.exp(-(std.square() * pulses.present).sum(-1) / pulses.present.sum(-1).clamp_min(1))
     row = (pulses.rows.detach().real.square() + pulses.rows.detach().imag.square()).sum(-1, dtype=torch.float64)
-    effective = row.sum(-1).square() / _or_one(row.square().sum(-1))
+    effective = row.sum(-1).square() / or_one(row.square().sum(-1))
     return Estimate(
         value={"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
         std={"phase_rad": std.reshape(*trials, pulses.n).to(real)},
@@ -203,7 +203,7 @@ def _refined(scene: _Scene, u: Tensor) -> tuple[Tensor, _Fit]:
         third, own = some.round(second, own)
         step, next_ = torch.angle(second * first.conj()), torch.angle(third * second.conj())
         bend = (next_ - step).norm(dim=-1, keepdim=True)
-        reach = (step.norm(dim=-1, keepdim=True) / _or_one(bend)).where(bend > 0, 1).clamp(1, _LONGEST)
+        reach = (step.norm(dim=-1, keepdim=True) / or_one(bend)).where(bend > 0, 1).clamp(1, _LONGEST)
         new, own = some.round(first * cis(2 * reach * step + reach.square() * (next_ - step)), own)
         u = u.index_copy(0, active, new)
         spectra = [of_all.index_copy(0, active, of_some) for of_all, of_some in zip(spectra, own, strict=True)]
@@ -262,7 +262,7 @@ class _Scene:
         z = rows.mT.to(torch.complex128)
         samples = present.sum(-1).to(torch.float64) * z.shape[-1]
         total = (z.real.square() + z.imag.square()).sum((-2, -1))
-        z = z * torch.where(total > 0, samples / _or_one(total), 1).sqrt()[:, None, None]
+        z = z * torch.where(total > 0, samples / or_one(total), 1).sqrt()[:, None, None]
         power = (z.real.square() + z.imag.square()).sum(-2)
         groups = []
         for inside in power_groups(power):
@@ -299,9 +299,7 @@ class _Scene:
         for own, _, cells in self.groups:
             spectrum = torch.fft.fft(own * u.conj()[..., None], 2 * u.shape[-1], dim=-2)
             power = (spectrum.real.square() + spectrum.imag.square()).sum(-1)
-            spectra.append(
-                self._smoothed(power / _or_one(self.present.sum(-1))[:, None], cells, smooth, SPECTRAL_FLOOR)
-            )
+            spectra.append(self._smoothed(power / or_one(self.present.sum(-1))[:, None], cells, smooth, SPECTRAL_FLOOR))
         return spectra
 
     def adapted(self, u: Tensor, fit: _Fit) -> list[Tensor]:
@@ -325,7 +323,7 @@ class _Scene:
     def _smoothed(self, power: Tensor, cells: Tensor, smooth: Smooth, floor: float) -> Tensor:
         """Smoothed mean of powers that were summed over the cells of a group."""
         mean = power.mean(-1, keepdim=True)
-        power = torch.where(mean > 0, torch.maximum(power, floor * mean), 1) / _or_one(cells)[:, None]
+        power = torch.where(mean > 0, torch.maximum(power, floor * mean), 1) / or_one(cells)[:, None]
         return smooth(power, (cells * self.independent).clamp_min(1))
 
     def round(self, u: Tensor, spectra: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
@@ -406,9 +404,9 @@ def _smallest(matrix: Tensor, start: Tensor) -> Tensor:
     vector = start
     for _ in range(4):
         vector = torch.cholesky_solve(vector[..., None], lower)[..., 0]
-        vector = vector / _or_one(vector.abs().amax(-1, keepdim=True))
+        vector = vector / or_one(vector.abs().amax(-1, keepdim=True))
     size = vector.abs()
-    return torch.where(size > 0, vector / _or_one(size), 1)
+    return torch.where(size > 0, vector / or_one(size), 1)
 
 
 def _newton(matrix: Tensor, u: Tensor, steps: int) -> Tensor:
@@ -498,8 +496,3 @@ def _deviation(information: Tensor) -> Tensor:
     flat = eye - line @ line.mT
     covariance = flat @ torch.linalg.inv(information + _PRIOR * eye) @ flat
     return torch.diagonal(covariance, dim1=-2, dim2=-1).clamp_min(0).sqrt()
-
-
-def _or_one(x: Tensor) -> Tensor:
-    """x where it is positive, else 1."""
-    return torch.where(x > 0, x, 1)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import Pulses, rotate
+from torchsar.compensate.pulse_phase.data import Pulses, or_one, rotate
 from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.core import Estimate, block_bytes_of, over_blocks
@@ -55,12 +55,12 @@ def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     row = power.sum(-1)
     tiny = torch.finfo(power.dtype).tiny
     # entropy of a row: ln(sum p) - sum p ln p / sum p
-    entropy = torch.log(row.clamp_min(tiny)) - (power * torch.log(power.clamp_min(tiny))).sum(-1) / _or_one(row)
+    entropy = torch.log(row.clamp_min(tiny)) - (power * torch.log(power.clamp_min(tiny))).sum(-1) / or_one(row)
     row, entropy = row.to(torch.float64), entropy.to(torch.float64)
-    share = row / _or_one(row.sum(-1, keepdim=True))
+    share = row / or_one(row.sum(-1, keepdim=True))
     lack = share * torch.where(row > 0, math.log(image.shape[-1]) - SPECKLE_NATS - entropy, 0)
     sharp = lack.sum(-1)
-    return sharp, 1 / _or_one(share.square().sum(-1)), sharp.square() / _or_one(lack.square().sum(-1))
+    return sharp, 1 / or_one(share.square().sum(-1)), sharp.square() / or_one(lack.square().sum(-1))
 
 
 def sharpness_of_noise(rows: Tensor) -> Tensor:
@@ -94,7 +94,7 @@ def occupied_band(rows: Tensor) -> Tensor:
     """
     spectrum = torch.fft.fft(rows, dim=-2)
     density = (spectrum.real.square() + spectrum.imag.square()).mean(-1, dtype=torch.float64)
-    return torch.where(density.sum(-1) > 0, density.mean(-1).square() / _or_one(density.square().mean(-1)), 1)
+    return torch.where(density.sum(-1) > 0, density.mean(-1).square() / or_one(density.square().mean(-1)), 1)
 
 
 def estimated(
@@ -260,8 +260,3 @@ def _drift(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor
             break
         current = reached
     return total
-
-
-def _or_one(x: Tensor) -> Tensor:
-    """x where it is positive, else 1."""
-    return torch.where(x > 0, x, 1)
