@@ -41,7 +41,8 @@ from torchsar.scene import Aircraft, Points, TurntableWorld, UniformStartPhase
 
 F64, SINGLE = torch.float64, torch.complex64
 PULSES, CELLS = 128, 48
-LADAR = InverseRadar(193.4e12, 150e9, 2000.0, 0.016)
+ROTATION_RAD_S = 0.016
+LADAR = InverseRadar(193.4e12, 150e9, 2000.0, ROTATION_RAD_S)
 
 
 def signal(x: Tensor) -> Signal:
@@ -62,7 +63,7 @@ def aircraft(snr_db: float | None) -> Callable[[int, int], Batch]:
 
 def dechirped(snr_db: float) -> Callable[[int, int], Batch]:
     """Draw dechirped pulses of small aircraft by an independent generator, with white phases."""
-    known = Ladar(LADAR.carrier_hz, LADAR.bandwidth_hz, LADAR.prf_hz, LADAR.rotation_rad_s, pulses=PULSES, cells=96)
+    known = Ladar(LADAR.carrier_hz, LADAR.bandwidth_hz, LADAR.prf_hz, ROTATION_RAD_S, pulses=PULSES, cells=96)
     radar = replace(LADAR, pulse_s=known.pulse_s)
 
     def draw(trials: int, seed: int) -> Batch:
