@@ -185,15 +185,14 @@ def align_envelopes(
     Returns:
         `shift_cells` in range cells, shape (..., pulse), positive towards greater range, of mean
         zero; `shift_range(data, -shift_cells)` removes these shifts. A pulse of zeros has the shift
-        of the fitted history. The standard deviation of a polynomial
-        follows from the scatter of the blocks about it. That of single pulses follows from the
-        shifts estimated from the lower and from the upper half of the band, and from the distance
-        by which three more iterations of `align_mean` move them. `quality` is 1 / (1 + (2 std)^2).
-        `ok` is False where the standard deviation reaches half a cell (a quarter of a polynomial),
-        fewer than two pulses hold samples, the halves of the band do not confirm the polynomial, or single pulses may be
+        of the fitted history. The standard deviation of a polynomial follows from the scatter of
+        the blocks about it. That of single pulses follows from the shifts estimated from the lower
+        and from the upper half of the band, and from the distance by which three more iterations of
+        `align_mean` move them. `quality` is 1 / (1 + (2 std)^2). `ok` is False where the standard
+        deviation reaches half a cell (a quarter of a polynomial), fewer than two pulses hold
+        samples, the halves of the band do not confirm the polynomial, or single pulses may be
         aligned at a wrong maximum of their likelihood, as with scatterers in evenly spaced range
-        cells. info["present"] is True for the
-        pulses that hold samples.
+        cells. info["present"] is True for the pulses that hold samples.
 
     Raises:
         TypeError: If the data are not complex.
@@ -238,7 +237,8 @@ def refine_alignment(
 
     Returns:
         `shift_cells` in range cells, shape (..., pulse). `quality` and `ok` are those of the last
-        `autofocus`, but `ok` is False in homogeneous scenes, whose entropy does not show shifts. info["entropy_nats"], shape (...,), is the entropy of the image.
+        `autofocus`, but `ok` is False in homogeneous scenes, whose entropy does not show shifts.
+        info["entropy_nats"], shape (...,), is the entropy of the image.
 
     Raises:
         TypeError: If the data are not complex.
