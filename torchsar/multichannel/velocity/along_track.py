@@ -22,7 +22,7 @@ from torchsar.core import Estimate
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.velocity.aperture import Aperture
+from torchsar.multichannel.velocity.aperture import Aperture, fits_aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
 from torchsar.multichannel.velocity.model import energy_ratio_db, point_phasor
 from torchsar.radar import BistaticRadar
@@ -62,7 +62,8 @@ def along_track_velocity(
         `u_a_m_s` of shape (...,), positive in the flight direction of the receiver, with its
         standard deviation, which follows from the curvature of the likelihood. `info` holds
         `snr_db`, the SNR over all samples, and `at_the_end`, True where the maximum lies at an end
-        of the search. `ok` is False where this SNR is below 19 dB, or where `at_the_end` is True.
+        of the search. `ok` is False where this SNR is below 19 dB, `at_the_end` is True, or the
+        amplitude does not follow the aperture, see `fits_aperture`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -162,7 +163,7 @@ def _estimate_at(
     ).clamp_min(1)
     snr = energy_ratio_db(energy, noise)
     value = {"u_a_m_s": motion.u_a_m_s}
-    ok = (snr >= DETECTED_DB) & ~ended
+    ok = (snr >= DETECTED_DB) & ~ended & fits_aperture(data, radar, motion, aperture, noise)
     std = torch.where(energy > 0, torch.sqrt(noise / curvature.clamp_min(_TINY)), torch.inf)
     return Estimate(
         value, torch.sigmoid((snr - DETECTED_DB) / 3), ok, {"u_a_m_s": std}, {"snr_db": snr, "at_the_end": ended}

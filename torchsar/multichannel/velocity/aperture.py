@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -9,7 +10,13 @@ import torch
 from torch import Tensor
 
 from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.velocity.model import point_phasor
 from torchsar.radar import BistaticRadar
+
+# Parts of the aperture whose amplitudes are compared, by choice, and the largest ratio of their
+# energy to that of the whole: two points of which one is 10 dB weaker have 1.1, a point that is
+# illuminated for half of the aperture has 2.
+_PARTS, _MOST_RATIO = 8, 1.5
 
 
 class Aperture(Protocol):
@@ -77,6 +84,44 @@ class ElementBeam:
         across = motion.range_m.detach()[..., None] - motion.u_r_m_s.detach()[..., None] * time_s
         turns = radar.element_m * along / torch.sqrt(along.square() + across.square()) / radar.wavelength_m
         return torch.sinc(turns)
+
+
+def fits_aperture(
+    data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture, noise_power: Tensor
+) -> Tensor:
+    """Check that the amplitude of a point follows the expected one over slow time.
+
+    The deramped echo is added up in eight parts of the aperture. If each part has an amplitude of
+    its own, more energy is explained; a point that is illuminated for a quarter of the aperture
+    explains four times as much. A tone that remains, of a small error of the velocity, does not
+    count.
+
+    Args:
+        data: Channels, shape (..., channel, pulse), complex.
+        radar: Radar parameters.
+        motion: Motion of the point, shape (...,).
+        aperture: Expected amplitude over slow time.
+        noise_power: Noise power per sample, shape (...,).
+
+    Returns:
+        True where the parts explain less than 1.5 times the energy of the whole, apart from noise,
+        bool (...,).
+    """
+    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
+    weight = aperture.weight(radar, motion, time_s)
+    still = (data.to(torch.complex128) * point_phasor(radar, motion, time_s, torch.complex128).conj()).sum(-2)
+    energy = weight.square() * radar.channels
+    share = energy.cumsum(-1) / energy.sum(-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+    part = (_PARTS * (share - 0.5 / still.shape[-1])).long().clamp(0, _PARTS - 1)
+    spectrum = torch.fft.fft(weight * still, 4 * still.shape[-1])
+    at = spectrum.abs().argmax(-1, keepdim=True) / (4 * still.shape[-1])
+    tone = torch.exp(-2j * math.pi * at * torch.arange(still.shape[-1], device=data.device))
+    sums = torch.zeros(*still.shape[:-1], _PARTS, dtype=still.dtype, device=still.device)
+    sums = sums.scatter_add(-1, part, weight * still * tone)
+    norm = torch.zeros_like(sums.real).scatter_add(-1, part, energy.expand(still.shape))
+    parts = (sums.abs().square() / norm.clamp_min(torch.finfo(torch.float64).tiny)).sum(-1)
+    whole = sums.sum(-1).abs().square() / norm.sum(-1).clamp_min(torch.finfo(torch.float64).tiny)
+    return parts - _PARTS * noise_power < _MOST_RATIO * whole
 
 
 def _abeam_s(motion: PointMotion) -> Tensor:

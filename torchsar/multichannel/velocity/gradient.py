@@ -8,7 +8,7 @@ from torch import Tensor
 from torchsar.core import Estimate
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.velocity.aperture import Aperture
+from torchsar.multichannel.velocity.aperture import Aperture, fits_aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
 from torchsar.multichannel.velocity.likelihood import PointLikelihood, maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of, moved, point_phasor, round_units
@@ -71,7 +71,8 @@ def gradient_likelihood(
     Returns:
         `u_r_m_s`, `u_a_m_s`, `y0_m` of shape (...,) with standard deviations of the unknowns.
         `info` holds `snr_db` (over all samples), `noise_power` (per sample) and `converged`. `ok`
-        is False where the search failed or `snr_db` is below 19.
+        is False where the search failed, `snr_db` is below 19, or the amplitude does not follow the
+        aperture, see `fits_aperture`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -101,7 +102,7 @@ def gradient_likelihood(
     fit = maximum_likelihood(data, radar, there(found.x), aperture, unknowns, steps=0)
     return estimate_of(
         fit,
-        found.ok & (fit.snr_db >= DETECTED_DB),
+        found.ok & (fit.snr_db >= DETECTED_DB) & fits_aperture(data, radar, fit.motion, aperture, fit.noise_power),
         torch.sigmoid((fit.snr_db - DETECTED_DB) / 3),
         converged=found.converged,
     )
