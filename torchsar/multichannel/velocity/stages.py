@@ -6,8 +6,6 @@ strongest range line of each trial.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -122,9 +120,7 @@ class Interferometry(_Velocity):
                 fewer than 4 pulses, or slow time is not zero at pulse n // 2.
         """
         data, radar, start, aperture = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
-        found = interferometry(data, radar, start, aperture)
-        there = replace(start, u_r_m_s=found["u_r_m_s"], y0_m=found["y0_m"])
-        return warned_of_ambiguity(found, data, radar, there, aperture) if self.check_ambiguity else found
+        return interferometry(data, radar, start, aperture, check_ambiguity=self.check_ambiguity)
 
 
 class AlongTrackAutofocus(_Velocity):
