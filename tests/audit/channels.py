@@ -6,15 +6,18 @@ import math
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
+from tests.direct.bistatic import Survey
 from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_bistatic
 from torchsar.multichannel import (
     AlongTrackAutofocus,
+    CompressChannels,
     Detector,
     Dwell,
     ElementBeam,
@@ -37,7 +40,7 @@ from torchsar.multichannel import (
     correct_balance,
     interferometry,
 )
-from torchsar.radar import BistaticRadar
+from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, KSea, MovingPoints, Pattern
 
 F64, C128 = torch.float64, torch.complex128
@@ -159,6 +162,24 @@ def lines(
         truth["u_r_m_s"] = truth["u_r_m_s"] + number * SPAN
         values = {name: truth[name] - (number * SPAN if name == "u_r_m_s" else 0) for name in given}
         return Batch(Signal(noisy.to(torch.complex64), RADAR.axes(*SMALL)), truth, values)
+
+    return draw
+
+
+def raw(snr_db: float) -> Callable[[int, int], Batch]:
+    """Draw uncompressed channels of one moving point by an independent generator, and compress."""
+    survey, (pulses, cells) = Survey(pulse_s=2e-6, transmit=(0.0, 0.0), wave_m_s=RADAR.wave_speed_m_s), SMALL
+    radar = published_radar(pulse=LinearFM(50e6, survey.pulse_s))
+    axes = radar.axes(pulses, cells + 256)
+
+    def draw(trials: int, seed: int) -> Batch:
+        move = moves(trials, seed, (-12.0, 12.0), 2.0, 20.0)
+        line_m = axes[2].values().numpy()
+        each = [survey.raw(pulses, line_m, *(float(x[i]) for x in move), lit_s=1.8) for i in range(trials)]
+        lines = CompressChannels(radar, "flat")(Signal(torch.from_numpy(np.stack(each)), axes)).data
+        noisy = 10 ** (snr_db / 20) * lines[..., 128 : 128 + cells] + noise(trials, seed, 3, *SMALL)
+        truth = {**named(move), "ambiguity": torch.zeros(trials, dtype=F64)}
+        return Batch(Signal(noisy.to(torch.complex64), RADAR.axes(*SMALL)), truth)
 
     return draw
 
@@ -317,6 +338,7 @@ def entries() -> list[Entry]:
     moving = MovingPointVelocity(RADAR, GATE, search=SEARCH)
     lone = MovingPointVelocity(LONE, GATE, search=SEARCH)
     ranged = [World("direct", lines(snr), snr) for snr in (-40.0, -30.0, -20.0, -10.0, 10.0)]
+    ranged += [World("direct raw", raw(snr), snr) for snr in (-20.0, 10.0)]
     return [
         Entry("multichannel.MovingPointVelocity", moving, worlds(), [U_R, U_A, Y0], 0.5),
         Entry(

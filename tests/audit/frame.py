@@ -197,7 +197,7 @@ def verdict(row: Mapping[str, Any]) -> list[str]:
 
 
 def estimators() -> Iterator[str]:
-    """Public functions and stages that return an `Estimate`, by introspection, as package.name."""
+    """Public functions and stages whose result has a verdict, by introspection, as package.name."""
     for package in PACKAGES:
         module = importlib.import_module(f"torchsar.{package}")
         for name in sorted(module.__all__):
@@ -206,13 +206,15 @@ def estimators() -> Iterator[str]:
                 if not issubclass(thing, nn.Module):
                     continue
                 thing = thing.forward
-            if inspect.isfunction(thing) and _mentions(typing.get_type_hints(thing).get("return")):
+            if inspect.isfunction(thing) and _judges(typing.get_type_hints(thing).get("return")):
                 yield f"{package}.{name}"
 
 
-def _mentions(hint: Any) -> bool:
-    """Whether a return type is an estimate or holds one."""
-    return hint is Estimate or any(_mentions(part) for part in typing.get_args(hint))
+def _judges(hint: Any) -> bool:
+    """Whether a return type has a verdict `ok`, such as `Estimate`, or holds one that has."""
+    if inspect.isclass(hint) and "ok" in {*getattr(hint, "__annotations__", {}), *vars(hint)}:
+        return True
+    return any(_judges(part) for part in typing.get_args(hint))
 
 
 def white(shape: Sequence[int], dtype: torch.dtype = torch.complex64) -> Callable[[int, int], Tensor]:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
+from tests.direct.triangular import Ladar
 from tests.repair.triangles import sweeps
 from torchsar.compensate import (
     MirrorProduct,
@@ -61,6 +62,30 @@ def direct(snr_db: float, scatterers=((0.5, 1.0), (0.9, 0.5))) -> Callable[[int,
     return draw
 
 
+def emitted(snr_db: float) -> Callable[[int, int], Batch]:
+    """Draw sweeps of six random points by an independent generator."""
+    ladar = Ladar(RADAR.carrier_hz, sampling_hz=RADAR.sample_rate_hz, parts=2)
+    start = RADAR.sweep_axes(PERIODS)[1].start
+    turning = (torch.arange(PERIODS, dtype=F64) + 0.5) * RADAR.pulse_step_s
+    speed = 0.3 + 20 * turning + 12e-3 * torch.pi * torch.cos(2 * torch.pi * 2000 * turning + 0.3)
+
+    def draw(trials: int, seed: int) -> Batch:
+        draws = Draws(seed, trials=range(trials))
+        x, y = draws.uniform("x", (6,), -0.08, 0.08), draws.uniform("y", (6,), 0.3, 1.5)
+        level = draws.normal("level", (6,), torch.complex128)
+        power = level.abs().square()
+        x = x - (power * x).sum(-1, keepdim=True) / power.sum(-1, keepdim=True)  # velocities are those of its centre
+        clean = torch.stack(
+            [ladar.sweeps(*one, PERIODS, lambda t: swing(t - start)) for one in zip(x, y, level, strict=True)]
+        )
+        noise = draws.normal("noise", tuple(clean.shape[1:]), torch.complex128)
+        power = clean.abs().square().mean((-3, -2, -1), keepdim=True)
+        data = clean + noise * (power * 10 ** (-snr_db / 10)).sqrt()
+        return Batch(signal(data), {"velocity_m_s": speed.expand(trials, -1)})
+
+    return draw
+
+
 def swing(t: Tensor) -> Tensor:
     """Radial motion in metres."""
     return 0.3 * t + 10 * t.square() + 3e-6 * torch.sin(2 * torch.pi * 2000 * t + 0.3)
@@ -93,6 +118,7 @@ WORLDS = (
     World("one point", own(Points([0.0], [0.4], random_phase=True)), 10.0),
     World("letter", own(LetterE()), 10.0),
     World("aliased", own(motion=FASTER), 10.0),
+    *(World("direct", emitted(snr), snr) for snr in (-10.0, 10.0)),
 )
 
 

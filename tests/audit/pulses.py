@@ -12,6 +12,7 @@ from torch import Tensor
 
 from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
 from tests.compensate.scenes import noisy, still, turned, white
+from tests.direct.inverse import Ladar, echo
 from torchsar.compensate import (
     AlignEnvelopes,
     Autofocus,
@@ -33,13 +34,15 @@ from torchsar.compensate import (
 )
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_turntable
+from torchsar.focus import compress_dechirped
 from torchsar.metrics import phase_rmse
 from torchsar.radar import InverseRadar
 from torchsar.scene import Aircraft, Points, TurntableWorld, UniformStartPhase
 
 F64, SINGLE = torch.float64, torch.complex64
 PULSES, CELLS = 128, 48
-LADAR = InverseRadar(193.4e12, 150e9, 2000.0, 0.016)
+ROTATION_RAD_S = 0.016
+LADAR = InverseRadar(193.4e12, 150e9, 2000.0, ROTATION_RAD_S)
 
 
 def signal(x: Tensor) -> Signal:
@@ -54,6 +57,21 @@ def aircraft(snr_db: float | None) -> Callable[[int, int], Batch]:
         world = TurntableWorld(Aircraft(), start_phase=[UniformStartPhase()], snr_db=snr_db)
         recording, truth = simulate_turntable(LADAR, world, PULSES, 192, Draws(seed, trials=range(trials)))
         return Batch(recording.signal, {"phase_rad": truth.values["phase_rad"]})
+
+    return draw
+
+
+def dechirped(snr_db: float) -> Callable[[int, int], Batch]:
+    """Draw dechirped pulses of small aircraft by an independent generator, with white phases."""
+    known = Ladar(LADAR.carrier_hz, LADAR.bandwidth_hz, LADAR.prf_hz, ROTATION_RAD_S, pulses=PULSES, cells=96)
+    radar = replace(LADAR, pulse_s=known.pulse_s)
+
+    def draw(trials: int, seed: int) -> Batch:
+        scenes = [Aircraft(4e-3, 0.08, 0.06).scatterers(Draws(seed + i)) for i in range(trials)]
+        raw = torch.stack([echo(known, s.azimuth_m, s.range_m, s.amplitude) for s in scenes])
+        phase = white(trials, PULSES, seed + 1)
+        data = turned(noisy(compress_dechirped(raw, radar), snr_db, seed + 2), phase)
+        return Batch(signal(data), {"phase_rad": phase})
 
     return draw
 
@@ -156,6 +174,7 @@ WORLDS = (
     World("aliased", direct(10.0, 3, 1.5), 10.0),
     World("direct", direct(10.0), 10.0),
     World("direct", direct(-10.0), -10.0),
+    *(World("direct pulses", dechirped(snr), snr) for snr in (-5.0, 10.0)),
 )
 ALIGN_WORLDS = (
     *nothing((PULSES, 128)),

@@ -363,9 +363,14 @@ def entries() -> list[Entry]:
             [
                 *no_record(TABLE1, 24, 2 * TABLE1.sweep_samples),
                 *(World("direct", trigger(TABLE1, 24, snr), snr) for snr in SNR_DB),
-                World("beyond the reference", trigger(TABLE1, 24, 10.0, scatterers=((-1.5, 1.0),)), 10.0),
                 World("many points", trigger(TABLE1, 24, 10.0, scatterers=SCATTERED), 10.0),
             ],
+            [Quantity("trigger_s", 2e-8, timing(TABLE1))],
+        ),
+        Entry(  # which side of the reference the scene lies on must be given: it shows in no sample
+            "repair.find_trigger:nearer",
+            lambda x: find_trigger(x, TABLE1, nearer=True),
+            [World("direct", trigger(TABLE1, 24, snr, scatterers=((-1.5, 1.0),)), snr) for snr in (-20.0, 10.0)],
             [Quantity("trigger_s", 2e-8, timing(TABLE1))],
         ),
         Entry(

@@ -38,10 +38,28 @@ SAME = {
     "multichannel.along_track_velocity": "multichannel.AlongTrackAutofocus",
     "multichannel.gradient_likelihood": "multichannel.GradientVelocity",
     "multichannel.estimate_balance": "multichannel.EstimateBalance",
+    "multichannel.find_body": "multichannel.MoversImage",
+    "repair.line_integrity": "repair.LineIntegrity",
     "repair.estimate_imbalance": "repair.EstimateImbalance",
     "repair.estimate_jitter_blind": "repair.BlindJitter",
     "repair.estimate_jitter_pilot": "repair.PilotJitter",
     "repair.estimate_response_sharpest": "repair.EstimateResponse",
+}
+
+# Functions whose `ok` is no claim about data: with the reason.
+_SEARCH = "`ok` says that the cost was finite: the minimum of a function that the caller gives"
+_LIMIT = "`ok` says that an algorithm meets a requirement: computed from parameters, not from data"
+OTHER = {
+    **dict.fromkeys(
+        ("optim.adam", "optim.differential_evolution", "optim.genetic", "optim.grid_search", "optim.lbfgs"), _SEARCH
+    ),
+    "optim.newton": _SEARCH,
+    "focus.requirements": _LIMIT,
+    "focus.inverse_requirements": _LIMIT,
+    "focus.ladar_requirements": _LIMIT,
+    "focus.ladar_limits": _LIMIT,
+    "multichannel.multichannel_requirements": _LIMIT,
+    "multichannel.multichannel_limits": _LIMIT,
 }
 
 

@@ -20,6 +20,7 @@ from tests.helpers import small_bistatic, small_ladar, small_radar
 from torchsar import compensate, core, echo, focus, metrics, multichannel, radar, repair, scene
 from torchsar.compensate.group import RangeGroup
 from torchsar.core import Draws, Estimate, Signal, Stage
+from torchsar.echo.turntable import fast_time_axis
 from torchsar.optim import parabola_minimum
 from torchsar.radar import FarField, InverseRadar
 
@@ -86,7 +87,7 @@ def _signal(kind: str, trials: int = 1, dtype: torch.dtype = torch.complex128) -
     if kind == "turntable":
         return Signal(base.data, TURNTABLE.raw_axes(48, 64))
     if kind == "dechirped":
-        return Signal(base.data, DECHIRPED.raw_axes(48, 64))
+        return Signal(base.data, (DECHIRPED.raw_axes(48, 64)[0], fast_time_axis(DECHIRPED, 64)))
     if kind == "row":
         return Signal(base.data[:, 20], base.axes[1:])
     return base

@@ -161,6 +161,33 @@ def test_along_track_speed():
     assert not bool(outside.ok.any()) and bool((outside.value["u_a_m_s"].abs() <= 8).all())
 
 
+@pytest.mark.parametrize("name", ["along_track", "likelihood", "gradient", "recommended"])
+def test_a_point_lit_in_a_part_of_the_aperture_is_as_certain_as_it_says(name):
+    """Lit for 1 s and 1.4 s of the 4.5 s that are expected: the estimates were wrong and sure."""
+    lit = (azimuth_echo(RADAR, N, 5.0, 2.0, y0, gate_s=gate) for gate, y0 in ((1.0, 20.0), (1.4, -30.0)))
+    each = 2 if name == "recommended" else 5
+    position = torch.tensor([20.0, -30.0], dtype=F64).repeat_interleave(each)
+    data = math.sqrt(10) * torch.stack(list(lit)).repeat_interleave(each, 0) + noise(2 * each, 3)
+    start = {"u_r_m_s": 5.0, "u_a_m_s": 2.0, "y0_m": position}
+    taken = {"recommended": (), "along_track": ("u_r_m_s", "y0_m")}.get(name, UNKNOWNS)
+    options = {"search": NEAR} if name == "recommended" else {}
+    signal = Signal(data, RADAR.axes(N))
+    found = ESTIMATORS[name](RADAR, GATE, **options)(signal, **{key: start[key] for key in taken})
+    assert bool(found.ok.all())
+    for key, std in found.std.items():
+        assert (0.5 if each == 5 else 0.1) < rms(found[key] - start[key]) / rms(std) < 1.6, key
+
+
+def test_a_point_that_crosses_range_lines_is_as_certain_as_it_says():
+    """Without correction of migration, the strongest line holds the middle of the aperture only."""
+    clean = compressed_echo(RADAR, 720, 48, [{"u_r": 3.0, "u_a": -2.0, "y0": 20.0}], 3.5).data
+    trials = clean + 0.3 * torch.stack([noise(48, seed, n=720).movedim(0, -1) for seed in range(3)])
+    found = MovingPointVelocity(RADAR, Dwell(3.5), search=NEAR)(Signal(trials, RADAR.axes(720, 48)))
+    assert bool(found.ok.all())
+    for key, true in (("u_r_m_s", 3.0), ("u_a_m_s", -2.0), ("y0_m", 20.0)):
+        assert rms((found[key] - true) / found.std[key]) < 2.5, key
+
+
 @pytest.mark.parametrize("aperture", [GATE, ElementBeam()], ids=["gate", "beam"])
 def test_gauss_newton_and_gradients_agree(aperture):
     signal = noisy(10.0, 3, radar=RADAR, u_r=10.0, u_a=5.0, y0=30.0)

@@ -45,7 +45,8 @@ def test_methods_reach_the_figures_of_a_point_also_where_the_beam_is_dark(tmp_pa
         batch = bench.batch(Draws(2, "run", [0]), detail=True)
         found = {n: {k: float(v[0]) for k, v in o.metrics.items()} for n, o in batch.outcomes.items()}
         best, none = found["recommended"], found["none"]
-        assert best["residual_phase_rms_rad"] < 0.06 and best["ok"] == 1.0 and best["velocity_rmse_m_s"] < 1e-3
+        assert best["residual_phase_rms_rad"] < 0.06 and best["velocity_rmse_m_s"] < 1e-3
+        assert best["ok"] == ("world" in changes)  # phases of pulses that do not see the point are not known
         assert none["residual_phase_rms_rad"] > 50 and "velocity_rmse_m_s" not in none
         if "world" not in changes:
             continue

@@ -237,9 +237,30 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
         shift = shift + (basis @ step[..., None]).squeeze(-1)
         shift = shift - shift.mean(-1, keepdim=True)
     residual = (found - (middle @ step[..., None]).squeeze(-1)).abs()
-    return shift, _robust_std(residual, count > 0).squeeze(-1) * (
-        (degree + 1) / (count > 0).sum(-1).clamp_min(1)
-    ).sqrt()
+    return shift, robust_std(residual, count > 0).squeeze(-1) * ((degree + 1) / (count > 0).sum(-1).clamp_min(1)).sqrt()
+
+
+def expected_outliers(pulses: Envelopes, shift: Tensor) -> Tensor:
+    """Predict how many pulses are aligned at a wrong maximum of their likelihood.
+
+    It is the sum over pulses of the probability that the shift of the pulse is wrong by more than a
+    cell, given the mean envelope. The log-likelihood is halved, because it takes the power of every
+    cell for independent and exponential.
+
+    Args:
+        pulses: Envelopes.
+        shift: Shifts in cells, shape (trial, pulse).
+
+    Returns:
+        The expected number, shape (trial,), float64.
+    """
+    moved = pulses.moved(shift)
+    mean = moved.sum(-2, keepdim=True) / pulses.count
+    # two samples per cell, of which one is independent
+    gain = pulses.on_grid(moved * pulses.likelihood(mean).conj(), _QUARTER).to(torch.float64) / (2 * _HALF)
+    at = wrapped(torch.arange(gain.shape[-1], dtype=torch.float64, device=gain.device) / _QUARTER, pulses.n)
+    wrong = (torch.softmax(gain, -1) * (at.abs() > 1)).sum(-1)
+    return torch.where(pulses.present, wrong, 0).sum(-1)
 
 
 def mean_drift(pulses: Envelopes) -> Tensor:
@@ -288,13 +309,21 @@ def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 
         if iteration < iterations // 2:
             now = weight / residual.clamp_min(0.1)
         else:
-            scale = _robust_std(residual, weight > 0) + _LEAST_CELLS
+            scale = robust_std(residual, weight > 0) + _LEAST_CELLS
             now = weight * (1 - (residual / (_TUKEY * scale)).square()).clamp_min(0).square()
     return coefficients
 
 
-def _robust_std(magnitude: Tensor, used: Tensor) -> Tensor:
-    """Standard deviation (trial, 1) of normal errors from the median of their magnitudes."""
+def robust_std(magnitude: Tensor, used: Tensor) -> Tensor:
+    """Compute the standard deviation of normal errors from the median of their magnitudes.
+
+    Args:
+        magnitude: Magnitudes of the errors, shape (trial, m).
+        used: Which of them count, shape (trial, m), bool.
+
+    Returns:
+        The standard deviation, shape (trial, 1).
+    """
     return 1.4826 * torch.where(used, magnitude, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num()
 
 

@@ -31,8 +31,10 @@ class BistaticRadar:
         prf_hz: Pulse repetition frequency of the transmitter in Hz.
         speed_m_s: Speed of the receiver along its straight, level track in m/s.
         reference_range_m: Closest slant range R0 of the scene centre in metres.
-        channel_m: Along-track positions dx_m of the channels relative to the reference point of the
-            track in metres, in any order and spacing.
+        channel_m: Along-track positions dx_m of the channels in metres, in any order and spacing:
+            channel m is where the reference point of the track was dx_m / v earlier, v being the
+            speed, so that a channel behind the reference point is positive, as in Remote Sens.
+            2020, 12, 1703, Eq. (4).
         element_m: Along-track length of each channel's aperture in metres.
         height_m: Height of the receiver in metres.
         transmit_range: Coefficients k1, k2, ... (m/s, m/s^2, ...) of R_T(t) - R_T(0) = k1 t + k2

@@ -10,6 +10,7 @@ rho and every phi_c - phi_0. Gains follow from the powers of the lines.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -24,6 +25,18 @@ from torchsar.core import (
     refuse_non_finite_values,
     unit_level,
 )
+
+# Blocks of lines for standard deviations, by choice, and least number of them.
+_BLOCKS, _LEAST_BLOCKS = 16, 4
+# Samples of a line from which on the noise is measured beside the band of the signal.
+_LEAST_BAND = 32
+# Standard deviations by which the noise must lie below the mean of the spectrum, relative error of
+# the noise level; and where it is not known, its ratio to the signal and the least coherence, by
+# choice.
+_SURE, _NOISE_ERROR, _WEAK_NOISE, _LEAST_COHERENCE = 6.0, 0.08, 0.03, 0.2
+# Largest standard deviation of a phase in rad and of a relative gain: the remaining imbalance is 20
+# dB below the signal.
+_MOST_STD = 0.1
 
 
 def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
@@ -42,25 +55,104 @@ def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
         and over the lines i of each channel and divided by the power of the strongest line, shape
         (..., C), complex128; and ln(power / power of channel 0), shape (..., C), float64.
     """
-    lines = x.shape[-2]
-    product = (x[..., 1:, :] * x[..., :-1, :].conj()).mean(-1).to(torch.complex128)
-    power = x.abs().square().mean(-1).to(torch.float64)
-    scale = power.amax(-1, keepdim=True).clamp_min(1e-300)
-    channel = torch.arange(lines, device=x.device) % channels
-    lag = torch.stack([(product[..., channel[1:] == c] / scale).mean(-1) for c in range(channels)], -1)
-    return lag, _relative_log_power(power / scale, channels)
+    sums = _Sums.of(x, channels).total
+    return sums.lag, sums.log_power
 
 
-def _relative_log_power(power: Tensor, channels: int) -> Tensor:
-    """Logarithm of each channel's power over that of channel 0 at the same lines, (..., C)."""
-    last = (power.shape[-1] - 1) // channels
-    reference, after = power[..., : last * channels : channels], power[..., channels : last * channels + 1 : channels]
-    ratios = [torch.zeros_like(power[..., 0])]
-    for c in range(1, channels):
-        expected = (1 - c / channels) * reference + c / channels * after
-        own = power[..., c : last * channels : channels]
-        ratios.append(torch.log(own.sum(-1).clamp_min(1e-300) / expected.sum(-1).clamp_min(1e-300)))
-    return torch.stack(ratios, -1)
+@dataclass(frozen=True)
+class _Sums:
+    """Sums over the lines of blocks of a recording, (..., block, channel) each.
+
+    Args:
+        product: Products of each line with the conjugate of the line before, in their channel.
+        count: Number of these lines, (block, channel).
+        own: Powers above the noise of the lines of a channel.
+        expected: Powers above the noise of channel 0 at the same lines.
+    """
+
+    product: Tensor
+    count: Tensor
+    own: Tensor
+    expected: Tensor
+
+    @staticmethod
+    def of(x: Tensor, channels: int, blocks: int = 1) -> _Sums:
+        """Sums of lines (..., line, range), divided by the power of the strongest line."""
+        lines, device = x.shape[-2], x.device
+        power = x.abs().square().mean(-1).to(torch.float64)
+        scale = power.amax(-1, keepdim=True).clamp_min(1e-300)
+        product = (x[..., 1:, :] * x[..., :-1, :].conj()).mean(-1).to(torch.complex128) / scale
+        channel, block = torch.arange(lines, device=device) % channels, torch.arange(lines, device=device)
+        block = (block * blocks // lines).clamp_max(blocks - 1)
+        clean = power / scale - (_noise(x, channels) / scale)[..., channel]
+        last = (lines - 1) // channels * channels
+        expected = torch.zeros_like(clean)
+        for c in range(channels):
+            weight = c / channels
+            expected[..., c:last:channels] = (1 - weight) * clean[..., :last:channels]
+            expected[..., c:last:channels] += weight * clean[..., channels : last + 1 : channels]
+        inside = torch.arange(lines, device=device) < last
+
+        def summed(values: Tensor, line: Tensor) -> Tensor:
+            at = block[line] * channels + channel[line]
+            total = torch.zeros(*values.shape[:-1], blocks * channels, dtype=values.dtype, device=device)
+            return total.index_add(-1, at, values).unflatten(-1, (blocks, channels))
+
+        after, used = torch.arange(1, lines, device=device), inside.nonzero()[:, 0]
+        ones = torch.ones(lines - 1, dtype=torch.float64, device=device)
+        return _Sums(
+            summed(product, after),
+            summed(ones, after),
+            summed(clean[..., used], used),
+            summed(expected[..., used], used),
+        )
+
+    @property
+    def total(self) -> _Sums:
+        """Sums over all blocks, without the dimension of the blocks."""
+        return _Sums(self.product.sum(-2), self.count.sum(-2), self.own.sum(-2), self.expected.sum(-2))
+
+    @property
+    def left_out(self) -> _Sums:
+        """Sums over all blocks but one, in turn."""
+        whole = self.total
+        return _Sums(
+            whole.product[..., None, :] - self.product,
+            whole.count - self.count,
+            whole.own[..., None, :] - self.own,
+            whole.expected[..., None, :] - self.expected,
+        )
+
+    @property
+    def lag(self) -> Tensor:
+        """Mean products, (..., channel)."""
+        return self.product / self.count.clamp_min(1)
+
+    @property
+    def log_power(self) -> Tensor:
+        """Logarithm of each channel's power over that of channel 0, (..., channel)."""
+        return torch.log(self.own.clamp_min(1e-300) / self.expected.clamp_min(1e-300))
+
+
+def _noise(x: Tensor, channels: int) -> Tensor:
+    """Noise power per sample of each channel, (..., channel), in the empty part of the range band.
+
+    It is zero where the spectrum is nearly flat, as if no part of the band were empty, and for
+    lines of fewer than 32 samples.
+    """
+    n, half = x.shape[-1], x.shape[-1] // 32
+    if n < _LEAST_BAND:
+        return torch.zeros(*x.shape[:-2], channels, dtype=torch.float64, device=x.device)
+    spectrum = torch.fft.fft(x, norm="ortho").abs().square().to(torch.float64)
+    floors = []
+    for c in range(channels):
+        power = spectrum[..., c::channels, :].mean(-2)
+        padded = torch.nn.functional.pad(power.reshape(-1, 1, n), (half, half), mode="circular")
+        smooth = torch.nn.functional.avg_pool1d(padded, 2 * half + 1, stride=1).reshape(power.shape)
+        floor = smooth.kthvalue(max(1, n // 20), -1).values
+        flat = 1 - _SURE / math.sqrt((2 * half + 1) * (x.shape[-2] // channels))
+        floors.append(torch.where(floor < flat * power.mean(-1), floor, 0))
+    return torch.stack(floors, -1)
 
 
 def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | float | None = None) -> Estimate:
@@ -80,10 +172,14 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
 
     Returns:
         Estimate with `gain` of shape (..., C), 1 for channel 0, and `phase_rad` of shape (..., C)
-        in radians, 0 for channel 0, which `correct_imbalance` removes. Standard deviations assume a
-        Gaussian scene and independent lines. `quality` is the coherence of neighbouring lines. `ok`
+        in radians, 0 for channel 0, which `correct_imbalance` removes. Standard deviations follow
+        from blocks of lines that are left out in turn; with fewer than four blocks they assume a
+        Gaussian scene and independent lines. Noise is measured in the part of the range band that
+        the signal leaves empty, and its bias of the gains is removed. Without such a part, noise
+        must be weak. `quality` is the coherence of neighbouring lines. `ok`
         is False where a channel has no power (gain outside 1e-3..1e3), or the coherence is below 5
-        / sqrt(range samples x lines per channel) and may be due to chance; gains are then 1 and
+        / sqrt(range samples x lines per channel) and may be due to chance, or below 0.2 without
+        such a part, or a standard deviation exceeds 0.1; gains are then 1 and
         phases 0.
 
     Raises:
@@ -98,9 +194,15 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
             f"got {channels} channels and {x.shape[-2]} lines"
         )
     x = unit_level(x)
-    lag, log_power = lag_products(x, channels)
+    blocks = _Sums.of(x, channels, max(1, min(_BLOCKS, x.shape[-2] // (2 * channels))))
+    sums = blocks.total
+    return _assess(x, sums.lag, _phases(sums.lag, channels, doppler_cycles), sums.log_power, blocks)
+
+
+def _phases(lag: Tensor, channels: int, doppler_cycles: Tensor | float | None) -> Tensor:
+    """Phases of the channels from the products of successive lines, (..., channel) each."""
     angle = torch.angle(lag)
-    turns = torch.arange(channels, dtype=torch.float64, device=x.device) / channels
+    turns = torch.arange(channels, dtype=torch.float64, device=lag.device) / channels
     rho = torch.angle(torch.polar(torch.ones_like(angle), angle).prod(-1))[..., None] / channels + 2 * math.pi * turns
     increments = angle[..., None, 1:] - rho[..., None]
     phases = torch.nn.functional.pad(torch.cumsum(increments, -1), (1, 0))
@@ -108,16 +210,15 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
     if doppler_cycles is None:
         cost = phases.square().sum(-1)
     else:
-        expected = 2 * math.pi * torch.as_tensor(doppler_cycles, dtype=torch.float64, device=x.device)
+        expected = 2 * math.pi * torch.as_tensor(doppler_cycles, dtype=torch.float64, device=lag.device)
         cost = -torch.cos(rho - expected[..., None])
     branch = cost.argmin(-1)[..., None, None].expand(*cost.shape[:-1], 1, channels)
-    phase = torch.gather(phases, -2, branch)[..., 0, :]
-    gain = torch.exp(log_power / 2)
-    return _assess(x, lag, phase, gain)
+    return torch.gather(phases, -2, branch)[..., 0, :]
 
 
-def _assess(x: Tensor, lag: Tensor, phase: Tensor, gain: Tensor) -> Estimate:
+def _assess(x: Tensor, lag: Tensor, phase: Tensor, log_power: Tensor, blocks: _Sums) -> Estimate:
     """Estimate with standard deviations, coherence and reliability."""
+    gain = torch.exp(log_power / 2)
     channels, lines = gain.shape[-1], x.shape[-2]
     power = x.abs().square().mean((-2, -1)).to(torch.float64)
     mean_gain = gain.square().mean(-1)
@@ -125,19 +226,39 @@ def _assess(x: Tensor, lag: Tensor, phase: Tensor, gain: Tensor) -> Estimate:
     product = gain * torch.roll(gain, 1, -1) / mean_gain[..., None]
     coherence = (lag.abs() / (level[..., None] * product).clamp_min(1e-300)).mean(-1).clamp(0, 1)
     looks = x.shape[-1] * lines / channels
-    single_std = torch.sqrt((1 - coherence.square()).clamp_min(0) / (2 * looks * coherence.square().clamp_min(1e-12)))
+    some = blocks.left_out
     order = torch.arange(channels, dtype=torch.float64, device=x.device)
-    phase_std = single_std[..., None] * torch.sqrt(order * (channels - order) / channels)
-    gain_std = (gain * math.sqrt(0.5 / looks)) * (order > 0)
+    if blocks.count.shape[-2] < _LEAST_BLOCKS:  # a Gaussian scene and independent lines
+        single = torch.sqrt((1 - coherence.square()).clamp_min(0) / (2 * looks * coherence.square().clamp_min(1e-12)))
+        phase_std = single[..., None] * torch.sqrt(order * (channels - order) / channels)
+        gain_std = (gain * math.sqrt(0.5 / looks)) * (order > 0)
+    else:
+        turns = torch.angle(some.lag * lag.conj()[..., None, :])
+        turns = turns - turns.mean(-1, keepdim=True)
+        phase_std = _jackknife(torch.nn.functional.pad(turns[..., 1:].cumsum(-1), (1, 0)))
+        gain_std = _jackknife(torch.exp(some.log_power / 2))
+    noise = (_noise(x, channels) / x.abs().square().mean((-2, -1)).clamp_min(1e-300)[..., None]).clamp_max(0.99)
+    # an error of the noise level brings the powers of the channels closer together or farther apart
+    bias = torch.where(noise > 0, _NOISE_ERROR * noise / (1 - noise), _WEAK_NOISE)
+    gain_std = torch.hypot(gain_std, gain * log_power.abs() / 2 * bias)
+    clear = (coherence > 5 / math.sqrt(looks)) & ((noise > 0).all(-1) | (coherence > _LEAST_COHERENCE))
     ok = (
         torch.isfinite(gain).all(-1)
         & (power > 0)
         & (gain > 1e-3).all(-1)
         & (gain < 1e3).all(-1)
-        & (coherence > 5 / math.sqrt(looks))
+        & clear
+        & (phase_std < _MOST_STD).all(-1)
+        & (gain_std < _MOST_STD * gain).all(-1)
     )
     value = {"gain": torch.where(ok[..., None], gain, 1), "phase_rad": torch.where(ok[..., None], phase, 0)}
     return Estimate(value, torch.where(ok, coherence, 0), ok, {"gain": gain_std, "phase_rad": phase_std})
+
+
+def _jackknife(values: Tensor) -> Tensor:
+    """Standard deviation (..., channel) from values without one block, (..., block, channel)."""
+    blocks = values.shape[-2]
+    return ((values - values.mean(-2, keepdim=True)).square().sum(-2) * ((blocks - 1) / blocks)).sqrt()
 
 
 def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:

@@ -26,6 +26,8 @@ from torchsar.repair.interference_tone import Tone, anything, find_tones, subtra
 
 # Largest number of bands that are subtracted, by choice: every round costs a search of all lines.
 _BAND_ROUNDS = 3
+# Power of a line after a notch filter over that of clutter from which on it is lost, by choice.
+_MOST_LEFT = 1.5
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,8 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     """Set contaminated cells of the range spectrum to zero: a notch filter, the simplest method.
 
     The clutter of those cells is removed as well. Side lobes of a tone that are below the threshold
-    remain. Differentiable in the lines.
+    remain; a line in which they make the power more than 1.5 times that of clutter is set to zero
+    and marked as missing. Differentiable in the lines.
 
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
@@ -118,11 +121,13 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     raw, level, found, touched = _searched(raw, "notch_interference", threshold)
     spectrum = torch.fft.fft(raw)
     with torch.no_grad():
-        hit = (
-            found.level.excess((spectrum.real.square() + spectrum.imag.square()) / raw.shape[-1]) > threshold
-        ) & touched[..., None]
+        power = (spectrum.real.square() + spectrum.imag.square()) / raw.shape[-1]
+        hit = (found.level.excess(power) > threshold) & touched[..., None]
+        left = power.masked_fill(hit, 0).sum(-1)
+        lost = touched & (left > _MOST_LEFT * found.level.density.sum(-1))
     data = torch.where(touched[..., None], torch.fft.ifft(spectrum.masked_fill(hit, 0)), raw)
-    return Repaired(data * level, touched, torch.zeros_like(touched), hit.sum(-1), _no_tone(touched))
+    data = data.masked_fill(lost[..., None], 0)
+    return Repaired(data * level, touched, lost, hit.sum(-1), _no_tone(touched))
 
 
 def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:

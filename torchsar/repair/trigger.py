@@ -43,6 +43,8 @@ from torchsar.repair.analytic import delayed
 MAX_WINDOWS = 192
 # Strongest scatterers whose tones are continued across a turning point, by choice.
 TONES = 4
+# Fringes tried on either side of the one nearest to the sharpest cuts, by choice.
+_FRINGES = 3
 # Certainty below which a result is unreliable, in standard deviations, by choice: in a normal
 # distribution the chance is 3e-7 above 5 and 1e-3 above 3.
 ORDER_SIGMAS, FRINGE_SIGMAS = 5.0, 3.0
@@ -99,7 +101,8 @@ def find_trigger(
         contiguous: Whether blocks follow each other without a gap; None: without a gap if blocks
             are one period long and every period is recorded. Blocks with gaps need at least 1.7
             periods of samples.
-        nearer: Whether the scene is nearer than the reference range.
+        nearer: Whether the scene is nearer than the reference range. A complex record cannot show
+            this: if it is wrong, the estimate is wrong by about half a period, and `ok`.
 
     Returns:
         Estimate with `trigger_s` of shape (...,), in seconds after the first sample of a block,
@@ -109,8 +112,8 @@ def find_trigger(
         `info` has three values for each trial. `order_sigmas` is the certainty, in standard
         deviations, that the up sweep is not mistaken for the down sweep. `fringe_sigmas` is the
         certainty, in standard deviations, that the right one of several instants with matching
-        phases was chosen. `coarse_s` is the estimate without use of phases, in seconds modulo half
-        a period.
+        phases was chosen; it is 0 if the best of them is the last one tried. `coarse_s` is the
+        estimate without use of phases, in seconds modulo half a period.
 
         `ok` is False where `order_sigmas` is below 5, `fringe_sigmas` below 3 or the drop below
         0.05, or where no whole period fits its block.
@@ -313,14 +316,16 @@ def _fringe(
     odd = _extrapolated(cycles[..., 1::2, :], value[..., 1::2, :], position - (n - 1) / 2)
     difference = (around - odd).abs().square() - (around - even).abs().square()
     total = torch.nn.functional.pad(torch.cumsum(difference, -1), (1, 0)).flatten(-3, -2)
-    order = torch.arange(-3, 4, dtype=torch.float64, device=base.device)
+    order = torch.arange(-_FRINGES, _FRINGES + 1, dtype=torch.float64, device=base.device)
     offsets = expected[..., None] + order / (2 * plus_cycles.clamp_min(1e-6))[..., None]
     gain = _interpolated(total, (offsets + reach).clamp(0, 2 * reach))
     best = gain.mean(-2).argmax(-1)
     advantage = take(gain.movedim(-1, -2), best, -2)[..., None] - gain
     sigmas = advantage.mean(-2) / (advantage.std(-2) / math.sqrt(advantage.shape[-2])).clamp_min(1e-9)
-    others = torch.arange(7, device=base.device) != best[..., None]
+    others = torch.arange(len(order), device=base.device) != best[..., None]
     certainty = torch.where(others, sigmas, torch.inf).amin(-1)
+    # at an end of the search, further fringes may be better
+    certainty = torch.where((best == 0) | (best == len(order) - 1), 0, certainty)
     return torch.where(certainty > FRINGE_SIGMAS, take(offsets, best), expected), certainty
 
 

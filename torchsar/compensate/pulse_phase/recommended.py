@@ -76,7 +76,7 @@ def autofocus(
         `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
         halves of the range cells; for point targets it is close to the true error. `ok` is False
         unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
-        cell contributes to the sharpness, and the Strehl ratio predicted from the standard
+        cell or a single point makes the sharpness, and the Strehl ratio predicted from the standard
         deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of
         speckle. Phases of `link_phases` have its standard deviations, `quality` and `ok`. `info`
         holds "homogeneous" of shape (...,), bool, True where the homogeneous description is more

@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import Pulses, or_one, rotate
+from torchsar.compensate.pulse_phase.data import Pulses, or_one, rotate, safe_angle
 from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.core import Estimate, block_bytes_of, over_blocks
-from torchsar.metrics.phase import phase_rmse
+from torchsar.metrics.phase import phase_rmse, residual_phase
 
 # difference of the entropies of a uniform row and of speckle, whose power has an exponential
 # distribution: 1 - Euler's constant
@@ -24,7 +24,15 @@ SPECKLE_NATS = 1 - 0.5772156649015329
 LEAST_STREHL = 0.8  # Strehl ratio of a well-focused image, a convention (Marechal)
 # factor by which the sharpness must exceed that of noise: `sharpness_of_noise` errs by up to 15 %
 _MARGIN = 1.5
-LEAST_ROWS = 1.5  # a single row cannot separate phase errors from the scene; 1 is a single row
+# a single row, 1, cannot separate phase errors from the scene, unless it holds one point
+LEAST_ROWS = 1.5
+# A single point: largest relative scatter of its modulus, far below the 0.52 of noise, and least
+# number of pulses; with fewer, phases can be found that make the scatter of noise as small.
+_STEADY, _LEAST_PULSES = 0.25, 32
+# Difference of halves of the rows from which on a phase counts as unknown: half of the difference
+# of uniformly distributed phases is half of their error. In normal errors of the largest standard
+# deviation that is ok, 3 % of the differences are larger.
+_APART_RAD = 2.0
 # limits of `_drift`, found by trial: more rounds, or rounds after smaller steps, cost time and
 # rarely change the result
 _ROUNDS = 6
@@ -108,12 +116,16 @@ def estimated(
     """Run an autofocus method on all trials and predict the accuracy of its phases.
 
     Trials are processed in blocks that fit into the cache, or all at once if gradients are
-    required. The standard deviation is the root sum of squares of two parts:
+    required. The standard deviation is the larger of two:
 
-    - Half of the rms difference between the phases from two halves of the rows (range cells). The
-      rows are sorted by energy and taken alternately; the noise of the halves is independent. The
-      difference is divided by the square root of `occupied_band`, because rows that are sampled
-      finer than their band requires are not independent.
+    - Half of the rms difference between the phases from two halves of the rows (range cells), and
+      the whole difference where it exceeds 2 rad, as in pulses that do not see the scene. The rows
+      are sorted by energy and taken alternately; the noise of the halves is independent. The result
+      is divided by the square root of `occupied_band`, because rows that are sampled finer than
+      their band requires are not independent. Where a single point makes the image sharp, it is the
+      relative scatter of the modulus of its echo instead: noise and weaker scatterers change the
+      modulus as much as the phase, and the phase error does not change it. The scatter of the phase
+      that remains is added.
     - The distance by which the phases move when the method is continued on all rows.
 
     Args:
@@ -122,7 +134,7 @@ def estimated(
         find: The autofocus method: a function of (rows, present, start). It returns the phase
             (trial, pulse), the number of iterations (trial,), and a function of (rows, present,
             phase) that continues the method from a phase, on all or on half of the rows.
-        at_rest: True if continuing the method does not move its result; the second part of the
+        at_rest: True if continuing the method does not move its result; the second
             standard deviation is then left out.
         compare: False if the scene is not to be compared with a homogeneous one, because its image
             is not the Fourier transform along pulses.
@@ -137,12 +149,14 @@ def estimated(
         `ok` is False unless the image is 1.5 times as sharp as autofocus can make pure noise, more
         than one row contributes to the sharpness, that Strehl ratio exceeds 0.8, and a homogeneous
         description of the scene is not more likely (see `describe`), because sharpness does not
-        find the phases of homogeneous clutter. `info` holds "present", shape (..., pulse), False
-        for pulses that hold only zeros; and, of shape (...,), "homogeneous" (True where that
-        description is more likely), "sparse_gain_nats" (gain of the log likelihood of the sparse
-        description over white noise), "iterations", "sharpness_nats", "noise_sharpness_nats" (the
-        largest sharpness that noise can reach), "effective_rows" (number of rows over which the
-        energy is spread) and "telling_rows" (number of rows over which the sharpness is spread).
+        find the phases of homogeneous clutter. It is True for a single point if that Strehl ratio
+        exceeds 0.8, the scatter of its modulus is below 0.25, and there are 32 pulses. `info` holds
+        "present", shape (..., pulse), False for pulses that hold only zeros; and, of shape (...,),
+        "homogeneous" (True where that description is more likely), "sparse_gain_nats" (gain of the
+        log likelihood of the sparse description over white noise), "iterations",
+        "sharpness_nats", "noise_sharpness_nats" (the largest sharpness that noise can reach),
+        "effective_rows" (number of rows over which the energy is spread) and "telling_rows" (number
+        of rows over which the sharpness is spread).
     """
     rows, present = pulses.rows, pulses.present
     if not len(rows) or pulses.n < 3:
@@ -171,30 +185,38 @@ def _assessed(
     compare: bool,
     imaging: Imaging | None = None,
 ) -> tuple[Tensor, ...]:
-    """Phase, iterations, sharpness, effective rows of both, std, and the descriptions per trial."""
+    """Phase, iterations, sharpness, effective rows of both, std, and the descriptions per trial.
+
+    The last is True where a single point makes the image sharp.
+    """
     phase, taken, again = find(rows, present, start)
     with torch.no_grad():
         focused = rotate(rows, phase)
         image = torch.fft.fft(focused, norm="ortho") if imaging is None else imaging.image(focused).mT
         sharp, effective, sharpness_rows = sharpness_beyond_speckle(image)
         occupied = occupied_band(rows)
-        std = _half_difference(rows, present, phase, again) / occupied.sqrt()
+        scatter, rest = _of_point(focused, present)
+        lone = (sharpness_rows <= LEAST_ROWS) & (scatter < _STEADY) & (present.sum(-1) >= _LEAST_PULSES)
+        lone = lone & (imaging is None) & (rows.shape[-2] > 1)
+        std = torch.where(
+            lone, torch.hypot(scatter, rest), _half_difference(rows, present, phase, again) / occupied.sqrt()
+        )
         if not at_rest:
-            std = torch.hypot(std, _drift(rows, present, phase, again))
+            std = torch.maximum(std, _drift(rows, present, phase, again))
         scene = describe(rows, phase, occupied)
-    homogeneous = scene.homogeneous & compare
-    return phase, taken, sharp, effective * occupied, sharpness_rows, std, scene.sparse, homogeneous
+    homogeneous = scene.homogeneous & compare & ~lone
+    return phase, taken, sharp, effective * occupied, sharpness_rows, std, scene.sparse, homogeneous, lone
 
 
 def _no_estimate(rows: Tensor) -> tuple[Tensor, ...]:
     """The result of `_assessed` where no phase can be found: too few pulses, or no trials."""
     zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
-    return rows[:, 0].real * 0, zero.long(), zero, zero, zero, zero + math.pi / math.sqrt(3), zero, zero > 0
+    return rows[:, 0].real * 0, zero.long(), zero, zero, zero, zero + math.pi / math.sqrt(3), zero, zero > 0, zero > 0
 
 
 def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     """Estimate from the results of all blocks of trials."""
-    phase, taken, sharp, effective, sharpness_rows, std_rad, sparse, homogeneous = (
+    phase, taken, sharp, effective, sharpness_rows, std_rad, sparse, homogeneous, lone = (
         torch.cat(pieces) for pieces in zip(*parts, strict=True)
     )
     present, shape = pulses.present, pulses.trials
@@ -202,8 +224,8 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     enough_pulses = present.sum(-1) >= 3
     strehl = torch.exp(-std_rad.square())
     quality = torch.where(enough_pulses, strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1)), 0)
-    ok = enough_pulses & (sharp > _MARGIN * noise) & (sharpness_rows > LEAST_ROWS) & (strehl > LEAST_STREHL)
-    ok = ok & ~homogeneous
+    distinct = (sharp > _MARGIN * noise) & (sharpness_rows > LEAST_ROWS) & ~homogeneous
+    ok = enough_pulses & (distinct | (lone & (sharp > noise))) & (strehl > LEAST_STREHL)
     phase = torch.where(enough_pulses[:, None], phase, 0)
     info = {
         "iterations": taken,
@@ -227,8 +249,26 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     )
 
 
+def _of_point(focused: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Scatter of modulus and phase of the strongest point over the pulses, (trial,) each.
+
+    The scatter of the modulus is a standard deviation over its mean; that of the phase is in rad,
+    about a straight line. The rows are added up with the weights and phases of the point: with the
+    conjugate of its cell in the image. focused: (trial, range, pulse), with the phases removed.
+    """
+    bright = (focused.real.square() + focused.imag.square()).sum(-1).argmax(-1)
+    row = focused.gather(1, bright[:, None, None].expand(-1, 1, focused.shape[-1]))
+    at = torch.fft.fft(row).abs().argmax(-1)[..., None].expand(-1, focused.shape[-2], 1)
+    echo = (focused * torch.fft.fft(focused).gather(-1, at).conj()).sum(-2)
+    modulus, count = echo.abs().to(torch.float64), present.sum(-1).clamp_min(1)
+    mean = modulus.sum(-1) / count
+    spread = torch.where(present, (modulus - mean[:, None]).square(), 0).sum(-1) / (count - 1).clamp_min(1)
+    angle = safe_angle(echo).to(torch.float64)
+    return torch.where(mean > 0, spread.sqrt() / or_one(mean), torch.pi), phase_rmse(angle, 0 * angle, present)
+
+
 def _half_difference(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:
-    """Half of the rms difference (rad) between the phases from two halves of the rows, (trial,).
+    """Std of the phase (rad) from the differences between two halves of the rows, (trial,).
 
     It is pi / sqrt(3), as for a random phase, if there is only one row.
     """
@@ -239,7 +279,9 @@ def _half_difference(rows: Tensor, present: Tensor, phase: Tensor, again: Again)
     one, other = (
         again(rows.gather(1, half[..., None].expand(-1, -1, rows.shape[-1])), present, phase) for half in halves
     )
-    return phase_rmse(one, other, present) / 2
+    apart = residual_phase(one, other, present)
+    apart = torch.where(apart.abs() > _APART_RAD, apart, apart / 2)
+    return (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
 
 
 def _drift(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:

@@ -6,12 +6,15 @@ does not.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, rotate, starting_phase
+from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import Run, in_turn
+from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate
 
 # standard deviation of the phase from which on it is not ok: a Strehl ratio of exp(-0.25) = 0.78
@@ -60,9 +63,12 @@ def phase_polish(
             weights end; the last kind of steps ends below half of it.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed. Its standard deviation is predicted from
-        the energy of the cells above the noise. `quality` is the share of the energy in cells that
-        clearly exceed the noise. `ok` is False where the standard deviation is 0.5 rad or more.
+        `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
+        halves of the range cells. `quality`, `ok` and `info` are those of `autofocus`: `ok` is
+        False unless the image is clearly sharper than autofocus can make pure noise, more than one
+        range cell contributes to the sharpness, the standard deviation is below 0.47 rad, and a
+        homogeneous description of the scene is not more likely, because sharpness does not find the
+        phases of homogeneous clutter.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -73,22 +79,19 @@ def phase_polish(
     refuse_odd_counts("phase_polish", 1, iterations=iterations)
     along = AlongPulses()
     begin = starting_phase(start, pulses, "phase_polish")
-    begin = torch.zeros_like(pulses.rows[:, 0].real) if begin is None else begin
-    settle = Run(_single_points, along, 1, 1.0, 0.0)
-    search = Run(_scene, along, iterations, _RELAXATION, tolerance_rad)
-    finish = Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 2)
-    phase, taken = in_turn(pulses.rows, begin, [settle, search, finish])
-    quality, std = _confidence(rotate(pulses.rows.detach(), phase.detach()))
-    shape = pulses.trials
-    # fewer than three pulses cannot distinguish a phase error from a shift of the image
-    ok = (std < ENOUGH_STD_RAD) & (pulses.present.sum(-1) > 2)
-    return Estimate(
-        {"phase_rad": phase.to(torch.float64).reshape(*shape, pulses.n)},
-        quality=quality.reshape(shape),
-        ok=ok.reshape(shape),
-        std={"phase_rad": std[:, None].expand(-1, pulses.n).reshape(*shape, pulses.n)},
-        info={"iterations": taken.reshape(shape)},
-    )
+    runs = [
+        Run(_single_points, along, 1, 1.0, 0.0),
+        Run(_scene, along, iterations, _RELAXATION, tolerance_rad),
+        Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 2),
+    ]
+    again = [Run(_scene, along, 4, _RELAXATION, 0.0), Run(_near_peak, AlongPulses(2), 5, 1.0, 0.0)]
+
+    def find(rows: Tensor, present: Tensor, at: Tensor | None) -> Found:
+        first = torch.zeros_like(rows[:, 0].real) if at is None else at
+        return *in_turn(rows, first, runs), lambda some, _, here: in_turn(some, here, again)[0]
+
+    found = estimated(pulses, begin, find, at_rest=True)
+    return replace(found, value={"phase_rad": found["phase_rad"].to(torch.float64)})
 
 
 def _bright(power: Tensor) -> Tensor:
@@ -126,22 +129,3 @@ def _near_peak(power: Tensor, mean: Tensor) -> Tensor:
     """Weights near one within 10 dB of the strongest cell of a range cell, falling below."""
     peak = power.amax(-1, keepdim=True)
     return power / torch.where(peak > 0, power + 0.1 * peak, 1)
-
-
-def _confidence(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Share of the energy that is scene, and standard deviation of the phase, (trial,) each.
-
-    rows: (trial, range, pulse), corrected. The noise level is the median cell of the image; cells
-    that clearly exceed it are scene. The phase of a pulse is known to 1 / sqrt(2 g), where g is its
-    energy over the noise variance.
-    """
-    image = torch.fft.fft(rows, norm="ortho")
-    power = (image.real.square() + image.imag.square()).to(torch.float64).flatten(-2)
-    noise = power.median(-1).values / 0.6931471805599453
-    tiny = torch.finfo(torch.float64).tiny
-    scene = torch.where(power > 12 * noise[:, None], power - noise[:, None], 0).sum(-1)
-    total = power.sum(-1)
-    gain = scene / rows.shape[-1] / noise.clamp_min(1e-30)
-    return torch.where(total > 0, scene / total.clamp_min(tiny), 0), torch.where(
-        total > 0, 1 / torch.sqrt(2 * gain.clamp_min(1e-3)), torch.pi
-    )

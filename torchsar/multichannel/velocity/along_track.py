@@ -23,6 +23,7 @@ from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
+from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
 from torchsar.multichannel.velocity.model import energy_ratio_db, point_phasor
 from torchsar.radar import BistaticRadar
@@ -62,7 +63,9 @@ def along_track_velocity(
         `u_a_m_s` of shape (...,), positive in the flight direction of the receiver, with its
         standard deviation, which follows from the curvature of the likelihood. `info` holds
         `snr_db`, the SNR over all samples, and `at_the_end`, True where the maximum lies at an end
-        of the search. `ok` is False where this SNR is below 19 dB, or where `at_the_end` is True.
+        of the search. Where the point is lit in a part of the aperture only, this part is used, see
+        `seen_aperture`. `ok` is False where this SNR is below 19 dB, where `at_the_end` is True, or
+        where the illumination of the point is not understood, see `lit_as_expected`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -83,6 +86,9 @@ def along_track_velocity(
     offsets = torch.linspace(-half_m_s, half_m_s, count, dtype=torch.float64, device=data.device)
     step = 2 * half_m_s / (count - 1)
     top = _best(data, radar, start, aperture, centre, offsets)
+    aperture, uneven = seen_aperture(data, radar, replace(start, u_a_m_s=top.u_a_m_s), aperture)
+    if bool(uneven.any()):
+        top = _best(data, radar, start, aperture, centre, offsets)
     ended = top.edge
     for _ in range(fine):
         step = 2 * step / 5
@@ -162,7 +168,7 @@ def _estimate_at(
     ).clamp_min(1)
     snr = energy_ratio_db(energy, noise)
     value = {"u_a_m_s": motion.u_a_m_s}
-    ok = (snr >= DETECTED_DB) & ~ended
+    ok = (snr >= DETECTED_DB) & ~ended & lit_as_expected(data, radar, motion, aperture)
     std = torch.where(energy > 0, torch.sqrt(noise / curvature.clamp_min(_TINY)), torch.inf)
     return Estimate(
         value, torch.sigmoid((snr - DETECTED_DB) / 3), ok, {"u_a_m_s": std}, {"snr_db": snr, "at_the_end": ended}

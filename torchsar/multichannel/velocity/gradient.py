@@ -9,6 +9,7 @@ from torchsar.core import Estimate
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
+from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
 from torchsar.multichannel.velocity.likelihood import PointLikelihood, maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of, moved, point_phasor, round_units
@@ -71,7 +72,9 @@ def gradient_likelihood(
     Returns:
         `u_r_m_s`, `u_a_m_s`, `y0_m` of shape (...,) with standard deviations of the unknowns.
         `info` holds `snr_db` (over all samples), `noise_power` (per sample) and `converged`. `ok`
-        is False where the search failed or `snr_db` is below 19.
+        is False where the search failed, `snr_db` is below 19, or the illumination of the point is
+        not understood, see `lit_as_expected`. Where it is lit in a part of the aperture only, this
+        part is used, see `seen_aperture`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -79,6 +82,7 @@ def gradient_likelihood(
             not finite, or if `unknowns` holds other names or a name twice.
     """
     data = checked_channels(data, radar, "gradient_likelihood")
+    aperture, _ = seen_aperture(data, radar, start, aperture)
     energy = data.abs().to(torch.float64).square().sum((-2, -1)).clamp_min(_TINY)
     at_start = maximum_likelihood(data, radar, start, aperture, unknowns, steps=0)
     # the phases of the unknowns are nearly alike: in whitened units the objective is isotropic
@@ -101,7 +105,7 @@ def gradient_likelihood(
     fit = maximum_likelihood(data, radar, there(found.x), aperture, unknowns, steps=0)
     return estimate_of(
         fit,
-        found.ok & (fit.snr_db >= DETECTED_DB),
+        found.ok & (fit.snr_db >= DETECTED_DB) & lit_as_expected(data, radar, fit.motion, aperture),
         torch.sigmoid((fit.snr_db - DETECTED_DB) / 3),
         converged=found.converged,
     )

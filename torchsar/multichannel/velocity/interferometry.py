@@ -20,6 +20,7 @@ from torchsar.core import Estimate
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.model import Found, covariance_of, estimate_of, phase_slopes, point_phasor
 from torchsar.radar import BistaticRadar
@@ -36,7 +37,12 @@ DETECTED_DB = 19.0
 
 
 def interferometry(
-    data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, passes: int = 4
+    data: Tensor,
+    radar: BistaticRadar,
+    start: PointMotion,
+    aperture: Aperture,
+    passes: int = 4,
+    check_ambiguity: bool = True,
 ) -> Estimate:
     """Estimate slant-range speed and position of one point per trial by along-track interferometry.
 
@@ -51,11 +57,15 @@ def interferometry(
         start: Starting motion, shape (...,).
         aperture: Expected amplitude over slow time.
         passes: Number of passes, each of which starts from the result of the previous one.
+        check_ambiguity: Whether to check that the velocity is not wrong by lambda * PRF, in about
+            10 ms per trial. Where it is wrong, a warning is given and `ok` is False.
 
     Returns:
         `u_r_m_s` (closing positive), `u_a_m_s` and `y0_m` of shape (...,). Standard deviations of
         u_r and y0 follow from the residual noise. `info` holds `snr_db` (over all samples) and
-        `noise_power` (per sample). `ok` is False where `snr_db` is below 19.
+        `noise_power` (per sample), and with `check_ambiguity` also `pulse_rates`, the number of
+        PRFs to add to the Doppler (-1, 0 or 1). `ok` is False where `snr_db` is below 19 or
+        `pulse_rates` is not zero.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -75,7 +85,8 @@ def interferometry(
         motion = _improved(data, radar, motion, weight, time_s)
     found = _fit_at(data, radar, motion, aperture.weight(radar, motion, time_s), time_s)
     snr = found.snr_db
-    return estimate_of(found, snr >= DETECTED_DB, _quality(snr))
+    estimate = estimate_of(found, snr >= DETECTED_DB, _quality(snr))
+    return warned_of_ambiguity(estimate, data, radar, motion, aperture) if check_ambiguity else estimate
 
 
 def _quality(snr_db: Tensor) -> Tensor:

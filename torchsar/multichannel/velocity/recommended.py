@@ -16,6 +16,7 @@ from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell
 from torchsar.multichannel.velocity.bank import Search, bank_search
+from torchsar.multichannel.velocity.illumination import SeenAperture, lit_as_expected, seen_aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, Found, chosen, estimate_of, point_phasor
@@ -63,8 +64,10 @@ def moving_point_velocity(
         position at t = 0 `y0_m` of shape (...,), with standard deviations. `info` holds `snr_db`
         (over all samples), `noise_power` (per sample) and `coloured` (True where clutter was found,
         and everywhere if `whitening` is given). `ok` is False where `snr_db` is below 19, the
-        estimate lies outside the search, or the standard deviation of u_r exceeds the half width of
-        the search, as with a single channel.
+        estimate lies outside the search, the standard deviation of u_r exceeds the half width of
+        the search, as with a single channel, or the illumination of the point is not understood,
+        see `lit_as_expected`. Where it is lit in a part of the aperture only, as in a range line
+        that it crosses, this part is used, see `seen_aperture`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -84,7 +87,9 @@ def moving_point_velocity(
             job.centred(job.found(whitening), whitening),
             torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device),
         )
-    plain = job.refined(job.found(None))
+    plain = job.found(None)
+    job, plain = job.as_seen(plain)
+    plain = job.refined(plain)
     if not bool(plain.coloured.any()):
         return job.estimate(plain.found, plain.coloured)
     other = job.refined(job.found(sample_whitening(job.data, radar)))
@@ -120,10 +125,20 @@ class _Job:
 
         The search uses the middle of the aperture, the last fit all of it.
         """
-        coarse = self.aperture if isinstance(self.aperture, Dwell) else Dwell(_COARSE_S)
+        whole = self.aperture.aperture if isinstance(self.aperture, SeenAperture) else self.aperture
+        coarse = whole if isinstance(whole, Dwell) else Dwell(_COARSE_S)
         start, _ = bank_search(self.data, self.radar, coarse, self.search, self.u_a_m_s, self.range_m, whitening)
         near = maximum_likelihood(self.data, self.radar, start, coarse, self.unknowns, whitening)
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
+
+    def as_seen(self, found: Found) -> tuple[_Job, Found]:
+        """Refit points that are lit in a part of the aperture only, and keep that part."""
+        aperture, uneven = seen_aperture(self.data, self.radar, found.motion, self.aperture)
+        if not bool(uneven.any()):
+            return self, found
+        job = replace(self, aperture=aperture)
+        again = maximum_likelihood(self.data, self.radar, found.motion, aperture, self.unknowns)
+        return job, _chosen_fit(again, found, uneven)
 
     def centred(self, found: Found, whitening: Whitening) -> Found:
         """Repeat the fit four times, with the expected amplitude about the last position found.
@@ -170,8 +185,12 @@ class _Job:
         determined = (
             found.covariance[..., 0, 0].sqrt() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         )  # False for one channel, which cannot separate velocity and position
+        lit = lit_as_expected(self.data, self.radar, found.motion, self.aperture)
         return estimate_of(
-            found, inside & determined & (snr >= DETECTED_DB), torch.sigmoid((snr - DETECTED_DB) / 3), coloured=coloured
+            found,
+            inside & determined & lit & (snr >= DETECTED_DB),
+            torch.sigmoid((snr - DETECTED_DB) / 3),
+            coloured=coloured,
         )
 
 

@@ -13,7 +13,7 @@ Reference:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -24,6 +24,7 @@ from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
 from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
 from torchsar.multichannel.velocity.aperture import Dwell
+from torchsar.multichannel.velocity.model import point_phasor
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
 
@@ -34,6 +35,9 @@ _CURVE_M_S = 0.5
 # Systematic error without noise, from echoes beyond the reconstructed bands: 0.035 m/s rms over
 # velocities and positions, up to 0.06 m/s.
 _REST_M_S = 0.035
+# Least share of the energy of a deramped line in its strongest tone: clutter that fills 800 Doppler
+# cells has 0.01; a target of ten equal points has 0.1.
+_POINT_SHARE = 0.05
 _GROUPS = 16  # of the jackknife: 8 and 32 groups give the same standard deviation within 6 %
 
 
@@ -241,8 +245,8 @@ class SignalIntensityRatio(Stage):
             `info` holds `log_ratio`, ln Gamma over the grid, shape (..., speed), and `pulse_rates`,
             the number of PRFs to add to the Doppler (-1, 0 or 1), shape (...,). `ok` is False if
             the data are zero (the value is then the middle of the search interval), the maximum
-            lies at an end of the interval, the quality is below `least_quality`, or `pulse_rates`
-            is not zero.
+            lies at an end of the interval, the quality is below `least_quality`, `pulse_rates` is
+            not zero, or no tone holds 5 % of the energy of the strongest line, as in clutter.
 
         Raises:
             ValueError: If the reconstruction is singular.
@@ -271,6 +275,7 @@ class SignalIntensityRatio(Stage):
         motion = self._motion(lines, found["u_r_m_s"], u_a_m_s, y0_m)
         line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
         dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2
+        found = replace(found, ok=found.ok & _is_point(line, self.radar, motion))
         return warned_of_ambiguity(found, line, self.radar, motion, Dwell(dwell_s))
 
     def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
@@ -291,6 +296,14 @@ class SignalIntensityRatio(Stage):
             {"u_r_m_s": std},
             {"log_ratio": -costs},
         )
+
+
+def _is_point(line: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
+    """Whether one tone of a deramped line has a share of the energy that clutter lacks, (...,)."""
+    time_s = radar.pulse_axis(line.shape[-1]).values(line.device)
+    still = line.to(torch.complex128) * point_phasor(radar, motion, time_s, torch.complex128).conj()
+    power = torch.fft.fft(still, norm="ortho").abs().square().sum(-2)
+    return power.amax(-1) > _POINT_SHARE * power.sum(-1)
 
 
 def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor) -> Tensor:

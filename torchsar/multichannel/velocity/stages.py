@@ -6,8 +6,6 @@ strongest range line of each trial.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -19,6 +17,7 @@ from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.bank import Search
 from torchsar.multichannel.velocity.gradient import gradient_likelihood
+from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB, interferometry
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of, refuse_unknowns
@@ -121,9 +120,7 @@ class Interferometry(_Velocity):
                 fewer than 4 pulses, or slow time is not zero at pulse n // 2.
         """
         data, radar, start, aperture = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
-        found = interferometry(data, radar, start, aperture)
-        there = replace(start, u_r_m_s=found["u_r_m_s"], y0_m=found["y0_m"])
-        return warned_of_ambiguity(found, data, radar, there, aperture) if self.check_ambiguity else found
+        return interferometry(data, radar, start, aperture, check_ambiguity=self.check_ambiguity)
 
 
 class AlongTrackAutofocus(_Velocity):
@@ -205,14 +202,19 @@ class LikelihoodVelocity(_Velocity):
 
         Returns:
             `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), with standard deviations of those
-            estimated. `ok` is False where the SNR of the point over all samples is below 19 dB.
+            estimated. Where the point is lit in a part of the aperture only, this part is used, see
+            `seen_aperture`. `ok` is False where the SNR of the point over all samples is below 19
+            dB, or where its illumination is not understood, see `lit_as_expected`.
 
         Raises:
             ValueError: If the data have other channels than the radar or fewer than 4 pulses, or
                 slow time is not zero at pulse n // 2.
         """
-        found = maximum_likelihood(*self.begin(signal, u_r_m_s, u_a_m_s, y0_m), self.unknowns)
-        return estimate_of(found, found.snr_db >= DETECTED_DB, ((found.snr_db - DETECTED_DB) / 3).sigmoid())
+        data, radar, start, aperture = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
+        aperture, _ = seen_aperture(data, radar, start, aperture)
+        found = maximum_likelihood(data, radar, start, aperture, self.unknowns)
+        ok = (found.snr_db >= DETECTED_DB) & lit_as_expected(data, radar, found.motion, aperture)
+        return estimate_of(found, ok, ((found.snr_db - DETECTED_DB) / 3).sigmoid())
 
 
 class GradientVelocity(_Velocity):

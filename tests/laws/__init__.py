@@ -1,0 +1,1 @@
+"""Laws of algebra that stages and estimators keep for any data."""
