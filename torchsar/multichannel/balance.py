@@ -407,11 +407,13 @@ def _estimate_of(
 def _standard_deviations(hessian: Tensor, reference: int, looks: float) -> tuple[Tensor, Tensor]:
     """Return standard deviations of log gains and phases (..., channel), at most 1e3."""
     channels = hessian.shape[-1] // 2
-    others = [i for i in range(2 * channels) if i % channels != reference]
+    # the common phase is not determined; the error of the common gain is shared by all channels
+    others = [i for i in range(2 * channels) if i != channels + reference]
     values, vectors = torch.linalg.eigh(hessian[..., others, :][..., others])
-    variance = (vectors.square() / (2 * looks * values).clamp_min(1e-6)[..., None, :]).sum(-1)
+    scaled = vectors / (2 * looks * values).clamp_min(1e-6).sqrt()[..., None, :]
+    scaled = torch.cat([scaled[..., :channels, :] - scaled[..., reference, None, :], scaled[..., channels:, :]], -2)
     std = torch.zeros_like(hessian[..., 0])
-    std[..., others] = variance.sqrt()
+    std[..., others] = scaled.square().sum(-1).sqrt()
     return std[..., :channels], std[..., channels:]
 
 
