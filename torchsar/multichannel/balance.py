@@ -47,11 +47,14 @@ _DELAY_PASSES = 2
 _COARSE_DB = 20.0
 # SNR values tried, in dB: a step of 1 dB changes the phases by 1e-3 rad, less than their errors.
 _LEVELS_DB = tuple(range(0, 61, 3))
+# Difference of the powers of balanced channels in dB that chance may cause, by choice: channels see
+# the clutter at different times.
+_CHANCE_DB = 0.25
 # (mean square)^2 / mean fourth power of the Hann weights: independent looks per pulse.
 _HANN_LOOKS = 18 / 35
-# Convention: a linear phase error of 0.1 rad already makes false targets of about -20 dB when three
-# bands are reconstructed at a PRF of 180 Hz.
-_LARGEST_STD_RAD = 0.1
+# Convention: a linear phase error of 0.1 rad, twice as much, already makes false targets of about
+# -20 dB when three bands are reconstructed at a PRF of 180 Hz.
+_LARGEST_STD_RAD = 0.05
 
 
 def correct_balance(
@@ -143,10 +146,13 @@ def estimate_balance(
 
     Returns:
         `phase_rad`, `gain_db` and `delay_s`, float64 (..., channel), relative to the channel whose
-        along-track position is nearest to zero, with standard deviations from the likelihood.
+        along-track position is nearest to zero. Standard deviations of phases and gains follow from
+        the likelihood; those of gains contain the difference that remains between the powers of the
+        balanced channels, as with a wrong prior. Those of delays follow from the scatter of the
+        blocks.
         `info` holds `snr_db` (...,), the ratio of the clutter power at the peak of the prior to the
         noise power. `ok` is False, and the values are zero, where a channel has no power or a phase
-        has a standard deviation above 0.1 rad.
+        has a standard deviation above 0.05 rad.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -169,17 +175,17 @@ def estimate_balance(
             _products(lines, blocks, no_power),
             torch.zeros(*data.shape[:-3], radar.channels, dtype=torch.float64, device=data.device),
         )
+        delay_std = torch.zeros_like(delay)
         for _ in range(_DELAY_PASSES if delays else 0):
-            delay = delay + _slope(
-                models.solve(products.movedim(-3, 0), _COARSE_DB)[0].movedim(0, -2), centres, reference
-            )
+            by_block = models.solve(products.movedim(-3, 0), _COARSE_DB)[0].movedim(0, -2)
+            step, delay_std = _slope(by_block, centres, reference)
+            delay = delay + step
             products = _products(lines * unit_phasor(delay[..., None, None] * frequency, lines.dtype), blocks, no_power)
         weights, hessian, snr_db, by_snr = models.best(products.mean(-3))
         looks = data.shape[-2] * frequency.numel() * _HANN_LOOKS
         by_snr = by_snr / math.sqrt(2 * looks)
-        return _estimate_of(
-            weights, hessian, delay, snr_db, no_power, reference, looks, centres if delays else None, by_snr
-        )
+        balanced = lines.abs().square().mean((-2, -1)) * weights.abs().square()
+        return _estimate_of(weights, hessian, (delay, delay_std), snr_db, no_power, reference, looks, by_snr, balanced)
 
 
 def _check_data(data: Tensor, radar: BistaticRadar, blocks: int, bands: int) -> None:
@@ -351,38 +357,47 @@ def _expanded(matrix: Tensor, logs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return t.real.sum((-2, -1)) / 2 - logs[..., :half].sum(-1), gradient, hessian
 
 
-def _slope(weights: Tensor, frequency_hz: Tensor, reference: int) -> Tensor:
-    """Return delays (..., channel) in seconds from the phases of weights (..., block, channel)."""
+def _slope(weights: Tensor, frequency_hz: Tensor, reference: int) -> tuple[Tensor, Tensor]:
+    """Return delays in seconds from the phases of weights (..., block, channel).
+
+    Their standard deviations follow from the scatter of the blocks; shape (..., channel) each.
+    """
     turn = weights * weights[..., reference, None].conj()
     step = frequency_hz[1] - frequency_hz[0]
     coarse = torch.angle((turn[..., 1:, :] * turn[..., :-1, :].conj()).sum(-2)) / (2 * math.pi * step)
     turn = turn * unit_phasor(-coarse[..., None, :] * frequency_hz[:, None], turn.dtype)
     angle = torch.angle(turn * turn.sum(-2, keepdim=True).conj())
     f = frequency_hz[:, None] - frequency_hz.mean()
-    return coarse + (angle * f).sum(-2) / f.square().sum() / (2 * math.pi)
+    slope = (angle * f).sum(-2) / f.square().sum()
+    left = angle - angle.mean(-2, keepdim=True) - slope[..., None, :] * f
+    std = (left.square().sum(-2) / max(1, len(f) - 2) / f.square().sum()).sqrt()
+    return coarse + slope / (2 * math.pi), std / (2 * math.pi)
 
 
 def _estimate_of(
     weights: Tensor,
     hessian: Tensor,
-    delay_s: Tensor,
+    delay: tuple[Tensor, Tensor],
     snr_db: Tensor,
     no_power: Tensor,
     reference: int,
     looks: float,
-    centres: Tensor | None,
     by_snr: Tensor,
+    balanced: Tensor,
 ) -> Estimate:
     """Form the estimate relative to the reference channel and judge it."""
     value = {
         "phase_rad": torch.angle(weights.conj() * weights[..., reference, None]),
         "gain_db": 20 * torch.log10(weights[..., reference, None].abs() / weights.abs()),
-        "delay_s": delay_s - delay_s[..., reference, None],
+        "delay_s": delay[0] - delay[0][..., reference, None],
     }
     log_std, phase_std = _standard_deviations(hessian, reference, looks)
     log_std = torch.hypot(log_std, by_snr - by_snr[..., reference, None])
-    per_hz = 0.0 if centres is None else 1 / (2 * math.pi * float(centres.square().mean().sqrt()))
-    std = {"phase_rad": phase_std, "gain_db": log_std * (20 / math.log(10)), "delay_s": phase_std * per_hz}
+    # balanced channels have equal power, but with a wrong prior other gains are more likely
+    uneven = 10 * torch.log10((balanced / balanced[..., reference, None].clamp_min(1e-300)).clamp_min(1e-30)).abs()
+    beyond = uneven > 5 * log_std * (20 / math.log(10)) + _CHANCE_DB
+    log_std = torch.where(beyond, torch.hypot(log_std, uneven * (math.log(10) / 20)), log_std)
+    std = {"phase_rad": phase_std, "gain_db": log_std * (20 / math.log(10)), "delay_s": delay[1]}
     worst = phase_std.amax(-1)
     ok = torch.stack([v.isfinite().all(-1) for v in value.values()]).all(0) & ~no_power & (worst < _LARGEST_STD_RAD)
     value = {name: torch.where(ok[..., None], v, 0.0) for name, v in value.items()}
@@ -392,11 +407,13 @@ def _estimate_of(
 def _standard_deviations(hessian: Tensor, reference: int, looks: float) -> tuple[Tensor, Tensor]:
     """Return standard deviations of log gains and phases (..., channel), at most 1e3."""
     channels = hessian.shape[-1] // 2
-    others = [i for i in range(2 * channels) if i % channels != reference]
+    # the common phase is not determined; the error of the common gain is shared by all channels
+    others = [i for i in range(2 * channels) if i != channels + reference]
     values, vectors = torch.linalg.eigh(hessian[..., others, :][..., others])
-    variance = (vectors.square() / (2 * looks * values).clamp_min(1e-6)[..., None, :]).sum(-1)
+    scaled = vectors / (2 * looks * values).clamp_min(1e-6).sqrt()[..., None, :]
+    scaled = torch.cat([scaled[..., :channels, :] - scaled[..., reference, None, :], scaled[..., channels:, :]], -2)
     std = torch.zeros_like(hessian[..., 0])
-    std[..., others] = variance.sqrt()
+    std[..., others] = scaled.square().sum(-1).sqrt()
     return std[..., :channels], std[..., channels:]
 
 

@@ -28,7 +28,9 @@ from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap
 _MOST_STD = 0.01
 # Systematic errors as shares of the rms offset, found by trial with lines of 512 samples: without
 # noise, and for each unit of noise over signal.
-_REST_SHARE, _NOISE_SHARE = 0.005, 0.1
+_REST_SHARE, _NOISE_SHARE = 0.002, 0.38
+# rms offset in samples at which terms of higher order double the first, found by trial
+_LARGE = 0.15
 
 
 @dataclass(frozen=True)
@@ -212,7 +214,8 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
             offsets[chosen] = total[..., tiled % m]
             # the terms of higher order that remain, and the error of the noise level
             share_of_noise = (1 - share[chosen]) / share[chosen].clamp_min(0.1)
-            rest = (_REST_SHARE + _NOISE_SHARE * share_of_noise) * total.square().mean(-1).sqrt()
+            size = total.square().mean(-1).sqrt()
+            rest = (_REST_SHARE * (1 + (size / _LARGE).square()) + _NOISE_SHARE * share_of_noise) * size
             std[chosen] = torch.hypot(fit.std_samples, rest)[..., None].expand(-1, longest)
     ok = ok & (std[:, 0] < _MOST_STD) & torch.isfinite(offsets).all(-1) & (smallest_gap(offsets) >= MIN_GAP)
     offsets = torch.where(ok[..., None], offsets, 0)
