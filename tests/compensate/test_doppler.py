@@ -26,7 +26,7 @@ from torchsar.io import read_stripmap
 from torchsar.metrics import beam_centre_bound_hz, reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.optim import gradient_minimum, grid_minimum, parabola_minimum
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
-from torchsar.scene import Dwell, RandomPoints, StripmapWorld
+from torchsar.scene import Dwell, Points, RandomPoints, Scene, Speckle, StripmapWorld
 
 PRF = 1000.0
 
@@ -271,6 +271,54 @@ def test_recorded_blocks_without_prior_knowledge(
     velocity = EffectiveVelocity(OmegaK(radar))(signal, doppler_hz=doppler["doppler_hz"])
     assert abs(float(velocity["velocity_m_s"]) - 7066) < 3
     assert bool(velocity.ok)
+
+
+SATELLITE = StripmapRadar(
+    3.2e9, LinearFM(50e6, 1e-6), 62.5e6, 1000.0, 7000.0, 700e3, pointing_doppler_hz=652.0, integration_s=0.3
+)
+AIRCRAFT = StripmapRadar(
+    3.2e9, LinearFM(40e6, 0.5e-6), 50e6, 400.0, 120.0, 4000.0, pointing_doppler_hz=0.0, integration_s=1.0
+)
+
+
+@pytest.mark.parametrize(
+    "scene, snr_db", [(Speckle(200, 600.0, 60.0), 0.0), (Points([0.0], [0.0], random_phase=True), 20.0)]
+)
+def test_velocity_is_ok_when_the_search_is_narrower_than_the_minimum(scene: Scene, snr_db: float) -> None:
+    """The minimum is 200 m/s wide here; 60 m/s are searched."""
+    doppler = torch.full((8,), 652.0, dtype=torch.float64)
+    world = StripmapWorld(scene, Dwell(0.3), velocity_m_s=7003.0, doppler_hz=doppler, snr_db=snr_db)
+    signal = simulate(SATELLITE, world, 512, 192, Draws(11, trials=range(8)))[0].signal
+    found = EffectiveVelocity(OmegaK(SATELLITE), 30.0, 128)(signal, doppler)
+    assert bool(found.ok.all())
+    rms = (found["velocity_m_s"] - 7003).square().mean().sqrt()
+    assert 0.5 < float(rms / found.std["velocity_m_s"].square().mean().sqrt()) < 1.6
+
+
+def test_velocity_without_an_image_is_not_ok() -> None:
+    """Noise in a narrow search, clutter that fills the band, a record shorter than the dwell."""
+    noise = Draws(12, trials=range(6)).normal("alone", (512, 192), torch.complex64)
+    stage = EffectiveVelocity(OmegaK(SATELLITE), 30.0, 128)
+    doppler = torch.full((6,), 652.0, dtype=torch.float64)
+    off = SATELLITE.doppler_hz(512, doppler)[0] - 652.0
+    clutter = torch.fft.ifft(torch.fft.fft(noise, dim=-2) * (off.abs() < 130)[:, None], dim=-2)
+    for data in (noise, clutter):
+        assert not bool(stage(Signal(data, SATELLITE.raw_axes(512, 192)), doppler).ok.any())
+    world = StripmapWorld(RandomPoints(24, 230.0, 150.0), Dwell(1.0), doppler_hz=doppler * 0, snr_db=10.0)
+    signal = simulate(AIRCRAFT, world, 230, 192, Draws(13, trials=range(6)))[0].signal
+    assert not bool(EffectiveVelocity(OmegaK(AIRCRAFT), 25.0)(signal, doppler * 0).ok.any())
+
+
+def test_a_wide_search_with_an_unknown_dwell_takes_few_images() -> None:
+    """An aperture of a whole PRF would be 5 s long, the step of the grid 0.2 m/s."""
+    unknown = replace(AIRCRAFT, integration_s=None)
+    doppler = torch.zeros(2, dtype=torch.float64)
+    world = StripmapWorld(RandomPoints(40, 250.0, 150.0), Dwell(1.0), velocity_m_s=121.5, doppler_hz=doppler, snr_db=15)
+    signal = simulate(AIRCRAFT, world, 768, 192, Draws(14, trials=range(2)))[0].signal
+    found = EffectiveVelocity(OmegaK(unknown), 80.0)(signal, doppler)
+    assert found.info["grid_velocity_m_s"].shape[0] <= 33 and float(found.info["grid_velocity_m_s"].min()) >= 60
+    assert bool(found.ok.all())
+    torch.testing.assert_close(found["velocity_m_s"], torch.full_like(doppler, 121.5), atol=0.2, rtol=0)
 
 
 def test_invalid_arguments_are_rejected() -> None:

@@ -13,7 +13,7 @@ from torchsar.echo import simulate, target_energy
 from torchsar.focus import OmegaK
 from torchsar.metrics import reference_doppler_std_hz, tone_frequency_bound_hz
 from torchsar.radar import LinearFM, StripmapRadar
-from torchsar.scene import Dwell, Points, StripmapWorld
+from torchsar.scene import Dwell, Points, RandomPoints, Scene, Speckle, StripmapWorld
 
 RADAR = StripmapRadar(
     3.2e9, LinearFM(50e6, 1e-6), 62.5e6, 1000.0, 7000.0, 700e3, pointing_doppler_hz=652.0, integration_s=0.3
@@ -47,6 +47,13 @@ def test_noise_alone_is_not_ok() -> None:
         Signal(torch.zeros(2, 64, 64, dtype=torch.complex64), RADAR.image_axes(RADAR.raw_axes(64, 64)))
     )
     assert not bool(silent.ok.any()) and bool(torch.isfinite(silent["doppler_hz"]).all())
+
+
+@pytest.mark.parametrize("scene", [Speckle(600, 900.0, 60.0), RandomPoints(3, 60.0, 400.0)])
+def test_a_point_that_does_not_stand_out_is_not_ok(scene: Scene) -> None:
+    world = StripmapWorld(scene, Dwell(0.3), doppler_hz=652.0, snr_db=10.0)
+    image = OmegaK(RADAR)(simulate(RADAR, world, 512, 192, Draws(6, trials=range(6)))[0].signal)
+    assert not bool(PointDoppler(RADAR)(image).ok.any())
 
 
 def test_doppler_at_inverts_the_image_position() -> None:

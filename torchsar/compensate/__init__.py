@@ -97,7 +97,12 @@ from torchsar.compensate.rotation import (
     search_rotation,
     uneven_rotation,
 )
-from torchsar.compensate.velocity import EffectiveVelocity, minimum_entropy_velocity, velocity_objective
+from torchsar.compensate.velocity import (
+    EffectiveVelocity,
+    VelocityMinimum,
+    minimum_entropy_velocity,
+    velocity_objective,
+)
 
 __all__ = [
     "AlignEnvelopes",
@@ -142,6 +147,7 @@ __all__ = [
     "SpectrumCorrelation",
     "TargetAutofocus",
     "UnevenRotation",
+    "VelocityMinimum",
     "align_envelopes",
     "align_mean",
     "align_running",

@@ -221,9 +221,10 @@ def beam_spectrum(group: RangeGroup, doppler_hz: Tensor, margin: float = 1.2) ->
 def column_signal(lines: Tensor) -> Tensor:
     """Measure the energy of each column (range cell) above the background.
 
-    The background is the energy that a tenth of the columns do not exceed. Four standard deviations
-    of noise are subtracted. The result is limited to 1e-3..10: the upper limit prevents one ship
-    from outweighing a hundred good columns.
+    The background is the energy that a tenth of the columns do not exceed, but at least a
+    thousandth of that of the brightest column, whose sidelobes fill the others. Four standard
+    deviations of noise are subtracted. The result is limited to 1e-3..10: the upper limit prevents
+    one ship from outweighing a hundred good columns.
 
     Args:
         lines: Lines or an image, shape (..., pulse, range), complex.
@@ -233,6 +234,7 @@ def column_signal(lines: Tensor) -> Tensor:
     """
     energy = (lines.detach().real.square() + lines.detach().imag.square()).sum(-2).to(torch.float64)
     floor = energy.kthvalue(max(1, energy.shape[-1] // 10), dim=-1, keepdim=True).values
+    floor = torch.maximum(floor, 1e-3 * energy.amax(-1, keepdim=True))
     excess = energy / torch.where(floor > 0, floor, 1) - 1 - 4 / math.sqrt(lines.shape[-2])
     return excess.clamp(1e-3, 10)
 
@@ -322,13 +324,34 @@ def block_entropy(image: Tensor) -> Tensor:
     Returns:
         The entropies in nats, shape (..., block), float64; 0 for an empty block.
     """
+    return entropy_parts(image, 1)[0][..., 0]
+
+
+def entropy_parts(image: Tensor, parts: int) -> tuple[Tensor, Tensor]:
+    """Compute what each part of the azimuth samples adds to the entropy of each block.
+
+    Args:
+        image: Image, shape (..., azimuth, range), complex.
+        parts: Number of parts along azimuth.
+
+    Returns:
+        The summands in nats and the shares of the energy of the block, shape (..., block, parts)
+        each, float64. The sum of the summands over the last dimension is `block_entropy`.
+    """
     power = image.real.square() + image.imag.square()
     tiny = torch.finfo(power.dtype).tiny
-    blocks = []
-    for part in power.tensor_split(_block_count(image.shape[-1]), -1):
-        p = part / part.sum((-2, -1), keepdim=True).clamp_min(tiny * 1e3)
-        blocks.append(-(p * torch.log(p.clamp_min(tiny))).sum((-2, -1)).to(torch.float64))
-    return torch.stack(blocks, -1)
+    blocks, shares = [], []
+    for block in power.tensor_split(_block_count(image.shape[-1]), -1):
+        p = block / block.sum((-2, -1), keepdim=True).clamp_min(tiny * 1e3)
+        terms = -(p * torch.log(p.clamp_min(tiny)))
+        blocks.append(_part_sums(terms, parts))
+        shares.append(_part_sums(p, parts))
+    return torch.stack(blocks, -2), torch.stack(shares, -2)
+
+
+def _part_sums(x: Tensor, parts: int) -> Tensor:
+    """Sums (..., parts) of x (..., azimuth, range) over parts of the azimuth samples, float64."""
+    return torch.stack([part.sum((-2, -1)).to(torch.float64) for part in x.tensor_split(parts, -2)], -1)
 
 
 def student_log_likelihood(t: Tensor, degrees: Tensor | int) -> Tensor:

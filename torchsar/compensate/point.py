@@ -26,6 +26,10 @@ from torchsar.radar import StripmapRadar
 
 # What remains without noise, from the interpolation of the response, in cycles per dwell.
 _REST_CYCLES = 2e-4
+# Power of the brightest point over that of any other, beyond the peaks of noise. Among equal points
+# or speckle nothing shows which point the beam centre crosses at the given time.
+_LEAST_LEAD = 4.0
+_POINT_CELLS = 4  # resolution cells to each side of a point that belong to its response
 
 
 def doppler_at(
@@ -116,6 +120,17 @@ def peak_time_s(
     return start_s + (point_doppler(tone, prf_hz, centre_hz=doppler_hz) - doppler_hz) / rate[..., 0]
 
 
+def _rival(power: Tensor, line: Tensor, sample: Tensor, lines: Tensor, samples: float) -> Tensor:
+    """Largest power (...,) of an image (..., azimuth, range) apart from lines and samples about a
+    point; the image is circular in azimuth.
+    """
+    n = power.shape[-2]
+    apart = (torch.arange(n, device=power.device) - line[..., None]).abs()
+    rows = torch.minimum(apart, n - apart) <= lines[..., None]
+    columns = (torch.arange(power.shape[-1], device=power.device) - sample[..., None]).abs() <= samples
+    return power.masked_fill(rows[..., :, None] & columns[..., None, :], 0).amax((-2, -1))
+
+
 class PointDoppler(Stage):
     """Doppler centroid of the beam from the brightest point of an image.
 
@@ -162,8 +177,8 @@ class PointDoppler(Stage):
             compression (info["q"], a power ratio) and the part of the dwell that lies in the
             record, and holds if radar.integration_s is the true dwell. `quality` is
             1 - 1 / (1 + q). `ok` is False where the time at which the beam centre crosses the point
-            lies outside the record, or where noise alone would have as high a peak in more than one
-            of 22,000 images.
+            lies outside the record, where noise alone would have as high a peak in more than one of
+            22,000 images, or where another point has more than a quarter of the power.
 
         Raises:
             ValueError: If neither `frame_hz` nor radar.pointing_doppler_hz gives the frame Doppler.
@@ -209,13 +224,22 @@ class PointDoppler(Stage):
         floor = power.flatten(-2).median(-1).values.double() / math.log(2)
         peak_to_noise = found["peak"].abs().square() / torch.where(floor > 0, floor, 1)
         visible = max(seen[1] - seen[0], 1 / radar.prf_hz)
+        strongest_noise = math.log(azimuth.n * slant.n) + 10
+        rival = _rival(
+            power,
+            line,
+            sample,
+            _POINT_CELLS * radar.prf_hz / (rate * visible),
+            _POINT_CELLS * radar.range_resolution_m / slant.step,
+        )
+        leads = found["peak"].abs().square() > _LEAST_LEAD * (rival.double() - strongest_noise * floor)
         # the image contains the noise of the whole PRF, not only that of the band of the point
         q = peak_to_noise * (radar.prf_hz / (rate * visible)).clamp_min(1)
         std = torch.hypot(tone_frequency_bound_hz(q.clamp_min(1e-12), visible), q.new_tensor(_REST_CYCLES / visible))
         return Estimate(
             {"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)},
             1 - 1 / (1 + q),
-            finite & (floor > 0) & (0 <= crossing <= record) & (peak_to_noise > math.log(azimuth.n * slant.n) + 10),
+            finite & (floor > 0) & (0 <= crossing <= record) & (peak_to_noise > strongest_noise) & leads,
             {"doppler_hz": std, "doppler_baseband_hz": std},
             {"q": q},
         )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -24,9 +24,10 @@ from torchsar.compensate.group import (
     block_weights,
     central_lines,
     compress,
+    entropy_parts,
     pick_group,
 )
-from torchsar.core import Estimate, Signal, Stage, checked_samples, settle, unit_level
+from torchsar.core import Estimate, Signal, Stage, checked_samples, fft_lines, settle, unit_level
 from torchsar.optim.scalar import gradient_minimum, grid_minimum
 from torchsar.radar import StripmapRadar
 
@@ -35,13 +36,22 @@ Refine = Callable[..., tuple[Tensor, Tensor]]
 # Variance of the entropy of n independent pixels of pure noise, times n: with the exponential
 # distribution of their intensity, 0.290.
 _NOISE_ENTROPY = 0.29
-# Depth of a significant minimum in standard deviations of noise. On noise the depth is below 3; of
-# 24 points at an SNR of -20 dB it is 4 to 8, at -10 dB above 60.
+# Depth of a significant minimum in standard deviations of noise. On noise and on clutter that fills
+# the Doppler band evenly the depth is below 5; 20 dB above the noise it is above 100.
 _LEAST_DEPTH = 8.0
-# Systematic part of the standard deviation over the width of the minimum: the entropy of points and
-# speckle is least 0.02 widths beside the true velocity, whatever the SNR.
-_REST_SHARE = 0.02
+# Distances from the minimum at which its depth is measured, in steps of the grid. The second pair
+# counts where the minimum reaches to the first, because the targets are seen for a short time.
+_DISTANCES = (2.0, 8.0)
+# Error that remains without noise: the spectrum of a short chirp is not that of the stationary
+# phase. It is a share of width^2 / velocity, or of the same with the step of the grid as the width.
+# Measured at time-bandwidth products of 19 to 374.
+_REST, _REST_STEP = 0.45, 0.11
+# Largest standard deviation of an estimate that is ok, over the width of the minimum: an eighth
+# of a cycle of phase at the ends of the aperture.
+_MOST_WIDTHS = 0.27
 _COMBS = 4  # interleaved sets of Doppler rows, of independent noise, for the standard deviation
+_PARTS = 8  # parts of the image along azimuth, for the standard deviation
+_GRID = 16  # largest number of steps of the grid search to either side
 
 
 class Focuser(Protocol):
@@ -105,6 +115,24 @@ def _objective(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Ca
     return blocks
 
 
+def _fine(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """Function of the velocity (...,) that returns the summands of the entropies of parts of the
+    image and their shares of the energy, each times the weight of the block, (..., block, part).
+
+    The image has twice as many azimuth samples as the spectrum has rows. The entropy of an image of
+    one sample per resolution cell changes with the place of a target between two samples, and a
+    wrong velocity moves targets.
+    """
+    height = 2 * spectrum.data.shape[-2]
+
+    def summands(velocity_m_s: Tensor) -> tuple[Tensor, Tensor]:
+        image = fft_lines(spectrum.rows(doppler_hz, velocity_m_s), inverse=True, n=height)
+        entropy, share = entropy_parts(image, _PARTS)
+        return entropy * weight[..., None], share * weight[..., None]
+
+    return summands
+
+
 def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float:
     """Compute the step of the grid search for the effective velocity.
 
@@ -123,32 +151,67 @@ def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float
     return 2 * radar.wavelength_m * range_m / (radar.velocity_m_s * dwell_s**2)
 
 
+class VelocityMinimum(NamedTuple):
+    """Velocity of least entropy.
+
+    Args:
+        velocity_m_s: The velocity in m/s, shape (...,).
+        std_m_s: Its predicted standard deviation in m/s, shape (...,).
+        most_m_s: Standard deviation in m/s with which an eighth of a cycle of phase remains at the
+            ends of the aperture, shape (...,).
+        clear: Whether the minimum is that of a focused image, bool (...,).
+        grid_m_s: Velocities of the grid search in m/s, shape (grid,).
+        grid_entropy: Their entropies in nats, shape (..., grid).
+    """
+
+    velocity_m_s: Tensor
+    std_m_s: Tensor
+    most_m_s: Tensor
+    clear: Tensor
+    grid_m_s: Tensor
+    grid_entropy: Tensor
+
+
 def minimum_entropy_velocity(
     group: RangeGroup, doppler_hz: Tensor, dwell_s: float, reach_m_s: float, refine: Refine, tolerance_m_s: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Find the velocity of least entropy: a grid search, then a refinement.
+) -> VelocityMinimum:
+    """Find the velocity of least entropy: a grid search, a refinement, and a parabola.
 
-    The standard deviation has three parts. The first follows from eight parts of the group: the
-    scatter of the slopes of their entropies at the common minimum, divided by the curvature of the
-    whole entropy. The second follows in the same way from four interleaved sets of Doppler rows,
-    whose noise is independent also where one target dominates; the larger of both counts. The third
-    is the systematic error, 0.02 times the width of the minimum. The width is that of a parabola
-    with the curvature at the minimum and the depth of the minimum below the mean over the grid.
+    The grid has steps of `grid_step_m_s`. Where that would be more than 33 velocities, only the
+    middle of the Doppler band is focused at first, with fewer and wider steps. Then the band is
+    doubled, and velocities about the best one are searched, until the band is whole.
+
+    The refinement stops at a two-hundredth of the step of the grid or at `tolerance_m_s`, whichever
+    is larger. The result is the vertex of a parabola through entropies of images with twice as many
+    azimuth samples, a tenth of a step to either side.
+
+    The depth of the minimum is measured against velocities 2 steps away, or 8 steps where that
+    shows a minimum of more than half this distance. Its width is that of a parabola with this depth
+    and with the curvature at the minimum. Neither depends on `reach_m_s`.
+
+    The standard deviation has three parts. The first follows from the parts of the image, blocks of
+    range cells times eight parts along azimuth: the slopes of their entropies at the minimum,
+    divided by the curvature of the whole entropy. The second follows in the same way from four
+    interleaved sets of Doppler rows, whose noise is independent also where one target dominates;
+    the larger of both counts. The third is what remains without noise, 0.45 width^2 / velocity
+    or 0.11 step^2 / velocity, whichever is larger.
 
     Args:
         group: Group of range cells.
         doppler_hz: Absolute Doppler centroid in Hz, shape (...,), positive when closing.
         dwell_s: Time that a target stays in the beam, in seconds.
-        reach_m_s: Half width of the search about the nominal velocity of the radar, in m/s.
+        reach_m_s: Half width of the search about the nominal velocity of the radar, in m/s; at most
+            half the nominal velocity is searched.
         refine: `parabola_minimum` or `gradient_minimum` of `torchsar.optim.scalar`.
         tolerance_m_s: Tolerance of the refinement in m/s.
 
     Returns:
-        The velocity in m/s, shape (...,); its predicted standard deviation in m/s, shape (...,);
-        the objective on the grid in nats, shape (..., grid); and whether the minimum is that of a
-        focused image, bool (...,). It is where its depth is 8 standard deviations of the entropy of
-        noise or more, and its width below that for the dwell: one step of `grid_step_m_s`. A wider
-        minimum shows that the targets are seen for a shorter time.
+        The minimum. It is clear where it is not at an end of the searched interval, its depth is 8
+        standard deviations of the entropy of noise or more, and the record is not shorter than the
+        dwell of the beam, if that is known: in a shorter record every target is cut, differently,
+        and the standard deviation does not hold. `most_m_s` is an eighth of
+        `grid_step_m_s` or, if the dwell of the beam is not known (`integration_s` of the radar), of
+        the step that belongs to the width of the minimum.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -156,30 +219,84 @@ def minimum_entropy_velocity(
     """
     lines = checked_samples(group.data, "minimum_entropy_velocity", "pulse, range", empty=False)
     group = RangeGroup(unit_level(lines), group.start, group.radar)
-    spectrum = beam_spectrum(group, doppler_hz)
+    spectrum, nominal = beam_spectrum(group, doppler_hz), group.radar.velocity_m_s
     weight = _weights(spectrum, doppler_hz, dwell_s)
-    blocks = _objective(spectrum, doppler_hz, weight)
-
-    def cost(velocity: Tensor) -> Tensor:
-        return blocks(velocity).sum(-1)
+    whole = _objective(spectrum, doppler_hz, weight)
+    fine = _fine(spectrum, doppler_hz, weight)
 
     full_step = grid_step_m_s(group.radar, float(group.radar.near_range_m), dwell_s)
-    step = min(full_step, reach_m_s / 2)
-    count = 2 * math.ceil(reach_m_s / step) + 1
-    start = torch.full(doppler_hz.shape, group.radar.velocity_m_s, dtype=torch.float64, device=doppler_hz.device)
-    coarse, costs = grid_minimum(cost, start, reach_m_s, count)
-    value, curvature = refine(cost, coarse, 2 * reach_m_s / (count - 1), tolerance_m_s)
-    value, _ = settle(value, group.radar.velocity_m_s)
+    start = torch.full(doppler_hz.shape, nominal, dtype=torch.float64, device=doppler_hz.device)
+    reach = min(reach_m_s, nominal / 2)
+    value, step, searched = _search(spectrum, doppler_hz, weight, start, reach, full_step)
+    costs = searched[0]
+    best = costs.argmin(-1)
+    grid = nominal + torch.linspace(-reach, reach, costs.shape[-1], dtype=torch.float64, device=doppler_hz.device)
+    value, _ = refine(lambda velocity: whole(velocity).sum(-1), value, step, max(tolerance_m_s, full_step / 200))
+    value, _ = settle(value, nominal)
     with torch.no_grad():
-        depth = costs.mean(-1) - costs.amin(-1)
-        width = (2 * depth / torch.where(curvature > 0, curvature, 1e-12)).clamp_min(0).sqrt()
+        half = min(full_step, nominal / 2) / 10
+        (low, low_share), (middle, share), (high, high_share) = (fine(value + side * half) for side in (-1, 0, 1))
+        curvature = (low - 2 * middle + high).sum((-2, -1)) / half**2
+        # without the energy that moves from one part to another, which changes no entropy by itself
+        level = middle.sum(-1, keepdim=True) / share.sum(-1, keepdim=True).clamp_min(1e-300)
+        slope = (high - low - level * (high_share - low_share)) / (2 * half)
+        # the step to the vertex of the parabola, at most to its ends
+        value = value - (_over(slope.sum((-2, -1)), curvature)).clamp(-half, half)
+        depth, width = _depth(lambda velocity: whole(velocity).sum(-1), value, curvature, min(full_step, nominal / 18))
         scatter = torch.maximum(
-            _scatter_std(blocks, value, curvature, max(tolerance_m_s, step / 50)),
-            _comb_std(spectrum, doppler_hz, weight, value, max(tolerance_m_s, step / 8)),
+            _over(slope.flatten(-2).square().sum(-1).sqrt(), curvature),
+            _comb_std(spectrum, doppler_hz, weight, value, half),
         )
-        std = torch.hypot(scatter, _REST_SHARE * width).clamp_max(1e6)
-        clear = (curvature > 0) & (depth > _LEAST_DEPTH * _noise_std(spectrum, weight)) & (width < full_step)
-    return value, std, costs, clear
+        rest = (_REST * width.square()).clamp_min(_REST_STEP * full_step**2) / nominal
+        std = torch.hypot(scatter, rest).clamp_max(1e6)
+        known = group.radar.integration_s
+        most = _MOST_WIDTHS * width if known is None else full_step / 8
+        inside = (best > 0) & (best < costs.shape[-1] - 1)
+        clear = inside & (curvature > 0) & (depth > _LEAST_DEPTH * _noise_std(spectrum, weight))
+        if known is not None and lines.shape[-2] < known * group.radar.prf_hz:
+            clear = torch.zeros_like(clear)
+    return VelocityMinimum(value, std, torch.as_tensor(most).to(std).expand(std.shape), clear, grid, costs)
+
+
+def _search(
+    spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, start: Tensor, reach: float, full_step: float
+) -> tuple[Tensor, float, list[Tensor]]:
+    """Best velocity of the whole band (...,), its step, and the costs of every grid (..., grid)."""
+    share, value, searched = min(1.0, math.sqrt(_GRID * full_step / reach)), start, []
+    while True:
+        blocks = _objective(_middle_rows(spectrum, share), doppler_hz, weight)
+        step = min(full_step / share**2, reach / 2)
+        count = 2 * math.ceil(reach / step - 1e-9) + 1
+        value, costs = grid_minimum(lambda velocity, f=blocks: f(velocity).sum(-1), value, reach, count)
+        searched.append(costs)
+        if share == 1:
+            return value, 2 * reach / (count - 1), searched
+        reach, share = 2 * step, min(1.0, 2 * share)
+
+
+def _middle_rows(spectrum: BeamSpectrum, share: float) -> BeamSpectrum:
+    """A share of the rows in the middle of the Doppler band, but at least 64."""
+    count = spectrum.data.shape[-2]
+    rows = min(count, max(64, round(share * count)))
+    part = slice((count - rows) // 2, (count - rows) // 2 + rows)
+    return replace(spectrum, data=spectrum.data[..., part, :], doppler_hz=spectrum.doppler_hz[..., part])
+
+
+def _depth(cost: Callable[[Tensor], Tensor], value: Tensor, curvature: Tensor, step: float) -> tuple[Tensor, Tensor]:
+    """Depth of the minimum in nats and its width in m/s, (...,) each."""
+    least, depth, width = cost(value), torch.zeros_like(value), torch.zeros_like(value)
+    for distance in _DISTANCES:
+        beside = 0.5 * (cost(value - distance * step) + cost(value + distance * step)) - least
+        wide = _over(2 * beside.clamp_min(0), curvature).sqrt()
+        taken = width <= 0 if distance == _DISTANCES[0] else width > _DISTANCES[0] * step / 2
+        depth, width = torch.where(taken, beside, depth), torch.where(taken, wide, width)
+    return depth, width
+
+
+def _over(value: Tensor, curvature: Tensor) -> Tensor:
+    """Quotient, 1e6 at most and where the curvature is not positive."""
+    good = curvature > 0
+    return torch.where(good, value / torch.where(good, curvature, 1), 1e6).clamp_max(1e6)
 
 
 def _noise_std(spectrum: BeamSpectrum, weight: Tensor) -> Tensor:
@@ -188,14 +305,6 @@ def _noise_std(spectrum: BeamSpectrum, weight: Tensor) -> Tensor:
     filled = min(1.0, radar.pulse.bandwidth_hz / radar.sampling_hz)  # neighbouring samples are alike
     pixels = filled * spectrum.data.shape[-2] * spectrum.data.shape[-1] / weight.shape[-1]
     return (_NOISE_ENTROPY / pixels * weight.square().sum(-1)).sqrt()
-
-
-def _scatter_std(blocks: Callable[[Tensor], Tensor], velocity: Tensor, curvature: Tensor, half: float) -> Tensor:
-    """Standard deviation (...,) in m/s from the slopes of eight parts at the minimum."""
-    slopes = (blocks(velocity + half) - blocks(velocity - half)) / (2 * half)
-    parts = torch.stack([part.sum(-1) for part in slopes.tensor_split(8, -1)], -1)
-    spread = parts.std(-1) * math.sqrt(parts.shape[-1])
-    return torch.where(curvature > 0, spread / torch.where(curvature > 0, curvature, 1), 1e6).clamp_max(1e6)
 
 
 def _comb_std(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, velocity: Tensor, half: float) -> Tensor:
@@ -211,8 +320,7 @@ def _comb_std(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, veloci
         values.append(torch.stack([part(velocity + step * half).sum(-1) for step in (-1, 0, 1)], -1))
     low, middle, high = torch.stack(values, -1).unbind(-2)
     curvature = (low - 2 * middle + high).mean(-1) / half**2
-    spread = ((high - low) / (2 * half)).std(-1) / math.sqrt(_COMBS)
-    return torch.where(curvature > 0, spread / torch.where(curvature > 0, curvature, 1), 1e6).clamp_max(1e6)
+    return _over(((high - low) / (2 * half)).std(-1) / math.sqrt(_COMBS), curvature)
 
 
 class EffectiveVelocity(Stage):
@@ -290,30 +398,24 @@ class EffectiveVelocity(Stage):
             exponentially with the standard deviation, to 1/e where an eighth of a cycle of phase
             remains at the ends of the aperture (an eighth of `grid_step_m_s`). `ok` is False where
             the standard deviation is larger, where the entropy is least at an end of the searched
-            interval, and where its minimum is not that of a focused image: see
-            `minimum_entropy_velocity`. info: grid_velocity_m_s, the velocities of the grid search,
-            shape (grid,); grid_entropy, their entropies in nats, shape (..., grid); and
-            group_start, the first range sample of the group of range cells used, shape (...,).
+            interval, where its minimum is not deep enough for a focused image, and where the record
+            is shorter than the dwell of the beam: see `minimum_entropy_velocity`. Clutter that
+            fills the Doppler band evenly has no image that is sharper than others, so that `ok` is
+            False. info: grid_velocity_m_s, the velocities of the first grid search, shape (grid,);
+            grid_entropy, their entropies in nats, shape (..., grid); and group_start, the first
+            range sample of the group of range cells used, shape (...,).
         """
         raw = signal.data.detach()
-        radar, doppler = self._focuser[0].radar, self._doppler(raw, doppler_hz)
         group, dwell = self.group(raw)
-        value, std, costs, clear = minimum_entropy_velocity(
-            group, doppler, dwell, self.reach_m_s, self.refine, self.tolerance_m_s
-        )
-        most = grid_step_m_s(radar, float(radar.near_range_m), dwell) / 8
-        best = costs.argmin(-1)
-        inside = (best > 0) & (best < costs.shape[-1] - 1)
-        grid = (
-            torch.linspace(-self.reach_m_s, self.reach_m_s, costs.shape[-1], dtype=torch.float64, device=raw.device)
-            + radar.velocity_m_s
+        found = minimum_entropy_velocity(
+            group, self._doppler(raw, doppler_hz), dwell, self.reach_m_s, self.refine, self.tolerance_m_s
         )
         return Estimate(
-            {"velocity_m_s": value},
-            torch.exp(-std / most),
-            inside & clear & (std < most),
-            {"velocity_m_s": std},
-            {"grid_velocity_m_s": grid, "grid_entropy": costs, "group_start": group.start},
+            {"velocity_m_s": found.velocity_m_s},
+            torch.exp(-found.std_m_s / found.most_m_s.clamp_min(1e-12)),
+            found.clear & (found.std_m_s < found.most_m_s),
+            {"velocity_m_s": found.std_m_s},
+            {"grid_velocity_m_s": found.grid_m_s, "grid_entropy": found.grid_entropy, "group_start": group.start},
         )
 
     @torch.no_grad()
