@@ -43,6 +43,7 @@ _SAMPLES_EACH = 1000
 # brightest alone bring the motion near, and the rounds between let it converge
 _SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
 _BLOCK_BYTES = 1 << 19  # phasors of a block of pulses that fit into the cache
+_GROUP = 16  # pulses over which the phase of an echo changes by a few turns
 _APART = 0.5  # Doppler and range cells within which scatterers are not resolved
 _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
 # added to the diagonal, relative: it keeps the curvature positive definite; the steps, which follow
@@ -259,15 +260,17 @@ def _new_scatterers(
 
 
 def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
-    """exp(2j pi left @ right), (trial, pulse, scatterer), for a short block of pulses.
+    """exp(2j pi left @ right), (trial, pulse, scatterer), for a block of pulses.
 
-    left: float64 (trial, pulse, 2) turns per unit of right, (trial, 2, scatterer). The first pulse
-    is computed in float64, the differences from it, a few turns, in the working precision. Twice as
-    fast as `core.unit_phasor` of every element.
+    left: float64 (trial, pulse, 2) turns per unit of right, (trial, 2, scatterer). One pulse of
+    every few is computed in float64, the differences of its neighbours from it, a few turns, in the
+    working precision. Faster than `core.unit_phasor` of every element.
     """
-    working = real_dtype(dtype)
-    begin = reduced_turns(left[:, :1] @ right).to(working)
-    turns = torch.baddbmm(begin, (left - left[:, :1]).to(working), right.to(working))
+    working, pulses = real_dtype(dtype), left.shape[1]
+    near = torch.arange(pulses, device=left.device) // _GROUP * _GROUP + _GROUP // 2
+    near = near.clamp_max(pulses - 1)
+    begin = reduced_turns(left[:, near[::_GROUP]] @ right).to(working).repeat_interleave(_GROUP, 1)[:, :pulses]
+    turns = torch.baddbmm(begin, (left - left[:, near]).to(working), right.to(working))
     angle = (turns - turns.round()) * (2 * math.pi)
     return torch.complex(torch.cos(angle), torch.sin(angle))
 
@@ -341,18 +344,21 @@ class _Step:
             (found.amplitude[..., None] * envelope).conj().to(data.dtype).resolve_conj(),
             envelope.mH.to(data.dtype).resolve_conj(),
         )
-        real_bases = bases.to(data.real.dtype)
+        # the bases are almost linearly dependent: with orthonormal ones the small part that shows
+        # the rotation is not lost in rounding
+        orthonormal, mixed = torch.linalg.qr(bases.mT)
+        orthonormal = orthonormal.mT.to(data.real.dtype)
         residual = torch.empty_like(data)
-        moments = data.real.new_zeros(data.shape[0], bases.shape[1], 2 * found.cell.shape[-1])
+        moments = bases.new_zeros(data.shape[0], bases.shape[1], 2 * found.cell.shape[-1])
         shift = data.new_zeros(envelope.shape)
         for some, part in _blocks(data, count):
             turned_back = _phasors(back_turns[some, part], right[some], data.dtype)
             rest = (data[some, part] - (turned_back @ weighted[some]).conj()) * present[some, part, None]
             residual[some, part] = rest
             projected = torch.view_as_real((rest @ back[some]) * turned_back).flatten(-2)
-            moments[some] += real_bases[some, :, part] @ projected
+            moments[some] += orthonormal[some, :, part] @ projected
             shift[some] += turned_back.mT @ rest
-        moments = torch.view_as_complex(moments.unflatten(-1, (-1, 2)).to(torch.float64))
+        moments = torch.view_as_complex((mixed.mT @ moments).unflatten(-1, (-1, 2)))
         shift = shift.to(torch.complex128)
         shifts = (shift * envelopes.slope.conj()).sum(-1)
         share = (found.amplitude.conj() * (shift * envelopes.difference.conj()).sum(-1)).real.sum(-1)
@@ -532,25 +538,27 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Factor:
-    """A symmetric matrix (trial, n, n), factorised.
+    """Symmetric matrices (trial, n, n), factorised.
 
-    factor: its Cholesky factor, or None where rounding has made the matrix indefinite.
+    factor: their Cholesky factors. failed: True for matrices that rounding has made indefinite.
     """
 
     matrix: Tensor
-    factor: Tensor | None
+    factor: Tensor
+    failed: Tensor
 
     @staticmethod
     def of(matrix: Tensor) -> _Factor:
-        """Factorise a matrix."""
-        factor, failed = torch.linalg.cholesky_ex(matrix)
-        return _Factor(matrix, None if bool(failed.any()) else factor)
+        """Factorise matrices."""
+        factor, info = torch.linalg.cholesky_ex(matrix)
+        return _Factor(matrix, factor, info != 0)
 
     def solve(self, right: Tensor) -> Tensor:
-        """Solution for right-hand sides."""
-        return (
-            torch.linalg.solve(self.matrix, right) if self.factor is None else torch.cholesky_solve(right, self.factor)
-        )
+        """Solutions for right-hand sides; how one is found does not depend on the other trials."""
+        solution = torch.cholesky_solve(right, self.factor)
+        if bool(self.failed.any()):
+            solution[self.failed] = torch.linalg.solve(self.matrix[self.failed], right[self.failed])
+        return solution
 
 
 def _covariance(normal: Tensor) -> Tensor:
