@@ -251,7 +251,7 @@ def test_gradient_and_curvature_of_a_step_are_those_of_the_model(gaps: bool) -> 
     flat = jacobian.flatten(0, 2)
     local, (cross, shared) = step._local(), step._shared(slopes)
     local = local[0] - torch.diag(local[0].diagonal() * _RIDGE / (1 + _RIDGE))
-    mine = torch.cat([torch.cat([local, cross[0]], 1), torch.cat([cross[0].mT, shared[0]], 1)])
+    mine = torch.cat([torch.cat([local, cross[0]], 1), torch.cat([cross[0].mT, shared[0].sum(0)], 1)])
     size = flat.square().sum(0).sqrt()
     torch.testing.assert_close(mine / size / size[:, None], flat.mT @ flat / size / size[:, None], rtol=0, atol=2e-3)
 

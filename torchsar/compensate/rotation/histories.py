@@ -224,26 +224,27 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tenso
     # few scatterers cannot disagree: what the samples of each show counts as well
     inverse = inverted(normal)[0]
     own = lag * inverse @ torch.einsum("bpij,bpkj->bik", rest, rest) @ inverse
-    return change, sandwich(normal, rest.sum(-1), used.sum(-1)) + own
+    pull, count = rest.sum(-1), used.sum(-1)
+    free = count / (count - normal.shape[-1]).clamp_min(_LEAST_FREE)
+    return change, sandwich(normal, pull.mT @ pull) * free[:, None, None] + own
 
 
-def sandwich(normal: Tensor, pull: Tensor, count: Tensor) -> Tensor:
-    """Compute a covariance from the differences between independent contributions to a fit.
+def sandwich(normal: Tensor, pulls: Tensor) -> Tensor:
+    """Compute a covariance from the differences between contributions to a fit.
 
     The mean square of the contributions to the gradient is measured and not derived from the noise,
     so that errors of the model count (the sandwich covariance of least squares).
 
     Args:
         normal: Normal matrices, shape (trial, n, n).
-        pull: Gradient that each scatterer contributes at the solution, shape (trial, scatterer, n).
-        count: Effective number of scatterers, shape (trial,).
+        pulls: Sums of the products of the gradients that two scatterers contribute at the solution,
+            over all pairs that are not independent, shape (trial, n, n).
 
     Returns:
         The covariance, shape (trial, n, n); zero along directions that the data do not determine.
     """
-    free = count / (count - normal.shape[-1]).clamp_min(_LEAST_FREE)
     inverse = inverted(normal)[0]
-    return inverse @ (pull.mT @ pull) @ inverse * free[:, None, None]
+    return inverse @ pulls @ inverse
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:

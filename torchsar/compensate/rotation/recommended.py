@@ -34,6 +34,7 @@ _BLOCKS = 8
 # last step of a fit that has converged, in standard deviations or as a phase of the scatterers in
 # rad, found by trial
 _REST_STDS, _REST_RAD = 3.0, 0.02
+_TO_GO = 0.5  # distance that is left after the last step over that step, found by trial
 _WRONG_FOCUS = 4.0  # phase error over `MOST_PHASE_ERROR_RAD` of a wrong focus, found by trial
 _HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
 
@@ -310,9 +311,10 @@ def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> 
     present = (rows != 0).any(-1).sum(-1)
     energy = fit.scatterers.amplitude.abs().square().sum(-1) * present
     explained = energy / _energy(rows, fit.noise, present)
-    converged = (fit.last_step <= _REST_STDS) | (
-        fit.last_step * (fit.noise / (2 * energy.clamp_min(torch.finfo(torch.float64).tiny))).sqrt() <= _REST_RAD
-    )
+    tiny = torch.finfo(torch.float64).tiny
+    predicted = fit.covariance.diagonal(dim1=-2, dim2=-1) * fit.noise[:, None]
+    step = (fit.change.abs() / predicted.clamp_min(tiny).sqrt()).amax(-1)
+    converged = (step <= _REST_STDS) | (step * (fit.noise / (2 * energy.clamp_min(tiny))).sqrt() <= _REST_RAD)
     quality = settle(explained.clamp(0, 1), 0.0)[0]
     std = _standard_deviations(fit, free_centre)
     # histories are less accurate than the fit: they only exclude a wrong focus
@@ -339,7 +341,12 @@ def _standard_deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
     known = (fit.scatterers.amplitude != 0).any(-1)
     covariance = fit.covariance * fit.noise[:, None, None]
     seen, predicted = (c.diagonal(dim1=-2, dim2=-1) for c in (fit.disagreement, covariance))
-    wider = (seen / predicted.clamp_min(torch.finfo(torch.float64).tiny)).clamp_min(1).sqrt()
+    # what the scatterers would differ by if the fit did not take up a part of it as well
+    taken_up = (predicted.shape[-1] / fit.scatterers.effective_number().clamp_min(1)).clamp_max(1)[:, None]
+    wider = (taken_up + (seen + fit.change.square()) / predicted.clamp_min(torch.finfo(torch.float64).tiny)).clamp_min(
+        1
+    )
+    wider = wider.sqrt()
     covariance = torch.where(known[:, None, None], covariance * wider[:, :, None] * wider[:, None], math.inf)
     k = covariance.diagonal(dim1=-2, dim2=-1)[:, :order].clamp_min(0).sqrt()
     w = torch.where(motion.w > 0, motion.w, 0)

@@ -35,7 +35,7 @@ _OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of p
 # a new scatterer has at least this share of the largest amplitude within so many lines and range
 # cells, found by trial: side lobes are excluded until their scatterer is subtracted
 _SHARE, _LINES, _CELLS = 0.5, 24, 2
-MOST, ROUNDS = 800, 8  # largest number of scatterers, number of steps; accuracy against time
+MOST, ROUNDS = 800, 12  # largest number of scatterers, number of steps; accuracy against time
 _FEWEST = 128  # default number of scatterers on small data, found by trial
 # samples of the data per scatterer, so that a fit costs as much as about thirty images
 _SAMPLES_EACH = 1000
@@ -44,6 +44,8 @@ _SAMPLES_EACH = 1000
 _SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
 _BLOCK_BYTES = 1 << 19  # phasors of a block of pulses that fit into the cache
 _GROUP = 16  # pulses over which the phase of an echo changes by a few turns
+# Doppler and range cells over which scatterers share errors of the model, found by trial
+_SHARED_CELLS = 2.0
 _APART = 0.5  # Doppler and range cells within which scatterers are not resolved
 _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
 # added to the diagonal, relative: it keeps the curvature positive definite; the steps, which follow
@@ -122,6 +124,29 @@ class Scatterers:
         beside = (near & (level[:, None] > level[:, :, None])).any(-1)
         return replace(self, amplitude=torch.where(beside, 0, self.amplitude))
 
+    def alike(self) -> Tensor:
+        """Compute how far the errors of scatterers depend on each other.
+
+        Scatterers a few resolution cells apart share what the model does not describe.
+
+        Returns:
+            Weights from 0 (independent) to 1, shape (trial, scatterer, scatterer), float64; 0 where
+            there is no scatterer.
+        """
+        apart = sum((x[:, :, None] - x[:, None]).square() for x in (self.cell, self.row))
+        used = (self.amplitude != 0).double()
+        return torch.exp(-apart / (2 * _SHARED_CELLS**2)) * used[:, :, None] * used[:, None]
+
+    def effective_number(self) -> Tensor:
+        """Count the independent scatterers over which the energy is spread.
+
+        Returns:
+            The number, shape (trial,), float64; 0 without scatterers.
+        """
+        power = self.amplitude.abs().square()
+        spread = (power * (self.alike() @ power[..., None])[..., 0]).sum(-1)
+        return power.sum(-1).square() / torch.where(spread > 0, spread, 1)
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -139,12 +164,13 @@ class Fit:
             one.
         disagreement: Covariance of the same parameters as the differences between scatterers show
             it, in absolute units, same shape. Errors of the model, such as several scatterers in
-            one resolution cell, add to it.
+            one resolution cell, add to it. It is too small by the share of the differences that the
+            fit takes up: the number of parameters over the number of scatterers.
         noise: Noise power per sample, shape (trial,).
         steps: Number of steps taken, shape (trial,).
         settled: True for trials that have ended, shape (trial,), bool.
-        last_step: Largest change of a parameter of the rotation in the last step, in units of its
-            standard deviation, shape (trial,).
+        change: Change of the same parameters in the last step, shape (trial, parameter); infinite
+            where the last step was not possible.
     """
 
     motion: Motion
@@ -155,7 +181,7 @@ class Fit:
     noise: Tensor
     steps: Tensor
     settled: Tensor
-    last_step: Tensor
+    change: Tensor
 
 
 def fit_scatterers(
@@ -194,7 +220,8 @@ def fit_scatterers(
     covariance = torch.zeros(trials, unknowns.size, unknowns.size, dtype=torch.float64, device=device)
     never = torch.zeros(trials, dtype=torch.bool, device=device)
     response = RangeResponse.of_unknown_share(trials, sampling.cells, device)
-    fit = Fit(start, Scatterers.none(data), response, covariance, covariance, noise, never.long(), never, noise)
+    still = covariance.new_zeros(trials, unknowns.size)
+    fit = Fit(start, Scatterers.none(data), response, covariance, covariance, noise, never.long(), never, still)
     residual, step = data, None
     for iteration in range(rounds + 1):
         new, noise = None, fit.noise
@@ -421,11 +448,17 @@ class _Step:
         moved = (found.amplitude.conj() * self.shift).real
         own = torch.cat([turned[..., 0].real, turned[..., 0].imag, -2 * math.pi * turned[..., 1].imag, moved], -1)
         joint = factor.solve(torch.cat([cross, own[..., None]], -1))
-        schur = shared - cross.mT @ joint[..., :-1]
-        # gradient of each scatterer, without the part that its own unknowns take up
-        taken_up = (joint[..., :-1] * own[..., None]).unflatten(1, (4, -1)).sum(1)
-        pull = torch.einsum("bpin,bpn->bpi", slopes, turned.imag) - taken_up
-        change = solved(schur, pull.sum(1))
+        # curvature and gradient of each scatterer, without what the unknowns of scatterers take up
+        taken_up = torch.einsum(
+            "brpi,brpj->bpij",
+            joint[..., :-1].unflatten(1, (4, -1)),
+            torch.cat([cross, own[..., None]], -1).unflatten(1, (4, -1)),
+        )
+        curvature, pull = shared - taken_up[..., :-1], torch.einsum("bpin,bpn->bpi", slopes, turned.imag)
+        pull = pull - taken_up[..., -1]
+        normal = curvature.sum(1)
+        change = solved(normal, pull.sum(1))
+        rest = pull - torch.einsum("bpij,bj->bpi", curvature, change)
         grow, turn, line, row = (
             (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
         )
@@ -435,8 +468,8 @@ class _Step:
             self._moved(change),
             Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), position),
             change,
-            _covariance(schur),
-            sandwich(schur, pull, _effective_number(found.amplitude)),
+            _covariance(normal),
+            sandwich(normal, rest.mT @ found.alike() @ rest),
         )
 
     def _local(self) -> Tensor:
@@ -488,7 +521,8 @@ class _Step:
     def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
         """Curvature between scatterers and common unknowns, and of the common unknowns.
 
-        (trial, 4 scatterer, unknown) and (trial, unknown, unknown).
+        (trial, 4 scatterer, unknown) and, as sums over the pairs of each scatterer, (trial,
+        scatterer, unknown, unknown).
         """
         pairs = self.pairs
         overlap, _, back, _ = self._overlaps()
@@ -513,7 +547,7 @@ class _Step:
                 for m in shared
             ]
         ).sum(0)
-        return cross, pairs.per_trial(both)
+        return cross, pairs.per_scatterer(both.flatten(1)).unflatten(-1, both.shape[1:])
 
     def _moved(self, change: Tensor) -> Motion:
         """The motion after a step of the common unknowns."""
@@ -567,13 +601,6 @@ def _covariance(normal: Tensor) -> Tensor:
     return inverse / 2 + torch.diag_embed(torch.where(lost, math.inf, 0.0))
 
 
-def _effective_number(amplitude: Tensor) -> Tensor:
-    """Number of scatterers over which the energy is spread, (trial,)."""
-    power = amplitude.abs().square()
-    tiny = torch.finfo(torch.float64).tiny
-    return power.sum(-1).square() / power.square().sum(-1).clamp_min(tiny)
-
-
 def _after_step(
     fit: Fit,
     taken: _Taken,
@@ -594,7 +621,7 @@ def _after_step(
         & (least_rate(motion.k, sampling.duration_s) > _LEAST_RATE)
     )
     std = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt() * noise.sqrt()[:, None]
-    step = torch.where(valid, (change.abs() / std.clamp_min(torch.finfo(torch.float64).tiny)).amax(-1), math.inf)
+    step = (change.abs() / std.clamp_min(torch.finfo(torch.float64).tiny)).amax(-1)
     active, old = ~fit.settled, fit.scatterers
     pick = (active & valid)[:, None]
     pairs = ((found.amplitude, old.amplitude), (found.cell, old.cell), (found.row, old.row))
@@ -606,6 +633,6 @@ def _after_step(
         disagreement=torch.where(active[:, None, None], disagreement, fit.disagreement),
         noise=torch.where(active, noise, fit.noise),
         steps=fit.steps + active,
-        settled=fit.settled | ((step <= _SETTLED) & search_over),
-        last_step=torch.where(active, step, fit.last_step),
+        settled=fit.settled | (valid & (step <= _SETTLED) & search_over),
+        change=torch.where(active[:, None], torch.where(valid[:, None], change, math.inf), fit.change),
     )
