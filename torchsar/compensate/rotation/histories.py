@@ -145,10 +145,10 @@ def _fitted_to_peaks(
     power = image.abs().square()
     noise = noise_power(power)
     if strict:
-        speckle = power.median(1, keepdim=True).values / math.log(2) * threshold(power)
+        speckle = power.median(1, keepdim=True).values / math.log(2) * threshold(power[0].numel())
         floor = torch.maximum(speckle, _FAINTEST * power.amax((-2, -1), keepdim=True))
         power = torch.where(power > floor, power, power * 1e-30)
-    peaks = find_peaks(power, noise * threshold(power), count, _ISOLATED, 2 * half_cells, 1)
+    peaks = find_peaks(power, noise * threshold(power[0].numel()), count, _ISOLATED, 2 * half_cells, 1)
     cells = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING
     history, u = _histories(image, peaks, half_cells)
     bases = _bases(motion, sampling, cells, sampling.range_m(peaks.cell), u, free_centre)

@@ -33,8 +33,8 @@ _ENTROPY_ROUNDING = 1e-3  # tolerance in nats of a comparison of entropies in fl
 _BLOCKS = 8
 # last step of a fit that has converged, in standard deviations or as a phase of the scatterers in
 # rad, found by trial
-_REST_STDS, _REST_RAD = 3.0, 0.02
-_TO_GO = 0.5  # distance that is left after the last step over that step, found by trial
+_REST_STDS, _REST_RAD = 3.0, 0.01
+_TO_GO = 0.25  # distance that is left after the last step over that step, found by trial
 _WRONG_FOCUS = 4.0  # phase error over `MOST_PHASE_ERROR_RAD` of a wrong focus, found by trial
 _HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
 
@@ -89,7 +89,8 @@ def uneven_rotation(
         scatterers are found, they explain 40 % of the energy or more, their phase histories agree
         over the whole aperture, the entropy is not higher than without compensation, and the fit
         has converged. `ok` is True where, in addition, the
-        standard deviation of the rate is below 5 %. Where only `ok` is False, the cross-range scale
+        standard deviation of the rate is below 5 %, also without the scatterers that may be peaks
+        of the noise. Where only `ok` is False, the cross-range scale
         of the image is unknown. Further info: scatterers (their number), noise_power, steps,
         entropy_nats, uncompensated_entropy_nats.
 
@@ -321,7 +322,8 @@ def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> 
     error, _ = warp_phase_error(rows, sampling, fit.motion, checks=0)
     confirmed = (count >= LEAST_SCATTERERS) & (error < _WRONG_FOCUS * MOST_PHASE_ERROR_RAD)
     focused = found.ok & confirmed & (quality >= _LEAST_EXPLAINED) & converged
-    scaled = (std["omega_rad_s"] < MOST_RATE_ERROR * fit.motion.omega_rad_s) & (fit.motion.w > 0)
+    certain = fit.certain[:, fit.motion.k.shape[-1]].clamp_min(tiny).sqrt()
+    scaled = (std["omega_rad_s"] < MOST_RATE_ERROR * fit.motion.omega_rad_s * certain) & (fit.motion.w > 0)
     info = {**found.info, "focused": focused, "scatterers": count, "noise_power": fit.noise, "steps": fit.steps}
     return Estimate(found.value, quality, focused & scaled, std, info)
 

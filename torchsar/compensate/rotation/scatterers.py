@@ -23,6 +23,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.compensate.rotation.couplings import Pairs
 from torchsar.compensate.rotation.histories import inverted, sandwich, solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
@@ -47,10 +48,9 @@ _GROUP = 16  # pulses over which the phase of an echo changes by a few turns
 # Doppler and range cells over which scatterers share errors of the model, found by trial
 _SHARED_CELLS = 2.0
 _APART = 0.5  # Doppler and range cells within which scatterers are not resolved
+_BRIGHT = 0.1  # share of the largest amplitude from which a scatterer limits a step, found by trial
 _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
-# added to the diagonal, relative: it keeps the curvature positive definite; the steps, which follow
-# from the exact residual, converge all the same
-_RIDGE = 1e-3
+_RIDGE = 1e-9  # added to the diagonal, relative: above the rounding of a matrix of float64
 _LEAST_RATE = 0.05  # least rate over that at the start; slower motions would nearly reverse
 # standard deviations by which the phase of a scatterer may differ before it loses weight, found by
 # trial
@@ -58,10 +58,12 @@ _AGREES = 5.0
 # power of errors of the model over that of the brightest scatterer, found by trial: weaker noise
 # does not limit the fit, and residuals below it are no scatterers and no evidence against one
 _MODEL = 1e-4
+# power over the detection threshold beyond which a scatterer cannot be a peak of the noise
+_CERTAIN = 2.0
 _SETTLED = 0.2  # steps of the motion below this share of its standard deviation end a trial
 
 
-_Taken: TypeAlias = "tuple[Motion, Scatterers, Tensor, Tensor, Tensor]"
+_Taken: TypeAlias = "tuple[Motion, Scatterers, Tensor, Tensor, Tensor, Tensor]"
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ class Scatterers:
         """
         power = self.amplitude.abs().square()
         spread = (power * (self.alike() @ power[..., None])[..., 0]).sum(-1)
-        return power.sum(-1).square() / torch.where(spread > 0, spread, 1)
+        return power.sum(-1).square() / or_one(spread)
 
 
 @dataclass(frozen=True)
@@ -166,6 +168,8 @@ class Fit:
             it, in absolute units, same shape. Errors of the model, such as several scatterers in
             one resolution cell, add to it. It is too small by the share of the differences that the
             fit takes up: the number of parameters over the number of scatterers.
+        certain: Share of what the data show about each of these parameters that comes from
+            scatterers too bright to be peaks of the noise, shape (trial, parameter).
         noise: Noise power per sample, shape (trial,).
         steps: Number of steps taken, shape (trial,).
         settled: True for trials that have ended, shape (trial,), bool.
@@ -178,6 +182,7 @@ class Fit:
     response: RangeResponse
     covariance: Tensor
     disagreement: Tensor
+    certain: Tensor
     noise: Tensor
     steps: Tensor
     settled: Tensor
@@ -220,8 +225,9 @@ def fit_scatterers(
     covariance = torch.zeros(trials, unknowns.size, unknowns.size, dtype=torch.float64, device=device)
     never = torch.zeros(trials, dtype=torch.bool, device=device)
     response = RangeResponse.of_unknown_share(trials, sampling.cells, device)
-    still = covariance.new_zeros(trials, unknowns.size)
-    fit = Fit(start, Scatterers.none(data), response, covariance, covariance, noise, never.long(), never, still)
+    zero = covariance.new_zeros(trials, unknowns.size)
+    none = Scatterers.none(data)
+    fit = Fit(start, none, response, covariance, covariance, zero, noise, never.long(), never, zero)
     residual, step = data, None
     for iteration in range(rounds + 1):
         new, noise = None, fit.noise
@@ -276,9 +282,9 @@ def _new_scatterers(
     floor = torch.maximum(noise_power(power).double(), _MODEL * brightest.amax(-1))
     noise = torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
     known = (fit.scatterers.amplitude != 0).sum(-1)
-    peaks = find_peaks(power, (floor * threshold(power)).to(power.dtype), bound, _SHARE, _LINES, _CELLS).first(
-        bound - known
-    )
+    peaks = find_peaks(
+        power, (floor * threshold(power[0].numel())).to(power.dtype), bound, _SHARE, _LINES, _CELLS
+    ).first(bound - known)
     value = torch.gather(image.flatten(1), 1, peaks.line * image.shape[2] + peaks.cell).to(
         torch.complex128
     ) / math.sqrt(sampling.pulses)
@@ -414,7 +420,8 @@ class _Step:
         Returns:
             The rotation and the scatterers after the step; the change of the parameters of the
             rotation, shape (trial, unknown); their covariance per unit noise power, and that from
-            the differences between scatterers, shape (trial, unknown, unknown) each.
+            the differences between scatterers, shape (trial, unknown, unknown) each; and the share
+            of each scatterer in what the data show about them, shape (trial, scatterer, unknown).
         """
         slopes, factor = self._slopes(), _Factor.of(self._local())
         found = self._solved(slopes, factor)
@@ -457,8 +464,10 @@ class _Step:
         curvature, pull = shared - taken_up[..., :-1], torch.einsum("bpin,bpn->bpi", slopes, turned.imag)
         pull = pull - taken_up[..., -1]
         normal = curvature.sum(1)
-        change = solved(normal, pull.sum(1))
+        change, inverse = solved(normal, pull.sum(1)), inverted(normal)[0]
+        informed = torch.einsum("bpij,bin,bjn->bpn", curvature, inverse, inverse)
         rest = pull - torch.einsum("bpij,bj->bpi", curvature, change)
+        change = change * self._within_reach((joint[..., :-1] @ change[..., None])[..., 0])[:, None]
         grow, turn, line, row = (
             (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
         )
@@ -470,7 +479,17 @@ class _Step:
             change,
             _covariance(normal),
             sandwich(normal, rest.mT @ found.alike() @ rest),
+            informed / or_one(informed.sum(1, keepdim=True)),
         )
+
+    def _within_reach(self, moved: Tensor) -> Tensor:
+        """Factor (trial,) of the common step that limits the Doppler by which it moves scatterers.
+
+        moved: change (trial, 4 scatterer) of the scatterers' unknowns that belongs to the step.
+        """
+        level, line = self.found.amplitude.abs(), moved.unflatten(-1, (4, -1))[:, 2].abs()
+        bright = level > _BRIGHT * level.amax(-1, keepdim=True)
+        return (_STEP / or_one(torch.where(bright, line, 0).amax(-1))).clamp_max(1)
 
     def _local(self) -> Tensor:
         """Gauss-Newton curvature of the scatterers' unknowns, (trial, 4 scatterer, 4 scatterer).
@@ -614,7 +633,9 @@ def _after_step(
     Trials that have ended, and steps to a motion that reverses its direction, leave the fit
     unchanged.
     """
-    motion, found, change, covariance, disagreement = taken
+    motion, found, change, covariance, disagreement, shares = taken
+    least = _CERTAIN * threshold(_OVERSAMPLING * sampling.pulses * sampling.cells) * noise / sampling.pulses
+    certain = (shares * (found.amplitude.abs().square() > least[:, None])[..., None]).sum(1)
     valid = (
         torch.isfinite(change).all(-1)
         & motion.possible(sampling)
@@ -631,6 +652,7 @@ def _after_step(
         response=response.where(active & valid, fit.response),
         covariance=torch.where(active[:, None, None], covariance, fit.covariance),
         disagreement=torch.where(active[:, None, None], disagreement, fit.disagreement),
+        certain=torch.where(active[:, None], certain, fit.certain),
         noise=torch.where(active, noise, fit.noise),
         steps=fit.steps + active,
         settled=fit.settled | (valid & (step <= _SETTLED) & search_over),
