@@ -61,6 +61,7 @@ def direct(snr_db: float, count: int = 30, row: bool = False, lit: float = 1.0) 
         data = []
         for i in range(trials):
             x, y, amplitude = points(seed + i, count)
+            x = x * (WIDTH_M / 2 / x.abs().max())  # targets reach the edge, where errors are judged
             clean = echo(x, 0.0 * y if row else y, amplitude)
             clean = clean * (torch.arange(PULSES) < lit * PULSES)[:, None]
             data.append(clean + noise_std(clean, snr_db) * noise(seed + i, *clean.shape))

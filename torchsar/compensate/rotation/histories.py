@@ -37,9 +37,9 @@ _ROBUST_ROUNDS = 3  # reweighted fits, found by trial: enough to exclude outlier
 # eigenvalue of a normal matrix of unit diagonal below which its direction is not determined: above
 # the rounding of float64, below any real information
 _NO_INFORMATION = 1e-7
-# largest phase error, in rad rms, of a scatterer at the edge of the target: its double then still
-# has a Strehl ratio of 0.8, the convention of Marechal
-MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8)) / 2
+# largest phase error, in rad rms, of a scatterer at the edge of the target: it then still has a
+# Strehl ratio of 0.8, the convention of Marechal
+MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8))
 # power over that of the brightest pixel below which side lobes are to be expected more than 24
 # cells away
 _FAINTEST = 1e-3
@@ -89,10 +89,10 @@ def warp_phase_error(data: Tensor, sampling: Sampling, motion: Motion, checks: i
     """Measure how well the relative derivatives of the rotation rate of a rotation fit the data.
 
     The rotation is refined by the histories of bright scatterers. They show by how much the
-    derivatives k1, k2, ... should change, and by how much the histories disagree about it. Both
-    together are given as the phase error that they cause to the scatterer farthest from zero
-    Doppler among those used. A constant phase and a phase that is linear in the warped time only
-    displace a scatterer and are left out.
+    derivatives k1, k2, ... should change, and by how much the histories disagree about it. The
+    change plus two standard deviations are given as the phase error that they cause to the
+    scatterer farthest from zero Doppler among those used. A constant phase and a phase that is
+    linear in the warped time only displace a scatterer and are left out.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
@@ -118,9 +118,9 @@ def warp_phase_error(data: Tensor, sampling: Sampling, motion: Motion, checks: i
     curves = warped.slopes - (warped.slopes @ line.mT) @ line
     size = curves @ curves.mT / sampling.pulses
     k, spread = refined.k - motion.k + change[:, :order], covariance[:, :order, :order]
-    error = torch.einsum("bi,bij,bj->b", k, size, k) + (size * spread).sum((-2, -1))
+    moved, unsure = torch.einsum("bi,bij,bj->b", k, size, k), (size * spread).sum((-2, -1))
     edge = 2 * math.pi * torch.where(used, cells.abs(), 0).amax(-1)
-    error = torch.nan_to_num(edge * error.clamp_min(0).sqrt(), nan=math.inf)
+    error = torch.nan_to_num(edge * (moved.clamp_min(0).sqrt() + 2 * unsure.clamp_min(0).sqrt()), nan=math.inf)
     seen = (count >= LEAST_SCATTERERS) & (lit > _LEAST_LIT) & (edge > 2 * math.pi)
     return torch.where(seen, error, math.inf), count
 

@@ -35,7 +35,7 @@ _BLOCKS = 8
 # rad, found by trial
 _REST_STDS, _REST_RAD = 3.0, 0.01
 _TO_GO = 0.25  # distance that is left after the last step over that step, found by trial
-_WRONG_FOCUS = 4.0  # phase error over `MOST_PHASE_ERROR_RAD` of a wrong focus, found by trial
+_WRONG_FOCUS = 2.0  # phase error over `MOST_PHASE_ERROR_RAD` of a wrong focus, found by trial
 _HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
 
 Part = Callable[[Tensor, Sampling, Tensor | None], Estimate]
@@ -141,9 +141,9 @@ def coarse_rotation(
         standard deviations. quality is the relative decrease of exp(entropy) of the image due to
         the compensation. `ok` is True where the entropy is not higher than without compensation and
         the phase histories of at least 3 bright scatterers confirm k1, k2, ...: the phase error
-        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler is below
-        0.24 rad rms, so that its double still has a Strehl ratio of 0.8. `ok` does not refer to
-        `omega_rad_s` and `yc_m`.
+        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler, plus
+        two of its standard deviations, is below 0.47 rad rms, a Strehl ratio of 0.8. `ok` does not
+        refer to `omega_rad_s` and `yc_m`.
 
     Raises:
         TypeError: If the data are not complex.
@@ -192,9 +192,9 @@ def phase_fit_rotation(
         standard deviations. quality is the relative decrease of exp(entropy) of the image due to
         the compensation. `ok` is True where the entropy is not higher than without compensation and
         the phase histories of at least 3 bright scatterers confirm k1, k2, ...: the phase error
-        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler is below
-        0.24 rad rms, so that its double still has a Strehl ratio of 0.8. `ok` does not refer to
-        `omega_rad_s` and `yc_m`.
+        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler, plus
+        two of its standard deviations, is below 0.47 rad rms, a Strehl ratio of 0.8. `ok` does not
+        refer to `omega_rad_s` and `yc_m`.
 
     Raises:
         TypeError: If the data are not complex.

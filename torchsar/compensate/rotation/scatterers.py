@@ -135,9 +135,9 @@ class Scatterers:
             Weights from 0 (independent) to 1, shape (trial, scatterer, scatterer), float64; 0 where
             there is no scatterer.
         """
-        apart = sum((x[:, :, None] - x[:, None]).square() for x in (self.cell, self.row))
+        lines, rows = ((x[:, :, None] - x[:, None]).square() for x in (self.cell, self.row))
         used = (self.amplitude != 0).double()
-        return torch.exp(-apart / (2 * _SHARED_CELLS**2)) * used[:, :, None] * used[:, None]
+        return torch.exp(-(lines + rows) / (2 * _SHARED_CELLS**2)) * used[:, :, None] * used[:, None]
 
     def effective_number(self) -> Tensor:
         """Count the independent scatterers over which the energy is spread.
