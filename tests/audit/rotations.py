@@ -26,6 +26,7 @@ from torchsar.compensate import (
     UnevenRotation,
 )
 from torchsar.core import Alternate, Draws, Signal, Turn
+from torchsar.core.warp import warp
 from torchsar.echo import simulate_turntable
 from torchsar.metrics import phase_rmse
 from torchsar.radar import InverseRadar
@@ -60,6 +61,7 @@ def direct(snr_db: float, count: int = 30, row: bool = False, lit: float = 1.0) 
         data = []
         for i in range(trials):
             x, y, amplitude = points(seed + i, count)
+            x = x * (WIDTH_M / 2 / x.abs().max())  # targets reach the edge, where errors are judged
             clean = echo(x, 0.0 * y if row else y, amplitude)
             clean = clean * (torch.arange(PULSES) < lit * PULSES)[:, None]
             data.append(clean + noise_std(clean, snr_db) * noise(seed + i, *clean.shape))
@@ -84,8 +86,10 @@ def satellite(snr_db: float, phases: bool = False) -> Callable[[int, int], Batch
             start_phase=[UniformStartPhase()] if phases else [],
         )
         recording, truth = simulate_turntable(RADAR, world, PULSES, BINS, Draws(seed, trials=range(trials)))
-        more = {"phase_rad": truth.values["phase_rad"]} if phases else {}
-        return Batch(recording.signal, truth_of(trials, **more), {"warp_k": K.expand(trials, -1)} if phases else {})
+        if not phases:
+            return Batch(recording.signal, truth_of(trials))
+        known = {"omega_rad_s": torch.full((trials,), OMEGA, dtype=F64), "warp_k": K.expand(trials, -1)}
+        return Batch(recording.signal, truth_of(trials, phase_rad=truth.values["phase_rad"]), known)
 
     return draw
 
@@ -109,10 +113,24 @@ def warp_error(found: Tensor, truth: Tensor) -> Tensor:
     return 4 * math.pi / RADAR.wavelength_m * WIDTH_M / 2 * angle.square().mean(-1).sqrt()
 
 
+def off_the_warp(found: Tensor, truth: Tensor) -> Tensor:
+    """Rms phase error in rad without its constant and its line in the warp, which shift the image.
+
+    The line is the maximum of the spectrum over the warp.
+    """
+    error, turns = found - truth, warp(torch.arange(PULSES, dtype=F64) / PRF, K)
+    angle = 2 * math.pi * turns / turns[-1]
+    tables = torch.polar(torch.ones(1, dtype=F64), -torch.arange(-40, 40.005, 0.02, dtype=F64)[:, None] * angle)
+    z = torch.polar(torch.ones_like(error), error)
+    flat = z * tables[(z @ tables.mT).abs().argmax(-1)]
+    return torch.angle(flat * flat.mean(-1, keepdim=True).conj()).square().mean(-1).sqrt()
+
+
 WARP = [Quantity("warp_k", 0.5, warp_error, predicted=False)]
 PARTS = [Quantity("k1_per_s", 4.0, floor=0.01), Quantity("k2_per_s2", 400.0, floor=1.0)]
 RATE = [Quantity("omega_rad_s", 0.1 * OMEGA, floor=1e-6)]
 PHASES = [Quantity("phase_rad", 0.5, phase_rmse, 0.01)]
+PHASES_OF_WARP = [Quantity("phase_rad", 0.5, off_the_warp, 0.01)]
 WORLDS = (
     *nothing((PULSES, BINS), signal),
     *(World("own", satellite(snr), snr) for snr in SNR_DB),
@@ -127,7 +145,12 @@ WORLDS = (
     World("direct", direct(-10.0), -10.0),
 )
 PHASE_WORLDS = (
-    *nothing((PULSES, BINS), signal, warp_k=lambda x: K.expand(len(x), -1)),
+    *nothing(
+        (PULSES, BINS),
+        signal,
+        omega_rad_s=lambda x: torch.full((len(x),), OMEGA, dtype=F64),
+        warp_k=lambda x: K.expand(len(x), -1),
+    ),
     *(World("own", satellite(snr, True), snr) for snr in (-20.0, -10.0, 0.0, 20.0, 60.0)),
 )
 
@@ -150,6 +173,6 @@ def entries() -> list[Entry]:
         Entry("compensate.CoarseRotation", CoarseRotation(RADAR), WORLDS, WARP),
         Entry("compensate.PhaseFitRotation", PhaseFitRotation(RADAR), WORLDS, WARP),
         *(Entry(f"compensate.{name}", stage, WORLDS, WARP, 0.1) for name, stage in searches.items()),
-        Entry("compensate.RotationAutofocus", RotationAutofocus(RADAR), PHASE_WORLDS, PHASES, 0.3),
-        Entry("core.Alternate", lambda x, warp_k: pair(x), PHASE_WORLDS, [*PHASES, *WARP], 0.3),
+        Entry("compensate.RotationAutofocus", RotationAutofocus(RADAR), PHASE_WORLDS, PHASES_OF_WARP, 0.3),
+        Entry("core.Alternate", lambda x, **_: pair(x), PHASE_WORLDS, [*PHASES, *WARP], 0.3),
     ]

@@ -101,6 +101,27 @@ def test_predicted_std_matches_the_errors_and_the_bound(snr_db: float) -> None:
     assert (rms > 0.5).all() and (rms < 1.5).all()
 
 
+def test_few_scatterers_are_judged_as_well_as_many() -> None:
+    """Three points contradict hardly any rotation; the noise alone then limits the errors."""
+    data = []
+    for seed in range(10):
+        clean = echo(*points(3000 + seed, 3))
+        data.append(clean + noise_std(clean, 10.0) * noise(3000 + seed, *clean.shape))
+    found = uneven_rotation(torch.stack(data).to(torch.complex64), **OPTIONS)
+    assert found.ok.double().mean() > 0.4
+    for name, true in {"omega_rad_s": OMEGA, "k1_per_s": 10.0, "k2_per_s2": 1000.0}.items():
+        error, std = (found[name] - true)[found.ok], found.std[name][found.ok]
+        assert 0.5 < float((error.square().mean() / std.square().mean()).sqrt()) < 1.7, name
+
+
+def test_a_peak_of_the_noise_does_not_show_the_rate() -> None:
+    """All points lie in one range cell, and the noise has a peak in another."""
+    x, y, amplitude = points(1053, 12)
+    clean = echo(x, 0.0 * y, amplitude)
+    found = uneven_rotation((clean + noise_std(clean, 10.0) * noise(1053, *clean.shape)).to(torch.complex64), **OPTIONS)
+    assert found.info["scatterers"] > 12 and found.info["focused"] and not found.ok
+
+
 def test_each_step_reduces_the_error() -> None:
     data = targets(4)
     errors = {

@@ -293,14 +293,7 @@ def spread(system: str, count: int) -> list[float]:
     return np.linspace(*VELOCITIES[system][1:], count).tolist()
 
 
-# In this small world the rounds of the rotation estimator end elsewhere in a batch than alone: yc
-# differs by 0.07 mm, omega by 2e-3 of its error. To be mended in the estimator.
-BATCH_MATTERS = pytest.mark.xfail(reason="the rounds of the rotation estimator depend on the batch")
-
-
-@pytest.mark.parametrize(
-    "system", [pytest.param(name, marks=[BATCH_MATTERS] if name == "isal_rotation" else []) for name in CONFIGS]
-)
+@pytest.mark.parametrize("system", CONFIGS)
 def test_trials_of_different_velocities_share_batches_and_give_the_numbers_of_cases(
     system: str, tmp_path: Path
 ) -> None:

@@ -93,9 +93,9 @@ def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: 
         due to the compensation. `ok` is False where the entropy decreases by less than 0.01 nats,
         where the minimum lies on the edge of the box, or where the phase histories of at least 3
         bright scatterers do not confirm k1, k2, ...: info["phase_error_rad"], the phase error that
-        they show for the scatterer farthest from zero Doppler, must be below 0.24 rad rms. `ok`
-        does not refer to `omega_rad_s` and `yc_m`: with few image lines they are biased, see
-        `EntropyObjective`.
+        they show for the scatterer farthest from zero Doppler, plus two of its standard deviations,
+        must be below 0.47 rad rms. `ok` does not refer to `omega_rad_s` and `yc_m`: with few image
+        lines they are biased, see `EntropyObjective`.
 
         info holds the number of evaluations; entropy_nats and uncompensated_entropy_nats, the
         entropy with and without compensation; on_edge, shape (..., n), True for unknowns on the

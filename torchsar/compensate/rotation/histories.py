@@ -37,9 +37,9 @@ _ROBUST_ROUNDS = 3  # reweighted fits, found by trial: enough to exclude outlier
 # eigenvalue of a normal matrix of unit diagonal below which its direction is not determined: above
 # the rounding of float64, below any real information
 _NO_INFORMATION = 1e-7
-# largest phase error, in rad rms, of a scatterer at the edge of the target: its double then still
-# has a Strehl ratio of 0.8, the convention of Marechal
-MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8)) / 2
+# largest phase error, in rad rms, of a scatterer at the edge of the target: it then still has a
+# Strehl ratio of 0.8, the convention of Marechal
+MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8))
 # power over that of the brightest pixel below which side lobes are to be expected more than 24
 # cells away
 _FAINTEST = 1e-3
@@ -89,10 +89,10 @@ def warp_phase_error(data: Tensor, sampling: Sampling, motion: Motion, checks: i
     """Measure how well the relative derivatives of the rotation rate of a rotation fit the data.
 
     The rotation is refined by the histories of bright scatterers. They show by how much the
-    derivatives k1, k2, ... should change, and by how much the histories disagree about it. Both
-    together are given as the phase error that they cause to the scatterer farthest from zero
-    Doppler among those used. A constant phase and a phase that is linear in the warped time only
-    displace a scatterer and are left out.
+    derivatives k1, k2, ... should change, and by how much the histories disagree about it. The
+    change plus two standard deviations are given as the phase error that they cause to the
+    scatterer farthest from zero Doppler among those used. A constant phase and a phase that is
+    linear in the warped time only displace a scatterer and are left out.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
@@ -118,9 +118,9 @@ def warp_phase_error(data: Tensor, sampling: Sampling, motion: Motion, checks: i
     curves = warped.slopes - (warped.slopes @ line.mT) @ line
     size = curves @ curves.mT / sampling.pulses
     k, spread = refined.k - motion.k + change[:, :order], covariance[:, :order, :order]
-    error = torch.einsum("bi,bij,bj->b", k, size, k) + (size * spread).sum((-2, -1))
+    moved, unsure = torch.einsum("bi,bij,bj->b", k, size, k), (size * spread).sum((-2, -1))
     edge = 2 * math.pi * torch.where(used, cells.abs(), 0).amax(-1)
-    error = torch.nan_to_num(edge * error.clamp_min(0).sqrt(), nan=math.inf)
+    error = torch.nan_to_num(edge * (moved.clamp_min(0).sqrt() + 2 * unsure.clamp_min(0).sqrt()), nan=math.inf)
     seen = (count >= LEAST_SCATTERERS) & (lit > _LEAST_LIT) & (edge > 2 * math.pi)
     return torch.where(seen, error, math.inf), count
 
@@ -145,10 +145,10 @@ def _fitted_to_peaks(
     power = image.abs().square()
     noise = noise_power(power)
     if strict:
-        speckle = power.median(1, keepdim=True).values / math.log(2) * threshold(power)
+        speckle = power.median(1, keepdim=True).values / math.log(2) * threshold(power[0].numel())
         floor = torch.maximum(speckle, _FAINTEST * power.amax((-2, -1), keepdim=True))
         power = torch.where(power > floor, power, power * 1e-30)
-    peaks = find_peaks(power, noise * threshold(power), count, _ISOLATED, 2 * half_cells, 1)
+    peaks = find_peaks(power, noise * threshold(power[0].numel()), count, _ISOLATED, 2 * half_cells, 1)
     cells = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING
     history, u = _histories(image, peaks, half_cells)
     bases = _bases(motion, sampling, cells, sampling.range_m(peaks.cell), u, free_centre)
@@ -224,26 +224,27 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tenso
     # few scatterers cannot disagree: what the samples of each show counts as well
     inverse = inverted(normal)[0]
     own = lag * inverse @ torch.einsum("bpij,bpkj->bik", rest, rest) @ inverse
-    return change, sandwich(normal, rest.sum(-1), used.sum(-1)) + own
+    pull, count = rest.sum(-1), used.sum(-1)
+    free = count / (count - normal.shape[-1]).clamp_min(_LEAST_FREE)
+    return change, sandwich(normal, pull.mT @ pull) * free[:, None, None] + own
 
 
-def sandwich(normal: Tensor, pull: Tensor, count: Tensor) -> Tensor:
-    """Compute a covariance from the differences between independent contributions to a fit.
+def sandwich(normal: Tensor, pulls: Tensor) -> Tensor:
+    """Compute a covariance from the differences between contributions to a fit.
 
     The mean square of the contributions to the gradient is measured and not derived from the noise,
     so that errors of the model count (the sandwich covariance of least squares).
 
     Args:
         normal: Normal matrices, shape (trial, n, n).
-        pull: Gradient that each scatterer contributes at the solution, shape (trial, scatterer, n).
-        count: Effective number of scatterers, shape (trial,).
+        pulls: Sums of the products of the gradients that two scatterers contribute at the solution,
+            over all pairs that are not independent, shape (trial, n, n).
 
     Returns:
         The covariance, shape (trial, n, n); zero along directions that the data do not determine.
     """
-    free = count / (count - normal.shape[-1]).clamp_min(_LEAST_FREE)
     inverse = inverted(normal)[0]
-    return inverse @ (pull.mT @ pull) @ inverse * free[:, None, None]
+    return inverse @ pulls @ inverse
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:

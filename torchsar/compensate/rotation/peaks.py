@@ -60,16 +60,16 @@ def noise_power(power: Tensor) -> Tensor:
     return every[:, :: max(1, every.shape[-1] // _SAMPLED)].median(-1).values / math.log(2)
 
 
-def threshold(power: Tensor) -> float:
+def threshold(pixels: int) -> float:
     """Compute the detection threshold that noise alone exceeds in about one of ten images.
 
     Args:
-        power: Power of the image, shape (trial, line, range); only its size is used.
+        pixels: Number of pixels of an image.
 
     Returns:
         The threshold, as a ratio of power to mean noise power.
     """
-    return math.log(power[0].numel()) + 2.5
+    return math.log(pixels) + 2.5
 
 
 def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: int, cells: int) -> Peaks:

@@ -33,8 +33,9 @@ _ENTROPY_ROUNDING = 1e-3  # tolerance in nats of a comparison of entropies in fl
 _BLOCKS = 8
 # last step of a fit that has converged, in standard deviations or as a phase of the scatterers in
 # rad, found by trial
-_REST_STDS, _REST_RAD = 3.0, 0.02
-_WRONG_FOCUS = 4.0  # phase error over `MOST_PHASE_ERROR_RAD` of a wrong focus, found by trial
+_REST_STDS, _REST_RAD = 3.0, 0.01
+_TO_GO = 0.25  # distance that is left after the last step over that step, found by trial
+_WRONG_FOCUS = 2.0  # phase error over `MOST_PHASE_ERROR_RAD` of a wrong focus, found by trial
 _HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
 
 Part = Callable[[Tensor, Sampling, Tensor | None], Estimate]
@@ -88,7 +89,8 @@ def uneven_rotation(
         scatterers are found, they explain 40 % of the energy or more, their phase histories agree
         over the whole aperture, the entropy is not higher than without compensation, and the fit
         has converged. `ok` is True where, in addition, the
-        standard deviation of the rate is below 5 %. Where only `ok` is False, the cross-range scale
+        standard deviation of the rate is below 5 %, also without the scatterers that may be peaks
+        of the noise. Where only `ok` is False, the cross-range scale
         of the image is unknown. Further info: scatterers (their number), noise_power, steps,
         entropy_nats, uncompensated_entropy_nats.
 
@@ -139,9 +141,9 @@ def coarse_rotation(
         standard deviations. quality is the relative decrease of exp(entropy) of the image due to
         the compensation. `ok` is True where the entropy is not higher than without compensation and
         the phase histories of at least 3 bright scatterers confirm k1, k2, ...: the phase error
-        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler is below
-        0.24 rad rms, so that its double still has a Strehl ratio of 0.8. `ok` does not refer to
-        `omega_rad_s` and `yc_m`.
+        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler, plus
+        two of its standard deviations, is below 0.47 rad rms, a Strehl ratio of 0.8. `ok` does not
+        refer to `omega_rad_s` and `yc_m`.
 
     Raises:
         TypeError: If the data are not complex.
@@ -190,9 +192,9 @@ def phase_fit_rotation(
         standard deviations. quality is the relative decrease of exp(entropy) of the image due to
         the compensation. `ok` is True where the entropy is not higher than without compensation and
         the phase histories of at least 3 bright scatterers confirm k1, k2, ...: the phase error
-        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler is below
-        0.24 rad rms, so that its double still has a Strehl ratio of 0.8. `ok` does not refer to
-        `omega_rad_s` and `yc_m`.
+        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler, plus
+        two of its standard deviations, is below 0.47 rad rms, a Strehl ratio of 0.8. `ok` does not
+        refer to `omega_rad_s` and `yc_m`.
 
     Raises:
         TypeError: If the data are not complex.
@@ -310,16 +312,18 @@ def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> 
     present = (rows != 0).any(-1).sum(-1)
     energy = fit.scatterers.amplitude.abs().square().sum(-1) * present
     explained = energy / _energy(rows, fit.noise, present)
-    converged = (fit.last_step <= _REST_STDS) | (
-        fit.last_step * (fit.noise / (2 * energy.clamp_min(torch.finfo(torch.float64).tiny))).sqrt() <= _REST_RAD
-    )
+    tiny = torch.finfo(torch.float64).tiny
+    predicted = fit.covariance.diagonal(dim1=-2, dim2=-1) * fit.noise[:, None]
+    step = (fit.change.abs() / predicted.clamp_min(tiny).sqrt()).amax(-1)
+    converged = (step <= _REST_STDS) | (step * (fit.noise / (2 * energy.clamp_min(tiny))).sqrt() <= _REST_RAD)
     quality = settle(explained.clamp(0, 1), 0.0)[0]
     std = _standard_deviations(fit, free_centre)
     # histories are less accurate than the fit: they only exclude a wrong focus
     error, _ = warp_phase_error(rows, sampling, fit.motion, checks=0)
     confirmed = (count >= LEAST_SCATTERERS) & (error < _WRONG_FOCUS * MOST_PHASE_ERROR_RAD)
     focused = found.ok & confirmed & (quality >= _LEAST_EXPLAINED) & converged
-    scaled = (std["omega_rad_s"] < MOST_RATE_ERROR * fit.motion.omega_rad_s) & (fit.motion.w > 0)
+    certain = fit.certain[:, fit.motion.k.shape[-1]].clamp_min(tiny).sqrt()
+    scaled = (std["omega_rad_s"] < MOST_RATE_ERROR * fit.motion.omega_rad_s * certain) & (fit.motion.w > 0)
     info = {**found.info, "focused": focused, "scatterers": count, "noise_power": fit.noise, "steps": fit.steps}
     return Estimate(found.value, quality, focused & scaled, std, info)
 
@@ -339,7 +343,12 @@ def _standard_deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
     known = (fit.scatterers.amplitude != 0).any(-1)
     covariance = fit.covariance * fit.noise[:, None, None]
     seen, predicted = (c.diagonal(dim1=-2, dim2=-1) for c in (fit.disagreement, covariance))
-    wider = (seen / predicted.clamp_min(torch.finfo(torch.float64).tiny)).clamp_min(1).sqrt()
+    # what the scatterers would differ by if the fit did not take up a part of it as well
+    taken_up = (predicted.shape[-1] / fit.scatterers.effective_number().clamp_min(1)).clamp_max(1)[:, None]
+    wider = (taken_up + (seen + fit.change.square()) / predicted.clamp_min(torch.finfo(torch.float64).tiny)).clamp_min(
+        1
+    )
+    wider = wider.sqrt()
     covariance = torch.where(known[:, None, None], covariance * wider[:, :, None] * wider[:, None], math.inf)
     k = covariance.diagonal(dim1=-2, dim2=-1)[:, :order].clamp_min(0).sqrt()
     w = torch.where(motion.w > 0, motion.w, 0)

@@ -23,6 +23,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.compensate.rotation.couplings import Pairs
 from torchsar.compensate.rotation.histories import inverted, sandwich, solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
@@ -35,7 +36,7 @@ _OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of p
 # a new scatterer has at least this share of the largest amplitude within so many lines and range
 # cells, found by trial: side lobes are excluded until their scatterer is subtracted
 _SHARE, _LINES, _CELLS = 0.5, 24, 2
-MOST, ROUNDS = 800, 8  # largest number of scatterers, number of steps; accuracy against time
+MOST, ROUNDS = 800, 12  # largest number of scatterers, number of steps; accuracy against time
 _FEWEST = 128  # default number of scatterers on small data, found by trial
 # samples of the data per scatterer, so that a fit costs as much as about thirty images
 _SAMPLES_EACH = 1000
@@ -43,11 +44,13 @@ _SAMPLES_EACH = 1000
 # brightest alone bring the motion near, and the rounds between let it converge
 _SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
 _BLOCK_BYTES = 1 << 19  # phasors of a block of pulses that fit into the cache
+_GROUP = 16  # pulses over which the phase of an echo changes by a few turns
+# Doppler and range cells over which scatterers share errors of the model, found by trial
+_SHARED_CELLS = 2.0
 _APART = 0.5  # Doppler and range cells within which scatterers are not resolved
+_BRIGHT = 0.1  # share of the largest amplitude from which a scatterer limits a step, found by trial
 _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
-# added to the diagonal, relative: it keeps the curvature positive definite; the steps, which follow
-# from the exact residual, converge all the same
-_RIDGE = 1e-3
+_RIDGE = 1e-9  # added to the diagonal, relative: above the rounding of a matrix of float64
 _LEAST_RATE = 0.05  # least rate over that at the start; slower motions would nearly reverse
 # standard deviations by which the phase of a scatterer may differ before it loses weight, found by
 # trial
@@ -55,10 +58,12 @@ _AGREES = 5.0
 # power of errors of the model over that of the brightest scatterer, found by trial: weaker noise
 # does not limit the fit, and residuals below it are no scatterers and no evidence against one
 _MODEL = 1e-4
+# power over the detection threshold beyond which a scatterer cannot be a peak of the noise
+_CERTAIN = 2.0
 _SETTLED = 0.2  # steps of the motion below this share of its standard deviation end a trial
 
 
-_Taken: TypeAlias = "tuple[Motion, Scatterers, Tensor, Tensor, Tensor]"
+_Taken: TypeAlias = "tuple[Motion, Scatterers, Tensor, Tensor, Tensor, Tensor]"
 
 
 @dataclass(frozen=True)
@@ -121,6 +126,29 @@ class Scatterers:
         beside = (near & (level[:, None] > level[:, :, None])).any(-1)
         return replace(self, amplitude=torch.where(beside, 0, self.amplitude))
 
+    def alike(self) -> Tensor:
+        """Compute how far the errors of scatterers depend on each other.
+
+        Scatterers a few resolution cells apart share what the model does not describe.
+
+        Returns:
+            Weights from 0 (independent) to 1, shape (trial, scatterer, scatterer), float64; 0 where
+            there is no scatterer.
+        """
+        lines, rows = ((x[:, :, None] - x[:, None]).square() for x in (self.cell, self.row))
+        used = (self.amplitude != 0).double()
+        return torch.exp(-(lines + rows) / (2 * _SHARED_CELLS**2)) * used[:, :, None] * used[:, None]
+
+    def effective_number(self) -> Tensor:
+        """Count the independent scatterers over which the energy is spread.
+
+        Returns:
+            The number, shape (trial,), float64; 0 without scatterers.
+        """
+        power = self.amplitude.abs().square()
+        spread = (power * (self.alike() @ power[..., None])[..., 0]).sum(-1)
+        return power.sum(-1).square() / or_one(spread)
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -138,12 +166,15 @@ class Fit:
             one.
         disagreement: Covariance of the same parameters as the differences between scatterers show
             it, in absolute units, same shape. Errors of the model, such as several scatterers in
-            one resolution cell, add to it.
+            one resolution cell, add to it. It is too small by the share of the differences that the
+            fit takes up: the number of parameters over the number of scatterers.
+        certain: Share of what the data show about each of these parameters that comes from
+            scatterers too bright to be peaks of the noise, shape (trial, parameter).
         noise: Noise power per sample, shape (trial,).
         steps: Number of steps taken, shape (trial,).
         settled: True for trials that have ended, shape (trial,), bool.
-        last_step: Largest change of a parameter of the rotation in the last step, in units of its
-            standard deviation, shape (trial,).
+        change: Change of the same parameters in the last step, shape (trial, parameter); infinite
+            where the last step was not possible.
     """
 
     motion: Motion
@@ -151,10 +182,11 @@ class Fit:
     response: RangeResponse
     covariance: Tensor
     disagreement: Tensor
+    certain: Tensor
     noise: Tensor
     steps: Tensor
     settled: Tensor
-    last_step: Tensor
+    change: Tensor
 
 
 def fit_scatterers(
@@ -193,7 +225,9 @@ def fit_scatterers(
     covariance = torch.zeros(trials, unknowns.size, unknowns.size, dtype=torch.float64, device=device)
     never = torch.zeros(trials, dtype=torch.bool, device=device)
     response = RangeResponse.of_unknown_share(trials, sampling.cells, device)
-    fit = Fit(start, Scatterers.none(data), response, covariance, covariance, noise, never.long(), never, noise)
+    zero = covariance.new_zeros(trials, unknowns.size)
+    none = Scatterers.none(data)
+    fit = Fit(start, none, response, covariance, covariance, zero, noise, never.long(), never, zero)
     residual, step = data, None
     for iteration in range(rounds + 1):
         new, noise = None, fit.noise
@@ -248,9 +282,9 @@ def _new_scatterers(
     floor = torch.maximum(noise_power(power).double(), _MODEL * brightest.amax(-1))
     noise = torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
     known = (fit.scatterers.amplitude != 0).sum(-1)
-    peaks = find_peaks(power, (floor * threshold(power)).to(power.dtype), bound, _SHARE, _LINES, _CELLS).first(
-        bound - known
-    )
+    peaks = find_peaks(
+        power, (floor * threshold(power[0].numel())).to(power.dtype), bound, _SHARE, _LINES, _CELLS
+    ).first(bound - known)
     value = torch.gather(image.flatten(1), 1, peaks.line * image.shape[2] + peaks.cell).to(
         torch.complex128
     ) / math.sqrt(sampling.pulses)
@@ -259,15 +293,17 @@ def _new_scatterers(
 
 
 def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
-    """exp(2j pi left @ right), (trial, pulse, scatterer), for a short block of pulses.
+    """exp(2j pi left @ right), (trial, pulse, scatterer), for a block of pulses.
 
-    left: float64 (trial, pulse, 2) turns per unit of right, (trial, 2, scatterer). The first pulse
-    is computed in float64, the differences from it, a few turns, in the working precision. Twice as
-    fast as `core.unit_phasor` of every element.
+    left: float64 (trial, pulse, 2) turns per unit of right, (trial, 2, scatterer). One pulse of
+    every few is computed in float64, the differences of its neighbours from it, a few turns, in the
+    working precision. Faster than `core.unit_phasor` of every element.
     """
-    working = real_dtype(dtype)
-    begin = reduced_turns(left[:, :1] @ right).to(working)
-    turns = torch.baddbmm(begin, (left - left[:, :1]).to(working), right.to(working))
+    working, pulses = real_dtype(dtype), left.shape[1]
+    near = torch.arange(pulses, device=left.device) // _GROUP * _GROUP + _GROUP // 2
+    near = near.clamp_max(pulses - 1)
+    begin = reduced_turns(left[:, near[::_GROUP]] @ right).to(working).repeat_interleave(_GROUP, 1)[:, :pulses]
+    turns = torch.baddbmm(begin, (left - left[:, near]).to(working), right.to(working))
     angle = (turns - turns.round()) * (2 * math.pi)
     return torch.complex(torch.cos(angle), torch.sin(angle))
 
@@ -341,18 +377,21 @@ class _Step:
             (found.amplitude[..., None] * envelope).conj().to(data.dtype).resolve_conj(),
             envelope.mH.to(data.dtype).resolve_conj(),
         )
-        real_bases = bases.to(data.real.dtype)
+        # the bases are almost linearly dependent: with orthonormal ones the small part that shows
+        # the rotation is not lost in rounding
+        orthonormal, mixed = torch.linalg.qr(bases.mT)
+        orthonormal = orthonormal.mT.to(data.real.dtype)
         residual = torch.empty_like(data)
-        moments = data.real.new_zeros(data.shape[0], bases.shape[1], 2 * found.cell.shape[-1])
+        moments = bases.new_zeros(data.shape[0], bases.shape[1], 2 * found.cell.shape[-1])
         shift = data.new_zeros(envelope.shape)
         for some, part in _blocks(data, count):
             turned_back = _phasors(back_turns[some, part], right[some], data.dtype)
             rest = (data[some, part] - (turned_back @ weighted[some]).conj()) * present[some, part, None]
             residual[some, part] = rest
             projected = torch.view_as_real((rest @ back[some]) * turned_back).flatten(-2)
-            moments[some] += real_bases[some, :, part] @ projected
+            moments[some] += orthonormal[some, :, part] @ projected
             shift[some] += turned_back.mT @ rest
-        moments = torch.view_as_complex(moments.unflatten(-1, (-1, 2)).to(torch.float64))
+        moments = torch.view_as_complex((mixed.mT @ moments).unflatten(-1, (-1, 2)))
         shift = shift.to(torch.complex128)
         shifts = (shift * envelopes.slope.conj()).sum(-1)
         share = (found.amplitude.conj() * (shift * envelopes.difference.conj()).sum(-1)).real.sum(-1)
@@ -381,7 +420,8 @@ class _Step:
         Returns:
             The rotation and the scatterers after the step; the change of the parameters of the
             rotation, shape (trial, unknown); their covariance per unit noise power, and that from
-            the differences between scatterers, shape (trial, unknown, unknown) each.
+            the differences between scatterers, shape (trial, unknown, unknown) each; and the share
+            of each scatterer in what the data show about them, shape (trial, scatterer, unknown).
         """
         slopes, factor = self._slopes(), _Factor.of(self._local())
         found = self._solved(slopes, factor)
@@ -415,11 +455,19 @@ class _Step:
         moved = (found.amplitude.conj() * self.shift).real
         own = torch.cat([turned[..., 0].real, turned[..., 0].imag, -2 * math.pi * turned[..., 1].imag, moved], -1)
         joint = factor.solve(torch.cat([cross, own[..., None]], -1))
-        schur = shared - cross.mT @ joint[..., :-1]
-        # gradient of each scatterer, without the part that its own unknowns take up
-        taken_up = (joint[..., :-1] * own[..., None]).unflatten(1, (4, -1)).sum(1)
-        pull = torch.einsum("bpin,bpn->bpi", slopes, turned.imag) - taken_up
-        change = solved(schur, pull.sum(1))
+        # curvature and gradient of each scatterer, without what the unknowns of scatterers take up
+        taken_up = torch.einsum(
+            "brpi,brpj->bpij",
+            joint[..., :-1].unflatten(1, (4, -1)),
+            torch.cat([cross, own[..., None]], -1).unflatten(1, (4, -1)),
+        )
+        curvature, pull = shared - taken_up[..., :-1], torch.einsum("bpin,bpn->bpi", slopes, turned.imag)
+        pull = pull - taken_up[..., -1]
+        normal = curvature.sum(1)
+        change, inverse = solved(normal, pull.sum(1)), inverted(normal)[0]
+        informed = torch.einsum("bpij,bin,bjn->bpn", curvature, inverse, inverse)
+        rest = pull - torch.einsum("bpij,bj->bpi", curvature, change)
+        change = change * self._within_reach((joint[..., :-1] @ change[..., None])[..., 0])[:, None]
         grow, turn, line, row = (
             (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
         )
@@ -429,9 +477,19 @@ class _Step:
             self._moved(change),
             Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), position),
             change,
-            _covariance(schur),
-            sandwich(schur, pull, _effective_number(found.amplitude)),
+            _covariance(normal),
+            sandwich(normal, rest.mT @ found.alike() @ rest),
+            informed / or_one(informed.sum(1, keepdim=True)),
         )
+
+    def _within_reach(self, moved: Tensor) -> Tensor:
+        """Factor (trial,) of the common step that limits the Doppler by which it moves scatterers.
+
+        moved: change (trial, 4 scatterer) of the scatterers' unknowns that belongs to the step.
+        """
+        level, line = self.found.amplitude.abs(), moved.unflatten(-1, (4, -1))[:, 2].abs()
+        bright = level > _BRIGHT * level.amax(-1, keepdim=True)
+        return (_STEP / or_one(torch.where(bright, line, 0).amax(-1))).clamp_max(1)
 
     def _local(self) -> Tensor:
         """Gauss-Newton curvature of the scatterers' unknowns, (trial, 4 scatterer, 4 scatterer).
@@ -482,7 +540,8 @@ class _Step:
     def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
         """Curvature between scatterers and common unknowns, and of the common unknowns.
 
-        (trial, 4 scatterer, unknown) and (trial, unknown, unknown).
+        (trial, 4 scatterer, unknown) and, as sums over the pairs of each scatterer, (trial,
+        scatterer, unknown, unknown).
         """
         pairs = self.pairs
         overlap, _, back, _ = self._overlaps()
@@ -507,7 +566,7 @@ class _Step:
                 for m in shared
             ]
         ).sum(0)
-        return cross, pairs.per_trial(both)
+        return cross, pairs.per_scatterer(both.flatten(1)).unflatten(-1, both.shape[1:])
 
     def _moved(self, change: Tensor) -> Motion:
         """The motion after a step of the common unknowns."""
@@ -532,38 +591,33 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Factor:
-    """A symmetric matrix (trial, n, n), factorised.
+    """Symmetric matrices (trial, n, n), factorised.
 
-    factor: its Cholesky factor, or None where rounding has made the matrix indefinite.
+    factor: their Cholesky factors. failed: True for matrices that rounding has made indefinite.
     """
 
     matrix: Tensor
-    factor: Tensor | None
+    factor: Tensor
+    failed: Tensor
 
     @staticmethod
     def of(matrix: Tensor) -> _Factor:
-        """Factorise a matrix."""
-        factor, failed = torch.linalg.cholesky_ex(matrix)
-        return _Factor(matrix, None if bool(failed.any()) else factor)
+        """Factorise matrices."""
+        factor, info = torch.linalg.cholesky_ex(matrix)
+        return _Factor(matrix, factor, info != 0)
 
     def solve(self, right: Tensor) -> Tensor:
-        """Solution for right-hand sides."""
-        return (
-            torch.linalg.solve(self.matrix, right) if self.factor is None else torch.cholesky_solve(right, self.factor)
-        )
+        """Solutions for right-hand sides; how one is found does not depend on the other trials."""
+        solution = torch.cholesky_solve(right, self.factor)
+        if bool(self.failed.any()):
+            solution[self.failed] = torch.linalg.solve(self.matrix[self.failed], right[self.failed])
+        return solution
 
 
 def _covariance(normal: Tensor) -> Tensor:
     """Covariance of the common unknowns per unit noise power; infinite if undetermined."""
     inverse, lost = inverted(normal)
     return inverse / 2 + torch.diag_embed(torch.where(lost, math.inf, 0.0))
-
-
-def _effective_number(amplitude: Tensor) -> Tensor:
-    """Number of scatterers over which the energy is spread, (trial,)."""
-    power = amplitude.abs().square()
-    tiny = torch.finfo(torch.float64).tiny
-    return power.sum(-1).square() / power.square().sum(-1).clamp_min(tiny)
 
 
 def _after_step(
@@ -579,14 +633,16 @@ def _after_step(
     Trials that have ended, and steps to a motion that reverses its direction, leave the fit
     unchanged.
     """
-    motion, found, change, covariance, disagreement = taken
+    motion, found, change, covariance, disagreement, shares = taken
+    least = _CERTAIN * threshold(_OVERSAMPLING * sampling.pulses * sampling.cells) * noise / sampling.pulses
+    certain = (shares * (found.amplitude.abs().square() > least[:, None])[..., None]).sum(1)
     valid = (
         torch.isfinite(change).all(-1)
         & motion.possible(sampling)
         & (least_rate(motion.k, sampling.duration_s) > _LEAST_RATE)
     )
     std = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt() * noise.sqrt()[:, None]
-    step = torch.where(valid, (change.abs() / std.clamp_min(torch.finfo(torch.float64).tiny)).amax(-1), math.inf)
+    step = (change.abs() / std.clamp_min(torch.finfo(torch.float64).tiny)).amax(-1)
     active, old = ~fit.settled, fit.scatterers
     pick = (active & valid)[:, None]
     pairs = ((found.amplitude, old.amplitude), (found.cell, old.cell), (found.row, old.row))
@@ -596,8 +652,9 @@ def _after_step(
         response=response.where(active & valid, fit.response),
         covariance=torch.where(active[:, None, None], covariance, fit.covariance),
         disagreement=torch.where(active[:, None, None], disagreement, fit.disagreement),
+        certain=torch.where(active[:, None], certain, fit.certain),
         noise=torch.where(active, noise, fit.noise),
         steps=fit.steps + active,
-        settled=fit.settled | ((step <= _SETTLED) & search_over),
-        last_step=torch.where(active, step, fit.last_step),
+        settled=fit.settled | (valid & (step <= _SETTLED) & search_over),
+        change=torch.where(active[:, None], torch.where(valid[:, None], change, math.inf), fit.change),
     )
