@@ -63,6 +63,8 @@ def phase_polish(
         `phase_rad` of shape (..., pulse), to be removed. Its standard deviation is predicted from
         the energy of the cells above the noise. `quality` is the share of the energy in cells that
         clearly exceed the noise. `ok` is False where the standard deviation is 0.5 rad or more.
+        `info` holds "iterations", and "image_cells" and "range_cells" of shape (...,), the
+        effective numbers of cells of the image and of range cells that hold this energy.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -78,7 +80,7 @@ def phase_polish(
     search = Run(_scene, along, iterations, _RELAXATION, tolerance_rad)
     finish = Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 2)
     phase, taken = in_turn(pulses.rows, begin, [settle, search, finish])
-    quality, std = _confidence(rotate(pulses.rows.detach(), phase.detach()))
+    quality, std, scatterers, range_cells = _confidence(rotate(pulses.rows.detach(), phase.detach()))
     shape = pulses.trials
     # fewer than three pulses cannot distinguish a phase error from a shift of the image
     ok = (std < ENOUGH_STD_RAD) & (pulses.present.sum(-1) > 2)
@@ -87,7 +89,11 @@ def phase_polish(
         quality=quality.reshape(shape),
         ok=ok.reshape(shape),
         std={"phase_rad": std[:, None].expand(-1, pulses.n).reshape(*shape, pulses.n)},
-        info={"iterations": taken.reshape(shape)},
+        info={
+            "iterations": taken.reshape(shape),
+            "image_cells": scatterers.reshape(shape),
+            "range_cells": range_cells.reshape(shape),
+        },
     )
 
 
@@ -128,20 +134,26 @@ def _near_peak(power: Tensor, mean: Tensor) -> Tensor:
     return power / torch.where(peak > 0, power + 0.1 * peak, 1)
 
 
-def _confidence(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Share of the energy that is scene, and standard deviation of the phase, (trial,) each.
+def _confidence(rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Share of the energy that is scene, standard deviation of the phase, and cells, (trial,) each.
 
     rows: (trial, range, pulse), corrected. The noise level is the median cell of the image; cells
     that clearly exceed it are scene. The phase of a pulse is known to 1 / sqrt(2 g), where g is its
-    energy over the noise variance.
+    energy over the noise variance. The effective numbers of cells of the image and of range cells
+    are (sum e)^2 / sum e^2 of their energies e.
     """
     image = torch.fft.fft(rows, norm="ortho")
-    power = (image.real.square() + image.imag.square()).to(torch.float64).flatten(-2)
-    noise = power.median(-1).values / 0.6931471805599453
+    power = (image.real.square() + image.imag.square()).to(torch.float64)
+    whole = power.flatten(-2)
+    noise = whole.median(-1).values[:, None, None] / 0.6931471805599453
     tiny = torch.finfo(torch.float64).tiny
-    scene = torch.where(power > 12 * noise[:, None], power - noise[:, None], 0).sum(-1)
-    total = power.sum(-1)
-    gain = scene / rows.shape[-1] / noise.clamp_min(1e-30)
-    return torch.where(total > 0, scene / total.clamp_min(tiny), 0), torch.where(
-        total > 0, 1 / torch.sqrt(2 * gain.clamp_min(1e-3)), torch.pi
+    scene = torch.where(power > 12 * noise, power - noise, 0)
+    row = scene.sum(-1)
+    energy, total = row.sum(-1), whole.sum(-1)
+    gain = energy / rows.shape[-1] / noise[:, 0, 0].clamp_min(1e-30)
+    return (
+        torch.where(total > 0, energy / total.clamp_min(tiny), 0),
+        torch.where(total > 0, 1 / torch.sqrt(2 * gain.clamp_min(1e-3)), torch.pi),
+        energy.square() / scene.square().sum((-2, -1)).clamp_min(tiny),
+        energy.square() / row.square().sum(-1).clamp_min(tiny),
     )
