@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -30,20 +29,16 @@ from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 from torchsar.compensate.pulse_phase.verdict import LEAST_ROWS, LEAST_STREHL, occupied_band
 from torchsar.core import Estimate, cis, over_blocks
 
-# Bands of the first guess as shares of the pulse rate, and the share of its power in the band.
-_WIDTHS, _IN_BAND = (0.1, 0.25, 0.45, 0.65, 0.8, 0.9), 0.85
-# Largest number of estimates of the spectrum; those smoothed by a window, because the first phases
-# are far off, and its half width in bins; Newton steps of the phases after each.
-_ROUNDS, _COARSE_ROUNDS, _WINDOW, _STEPS = 16, 2, 4, 4
+# Longest block whose phases are found by themselves, in pulses; bands of their first guesses as
+# shares of the pulse rate, and the share of the power in the band.
+_BLOCK, _WIDTHS, _IN_BAND = 32, (0.1, 0.25, 0.45, 0.65, 0.8, 0.9), 0.85
+# Estimates of the spectrum of such a block, and of two blocks that were joined; those smoothed by a
+# window, because the first phases are far off, and its half width in bins; Newton steps of the
+# phases after each.
+_ROUNDS, _JOINT_ROUNDS, _COARSE_ROUNDS, _WINDOW, _STEPS = 8, 3, 2, 4, 4
 # Triples of rounds with adapted spectra; longest extrapolation; change, as a share of the predicted
 # standard deviation, that ends them; least density relative to the mean, which rounding allows.
 _REFINEMENTS, _LONGEST, _SMALL, _LEAST_FLOOR = 6, 8.0, 0.3, 1e-8
-_STILL_RAD = 0.01  # phase change, rms over the pulses, that ends the rounds
-# Kinks: from one of 64 pulses on, the slope of the phase changes by so many Doppler cells. A block
-# of pulses that has slipped by a cell is the usual local minimum. Kinks are sought in two rounds;
-# the best of them are refined, as often as one gains so many nats.
-_SLOPES, _KINKS, _KINK_ROUNDS, _REFINED, _REPEATS, _GAIN_NATS = (1, 2, 4, 8), 64, (0, 3), 4, 8, 0.5
-_EDGES, _BLOCK_SLOPES = 16, (2, 4)
 _PRIOR = 3 / math.pi**2  # information in 1/rad^2 of a phase that is uniform over a turn
 # Gain of the log likelihood per pulse by which the phases fit circular noise: 1.1 to 2.3 nats were
 # measured for 4 to 192 range cells and 64 to 256 pulses. A scene must gain twice as much.
@@ -111,7 +106,7 @@ def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
         The `Estimate` that `link_phases` returns.
     """
     rows, n = pulses.rows, pulses.n
-    size = max(1, _BLOCK_BYTES // (16 * n * (6 * n + 2 * rows.shape[1] + 8 * _KINKS)))
+    size = max(1, _BLOCK_BYTES // (16 * n * (6 * n + 2 * rows.shape[1])))
     parts = [slice(first, first + size) for first in range(0, max(1, len(rows)), size)]
     done: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
 
@@ -154,12 +149,8 @@ def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[Tensor
         return zero, zero + torch.inf, zero[:, 0]
     with torch.no_grad():
         scene = _Scene.of(rows.detach(), present)
-        u, fit = _refined(scene, _search(scene) if start is None else cis(start.to(torch.float64)))
-        if start is not None:
-            bent = _without_kinks(fit.matrix, u)
-            if bool((bent != u).any()):
-                u, fit = _refined(scene, bent)
-        gain = scene.independent * (scene.samples - fit.constant - _value(fit.matrix, u))
+        u, fit = _refined(scene, _grown(scene) if start is None else cis(start.to(torch.float64)))
+        gain = scene.independent * scene.gain(u, fit)
         std = _deviation(scene.independent[:, None, None] * scene.information(fit))
     if not rows.requires_grad or not torch.is_grad_enabled():
         return torch.angle(u), std, gain
@@ -167,23 +158,66 @@ def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[Tensor
     return torch.angle(u) + step - step.detach(), std, gain
 
 
-def _search(scene: _Scene) -> Tensor:
-    """Phases of greatest likelihood for periodograms, as exp(j phase), (trial, pulse)."""
-    u = scene.start()
-    active = torch.arange(len(u), device=u.device)
-    for count in range(_ROUNDS):
-        some = scene.trials(active)
-        smooth = _windowed if count < _COARSE_ROUNDS else smoothed_spectrum
-        matrix = some.fit(some.periodograms(u[active], smooth)).matrix
-        new = _newton(matrix, u[active], _STEPS)
-        if count in _KINK_ROUNDS:
-            new = _without_kinks(matrix, new)
-        moved = _distance(new, u[active])
-        u = u.index_copy(0, active, new)
-        if count > max(_KINK_ROUNDS):
-            active = active[moved > _STILL_RAD]
-            if not len(active):
-                break
+def _grown(scene: _Scene) -> Tensor:
+    """Phases near those of greatest likelihood, as exp(j phase), (trial, pulse).
+
+    A search over all pulses ends in local minima, in which parts of the pulses have slipped by a
+    Doppler cell. Few pulses have few minima. The phases of short blocks are therefore found first,
+    and neighbouring blocks are joined until one is left.
+    """
+    trials, n = scene.present.shape
+    size = -(-n // 2 ** max(0, math.ceil(math.log2(n / _BLOCK))))
+    u = _solved(scene.blocks(size))
+    while size < n:
+        size *= 2
+        u = _joined(scene.blocks(size), u.reshape(-1, size))
+    return u.reshape(trials, -1)[:, :n]
+
+
+def _solved(blocks: _Scene) -> Tensor:
+    """Phases of short blocks: those of greatest likelihood that are found from several bands."""
+    best, most = torch.ones_like(blocks.groups[0][0][..., 0]), torch.full_like(blocks.samples, -torch.inf)
+    for width in _WIDTHS:
+        u = blocks.start(width)
+        for count in range(_ROUNDS):
+            smooth = _windowed if count < _COARSE_ROUNDS else smoothed_spectrum
+            u = _newton(blocks.fit(blocks.periodograms(u, smooth)).matrix, u, _STEPS)
+        fit = blocks.fit(blocks.periodograms(u, smoothed_spectrum))
+        gain = blocks.gain(u, fit)
+        best = torch.where((gain > most)[:, None], u, best)
+        most = torch.maximum(gain, most)
+    return best
+
+
+def _joined(pairs: _Scene, u: Tensor) -> Tensor:
+    """Phases of pairs of blocks, from phases that are right in each block but for a straight line.
+
+    The spectra of both blocks are laid on each other for a common covariance. For each slope of the
+    second block, the best constant phase follows in closed form. With a matrix M and the phases a
+    and b of the blocks it leaves b^H M b - 2 |a^H M b|: two Fourier transforms over the slopes.
+    """
+    half, slopes = u.shape[-1] // 2, 4 * u.shape[-1]
+    left, right = u[:, :half], u[:, half:]
+    powers = [pairs.powers(u, slice(0, half)), pairs.powers(u, slice(half, None))]
+    likeness = sum(
+        torch.fft.ifft(torch.fft.fft(one.sqrt()).conj() * torch.fft.fft(other.sqrt())).real
+        for one, other in zip(*powers, strict=True)
+    )
+    bins = powers[0][0].shape[-1]
+    at = (torch.arange(bins, device=u.device) + torch.as_tensor(likeness).argmax(-1, keepdim=True)) % bins
+    both = [one + other.gather(-1, at) for one, other in zip(*powers, strict=True)]
+    matrix = pairs.fit(pairs.smoothed(both, smoothed_spectrum)).matrix
+
+    sums = _lag_sums(right.conj()[:, :, None] * matrix[:, half:, half:] * right[:, None, :])
+    own = torch.fft.fft(torch.roll(torch.nn.functional.pad(sums, (0, slopes - sums.shape[-1])), 1 - half, -1)).real
+    crossed = (left.conj()[:, None, :] @ matrix[:, :half, half:])[:, 0] * right
+    mutual = slopes * torch.fft.ifft(crossed, slopes)
+    best = (own - 2 * mutual.abs()).argmin(-1, keepdim=True)
+    line = 2 * math.pi / slopes * best * torch.arange(half, device=u.device)
+    u = torch.cat([left, -right * cis(line - torch.angle(mutual.gather(-1, best)))], -1)
+    for _ in range(_JOINT_ROUNDS):
+        u = _newton(matrix, u, _STEPS)
+        matrix = pairs.fit(pairs.periodograms(u, smoothed_spectrum)).matrix
     return u
 
 
@@ -191,7 +225,8 @@ def _refined(scene: _Scene, u: Tensor) -> tuple[Tensor, _Fit]:
     """The phases of greatest likelihood for adapted spectra, and the fit with these spectra.
 
     Phases and spectra are found in turn. A smooth error of the phase widens the spectrum, and the
-    wider spectrum hardly opposes it; three rounds are therefore extrapolated (squared iteration).
+    wider spectrum hardly opposes it; three rounds are therefore extrapolated (squared iteration)
+    where that makes the phases more likely.
     """
     spectra = scene.periodograms(u, smoothed_spectrum)
     std = _deviation(scene.information(scene.fit(spectra))).square().mean(-1).sqrt()
@@ -204,7 +239,10 @@ def _refined(scene: _Scene, u: Tensor) -> tuple[Tensor, _Fit]:
         step, next_ = torch.angle(second * first.conj()), torch.angle(third * second.conj())
         bend = (next_ - step).norm(dim=-1, keepdim=True)
         reach = (step.norm(dim=-1, keepdim=True) / or_one(bend)).where(bend > 0, 1).clamp(1, _LONGEST)
-        new, own = some.round(first * cis(2 * reach * step + reach.square() * (next_ - step)), own)
+        far, of_far = some.round(first * cis(2 * reach * step + reach.square() * (next_ - step)), own)
+        better = some.gain(far, some.fit(of_far)) > some.gain(third, some.fit(own))
+        new = torch.where(better[:, None], far, third)
+        own = [torch.where(better[:, None], one, other) for one, other in zip(of_far, own, strict=True)]
         u = u.index_copy(0, active, new)
         spectra = [of_all.index_copy(0, active, of_some) for of_all, of_some in zip(spectra, own, strict=True)]
         active = active[_distance(new, first) > _SMALL * std[active]]
@@ -276,31 +314,54 @@ class _Scene:
         groups = [(own[at], products[at], cells[at]) for own, products, cells in self.groups]
         return _Scene(groups, self.present[at], self.samples[at], self.independent[at])
 
-    def start(self) -> Tensor:
-        """The phases of greatest likelihood for one of several bands, as exp(j phase)."""
+    def blocks(self, size: int) -> _Scene:
+        """Blocks of so many pulses, (trial * block); pulses beyond the last are absent."""
         n = self.present.shape[-1]
-        lag = torch.arange(n, dtype=torch.float64, device=self.present.device)
-        every = sum(products for _, products, _ in self.groups) / self._cells[:, None, None]
+        count = -(-n // size)
+
+        def cut(x: Tensor, dim: int) -> Tensor:
+            return torch.cat([x, x.new_zeros(*x.shape[:dim], count * size - n, *x.shape[dim + 1 :])], dim)
+
+        present = cut(self.present, 1).reshape(-1, size)
+        groups = []
+        for samples, _, cells in self.groups:
+            own = cut(samples, 1).reshape(-1, size, samples.shape[-1])
+            groups.append((own, own @ own.mH, cells.repeat_interleave(count)))
+        samples = present.sum(-1) * self._cells.repeat_interleave(count)
+        return _Scene(groups, present, samples, self.independent.repeat_interleave(count))
+
+    def start(self, width: float) -> Tensor:
+        """Phases of greatest likelihood for a band (share of the pulse rate), as exp(j phase)."""
+        lag = torch.arange(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
+        every = sum(products for _, products, _ in self.groups) / or_one(self._cells)[:, None, None]
         flat = torch.ones_like(every[:, 0])
-        least, best = torch.full_like(self.samples, torch.inf), flat
-        for width in _WIDTHS:
-            band = _IN_BAND * torch.sinc(width * lag) + (1 - _IN_BAND) * (lag == 0)
-            lower, log_det = self._factor(self._toeplitz(band.to(flat.dtype).expand_as(flat)))
-            matrix = torch.cholesky_inverse(lower).mT * every
-            u = _newton(matrix, _smallest(matrix, flat), _STEPS)
-            value = log_det + _value(matrix, u)
-            best = torch.where((value < least)[:, None], u, best)
-            least = torch.minimum(value, least)
-        return best
+        band = _IN_BAND * torch.sinc(width * lag) + (1 - _IN_BAND) * (lag == 0)
+        lower, _ = self._factor(self._toeplitz(band.to(flat.dtype).expand_as(flat)))
+        matrix = torch.cholesky_inverse(lower).mT * every
+        return _newton(matrix, _smallest(matrix, flat), _STEPS)
+
+    def powers(self, u: Tensor, part: slice = slice(None)) -> list[Tensor]:
+        """Periodograms of each group over a part of the pulses, without the phases of u.
+
+        They are summed over the range cells, shape (trial, bin), at twice as many bins as pulses.
+        """
+        powers = []
+        for own, *_ in self.groups:
+            spectrum = torch.fft.fft((own * u.conj()[..., None])[:, part], 2 * u.shape[-1], dim=-2)
+            powers.append((spectrum.real.square() + spectrum.imag.square()).sum(-1))
+        return powers
 
     def periodograms(self, u: Tensor, smooth: Smooth) -> list[Tensor]:
         """Smoothed mean periodograms of each group, without the phases of u."""
-        spectra = []
-        for own, _, cells in self.groups:
-            spectrum = torch.fft.fft(own * u.conj()[..., None], 2 * u.shape[-1], dim=-2)
-            power = (spectrum.real.square() + spectrum.imag.square()).sum(-1)
-            spectra.append(self._smoothed(power / or_one(self.present.sum(-1))[:, None], cells, smooth, SPECTRAL_FLOOR))
-        return spectra
+        return self.smoothed(self.powers(u), smooth)
+
+    def smoothed(self, powers: list[Tensor], smooth: Smooth) -> list[Tensor]:
+        """Smoothed mean periodograms of each group, from their sums over the range cells."""
+        pulses = or_one(self.present.sum(-1))[:, None]
+        return [
+            self._smoothed(power / pulses, cells, smooth, SPECTRAL_FLOOR)
+            for power, (*_, cells) in zip(powers, self.groups, strict=True)
+        ]
 
     def adapted(self, u: Tensor, fit: _Fit) -> list[Tensor]:
         """Smoothed powers of each group behind filters that suppress all other frequencies.
@@ -340,6 +401,10 @@ class _Scene:
             inverses.append(torch.cholesky_inverse(lower).mT)
             constant = constant + cells * log_det
         return _Fit(spectra, inverses, self.matrix(inverses), constant)
+
+    def gain(self, u: Tensor, fit: _Fit) -> Tensor:
+        """Log likelihood of the phases u minus that of white noise, shape (trial,)."""
+        return self.samples - fit.constant - _value(fit.matrix, u)
 
     def information(self, fit: _Fit) -> Tensor:
         """Fisher information of the phases in 1/rad^2, shape (trial, pulse, pulse)."""
@@ -438,53 +503,6 @@ def _step(matrix: Tensor, u: Tensor) -> Tensor:
     ridge = 1e-6 * torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1).detach()
     eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
     return -torch.linalg.solve(bend + ridge[:, None, None] * eye, 2 * slope.imag)
-
-
-def _without_kinks(matrix: Tensor, u: Tensor) -> Tensor:
-    """Remove kinks of the phase as long as that lowers u^H M u."""
-    value, n = _value(matrix, u), u.shape[-1]
-    active = torch.arange(len(u), device=u.device)
-    for _ in range(_REPEATS):
-        if not len(active):
-            break
-        bent = _bent(matrix[active], u[active]).flatten(0, 1)
-        bent = _newton(matrix[active].repeat_interleave(_REFINED, 0), bent, _STEPS)
-        reached = _value(matrix[active].repeat_interleave(_REFINED, 0), bent).unflatten(0, (-1, _REFINED))
-        at = reached.argmin(-1, keepdim=True)
-        better = reached.gather(-1, at)[:, 0] < value[active] - _GAIN_NATS
-        chosen = bent.unflatten(0, (-1, _REFINED)).gather(1, at[..., None].expand(-1, -1, n))[:, 0]
-        active, chosen = active[better], chosen[better]
-        u = u.index_copy(0, active, chosen)
-        value = value.index_copy(0, active, _value(matrix[active], chosen))
-    return u
-
-
-def _bent(matrix: Tensor, u: Tensor) -> Tensor:
-    """The bends of u with the lowest values, shape (trial, bend, pulse)."""
-    bends = _bends(u.shape[-1], u.device)
-    turned = u.conj()[..., :, None] * matrix * u[..., None, :]
-    values = ((turned @ bends.mT) * bends.mH).sum(-2).real
-    return u[:, None] * bends[values.topk(_REFINED, largest=False).indices]
-
-
-@lru_cache(maxsize=4)
-def _bends(n: int, device: torch.device) -> Tensor:
-    """Changes of slope from a pulse to the end or for a block of pulses, shape (bend, pulse)."""
-    pulse = torch.arange(n, dtype=torch.float64, device=device)
-    cell = 2 * math.pi / n
-
-    def ramps(slopes: tuple[int, ...], first: Tensor, last: Tensor) -> Tensor:
-        slope = cell * torch.tensor([s for size in slopes for s in (size, -size)], dtype=torch.float64, device=device)
-        length = (pulse - first[:, None]).clamp_min(0).minimum((last - first)[:, None])
-        return (slope[:, None, None] * length).flatten(0, 1)
-
-    first = torch.linspace(0, n, _KINKS + 2, dtype=torch.float64, device=device)[1:-1].round()
-    edge = torch.linspace(0, n, _EDGES + 1, dtype=torch.float64, device=device).round()
-    pairs = torch.combinations(torch.arange(_EDGES + 1, device=device))
-    inner = pairs[(pairs[:, 0] > 0) & (pairs[:, 1] < _EDGES)]
-    kinks = ramps(_SLOPES, first, torch.full_like(first, n))
-    blocks = ramps(_BLOCK_SLOPES, edge[inner[:, 0]], edge[inner[:, 1]])
-    return cis(torch.cat([kinks, blocks]))
 
 
 def _deviation(information: Tensor) -> Tensor:
