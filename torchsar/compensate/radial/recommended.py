@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase import Listed, pga
-from torchsar.compensate.pulse_phase.data import prepare
+from torchsar.compensate.pulse_phase.data import or_one, prepare
 from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.pairs import pair_phase
@@ -128,7 +128,7 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
         The `Estimate` that the function `radial_motion` returns.
     """
     cells = deramped_lines(bands, coarse["velocity_m_s"], pulse)
-    step = 4 * math.pi / bands.radar.wavelength_m * pulse.step * coarse.std["velocity_m_s"][..., 0].detach()
+    step = 4 * math.pi / bands.radar.wavelength_m * pulse.step * coarse.info["noise_m_s"].detach()
     fine = phase_polish(
         cells, start=_start(cells, coarse, bands.radar, pulse), iterations=iterations, tolerance_rad=tolerance_rad
     )
@@ -163,10 +163,14 @@ def _judged(cells: Tensor, step_rad: Tensor, sharpest: Estimate) -> Estimate:
         sharpest.ok.flatten(),
     )
     range_cells, image_cells = (sharpest.info[name].flatten() for name in ("range_cells", "image_cells"))
+    lit = sharpest.info["lit"].reshape(-1, n)
     expected = step_rad.flatten() * math.sqrt(n / 15)
     dense = ok & (image_cells > _DENSE_CELLS)
-    modulated = _modulation(lines.detach()) > _MODULATION + _SURE * math.sqrt(2) * std[:, 0].detach()
-    far = modulated | (_rms_without_line(phase.detach()) > _UNEXPECTED * expected + _FAR_RAD)
+    modulated = (
+        _modulation(lines.detach(), sharpest.info["lit"].reshape(-1, n))
+        > _MODULATION + _SURE * math.sqrt(2) * std[:, 0].detach()
+    )
+    far = modulated | (_rms_without_line(phase.detach(), lit) > _UNEXPECTED * expected + _FAR_RAD)
     ok = ok & ~(modulated & (range_cells < _ONE_CELL))
     far = ok & ~dense & far
     if bool(dense.any()):
@@ -193,18 +197,26 @@ def _judged(cells: Tensor, step_rad: Tensor, sharpest: Estimate) -> Estimate:
     )
 
 
-def _modulation(lines: Tensor) -> Tensor:
-    """Standard deviation over mean of the power of the pulses (trial, pulse, range), (trial,)."""
+def _modulation(lines: Tensor, lit: Tensor) -> Tensor:
+    """Standard deviation over mean of the power of the lit pulses, (trial,).
+
+    lines: (trial, pulse, range); lit: (trial, pulse), bool.
+    """
     power = (lines.real.square() + lines.imag.square()).sum(-1, dtype=torch.float64)
-    return power.std(-1) / power.mean(-1).clamp_min(torch.finfo(torch.float64).tiny)
+    count, tiny = lit.sum(-1, keepdim=True).clamp_min(1), torch.finfo(torch.float64).tiny
+    mean = (power * lit).sum(-1, keepdim=True) / count
+    square = ((power / mean.clamp_min(tiny) - 1).square() * lit).sum(-1) / count[:, 0]
+    return square.sqrt()
 
 
-def _rms_without_line(phase: Tensor) -> Tensor:
-    """Rms of phases (trial, pulse) in rad without a straight line, (trial,)."""
+def _rms_without_line(phase: Tensor, lit: Tensor) -> Tensor:
+    """Rms over the lit pulses of phases (trial, pulse) in rad without a straight line, (trial,)."""
     pulse = torch.linspace(-1, 1, phase.shape[-1], dtype=phase.dtype, device=phase.device)
-    rest = phase - phase.mean(-1, keepdim=True)
-    rest = rest - (rest * pulse).sum(-1, keepdim=True) / pulse.square().sum() * pulse
-    return rest.square().mean(-1).sqrt()
+    share = lit / lit.sum(-1, keepdim=True).clamp_min(1)
+    pulse = pulse - (pulse * share).sum(-1, keepdim=True)
+    rest = phase - (phase * share).sum(-1, keepdim=True)
+    slope = (rest * pulse * share).sum(-1, keepdim=True) / or_one((pulse.square() * share).sum(-1, keepdim=True))
+    return ((rest - slope * pulse).square() * share).sum(-1).sqrt()
 
 
 @torch.no_grad()
@@ -217,7 +229,7 @@ def _start(cells: Tensor, coarse: Estimate, radar: TriangularLadar, pulse: Axis)
         4
         * math.pi
         / radar.wavelength_m
-        * integrated_range_detrended_bound_m(coarse.std["velocity_m_s"][..., 0], pulse.step, pulse.n)
+        * integrated_range_detrended_bound_m(coarse.info["noise_m_s"], pulse.step, pulse.n)
     )
     far = coarse.ok & (drift > _FAR_RAD)
     if pulse.n < _FEW_PERIODS or not bool(far.any()):
