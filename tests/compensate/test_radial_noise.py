@@ -14,7 +14,7 @@ from torchsar.metrics import (
     velocity_free_offset_bound_m_s,
     velocity_known_offset_bound_m_s,
 )
-from torchsar.scene import LinearInSweep
+from torchsar.scene import LinearInSweep, Polynomial, Sinusoid
 
 RADAR = table1()
 GATE = (1.5 - 20 * RADAR.range_step_m, 1.5 + 20 * RADAR.range_step_m)
@@ -118,3 +118,12 @@ def test_failed_estimates_are_not_ok(name) -> None:
         found = ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE)
         assert not bool((found.ok & (velocity_rms(found, truth) > 3 * found.std["velocity_m_s"][:, 0])).any())
         assert not bool(found.ok.any())
+
+
+@pytest.mark.parametrize("name", ["segmented_sum", "correlation", "peak", "mirror", "recommended"])
+def test_motion_faster_than_the_search_is_not_ok(name) -> None:
+    """Velocities change by several bins between blocks of periods; the product contradicts them."""
+    fast = (Polynomial([0.3, 20.0]), Sinusoid(60e-6, 3000.0, 20.0))
+    sweeps, pulse, truth = seen(n=96, snr_db=10.0, motion=fast, dtype=torch.complex64, fidelity=LINES)
+    found = ESTIMATORS[name](sweeps, RADAR, pulse)
+    assert float(velocity_rms(found, truth)) > 0.05 and not bool(found.ok)

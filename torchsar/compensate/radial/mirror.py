@@ -59,8 +59,10 @@ def mirror_product(
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
         positive. Its standard deviation is predicted from the measured SNR and includes the
-        squaring loss. `ok` is False where the SNR after compression, less the squaring loss, is
-        below 15 dB, or no scatterer is illuminated in any period. `info` holds "snr_db" (after
+        squaring loss, but not the interference of many scatterers in a range cell, by which the
+        error may be several times as large. `ok` is False where the SNR after compression, less the
+        squaring loss, is below 15 dB, where the peaks of the product over all velocities contradict
+        the result, or no scatterer is illuminated in any period. `info` holds "snr_db" (after
         compression), shape (...,); "shift" (Doppler shift in whole bins) and "lit" (True in periods
         with an echo), shape (..., pulse); and, with intercept "record", "intercept_rad", the
         estimated phase, shape (...,).

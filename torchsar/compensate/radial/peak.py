@@ -51,7 +51,7 @@ def ml_peak(
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
         positive, with its standard deviation. `ok` is False where the SNR after compression is
-        below 14 dB, or no scatterer is illuminated in any period.
+        below 16 dB, or no scatterer is illuminated in any period.
 
     Raises:
         TypeError: If the sweeps are not complex.

@@ -6,6 +6,7 @@ does not.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -77,21 +78,62 @@ def phase_polish(
     """
     pulses = prepare(data, "phase_polish", empty=False)
     refuse_odd_counts("phase_polish", 1, iterations=iterations)
-    along = AlongPulses()
     begin = starting_phase(start, pulses, "phase_polish")
+
+    def find(rows: Tensor, present: Tensor, at: Tensor | None) -> Found:
+        phase, taken = sharpened(rows, at, iterations, tolerance_rad)
+        again = [Run(_scene, AlongPulses(), 4, _RELAXATION, 0.0), Run(_near_peak, AlongPulses(2), 5, 1.0, 0.0)]
+        return phase, taken, lambda some, _, here: in_turn(some, here, again)[0]
+
+    found = estimated(pulses, begin, find, at_rest=True)
+    return replace(found, value={"phase_rad": found["phase_rad"].to(torch.float64)})
+
+
+def sharpened(rows: Tensor, start: Tensor | None, iterations: int, tolerance_rad: float) -> tuple[Tensor, Tensor]:
+    """Estimate the phases as `phase_polish` does, without a verdict.
+
+    Args:
+        rows: Range cells over the pulses, shape (trial, range, pulse), complex.
+        start: Phase to start from in rad, shape (trial, pulse), or None for zero.
+        iterations: Largest number of iterations, see `phase_polish`.
+        tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.
+
+    Returns:
+        The phases in rad, shape (trial, pulse), and the iterations taken, shape (trial,).
+    """
+    start = torch.zeros_like(rows[:, 0].real) if start is None else start
+    along = AlongPulses()
     runs = [
         Run(_single_points, along, 1, 1.0, 0.0),
         Run(_scene, along, iterations, _RELAXATION, tolerance_rad),
         Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 2),
     ]
-    again = [Run(_scene, along, 4, _RELAXATION, 0.0), Run(_near_peak, AlongPulses(2), 5, 1.0, 0.0)]
+    return in_turn(rows, start, runs)
 
-    def find(rows: Tensor, present: Tensor, at: Tensor | None) -> Found:
-        first = torch.zeros_like(rows[:, 0].real) if at is None else at
-        return *in_turn(rows, first, runs), lambda some, _, here: in_turn(some, here, again)[0]
 
-    found = estimated(pulses, begin, find, at_rest=True)
-    return replace(found, value={"phase_rad": found["phase_rad"].to(torch.float64)})
+@torch.no_grad()
+def scene_cells(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the effective numbers of image cells and of range cells that hold the scene.
+
+    The noise level is the median cell of the image; cells that clearly exceed it are scene. The
+    effective number of cells with the energies e is (sum e)^2 / sum e^2.
+
+    Args:
+        rows: Corrected range cells over the pulses, shape (trial, range, pulse), complex.
+
+    Returns:
+        The number of image cells and that of range cells, float64 (trial,) each.
+    """
+    image = torch.fft.fft(rows, norm="ortho")
+    power = (image.real.square() + image.imag.square()).to(torch.float64)
+    noise = power.flatten(-2).median(-1).values[:, None, None] / math.log(2)
+    scene = torch.where(power > 12 * noise, power - noise, 0)
+    row, tiny = scene.sum(-1), torch.finfo(torch.float64).tiny
+    energy = row.sum(-1).square()
+    return (
+        energy / scene.square().sum((-2, -1)).clamp_min(tiny),
+        energy / row.square().sum(-1).clamp_min(tiny),
+    )
 
 
 def _bright(power: Tensor) -> Tensor:

@@ -7,16 +7,24 @@ It estimates velocities by `mirror_product`, and then the residual phase of ever
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase import Listed, pga
+from torchsar.compensate.pulse_phase.data import or_one, prepare, rotate, starting_phase
+from torchsar.compensate.pulse_phase.homogeneous import describe
+from torchsar.compensate.pulse_phase.imaging import AlongPulses
+from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
+from torchsar.compensate.pulse_phase.verdict import occupied_band
 from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
+from torchsar.compensate.radial.dense import linked_walk, phase_difference
 from torchsar.compensate.radial.mirror import Intercept, mirror_estimate, refuse_other_intercept
-from torchsar.compensate.radial.polish import ENOUGH_STD_RAD, phase_polish
+from torchsar.compensate.radial.polish import ENOUGH_STD_RAD, scene_cells, sharpened
 from torchsar.compensate.radial.trajectory import integrated_range, sweep_motion
 from torchsar.core import Axis, Estimate
 from torchsar.core.spline import UniformSpline
@@ -27,6 +35,15 @@ from torchsar.radar import TriangularLadar, sweep_middles
 # random walk of the integrated velocities beyond which the polish is started from PGA, found by
 # trial: beyond a radian the polish alone may end in an image of two peaks
 _FAR_RAD = 0.4
+# scenes of more effective image cells are dense
+_DENSE_CELLS = 20.0
+# phases that exceed the expected random walk by this factor, besides 0.4 rad, are not due to noise
+_UNEXPECTED = 3.0
+# effective range cells below which a scene is a single range cell, and relative modulation of the
+# power of its pulses, besides so many standard deviations of noise, that shows several scatterers
+_ONE_CELL, _MODULATION, _SURE = 1.5, 0.1, 4.0
+# least entropy, as in `autofocus`: a second estimate for the verdict
+_SHARPEN = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)
 _FEW_PERIODS = 32  # fewer periods are not started from PGA, whose first window is as wide
 # windows of PGA in Doppler cells, found by trial: a random walk blurs by few cells
 _WINDOWS = Listed((31.0, 21.0, 15.0, 9.0, 9.0, 9.0))
@@ -49,8 +66,11 @@ def radial_motion(
     `mirror_product` estimates the velocities. The range cells of the window are compensated with
     the integral of the velocities and deramped in azimuth. `phase_polish` then estimates the
     residual phase of each pulse, so that the range error does not grow with the length of the
-    record. All steps use only the bins of the window: a window that holds the scene and little else
-    saves time and allows a lower SNR. Differentiable, except for the peak searches.
+    record. In dense scenes, whose energy fills more than 20 cells of the image, phases of maximum
+    likelihood replace those that sharpen the image, because sharpness prefers wrong phases there;
+    this takes some seconds per trial. All steps use only the bins of the window: a window that
+    holds the scene and little else saves time and allows a lower SNR. Differentiable, except for
+    the peak searches and the choice between results.
 
     Args:
         sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
@@ -71,7 +91,11 @@ def radial_motion(
         deviations. The phase is to be removed after `compensate_motion` with the velocities.
         `range_error` combines both to a range error. `quality` is that of the velocities. `ok` is
         False where `ok` of `mirror_product` is False, or the phase has a standard deviation of 0.5
-        rad or more.
+        rad or more. From 32 periods on, it is also False where linked phases of a dense scene are
+        not confirmed; where the power of the pulses is modulated or the phases exceed the random
+        walk that noise explains by far, and least entropy leads to other phases; and where a single
+        range cell has a modulated power, because the interference of scatterers then cannot be
+        distinguished from motion.
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -90,8 +114,8 @@ def radial_motion(
 def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, tolerance_rad: float) -> Estimate:
     """Complete an estimate of radial velocities by the residual phase of each up sweep.
 
-    The motion is compensated with the velocities first; `phase_polish` then estimates the phases
-    that remain.
+    The motion is compensated with the velocities first; then the phases that remain are estimated
+    as by `phase_polish`.
 
     Args:
         bands: Filtered sweeps from which the velocities were estimated.
@@ -104,17 +128,103 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
         The `Estimate` that the function `radial_motion` returns.
     """
     cells = deramped_lines(bands, coarse["velocity_m_s"], pulse)
-    fine = phase_polish(
-        cells, start=_start(cells, coarse, bands.radar, pulse), iterations=iterations, tolerance_rad=tolerance_rad
-    )
+    step = 4 * math.pi / bands.radar.wavelength_m * pulse.step * coarse.info["noise_m_s"].detach()
+    pulses = prepare(cells, "radial_motion", empty=False)
+    start = starting_phase(_start(cells, coarse, bands.radar, pulse), pulses, "radial_motion")
+    phase, taken = sharpened(pulses.rows, start, iterations, tolerance_rad)
+    found = scene_cells(rotate(pulses.rows.detach(), phase.detach()))
+    image_cells, range_cells = (count.reshape(pulses.trials) for count in found)
+    phase = phase.to(torch.float64).reshape(*pulses.trials, pulses.n)
     std = (1 / torch.sqrt(2 * 10 ** (coarse.info["snr_db"] / 10))).clamp_max(math.pi)
-    return Estimate(
-        {**coarse.value, **fine.value},
-        quality=coarse.quality,
-        ok=coarse.ok & (std < ENOUGH_STD_RAD),
-        std={**coarse.std, "phase_rad": std[..., None].expand_as(fine["phase_rad"])},
-        info={**coarse.info, **fine.info},
+    return _judged(
+        cells,
+        step,
+        Estimate(
+            {**coarse.value, "phase_rad": phase},
+            quality=coarse.quality,
+            ok=coarse.ok & (std < ENOUGH_STD_RAD),
+            std={**coarse.std, "phase_rad": std[..., None].expand_as(phase)},
+            info={
+                **coarse.info,
+                "iterations": taken.reshape(pulses.trials),
+                "image_cells": image_cells,
+                "range_cells": range_cells,
+            },
+        ),
     )
+
+
+def _judged(cells: Tensor, step_rad: Tensor, sharpest: Estimate) -> Estimate:
+    """The estimate with linked phases in trials of dense scenes, and with stricter verdicts.
+
+    In dense scenes it is ok where `linked_walk` is ok. In other scenes, where the phases exceed the
+    random walk of the velocities by far or the power of the pulses is modulated, it is ok where
+    least entropy has nearly the same phases. In a scene of one range cell the interference of
+    scatterers cannot be distinguished from motion; the power of the pulses must then be constant.
+    """
+    n, phase = cells.shape[-2], sharpest["phase_rad"].reshape(-1, cells.shape[-2])
+    if n < _FEW_PERIODS or not bool(sharpest.ok.any()):
+        return sharpest
+    lines, std, ok = (
+        cells.reshape(-1, *cells.shape[-2:]),
+        sharpest.std["phase_rad"].reshape(-1, n),
+        sharpest.ok.flatten(),
+    )
+    range_cells, image_cells = (sharpest.info[name].flatten() for name in ("range_cells", "image_cells"))
+    lit = sharpest.info["lit"].reshape(-1, n)
+    expected = step_rad.flatten() * math.sqrt(n / 15)
+    dense = ok & (image_cells > _DENSE_CELLS)
+    modulated = (
+        _modulation(lines.detach(), sharpest.info["lit"].reshape(-1, n))
+        > _MODULATION + _SURE * math.sqrt(2) * std[:, 0].detach()
+    )
+    far = modulated | (_rms_without_line(phase.detach(), lit) > _UNEXPECTED * expected + _FAR_RAD)
+    ok = ok & ~(modulated & (range_cells < _ONE_CELL))
+    far = ok & ~dense & far
+    if bool(dense.any()):
+        at = dense.nonzero()[:, 0]
+        linked = linked_walk(lines[at], phase[at], step_rad.flatten()[at])
+        phase = phase.index_copy(0, at, linked["phase_rad"].to(phase.dtype))
+        std = std.index_copy(0, at, linked.std["phase_rad"].to(std.dtype))
+        ok = ok.index_put((at,), ok[at] & linked.ok)
+    if bool(far.any()):
+        at = far.nonzero()[:, 0]
+        with torch.no_grad():
+            pulses = prepare(lines[at], "radial_motion")
+            other = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
+            own = phase[at].to(other.dtype)
+            coherent = describe(pulses.rows, own, occupied_band(pulses.rows)).ratio > 0
+        apart = phase_difference(phase[at].detach(), other.to(phase.dtype))
+        std = std.index_put((at,), (std[at].square() + (2 * apart[:, None]).square()).sqrt())
+        ok = ok.index_put((at,), ok[at] & coherent & (2 * apart < ENOUGH_STD_RAD))
+    return replace(
+        sharpest,
+        value={**sharpest.value, "phase_rad": phase.reshape(sharpest["phase_rad"].shape)},
+        std={**sharpest.std, "phase_rad": std.reshape(sharpest["phase_rad"].shape)},
+        ok=ok.reshape(sharpest.ok.shape),
+    )
+
+
+def _modulation(lines: Tensor, lit: Tensor) -> Tensor:
+    """Standard deviation over mean of the power of the lit pulses, (trial,).
+
+    lines: (trial, pulse, range); lit: (trial, pulse), bool.
+    """
+    power = (lines.real.square() + lines.imag.square()).sum(-1, dtype=torch.float64)
+    count, tiny = lit.sum(-1, keepdim=True).clamp_min(1), torch.finfo(torch.float64).tiny
+    mean = (power * lit).sum(-1, keepdim=True) / count
+    square = ((power / mean.clamp_min(tiny) - 1).square() * lit).sum(-1) / count[:, 0]
+    return square.sqrt()
+
+
+def _rms_without_line(phase: Tensor, lit: Tensor) -> Tensor:
+    """Rms over the lit pulses of phases (trial, pulse) in rad without a straight line, (trial,)."""
+    pulse = torch.linspace(-1, 1, phase.shape[-1], dtype=phase.dtype, device=phase.device)
+    share = lit / lit.sum(-1, keepdim=True).clamp_min(1)
+    pulse = pulse - (pulse * share).sum(-1, keepdim=True)
+    rest = phase - (phase * share).sum(-1, keepdim=True)
+    slope = (rest * pulse * share).sum(-1, keepdim=True) / or_one((pulse.square() * share).sum(-1, keepdim=True))
+    return ((rest - slope * pulse).square() * share).sum(-1).sqrt()
 
 
 @torch.no_grad()
@@ -127,7 +237,7 @@ def _start(cells: Tensor, coarse: Estimate, radar: TriangularLadar, pulse: Axis)
         4
         * math.pi
         / radar.wavelength_m
-        * integrated_range_detrended_bound_m(coarse.std["velocity_m_s"][..., 0], pulse.step, pulse.n)
+        * integrated_range_detrended_bound_m(coarse.info["noise_m_s"], pulse.step, pulse.n)
     )
     far = coarse.ok & (drift > _FAR_RAD)
     if pulse.n < _FEW_PERIODS or not bool(far.any()):

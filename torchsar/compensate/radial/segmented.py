@@ -59,7 +59,7 @@ def segmented_interference(
             from the lag between the range envelopes of the two sweeps. "gradient", the published
             method, does so for one period only and then adds the wrapped phase changes from period
             to period. It slips by a turn where the velocity changes by lambda / (4 T) per period,
-            or where the SNR after compression is below 14 dB.
+            or where the SNR after compression is below 16 dB.
         scatterers: Number of scatterers with "peak". Each is used in the periods in which it is
             illuminated.
         padding: Factor of the zero-padding of the halves, 1..16.
@@ -71,7 +71,7 @@ def segmented_interference(
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
         positive, with its standard deviation. `ok` is False where the SNR after compression is
-        below 14 dB, or no scatterer is illuminated in any period. `info` holds
+        below 16 dB, or no scatterer is illuminated in any period. `info` holds
 
         - "phase_rad" and "integer" (whole turns), shape (..., pulse);
         - "slips", the number of changes between periods in which "gradient" and "per_pulse" differ
