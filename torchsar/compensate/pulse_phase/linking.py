@@ -43,9 +43,10 @@ _PRIOR = 3 / math.pi**2  # information in 1/rad^2 of a phase that is uniform ove
 # Gain of the log likelihood per pulse by which the phases fit circular noise: 1.1 to 2.3 nats were
 # measured for 4 to 192 range cells and 64 to 256 pulses. A scene must gain twice as much.
 _NOISE_NATS, _MARGIN = 2.0, 2.0
-# The errors of neighbouring pulses depend on each other, so that the rms error of a scene may
-# exceed its standard deviation by this factor.
-_SPREAD = 1.4
+# The errors of neighbouring pulses depend on each other, and where the spectrum has no edges a slow
+# phase error hardly changes it, so that the rms error of a scene may exceed its standard deviation
+# by this factor.
+_SPREAD = 1.9
 # the phases that sharpen a sparse scene, as in `autofocus`
 _SHARPEN = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)
 _BLOCK_BYTES = 64 << 20  # limits the memory of a block of trials
@@ -69,7 +70,7 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         cells (see `occupied_band`), raised by the share of the likelihood that the phases gain on
         noise. A constant and a linear phase only add a phase to the image and shift it; they are
         left out of the standard deviation. `quality` is the predicted Strehl ratio times the share
-        of the likelihood that noise does not explain. `ok` is False where the Strehl ratio for 1.4
+        of the likelihood that noise does not explain. `ok` is False where the Strehl ratio for 1.9
         times the standard deviation is below 0.8, the gain in likelihood below twice that of noise,
         a single range cell holds nearly all of the energy, adjacent pulses are not coherent in any
         ten range cells of similar power, or a sparse description of the scene with the phases that

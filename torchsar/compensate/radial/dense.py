@@ -147,19 +147,23 @@ def _slope(phasors: Tensor) -> Tensor:
     return at.to(torch.float64) * (2 * math.pi / (64 * n))
 
 
-def phase_difference(a: Tensor, b: Tensor) -> Tensor:
+def phase_difference(a: Tensor, b: Tensor, lit: Tensor | None = None) -> Tensor:
     """Compute the difference of phases, apart from a constant and a straight line.
 
     Args:
         a: Phases in rad, shape (..., pulse), float64.
         b: Other phases in rad, shape (..., pulse), float64.
+        lit: Pulses that count, shape (..., pulse), bool; all by default.
 
     Returns:
         The rms difference in rad, shape (...,), at most the square root of 2.
     """
     turned = cis(a.detach() - b.detach())
+    if lit is not None:
+        turned = turned * lit
     tone = turned * cis(-_slope(turned)[..., None] * torch.arange(a.shape[-1], device=a.device))
-    return (2 * (1 - tone.mean(-1).abs())).clamp_min(0).sqrt()
+    count = a.shape[-1] if lit is None else lit.sum(-1).clamp_min(1)
+    return (2 * (1 - tone.sum(-1).abs() / count)).clamp_min(0).sqrt()
 
 
 def _without_line(phase: Tensor) -> Tensor:
