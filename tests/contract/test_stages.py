@@ -584,7 +584,7 @@ def single(values: dict[str, Tensor], i: int) -> dict[str, Tensor]:
 @pytest.mark.parametrize("trials", [1, 3])
 @pytest.mark.parametrize("case", CASES, ids=IDS)
 def test_batch_equals_singles(case: Case, trials: int) -> None:
-    """To the tolerance times the value or, in data that do not determine it, its predicted deviation."""
+    """To the tolerance times the value or, if that is larger, times its predicted deviation."""
     stage, signal = case.build(), entering(case, raw(trials, n_range=case.n_range))
     values = case.values(signal)
     together = results(stage(signal, **values))
