@@ -27,6 +27,9 @@ _SAME_RAD = 0.1  # rms difference below which two results are the same
 # floors relative to the mean power, steps for each, and length of a step. A high floor lets the
 # descent pass over local minima; the walks of velocities from dense scenes are 0.4 to 1.6 rad.
 _COSINES, _WALK_RAD, _FLOORS, _STEPS, _LENGTH = 60, 1.0, (1e-1, 1e-2, 1e-3, 1e-4), 40, 0.3
+# variance of a random walk about a spline through the means of blocks of n steps, over n times that
+# of a step; simulated for n = 2 to 16
+_WITHIN = 0.115
 _MEMORY = (0.9, 0.98)  # of the mean slope and of the mean squared slope
 
 
@@ -43,8 +46,8 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
     Returns:
         `phase_rad` of shape (trial, pulse), without steps of whole turns and without a straight
         line. Its standard deviation is that of `link_phases`, of the walk within a block of pulses,
-        and of the difference of the two nearest results. `ok` is False where no two starts reach
-        the same phases within 0.1 rad, or `link_phases` is not ok.
+        and that which the difference of the two nearest results shows. `ok` is False where no two
+        starts reach the same phases within 0.1 rad, or `link_phases` is not ok.
     """
     n = cells.shape[-2]
     size = max(1, n // _BLOCKS)
@@ -70,8 +73,9 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
     chosen = phase[best, trial]
     apart = phase_difference(phase, chosen).index_put((best, trial), torch.full_like(gain[0], torch.inf)).amin(0)
     walk = _without_line(chosen)
-    within = step_rad.to(torch.float64).square() * size / 6
-    spread = (std[best, trial].square() + (within + apart.square())[:, None]).sqrt()
+    within = step_rad.to(torch.float64).square() * size * _WITHIN
+    # two results of the same deviation differ by the square root of two of it
+    spread = (std[best, trial].square() + (within + apart.square() / 2)[:, None]).sqrt()
     middle = first + (size - 1) / 2
     at = torch.arange(n, dtype=torch.float64, device=cells.device)
     block = ((at - first) / size).floor().clamp(0, count - 1).long()
