@@ -91,6 +91,14 @@ def test_error_of_integrated_velocities_grows_and_that_of_the_chain_does_not() -
     assert rms[1024][1] < 1.1 * rms[128][1] and rms[1024][1] < 1.5e-9
 
 
+@pytest.mark.filterwarnings("ignore:radial_motion")
+def test_two_periods_show_no_phase() -> None:
+    """A phase error of two cannot be distinguished from a shift of the image."""
+    sweeps, pulse, _ = noisy(30, n=2, trials=2)
+    found = radial_motion(sweeps, RADAR, pulse, window_m=GATE)
+    assert not bool(found.ok.any()) and not bool(found["phase_rad"].any())
+
+
 def test_the_chain_tolerates_random_walks_of_radians() -> None:
     """At -10 dB velocities integrate to more than a radian; a start by PGA prevents two peaks."""
     sweeps, pulse, truth = noisy(-8, trials=16)

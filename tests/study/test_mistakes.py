@@ -58,6 +58,7 @@ MISTAKES = [
     # of every system
     ("isal", {"metrics": {"reference": "sca"}}, "name a method with 'input: clean'"),
     ("sal", {"beyond_limits": ["segmentd"]}, "beyond_limits names 'segmentd', which is no method"),
+    ("sal", {"metrics": {"reference": ["sca"]}}, "metrics.reference names ['sca'], which is no method"),
     ("stripmap", {"world": world("stripmap", squint_deg=1.0)}, "both give the direction of the beam"),
     ("stripmap", {"world": world("stripmap", doppler_hz=None, squint_deg=90.0)}, "between -90 and 90 degrees"),
     ("stripmap", {"world": world("stripmap", lines=1)}, "at least one scene, 2 lines and 2 samples"),

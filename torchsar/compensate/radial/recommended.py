@@ -91,8 +91,8 @@ def radial_motion(
         `phase_rad` at the middles of the up sweeps, shape (..., pulse) each, with standard
         deviations. The phase is to be removed after `compensate_motion` with the velocities.
         `range_error` combines both to a range error. `quality` is that of the velocities. `ok` is
-        False where `ok` of `mirror_product` is False, or the phase has a standard deviation of 0.5
-        rad or more. From 32 periods on, it is also False where linked phases of a dense scene are
+        False where `ok` of `mirror_product` is False, the phase has a standard deviation of 0.5 rad
+        or more, or fewer than three periods have an echo; the phase is then zero. From 32 periods on, it is also False where linked phases of a dense scene are
         not confirmed; where the power of the pulses is modulated or the phases exceed the random
         walk that noise explains by far, and least entropy leads to other phases; and where a single
         range cell has a modulated power, because the interference of scatterers then cannot be
@@ -135,7 +135,8 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
     phase, taken = sharpened(pulses.rows, start, iterations, tolerance_rad)
     found = scene_cells(rotate(pulses.rows.detach(), phase.detach()))
     image_cells, range_cells = (count.reshape(pulses.trials) for count in found)
-    phase = phase.to(torch.float64).reshape(*pulses.trials, pulses.n)
+    enough = pulses.present.sum(-1) > 2  # two cannot distinguish a phase error from a shift of the image
+    phase = torch.where(enough[:, None], phase, 0).to(torch.float64).reshape(*pulses.trials, pulses.n)
     std = (1 / torch.sqrt(2 * 10 ** (coarse.info["snr_db"] / 10))).clamp_max(math.pi)
     return _judged(
         cells,
@@ -143,7 +144,7 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
         Estimate(
             {**coarse.value, "phase_rad": phase},
             quality=coarse.quality,
-            ok=coarse.ok & (std < ENOUGH_STD_RAD),
+            ok=coarse.ok & (std < ENOUGH_STD_RAD) & enough.reshape(pulses.trials),
             std={**coarse.std, "phase_rad": std[..., None].expand_as(phase)},
             info={
                 **coarse.info,

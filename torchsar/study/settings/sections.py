@@ -184,7 +184,7 @@ class Config(Strict):
         reference = self.metrics.get("reference")
         named = [*(("beyond_limits", name) for name in self.beyond_limits), ("metrics.reference", reference)]
         for key, name in named:
-            if name is not None and name not in self.processor:
+            if name is not None and name not in tuple(self.processor):
                 raise ValueError(
                     f"{key} names {name!r}, which is no method of the processor ({', '.join(self.processor)})"
                 )
