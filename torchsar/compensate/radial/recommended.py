@@ -92,11 +92,11 @@ def radial_motion(
         deviations. The phase is to be removed after `compensate_motion` with the velocities.
         `range_error` combines both to a range error. `quality` is that of the velocities. `ok` is
         False where `ok` of `mirror_product` is False, the phase has a standard deviation of 0.5 rad
-        or more, or fewer than three periods have an echo; the phase is then zero. From 32 periods on, it is also False where linked phases of a dense scene are
-        not confirmed; where the power of the pulses is modulated or the phases exceed the random
-        walk that noise explains by far, and least entropy leads to other phases; and where a single
-        range cell has a modulated power, because the interference of scatterers then cannot be
-        distinguished from motion.
+        or more, or fewer than three periods have an echo; the phase is then zero. From 32 periods
+        on, it is also False where linked phases of a dense scene are not confirmed; where the power
+        of the pulses is modulated or the phases exceed the random walk that noise explains by far,
+        and least entropy leads to other phases; and where a single range cell has a modulated
+        power, because the interference of scatterers then cannot be distinguished from motion.
 
     Raises:
         TypeError: If the sweeps are not complex.
