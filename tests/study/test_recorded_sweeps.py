@@ -15,24 +15,10 @@ from torchsar.study.table import load
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = sorted((ROOT / "docs" / "sweeps").glob("*.json"))
-# To be recorded again; strict, so that a new record is noticed here.
-OLD = {
-    "stripmap_doppler": "recorded before the first sample of a pulse moved to its leading edge, which changes speckle",
-}
 
 
 @pytest.mark.filterwarnings("ignore:at a pulse rate")
-@pytest.mark.parametrize(
-    "file",
-    [
-        pytest.param(
-            file,
-            id=file.stem,
-            marks=[pytest.mark.xfail(strict=True, reason=OLD[file.stem])] if file.stem in OLD else [],
-        )
-        for file in RECORDS
-    ],
-)
+@pytest.mark.parametrize("file", RECORDS, ids=[file.stem for file in RECORDS])
 def test_trials_of_a_record_come_out_again(file: Path) -> None:
     """One point of each; figures are of single precision, hence a per cent of the largest trial."""
     sample = json.loads(file.read_text(encoding="utf-8"))["sample"]
