@@ -79,7 +79,8 @@ def differences(found: Results, wanted: Results, entry: Entry, level: float = 1.
             gap = torch.remainder(gap + torch.pi, 2 * torch.pi) - torch.pi
         error = torch.where((a == b) | (a.isnan() & b.isnan()), 0, gap.abs())
         size = torch.where(torch.isfinite(b.abs()), b.abs(), 0).max()
-        if not bool(error.max() <= tolerance * size.clamp_min(1.0 if name.startswith("phase_rad") else 1e-300)):
+        least = 1.0 if name.startswith("phase_rad") else max(entry.least, 1e-300)
+        if not bool(error.max() <= tolerance * size.clamp_min(least)):
             return f"{name}: off by {float(error.max()):.3g} of {float(size):.3g}"
     return ""
 
@@ -174,7 +175,7 @@ def random_case(entries: list[Entry], seed: int) -> str:
         for i, kind in enumerate(kinds):
             mine = trial(found, i, len(kinds))
             if kind == "nan":
-                hidden = mine and not any(map(has_nan, mine.values()))
+                hidden = batch[i].numel() and mine and not any(map(has_nan, mine.values()))
                 if hidden and not ("ok" in mine and not bool(mine["ok"].any())) and uses_nan(entry, batch, i, mine):
                     return f"{case}: trial {i} does not show its NaN"
                 continue

@@ -43,6 +43,7 @@ class Entry:
         zero_ok: Reason why a trial of zeros may be ok.
         joint: All trials together give one result.
         refuses_levels: It refuses samples whose power does not fit their precision.
+        least: Size of a result below which its rounding errors do not matter.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Entry:
     zero_ok: str = ""
     joint: bool = False
     refuses_levels: bool = False
+    least: float = 0.0
 
 
 def named(out: Any, name: str = "data") -> dict[str, Tensor]:
@@ -598,7 +600,7 @@ FUNCTIONS = [
     _entry("focus.defocus_omega_k", "image", lambda x: focus.defocus_omega_k(x, RADAR, **DOPPLER)),
     _entry("focus.closest_range", "image", lambda x: focus.closest_range(x, RADAR, 5.0)),
     # metrics
-    _entry("metrics.entropy", "image", metrics.entropy, 0),
+    _entry("metrics.entropy", "image", metrics.entropy, 0, least=0.01),
     _entry("metrics.contrast", "image", metrics.contrast, 0),
     _entry("metrics.correlation", "image", lambda x: metrics.correlation(x, x.roll(1, -1)), 0),
     _entry("metrics.error_db", "image", lambda x: metrics.error_db(x, x.roll(1, -1)), 0),
