@@ -65,6 +65,7 @@ CELLS = [
     ("multichannel.AlongTrackAutofocus", "partly lit", 10.0, 0.0),
     ("multichannel.LikelihoodVelocity", "partly lit", 10.0, 0.0),
     ("multichannel.LikelihoodVelocity", "own", 10.0, 1.0),
+    ("compensate.RadialMotion", "letter", 10.0, 1.0),
     ("compensate.PhasePolish", "noise", None, 0.0),
     ("compensate.PhasePolish", "own", -10.0, 0.0),
     ("compensate.PhasePolish", "clutter 60 %", 5.0, 0.0),

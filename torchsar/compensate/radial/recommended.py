@@ -129,7 +129,7 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
         The `Estimate` that the function `radial_motion` returns.
     """
     cells = deramped_lines(bands, coarse["velocity_m_s"], pulse)
-    step = 4 * math.pi / bands.radar.wavelength_m * pulse.step * coarse.info["noise_m_s"].detach()
+    per_velocity = 4 * math.pi / bands.radar.wavelength_m * pulse.step
     pulses = prepare(cells, "radial_motion", empty=False)
     start = starting_phase(_start(cells, coarse, bands.radar, pulse), pulses, "radial_motion")
     phase, taken = sharpened(pulses.rows, start, iterations, tolerance_rad)
@@ -140,7 +140,7 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
     std = (1 / torch.sqrt(2 * 10 ** (coarse.info["snr_db"] / 10))).clamp_max(math.pi)
     return _judged(
         cells,
-        step,
+        per_velocity,
         Estimate(
             {**coarse.value, "phase_rad": phase},
             quality=coarse.quality,
@@ -156,13 +156,16 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
     )
 
 
-def _judged(cells: Tensor, step_rad: Tensor, sharpest: Estimate) -> Estimate:
+def _judged(cells: Tensor, per_velocity: float, sharpest: Estimate) -> Estimate:
     """The estimate with linked phases in trials of dense scenes, and with stricter verdicts.
 
-    In dense scenes it is ok where `linked_walk` is ok. In other scenes, where the phases exceed the
-    random walk of the velocities by far or the power of the pulses is modulated, it is ok where
-    least entropy has nearly the same phases. In a scene of one range cell the interference of
-    scatterers cannot be distinguished from motion; the power of the pulses must then be constant.
+    An error of the velocity in m/s times `per_velocity` is the step of the phase in rad between
+    periods. In dense scenes, in which scatterers interfere, the linked phases thus show the errors
+    of the velocities but for a constant, which is taken to be as large, and the estimate is ok
+    where `linked_walk` is ok. In other scenes, where the phases exceed the random walk of the
+    velocities by far or the power of the pulses is modulated, it is ok where least entropy has
+    nearly the same phases. In a scene of one range cell the interference of scatterers cannot be
+    distinguished from motion; the power of the pulses must then be constant.
     """
     n, phase = cells.shape[-2], sharpest["phase_rad"].reshape(-1, cells.shape[-2])
     if n < _FEW_PERIODS or not bool(sharpest.ok.any()):
@@ -174,7 +177,9 @@ def _judged(cells: Tensor, step_rad: Tensor, sharpest: Estimate) -> Estimate:
     )
     range_cells, image_cells = (sharpest.info[name].flatten() for name in ("range_cells", "image_cells"))
     lit = sharpest.info["lit"].reshape(-1, n)
-    expected = step_rad.flatten() * math.sqrt(n / 15)
+    step_rad = per_velocity * sharpest.info["noise_m_s"].detach().flatten()
+    velocity_std = sharpest.std["velocity_m_s"].reshape(-1, n)
+    expected = step_rad * math.sqrt(n / 15)
     dense = ok & (image_cells > _DENSE_CELLS)
     modulated = (
         _modulation(lines.detach(), sharpest.info["lit"].reshape(-1, n))
@@ -185,10 +190,13 @@ def _judged(cells: Tensor, step_rad: Tensor, sharpest: Estimate) -> Estimate:
     far = ok & ~dense & far
     if bool(dense.any()):
         at = dense.nonzero()[:, 0]
-        linked = linked_walk(lines[at], phase[at], step_rad.flatten()[at])
+        linked = linked_walk(lines[at], phase[at], step_rad[at])
         phase = phase.index_copy(0, at, linked["phase_rad"].to(phase.dtype))
         std = std.index_copy(0, at, linked.std["phase_rad"].to(std.dtype))
         ok = ok.index_put((at,), ok[at] & linked.ok)
+        steps = torch.diff(linked["phase_rad"].detach()).square().mean(-1, keepdim=True)
+        spread = (velocity_std[at].square() + 2 * steps / per_velocity**2).sqrt()
+        velocity_std = velocity_std.index_put((at,), spread)
     if bool(far.any()):
         at = far.nonzero()[:, 0]
         with torch.no_grad():
@@ -201,10 +209,11 @@ def _judged(cells: Tensor, step_rad: Tensor, sharpest: Estimate) -> Estimate:
         apart = phase_difference(phase[at].detach(), other.to(phase.dtype), lit[at])
         std = std.index_put((at,), (std[at].square() + (2 * apart[:, None]).square()).sqrt())
         ok = ok.index_put((at,), ok[at] & coherent & (2 * apart < _ENOUGH_APART_RAD))
+    stds = {"velocity_m_s": velocity_std, "phase_rad": std}
     return replace(
         sharpest,
         value={**sharpest.value, "phase_rad": phase.reshape(sharpest["phase_rad"].shape)},
-        std={**sharpest.std, "phase_rad": std.reshape(sharpest["phase_rad"].shape)},
+        std={name: one.reshape(sharpest["phase_rad"].shape) for name, one in stds.items()},
         ok=ok.reshape(sharpest.ok.shape),
     )
 
