@@ -227,8 +227,7 @@ def minimum_entropy_velocity(
     full_step = grid_step_m_s(group.radar, float(group.radar.near_range_m), dwell_s)
     start = torch.full(doppler_hz.shape, nominal, dtype=torch.float64, device=doppler_hz.device)
     reach = min(reach_m_s, nominal / 2)
-    value, step, searched = _search(spectrum, doppler_hz, weight, start, reach, full_step)
-    costs = searched[0]
+    value, step, costs = _search(spectrum, doppler_hz, weight, start, reach, full_step)
     best = costs.argmin(-1)
     grid = nominal + torch.linspace(-reach, reach, costs.shape[-1], dtype=torch.float64, device=doppler_hz.device)
     value, _ = refine(lambda velocity: whole(velocity).sum(-1), value, step, max(tolerance_m_s, full_step / 200))
@@ -260,17 +259,17 @@ def minimum_entropy_velocity(
 
 def _search(
     spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, start: Tensor, reach: float, full_step: float
-) -> tuple[Tensor, float, list[Tensor]]:
-    """Best velocity of the whole band (...,), its step, and the costs of every grid (..., grid)."""
-    share, value, searched = min(1.0, math.sqrt(_GRID * full_step / reach)), start, []
+) -> tuple[Tensor, float, Tensor]:
+    """Best velocity (...,) of the whole band, its step, and costs (..., grid) of the first grid."""
+    share, value, first = min(1.0, math.sqrt(_GRID * full_step / reach)), start, None
     while True:
         blocks = _objective(_middle_rows(spectrum, share), doppler_hz, weight)
         step = min(full_step / share**2, reach / 2)
         count = 2 * math.ceil(reach / step - 1e-9) + 1
         value, costs = grid_minimum(lambda velocity, f=blocks: f(velocity).sum(-1), value, reach, count)
-        searched.append(costs)
+        first = costs if first is None else first
         if share == 1:
-            return value, 2 * reach / (count - 1), searched
+            return value, 2 * reach / (count - 1), first
         reach, share = 2 * step, min(1.0, 2 * share)
 
 

@@ -1,9 +1,9 @@
 """Phases of the pulses of a dense scene by maximum likelihood.
 
-Many scatterers in a range cell interfere, and sharpness then prefers wrong phases. The phases that
-phase linking finds have the greatest likelihood, but the search ends in a local maximum unless it
-starts near enough. It is therefore started from two independent estimates, and from a third if
-their results differ. Only a result that was reached twice is reliable.
+Many scatterers in a range cell interfere, and sharpness then prefers wrong phases. The phases of
+greatest likelihood are the right ones, but a search that starts too far away ends in a local
+maximum. It is therefore started from two independent estimates, and if their results differ it is
+also made without a start. Only a result that was reached twice is reliable.
 """
 
 from __future__ import annotations

@@ -181,10 +181,7 @@ def _judged(cells: Tensor, per_velocity: float, sharpest: Estimate) -> Estimate:
     velocity_std = sharpest.std["velocity_m_s"].reshape(-1, n)
     expected = step_rad * math.sqrt(n / 15)
     dense = ok & (image_cells > _DENSE_CELLS)
-    modulated = (
-        _modulation(lines.detach(), sharpest.info["lit"].reshape(-1, n))
-        > _MODULATION + _SURE * math.sqrt(2) * std[:, 0].detach()
-    )
+    modulated = _modulation(lines.detach(), lit) > _MODULATION + _SURE * math.sqrt(2) * std[:, 0].detach()
     far = modulated | (_rms_without_line(phase.detach(), lit) > _UNEXPECTED * expected + _FAR_RAD)
     ok = ok & ~(modulated & (range_cells < _ONE_CELL))
     far = ok & ~dense & far
