@@ -15,8 +15,10 @@ targets, aliased motion, data of another system, and data of an independent gene
   value for which it is farthest from 1; null where no standard deviation is predicted;
 - `refused`: the sentence with which the estimator rejects such data, if it does.
 
-Rows that miss a bar are printed: `ok` in noise and zeros at most 1 %, `false_ok` at most 1 %, and a
-predicted standard deviation of 0.7 to 1.5 times the rms error.
+Rows that miss a bar are printed: `ok` in noise and zeros at most 1 %, `false_ok` at most 1 %, a
+predicted standard deviation of 0.7 to 1.5 times the rms error, and `needless` at most 5 % from 10
+dB above the SNR at which the estimate is of use. With `--only`, rows of other estimators that the
+file already holds are kept. The file is written after each row.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -37,7 +40,7 @@ SMALL = 4
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the audit and write its rows."""
     sys.path.insert(0, str(ROOT))  # the worlds stand beside the tests
-    from tests.audit.frame import NOTHING, SURE, Entry, World, audit, verdict
+    from tests.audit.frame import NOTHING, SURE, Entry, World, audit, doubted, verdict
     from tests.audit.table import entries
 
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -55,18 +58,32 @@ def main(arguments: Sequence[str] | None = None) -> None:
         many = options.trials * (1.5 if world.name in NOTHING else 1.0) * entry.share
         return SMALL if options.small else max(20, round(many))
 
-    rows = []
+    tried = {entry.name for entry in chosen}
+    kept = [row for row in read(options.out) if row["estimator"] not in tried] if options.only else []
+    rows: list[dict[str, Any]] = []
     for row in audit(chosen, trials):
         rows.append(row)
-        if missed := verdict(row):
-            where = f"{row['estimator']:40s} {row['world']:20s} {row['snr_db']!s:>6s}"
-            print(f"{where}  {'; '.join(missed)}", flush=True)
-            write(options.out, rows, SURE)
-    write(options.out, sorted(rows, key=lambda row: row["estimator"]), SURE)
-    print(f"{len(rows)} rows, {sum(bool(verdict(row)) for row in rows)} of them miss a bar: {options.out}")
+        for missed in verdict(row):
+            report(row, missed)
+        write(options.out, sorted([*kept, *rows], key=lambda row: row["estimator"]), SURE)
+    needless = list(doubted(rows))
+    for row in needless:
+        report(row, f"needless doubt {row['needless']:.2f}")
+    missed = sum(bool(verdict(row)) or row in needless for row in rows)
+    print(f"{len(rows)} rows, {missed} of them miss a bar: {options.out}")
 
 
-def write(path: Path, rows: list[dict], sure: float) -> None:
+def report(row: dict[str, Any], missed: str) -> None:
+    """Print a row that misses a bar."""
+    print(f"{row['estimator']:40s} {row['world']:20s} {row['snr_db']!s:>6s}  {missed}", flush=True)
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """Read the rows of an earlier run; none where there is no file."""
+    return json.loads(path.read_text(encoding="utf-8"))["rows"] if path.exists() else []
+
+
+def write(path: Path, rows: list[dict[str, Any]], sure: float) -> None:
     """Write the rows, one per line."""
     text = ",\n".join(
         json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}) for row in rows

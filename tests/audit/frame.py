@@ -24,6 +24,7 @@ from torchsar.core import Draws, Estimate
 PACKAGES = ("core", "repair", "compensate", "multichannel", "focus", "metrics", "optim", "io")
 NOTHING = ("noise", "zeros")  # worlds with nothing to be found
 SURE, RATIO = 5.0, (0.7, 1.5)  # predicted standard deviations of a false ok; bar of predicted over true
+DOUBT = 0.05  # bar of needless doubt, 10 dB above the threshold
 SNR_DB = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 40.0, 60.0)
 
 
@@ -194,6 +195,23 @@ def verdict(row: Mapping[str, Any]) -> list[str]:
     if ratio is not None and row["trials"] * row["ok"] >= 20 and not 1 / RATIO[1] <= ratio <= 1 / RATIO[0]:
         missed.append(f"rms over std {ratio:.2f}")
     return missed
+
+
+def doubted(rows: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+    """Rows of needless doubt: more than 5 % of the trials, 10 dB or more above the threshold.
+
+    The threshold is the lowest SNR of the same estimator and world from which on at least 95 % of
+    the estimates are within the tolerance of use, whatever their verdict.
+    """
+    for row in rows:
+        if row["snr_db"] is None or row["needless"] <= DOUBT:
+            continue
+        same = [r for r in rows if (r["estimator"], r["world"]) == (row["estimator"], row["world"])]
+        useless = [r["snr_db"] for r in same if r["ok"] - r["false_ok"] + r["needless"] < 1 - DOUBT]
+        below = [r["snr_db"] for r in same if r["snr_db"] < row["snr_db"]]
+        useful = [snr_db for snr_db in below if snr_db > max(useless, default=-math.inf)]
+        if useful and row["snr_db"] - min(useful) >= 10:
+            yield row
 
 
 def estimators() -> Iterator[str]:

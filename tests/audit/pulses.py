@@ -199,7 +199,7 @@ def entries() -> list[Entry]:
         "TargetAutofocus": TargetAutofocus(LADAR),
         "PhasePolish": PhasePolish(),
     }
-    heavy = ("SharpestPhase", "maximum_contrast", "Autofocus", "TargetAutofocus", "LinkPhases")
+    
     shifts = [Quantity("shift_cells", 0.5, shift_error, 0.02)]
     aligners = {
         "align_envelopes": align_envelopes,
@@ -210,7 +210,7 @@ def entries() -> list[Entry]:
         "AlignEnvelopes": lambda x: _in_cells(x),
     }
     return [
-        *(Entry(f"compensate.{n}", f, WORLDS, PHASES, 0.3 if n in heavy else 1.0) for n, f in phases.items()),
+        *(Entry(f"compensate.{n}", f, WORLDS, PHASES) for n, f in phases.items()),
         *(Entry(f"compensate.{n}", f, ALIGN_WORLDS, shifts) for n, f in aligners.items()),
         Entry(
             "compensate.pulse_gain",
