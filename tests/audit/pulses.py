@@ -199,7 +199,6 @@ def entries() -> list[Entry]:
         "TargetAutofocus": TargetAutofocus(LADAR),
         "PhasePolish": PhasePolish(),
     }
-    
     shifts = [Quantity("shift_cells", 0.5, shift_error, 0.02)]
     aligners = {
         "align_envelopes": align_envelopes,
