@@ -155,6 +155,7 @@ def test_bounds_of_unobservable_unknowns_are_infinite():
         ({"unknown": ()}, "unknown must name some of"),
         ({"integration_s": -1.0}, "must be positive"),
         ({"integration_s": 4.5, "gate_tells": True}, "gate_tells needs the antenna pattern"),
+        ({"range_m": torch.tensor([8e3, 0.0])}, "range_m must be positive"),
         ({"covariance": torch.eye(3)}, "n_pulse, channel, channel"),
     ],
 )

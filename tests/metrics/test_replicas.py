@@ -163,6 +163,8 @@ def test_invalid_arguments_raise():
         replica_level(profile.real, 1.0, torch.tensor([[70.0, 74.0]], dtype=F64))
     with pytest.raises(ValueError, match="orders from 1 on"):
         replica_zones(RADAR, 2, orders=(0,))
+    with pytest.raises(ValueError, match="range_m must be positive"):
+        replica_zones(RADAR, 2, range_m=-8e3)
     with pytest.raises(ValueError, match="NaN or Inf"):
         azimuth_response(profile * math.nan, 1.0)
     assert (

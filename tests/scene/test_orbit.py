@@ -176,6 +176,8 @@ def test_swaths_fit_where_every_range_is_clear():
         (lambda: off_nadir_ground_m(36_500e3, 9.0), "off_nadir_deg must lie in"),
         (lambda: diagram(pulse_s=3e-3), "leave nothing"),
         (lambda: timing_diagram(1e6, torch.tensor([100.0]), torch.tensor([0.0, 1e7]), 1e-5), "horizon"),
+        (lambda: timing_diagram(1e6, torch.tensor([]), torch.tensor([0.0, 1e5]), 1e-5), "at least one pulse rate"),
+        (lambda: timing_diagram(1e6, torch.tensor([100.0]), torch.tensor([]), 1e-5), "at least two positions"),
     ],
 )
 def test_impossible_orbits_are_refused(build, message):

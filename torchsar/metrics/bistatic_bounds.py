@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import per_trial, refuse_non_finite, unit_phasor
-from torchsar.metrics.bounds import nonnegative
+from torchsar.metrics.bounds import nonnegative, range_of_point
 from torchsar.radar import BistaticRadar, receive_range
 
 # slant-range speed (closing positive), along-track speed, along-track position at t = 0
@@ -109,14 +109,12 @@ def bistatic_bounds(
         unknowns that the data do not determine.
 
     Raises:
-        ValueError: If `unknown` has other names, `gate_tells` is set with a rectangular gate, or
-            `covariance` has another shape.
+        ValueError: If `unknown` has other names, `gate_tells` is set with a rectangular gate,
+            `range_m` is not positive and finite, or `covariance` has another shape.
     """
     _check(radar, n_pulse, unknown, integration_s, gate_tells, covariance)
     like = next((x for x in (u_r_m_s, u_a_m_s, y0_m, snr, covariance) if isinstance(x, Tensor)), torch.zeros(()))
-    values = [
-        per_trial(x, 2, like) for x in (u_r_m_s, u_a_m_s, y0_m, radar.reference_range_m if range_m is None else range_m)
-    ]
+    values = [per_trial(x, 2, like) for x in (u_r_m_s, u_a_m_s, y0_m, range_of_point(radar, range_m))]
     point = _MovingPoint.of(radar, radar.pulse_axis(n_pulse).values(like.device), *values)
     weight, slopes = (
         (point.pattern(), point.pattern_slopes())

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.radar import InverseRadar
+from torchsar.radar import BistaticRadar, InverseRadar
 
 Value = Tensor | float
 
@@ -40,6 +40,31 @@ def nonnegative(value: Value) -> Tensor:
             f"got {float(value.detach().min()):g}"
         )
     return value
+
+
+def range_of_point(radar: BistaticRadar, range_m: Value | None) -> Value:
+    """Return the range across the track, by default that of the radar.
+
+    Args:
+        radar: Radar with the default.
+        range_m: Range in metres, a number or tensor; None for the reference range of the radar.
+
+    Returns:
+        The range in metres.
+
+    Raises:
+        ValueError: If a range is not positive and finite.
+    """
+    if range_m is None:
+        return radar.reference_range_m
+    value = torch.as_tensor(range_m).detach()
+    try:
+        good = bool(((value > 0) & value.isfinite()).all())
+    except RuntimeError:  # inside vmap values cannot be read
+        return range_m
+    if not good:
+        raise ValueError(f"range_m must be positive and finite, got {float(value.min()):g} m")
+    return range_m
 
 
 def tone_frequency_bound_hz(q: Value, duration_s: Value) -> Tensor:

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import checked_samples, linear_phasor, per_trial
+from torchsar.metrics.bounds import range_of_point
 from torchsar.metrics.impulse import cut_figures, cut_offset
 from torchsar.radar import BistaticRadar
 
@@ -238,7 +239,7 @@ def replica_zones(
         There are two zones for each order, in the order of rising k from negative to positive.
 
     Raises:
-        ValueError: If `bands` or an order is below 1.
+        ValueError: If `bands` or an order is below 1, or `range_m` is not positive and finite.
 
     Reference:
         Remote Sens. 2020, 12, 1703, Figure 17.
@@ -251,9 +252,7 @@ def replica_zones(
         (x for x in (u_r_m_s, u_a_m_s, y0_m, range_m, *(focused_at or ()), axis_speed_m_s) if isinstance(x, Tensor)),
         torch.zeros(()),
     )
-    u_r, u_a, y0, r0 = (
-        per_trial(x, 1, like) for x in (u_r_m_s, u_a_m_s, y0_m, radar.reference_range_m if range_m is None else range_m)
-    )
+    u_r, u_a, y0, r0 = (per_trial(x, 1, like) for x in (u_r_m_s, u_a_m_s, y0_m, range_of_point(radar, range_m)))
     point = _Hyperbola.of(radar, u_r, u_a, y0, r0)
     assumed = (
         point

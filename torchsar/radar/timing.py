@@ -147,6 +147,8 @@ def _check_arguments(
             "a timing diagram needs height_m and pulse_s above 0, and guard_s and nadir_s of 0 s or more, got "
             f"height_m={height_m}, pulse_s={pulse_s}, guard_s={guard_s}, nadir_s={nadir_s}"
         )
+    if prf_hz.numel() == 0:
+        raise ValueError("prf_hz of a timing diagram needs at least one pulse rate, got none")
     if not bool((prf_hz > 0).all()) or float(prf_hz.max()) * 2 * (pulse_s + guard_s) >= 1:
         raise ValueError(
             f"pulses of {pulse_s:g} s with guards of {guard_s:g} s leave nothing of the pulse period for reception at "
@@ -154,8 +156,10 @@ def _check_arguments(
             "shorter pulse"
         )
     horizon = EARTH_RADIUS_M * math.acos(EARTH_RADIUS_M / (EARTH_RADIUS_M + height_m))
-    if ground_m.numel() < 2 or not (float(ground_m.min()) >= 0 and float(ground_m.max()) <= horizon):
+    if ground_m.numel() < 2:
+        raise ValueError(f"ground_m of a timing diagram needs at least two positions, got {ground_m.numel()}")
+    if not (float(ground_m.min()) >= 0 and float(ground_m.max()) <= horizon):
         raise ValueError(
-            f"ground_m needs at least two positions from 0 m to the horizon at {horizon:.6g} m, got "
-            f"{ground_m.numel()} from {float(ground_m.min()):g} to {float(ground_m.max()):g} m"
+            f"ground_m must lie from 0 m to the horizon at {horizon:.6g} m, got positions from "
+            f"{float(ground_m.min()):g} to {float(ground_m.max()):g} m"
         )

@@ -32,8 +32,8 @@ class LinearFM:
         direction: +1 for an up-chirp, -1 for a down-chirp.
 
     Raises:
-        ValueError: If the bandwidth or the duration is not positive, or `direction` is neither +1
-            nor -1.
+        ValueError: If the bandwidth or the duration is not positive and finite, or `direction` is
+            neither +1 nor -1.
     """
 
     bandwidth_hz: float
@@ -41,8 +41,10 @@ class LinearFM:
     direction: int = 1
 
     def __post_init__(self) -> None:
-        if not (self.bandwidth_hz > 0 and self.duration_s > 0 and self.direction in (-1, 1)):
-            raise ValueError(f"a pulse needs bandwidth_hz > 0, duration_s > 0 and direction +1 or -1, got {self}")
+        if not (0 < self.bandwidth_hz < math.inf and 0 < self.duration_s < math.inf and self.direction in (-1, 1)):
+            raise ValueError(
+                f"a pulse needs bandwidth_hz and duration_s above 0 and finite, and direction +1 or -1, got {self}"
+            )
 
     @property
     def rate_hz_s(self) -> float:
