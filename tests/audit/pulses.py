@@ -30,7 +30,6 @@ from torchsar.compensate import (
     maximum_contrast,
     pulse_gain,
     refine_alignment,
-    shift_range,
 )
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_turntable
@@ -113,8 +112,10 @@ def clutter(snr_db: float, width: float) -> Callable[[int, int], Batch]:
     return draw
 
 
-def aligned(snr_db: float, size: float) -> Callable[[int, int], Batch]:
-    """Draw direct scenes whose pulses drift in range along a parabola of `size` cells."""
+def aligned(snr_db: float, size: float, even: bool = False) -> Callable[[int, int], Batch]:
+    """Draw targets of 24 points within 64 range cells, at any range or in 8 cells with `even`
+    spacing, whose pulses drift in range along a parabola of `size` cells.
+    """
 
     def draw(trials: int, seed: int) -> Batch:
         draws = Draws(seed + 9, trials=range(trials))
@@ -122,11 +123,16 @@ def aligned(snr_db: float, size: float) -> Callable[[int, int], Batch]:
         curve = size * (
             draws.uniform("slope", (), -1, 1)[:, None] * u + draws.uniform("bend", (), -1, 1)[:, None] * u**2
         )
+        where, turns = draws.uniform("range", (24,), -32, 32), draws.uniform("cross range", (24,), -0.25, 0.25)
+        where = 8 * (where / 8).floor() if even else where
+        amplitude = draws.normal("amplitude", (24,), torch.complex128)
+        at = torch.fft.fftfreq(128, dtype=F64) * (where[..., None, None] + 64 + curve[:, None, :, None])
+        pulses = torch.polar(
+            torch.ones((), dtype=F64), 2 * math.pi * (turns[..., None] * torch.arange(PULSES, dtype=F64))
+        )
+        spectrum = torch.einsum("tk,tkp,tkpf->tpf", amplitude, pulses, torch.exp(-2j * math.pi * at))
         phase = white(trials, PULSES, seed + 1)
-        few = still(trials, PULSES, 64, 2, 0.5, seed)
-        few = few * (torch.arange(64) % 8 == 4)  # separate rows, which show the shift
-        pad = torch.zeros(trials, PULSES, 32, dtype=few.dtype)
-        data = shift_range(turned(torch.cat([pad, few, pad], -1), phase), curve)
+        data = turned(math.sqrt(128) * torch.fft.ifft(spectrum), phase)
         return Batch(noisy(data, snr_db, seed + 2).to(SINGLE), {"shift_cells": curve})
 
     return draw
@@ -181,6 +187,7 @@ ALIGN_WORLDS = (
     *(World("direct", aligned(snr, 3.0), snr) for snr in SNR_DB),
     World("clutter", lambda trials, seed: Batch(clutter(10.0, 0.6)(trials, seed).data.data, None), 10.0),
     World("far", aligned(10.0, 40.0), 10.0),
+    *(World("even rows", aligned(snr, 3.0, even=True), snr) for snr in (10.0, 40.0)),
 )
 
 
