@@ -72,18 +72,18 @@ class CyclicFit:
         used = [k - 1 for k in range(1, m) if not primitive or math.gcd(k, m) == 1]
         return (self.coefficient.abs().square() / self.variance)[..., used].sum(-1)
 
-    def excess(self, period: Tensor) -> Tensor:
+    def excess(self, period: int) -> Tensor:
         """Return the mean square of jitter that a shorter period lacks, beyond what chance gives.
 
         Args:
-            period: Shorter period, which divides M, shape (...,), int64.
+            period: Shorter period, which divides M.
 
         Returns:
             Mean square in samples^2, less the mean and twice the standard deviation of chance,
             shape (...,); it may be negative.
         """
         m = self.coefficient.shape[-1] + 1
-        other = (torch.arange(1, m, device=period.device) * period[..., None]) % m != 0
+        other = torch.arange(1, m, device=self.variance.device) * period % m != 0
         chance = (self.variance * other).sum(-1) + 2 * ((self.variance * other).square().sum(-1) * 2).sqrt()
         return (self.coefficient.abs().square() * other).sum(-1) - chance
 
@@ -188,7 +188,7 @@ def _smooth(power: Tensor, width: int) -> Tensor:
     return sum((torch.roll(power, i, -1) for i in range(-half, half + 1)), torch.zeros_like(power)) / (2 * half + 1)
 
 
-def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> tuple[Tensor, Tensor]:
+def detect_jitter_period(y: Tensor, max_period: int = 16) -> Tensor:
     """Find the shortest period that explains all significant Fourier coefficients of the jitter.
 
     For each period, only the coefficients are tested that do not occur for a shorter period; the
@@ -198,16 +198,11 @@ def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> t
     Args:
         y: Lines, shape (..., pulse, range), complex.
         max_period: Longest period that is tested.
-        lines: Approximate number of lines that are used, spread over the recording.
 
     Returns:
-        Period in samples, 1 where there is no jitter, shape (...,), int64; and the largest mean
-        square in samples^2 of jitter that a multiple of this period shows above the mean of chance,
-        but not so far that it is significant, shape (...,).
+        Period in samples, 1 where there is no jitter, shape (...,), int64.
     """
-    stride = max(1, y.shape[-2] // lines)
-    fits = {m: cyclic_fit(y[..., ::stride, :], m) for m in range(2, max_period + 1)}
-    found = {m: fit.significance(primitive=True) for m, fit in fits.items()}
+    found = {m: cyclic_fit(_some_lines(y), m).significance(primitive=True) for m in range(2, max_period + 1)}
     leak = 0.002 * torch.stack(list(found.values())).amax(0)
     new = {m: sum(math.gcd(k, m) == 1 for k in range(1, m)) for m in found}
     counted = {m: torch.where(chi > 9 * new[m] + 16 + leak, chi, 0) for m, chi in found.items()}
@@ -215,9 +210,26 @@ def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> t
         sum((counted[m] for m in counted if p % m == 0), torch.zeros_like(leak)) * (1 - 1e-9 * p)
         for p in range(1, max_period + 1)
     ]
-    period = torch.stack(explained).argmax(0) + 1
-    hidden = [torch.where(p % period == 0, fit.excess(period), 0) for p, fit in fits.items()]
-    return period, torch.stack(hidden).amax(0).clamp_min(0)
+    return torch.stack(explained).argmax(0) + 1
+
+
+def _some_lines(y: Tensor, lines: int = 256) -> Tensor:
+    """About this number of lines, spread over the recording."""
+    return y[..., :: max(1, y.shape[-2] // lines), :]
+
+
+def _hidden(y: Tensor, period: int, offsets: Tensor, max_period: int) -> Tensor:
+    """Largest mean square in samples^2 of jitter that a multiple of the period shows beyond chance
+    in lines (trial, pulse, range) after correction of the offsets (trial, period), (trial,).
+    """
+    y = _some_lines(y)
+    most = torch.zeros(y.shape[0], dtype=torch.float64, device=y.device)
+    for p in range(2 * period, max_period + 1, period):
+        cut = y[..., : y.shape[-1] - y.shape[-1] % p]
+        tiled = offsets.repeat(1, p // period)
+        fit = cyclic_fit(correct_jitter_exact(cut, tiled), p, tiled) if period > 1 else cyclic_fit(cut, p)
+        most = torch.maximum(most, fit.excess(period))
+    return most
 
 
 def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = None, passes: int = 12) -> Estimate:
@@ -259,23 +271,25 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
             f"got a period of {longest} and lines of {y.shape[-1]} samples; give longer lines or a shorter period"
         )
     rows = y.detach().reshape(-1, *y.shape[-2:])
-    share = _signal_share(rows)
-    if period is None:
-        periods, hidden = detect_jitter_period(rows, max_period)
-    else:
-        periods, hidden = torch.full(rows.shape[:1], period, device=y.device), torch.zeros_like(share)
+    periods = (
+        detect_jitter_period(rows, max_period)
+        if period is None
+        else torch.full(rows.shape[:1], period, device=y.device)
+    )
     offsets, std = (torch.zeros((rows.shape[0], longest), dtype=torch.float64, device=y.device) for _ in range(2))
+    share = _signal_share(rows)
     ok = (rows.abs().amax((-2, -1)) > 0) & (share >= 0.5)
     tiled = torch.arange(longest, device=y.device)
     for m in torch.unique(periods).tolist():
         chosen = (periods == m).nonzero()[:, 0]
         if m == 1:
-            std[chosen] = cyclic_fit(rows[chosen], longest).std_samples[..., None].expand(-1, longest)
+            total = torch.zeros((len(chosen), 1), dtype=torch.float64, device=y.device)
+            chance, left = cyclic_fit(rows[chosen], longest).std_samples, total[:, 0]
         else:
             total, chance, left = refine_offsets(rows[chosen], m, passes)
-            offsets[chosen] = total[..., tiled % m]
-            std[chosen] = torch.hypot(chance, left)[..., None].expand(-1, longest)
-    std = (std.square() + hidden[:, None]).sqrt()
+        offsets[chosen] = total[..., tiled % m]
+        hidden = 0 if period else _hidden(rows[chosen], m, total, max_period)
+        std[chosen] = (chance.square() + left.square() + hidden).sqrt()[..., None].expand(-1, longest)
     ok = (
         ok
         & (std[:, 0] < _MOST_STD)
