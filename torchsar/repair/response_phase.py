@@ -265,7 +265,8 @@ def estimate_response_sharpest(
     Sharpness is measured by the entropy of range windows about the points. After each pass the
     image is corrected and the points are chosen again. The last pass fits two halves of the points
     separately, which share few targets. The estimate is the mean of both fits; the standard
-    deviation follows from their difference. Not differentiable.
+    deviation follows from their difference and from the size of the highest two degrees, since a
+    finer ripple needs higher ones. Not differentiable.
 
     Args:
         image: Image whose pulse band is centred at zero range frequency, shape (..., azimuth,
@@ -308,7 +309,12 @@ def estimate_response_sharpest(
     std = torch.where(
         (weights.sum(-1) > 0).reshape(2, -1).all(0), torch.linalg.vector_norm(first - second, dim=-1) / 2, torch.inf
     )
-    return _phase_estimate(total @ basis, std, image.shape[:-2])
+    return _phase_estimate(total @ basis, torch.hypot(std, _beyond(total)), image.shape[:-2])
+
+
+def _beyond(c: Tensor) -> Tensor:
+    """Phase in rad, (trial,), that higher degrees may add: that of the highest two."""
+    return torch.linalg.vector_norm(c[:, -2:], dim=-1)
 
 
 def _phase_estimate(phase_rad: Tensor, std: Tensor, trials: torch.Size) -> Estimate:
@@ -391,7 +397,8 @@ def estimate_response_points(
 
     This is the simpler method. It uses one line of the image for each point and is more sensitive
     to noise than `estimate_response_sharpest`. It fails if the brightest maxima are not single
-    points, or if the response spreads them over much of the window. Not differentiable.
+    points, or if the response spreads them over much of the window. The standard deviation is
+    formed as there. Not differentiable.
 
     Args:
         image: Image whose pulse band is centred at zero range frequency, shape (..., azimuth,
@@ -428,7 +435,7 @@ def estimate_response_points(
         total = total + point_average_coefficients(windows, weight, band, order)
     first, second = point_average_coefficients(*halved(windows, weight, line), band, order).chunk(2)
     std = torch.where((weight.sum(-1) > 1), torch.linalg.vector_norm(first - second, dim=-1) / 2, torch.inf)
-    return _phase_estimate(total @ basis, std, image.shape[:-2])
+    return _phase_estimate(total @ basis, torch.hypot(std, _beyond(total)), image.shape[:-2])
 
 
 _METHODS = {"sharpest": estimate_response_sharpest, "points": estimate_response_points}
