@@ -216,7 +216,7 @@ def test_the_ends_of_recorded_lines_do_not_join():
     found = estimate_jitter_blind(x + 1e-3 * clutter(32, 512, 1.0, 8), 8)
     error = (found["offset_samples"][:7] - true).square().mean().sqrt()
     assert bool(found.ok) and int(found["period"]) == 7
-    assert float(error) < 3e-4 and float(error) < 3 * float(found.std["offset_samples"][0])
+    assert float(error) < 5e-4 and float(error) < 3 * float(found.std["offset_samples"][0])
 
 
 def test_offsets_on_which_the_fit_may_settle_wrongly_are_not_ok():
@@ -236,3 +236,10 @@ def test_jitter_too_small_to_find_is_in_the_deviation_of_the_pilot_estimate():
     found = estimate_jitter_pilot(pilot, 8)
     error = (found["offset_samples"] - true[:, :8])[found.ok].square().mean().sqrt()
     assert 0.67 < float(error / found.std["offset_samples"][found.ok].square().mean().sqrt()) < 1.4
+
+
+def test_a_periodic_gain_is_not_taken_for_jitter():
+    true = offsets(4, 0.08, 1)
+    y = sample_unevenly(clutter(32, 512, seed=11), true) + 0.02 * clutter(32, 512, 1.0, 12)
+    found = estimate_jitter_blind(y * torch.tensor([1.1, 0.95, 1.05, 0.88]).repeat(128), 8)
+    assert not bool(found.ok) or float((found["offset_samples"][:4] - true).square().mean().sqrt()) < 0.015

@@ -11,8 +11,8 @@ Each E_k is fitted to this relation over the band by least squares. Then the lin
 exactly and fitted again, which removes the terms of higher order. The correction gives the noise of
 the converter, which has no jitter, a correlation of its own; it is computed from the noise level
 and subtracted. Where f - k/M is wrapped, the
-bracket jumps; this distinguishes jitter from a periodic gain, whose correlation does not jump. The
-mean offset (k = 0) cannot be observed.
+bracket jumps; this distinguishes jitter from a periodic gain, whose correlation S(f) + S(f - k/M)
+is fitted along with it. The mean offset (k = 0) cannot be observed.
 """
 
 from __future__ import annotations
@@ -137,6 +137,10 @@ def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None) -> Cycli
         other = torch.roll(power, step, -1)
         slope = 2j * math.pi * (torch.roll(frequency * signal, step, -1) - frequency * signal)
         weight = 1 / (power.clamp_min(_LEAST_POWER) * other.clamp_min(_LEAST_POWER))
+        both = power + other  # the correlation that a periodic gain gives; its share is taken out
+        scale_both = (weight * both.square()).sum(-1, keepdim=True).clamp_min(1e-150)
+        slope = slope - both * ((weight * both * slope).sum(-1, keepdim=True) / scale_both)
+        cross = cross - both * ((weight * both * cross).sum(-1, keepdim=True) / scale_both)
         information = (weight * slope.abs().square()).sum(-1).clamp_min(1e-150)
         value = (weight * slope.conj() * cross).sum(-1) / information
         scatter = (weight * slope).abs() * (cross - slope * value[..., None]).abs()
@@ -237,7 +241,7 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
 
     The signal must fill most of the sampled band, but leave a twentieth of it to noise alone: noise
     that the converter adds has no jitter, and its power is measured there. A periodic gain that
-    accompanies the jitter is not modelled. Not differentiable.
+    accompanies the jitter is modelled to first order. Not differentiable.
 
     Args:
         y: Raw or range-compressed lines, shape (..., pulse, range), complex, in any order.
