@@ -48,6 +48,25 @@ def test_imbalance_within_its_predicted_error(gain, degrees, seed):
     assert float(estimate.std["phase_rad"].max()) < 0.5 * DEGREE and float(estimate.std["gain"].max()) < 0.01
 
 
+def test_deviations_of_a_point_of_noise_and_of_few_lines():
+    """The chirp of a point is the same in both channels, and few lines resemble each other."""
+    generator = torch.Generator().manual_seed(2)
+    noise = torch.randn(40, 128, 64, dtype=torch.complex128, generator=generator)
+    k = torch.arange(128, dtype=torch.float64) - 64
+    chirp = torch.zeros_like(noise)
+    chirp[..., 20] = 8 * torch.polar(torch.ones_like(k), math.pi * 0.8 * k.square() / 128)
+    band = torch.fft.fftfreq(64).abs() < 0.38
+    field = torch.fft.ifft(torch.fft.fft(scene(128, 64, trials=40)) * band)
+    field = field / field.abs().square().mean().sqrt()
+    for x in (chirp + 0.1 * noise, field + noise, scene(10, 16, trials=40)):
+        found = estimate_imbalance(unbalanced(x, (1, 1.3), (0, 50)))
+        ok = found.ok
+        assert float(ok.double().mean()) > 0.6
+        for name, true in (("gain", 1.3), ("phase_rad", 50 * DEGREE)):
+            ratio = (found[name][ok, 1] - true).square().mean().sqrt() / found.std[name][ok, 1].square().mean().sqrt()
+            assert 0.4 < float(ratio) < 1.4, (name, float(ratio))
+
+
 def test_the_doppler_centroid_resolves_phases_beyond_ninety_degrees():
     y = unbalanced(scene(centre=0.3), (1, 1.0), (0, 130))
     blind, with_doppler = estimate_imbalance(y), estimate_imbalance(y, doppler_cycles=torch.tensor([0.3, 0.33]))

@@ -192,3 +192,54 @@ def test_blind_on_recorded_data(recorded, name, seed):
     repaired = correct_jitter(y, estimate["offset_samples"], estimate["period"])
     assert float(correlation(y.to(torch.complex128), x.to(torch.complex128))) < 0.99
     assert float(correlation(repaired.to(torch.complex128), x.to(torch.complex128))) > 0.9999
+
+
+def test_noise_and_jitter_too_small_to_find_are_in_the_deviation_of_the_blind_estimate():
+    x = clutter(32 * 12, 512, seed=5).reshape(12, 32, 512)
+    true = torch.stack([offsets(4, size, i) for i, size in enumerate((0.1, 0.02) * 6)])
+    y = sample_unevenly(x / x.abs().square().mean().sqrt(), true) + 0.32 * clutter(32 * 12, 512, 1.0, 6).reshape(
+        x.shape
+    )
+    found = estimate_jitter_blind(y, 8)
+    ok = found.ok
+    error = (found["offset_samples"] - true.repeat(1, 2))[ok].square().mean().sqrt()
+    assert int(ok.sum()) >= 9
+    assert 0.67 < float(error / found.std["offset_samples"][ok].square().mean().sqrt()) < 1.4
+    large = true[::2].repeat(1, 2)  # neither too small nor too large
+    assert abs(float((found["offset_samples"][::2] * large).sum() / large.square().sum()) - 1) < 0.05
+
+
+def test_the_ends_of_recorded_lines_do_not_join():
+    """Lines cut from longer ones, as a receiver records them; 7 does not divide their length."""
+    true = offsets(7, 0.1, 3)
+    x = sample_unevenly(clutter(32, 1022, seed=7), true)[:, 140:652]
+    found = estimate_jitter_blind(x + 1e-3 * clutter(32, 512, 1.0, 8), 8)
+    error = (found["offset_samples"][:7] - true).square().mean().sqrt()
+    assert bool(found.ok) and int(found["period"]) == 7
+    assert float(error) < 5e-4 and float(error) < 3 * float(found.std["offset_samples"][0])
+
+
+def test_offsets_on_which_the_fit_may_settle_wrongly_are_not_ok():
+    true = torch.tensor([0.45, -0.35, -0.08, -0.02], dtype=torch.float64)
+    found = estimate_jitter_blind(sample_unevenly(clutter(32, 512, seed=9), true), period=4)
+    assert not bool(found.ok)
+
+
+def test_jitter_too_small_to_find_is_in_the_deviation_of_the_pilot_estimate():
+    draws = Draws(8, trials=range(200))
+    true = 0.02 * draws.normal("offsets", (4,))
+    true = (true - true.mean(-1, keepdim=True)).repeat(1, 256)
+    turns = draws.uniform("f", (1,), 0.1, 0.4) * (torch.arange(1024, dtype=torch.float64) + true)
+    pilot = torch.polar(torch.ones_like(turns), 2 * math.pi * turns) + 0.1 * draws.normal(
+        "noise", (1024,), clutter(1, 8).dtype
+    )
+    found = estimate_jitter_pilot(pilot, 8)
+    error = (found["offset_samples"] - true[:, :8])[found.ok].square().mean().sqrt()
+    assert 0.67 < float(error / found.std["offset_samples"][found.ok].square().mean().sqrt()) < 1.4
+
+
+def test_a_periodic_gain_is_not_taken_for_jitter():
+    true = offsets(4, 0.08, 1)
+    y = sample_unevenly(clutter(32, 512, seed=11), true) + 0.02 * clutter(32, 512, 1.0, 12)
+    found = estimate_jitter_blind(y * torch.tensor([1.1, 0.95, 1.05, 0.88]).repeat(128), 8)
+    assert not bool(found.ok) or float((found["offset_samples"][:4] - true).square().mean().sqrt()) < 0.015

@@ -142,3 +142,15 @@ def test_one_inconsistent_trial_does_not_change_others() -> None:
 def test_inconsistent_or_invalid_numbers_raise(number: Tensor, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         LineIntegrity()(Signal(lines(None), small_radar().raw_axes(N, 3)), number)
+
+
+def test_lines_beyond_the_last_accepted_number_are_not_placed_where_lines_are_lost() -> None:
+    generator = torch.Generator().manual_seed(4)
+    kept = torch.rand(50, 300, generator=generator) > 0.1
+    true = torch.stack([row.nonzero()[:200, 0] for row in kept])
+    wrong = torch.rand(true.shape, generator=generator) < 0.2
+    seen = torch.where(wrong, torch.randint(0, 5000, true.shape, generator=generator), true)
+    plan = line_integrity(torch.randn(50, 200, 2, dtype=torch.complex64, generator=generator), seen)
+    misplaced = (plan.number >= 0) & (plan.number != true)
+    assert bool(plan.ok.all()) and float(misplaced.sum(-1).max()) <= 2
+    assert float((plan.number >= 0).double().mean()) > 0.9

@@ -27,13 +27,13 @@ from torchsar.core import (
 )
 
 # Blocks of lines for standard deviations, by choice, and least number of them.
-_BLOCKS, _LEAST_BLOCKS = 16, 4
+_BLOCKS, _LEAST_BLOCKS = 16, 8
 # Samples of a line from which on the noise is measured beside the band of the signal.
 _LEAST_BAND = 32
-# Standard deviations by which the noise must lie below the mean of the spectrum, relative error of
-# the noise level; and where it is not known, its ratio to the signal and the least coherence, by
-# choice.
-_SURE, _NOISE_ERROR, _WEAK_NOISE, _LEAST_COHERENCE = 6.0, 0.08, 0.03, 0.2
+# Standard deviations of the averaged noise by which it must lie below the mean power, and by which
+# its lowest twentieth may lie below its mean; and where the noise is not known, its ratio to the
+# signal and the least coherence, by choice.
+_SURE, _LOWEST, _WEAK_NOISE, _LEAST_COHERENCE = 6.0, 3.0, 0.03, 0.2
 # Largest standard deviation of a phase in rad and of a relative gain: the remaining imbalance is 20
 # dB below the signal.
 _MOST_STD = 0.1
@@ -42,9 +42,9 @@ _MOST_STD = 0.1
 def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
     """Compute products of successive lines and powers, averaged for each channel.
 
-    Channel c of C channels recorded the lines i with i mod C = c. Powers are compared with those of
-    channel 0 interpolated to the same lines, so that a slow change of the scene is not taken for a
-    gain.
+    Channel c of C channels recorded the lines i with i mod C = c. Products and powers of all
+    channels are interpolated to the same lines, so that a slow change of the scene is not taken for
+    an imbalance.
 
     Args:
         x: Raw lines, shape (..., pulse, range), complex.
@@ -61,66 +61,53 @@ def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _Sums:
-    """Sums over the lines of blocks of a recording, (..., block, channel) each.
+    """Sums over groups of lines, (..., block, channel) each.
+
+    Group g holds, of each channel, the mean of the lines before and after line C g, weighted so
+    that their centre is line C g. A slow change of the scene is therefore the same in all channels.
 
     Args:
         product: Products of each line with the conjugate of the line before, in their channel.
-        count: Number of these lines, (block, channel).
         own: Powers above the noise of the lines of a channel.
-        expected: Powers above the noise of channel 0 at the same lines.
+        count: Number of groups, (block, 1).
     """
 
     product: Tensor
-    count: Tensor
     own: Tensor
-    expected: Tensor
+    count: Tensor
 
     @staticmethod
     def of(x: Tensor, channels: int, blocks: int = 1) -> _Sums:
         """Sums of lines (..., line, range), divided by the power of the strongest line."""
-        lines, device = x.shape[-2], x.device
+        groups, device = x.shape[-2] // channels - 1, x.device
         power = x.abs().square().mean(-1).to(torch.float64)
         scale = power.amax(-1, keepdim=True).clamp_min(1e-300)
         product = (x[..., 1:, :] * x[..., :-1, :].conj()).mean(-1).to(torch.complex128) / scale
-        channel, block = torch.arange(lines, device=device) % channels, torch.arange(lines, device=device)
-        block = (block * blocks // lines).clamp_max(blocks - 1)
+        channel = torch.arange(x.shape[-2], device=device) % channels
         clean = power / scale - (_noise(x, channels) / scale)[..., channel]
-        last = (lines - 1) // channels * channels
-        expected = torch.zeros_like(clean)
-        for c in range(channels):
-            weight = c / channels
-            expected[..., c:last:channels] = (1 - weight) * clean[..., :last:channels]
-            expected[..., c:last:channels] += weight * clean[..., channels : last + 1 : channels]
-        inside = torch.arange(lines, device=device) < last
+        before = torch.arange(channels, dtype=torch.float64, device=device) / channels
+        block = torch.arange(groups, device=device) * blocks // groups
 
-        def summed(values: Tensor, line: Tensor) -> Tensor:
-            at = block[line] * channels + channel[line]
-            total = torch.zeros(*values.shape[:-1], blocks * channels, dtype=values.dtype, device=device)
-            return total.index_add(-1, at, values).unflatten(-1, (blocks, channels))
+        def summed(values: Tensor) -> Tensor:
+            table = values[..., : channels * (groups + 1)].unflatten(-1, (groups + 1, channels))
+            centred = (1 - before) * table[..., 1:, :] + before * table[..., :-1, :]
+            total = torch.zeros(*centred.shape[:-2], blocks, channels, dtype=values.dtype, device=device)
+            return total.index_add(-2, block, centred)
 
-        after, used = torch.arange(1, lines, device=device), inside.nonzero()[:, 0]
-        ones = torch.ones(lines - 1, dtype=torch.float64, device=device)
-        return _Sums(
-            summed(product, after),
-            summed(ones, after),
-            summed(clean[..., used], used),
-            summed(expected[..., used], used),
-        )
+        count = torch.bincount(block, minlength=blocks).to(torch.float64)[:, None]
+        return _Sums(summed(torch.nn.functional.pad(product, (1, 0))), summed(clean), count)
 
     @property
     def total(self) -> _Sums:
         """Sums over all blocks, without the dimension of the blocks."""
-        return _Sums(self.product.sum(-2), self.count.sum(-2), self.own.sum(-2), self.expected.sum(-2))
+        return _Sums(self.product.sum(-2), self.own.sum(-2), self.count.sum(-2))
 
     @property
     def left_out(self) -> _Sums:
         """Sums over all blocks but one, in turn."""
         whole = self.total
         return _Sums(
-            whole.product[..., None, :] - self.product,
-            whole.count - self.count,
-            whole.own[..., None, :] - self.own,
-            whole.expected[..., None, :] - self.expected,
+            whole.product[..., None, :] - self.product, whole.own[..., None, :] - self.own, whole.count - self.count
         )
 
     @property
@@ -131,28 +118,34 @@ class _Sums:
     @property
     def log_power(self) -> Tensor:
         """Logarithm of each channel's power over that of channel 0, (..., channel)."""
-        return torch.log(self.own.clamp_min(1e-300) / self.expected.clamp_min(1e-300))
+        return torch.log(self.own.clamp_min(1e-300) / self.own[..., :1].clamp_min(1e-300))
 
 
 def _noise(x: Tensor, channels: int) -> Tensor:
-    """Noise power per sample of each channel, (..., channel), in the empty part of the range band.
+    """Noise power per sample of each channel, (..., channel), where band or range cells are empty.
 
-    It is zero where the spectrum is nearly flat, as if no part of the band were empty, and for
+    It is zero where both spectrum and cells are nearly flat, as if no part were empty, and for
     lines of fewer than 32 samples.
     """
     n, half = x.shape[-1], x.shape[-1] // 32
     if n < _LEAST_BAND:
         return torch.zeros(*x.shape[:-2], channels, dtype=torch.float64, device=x.device)
-    spectrum = torch.fft.fft(x, norm="ortho").abs().square().to(torch.float64)
     floors = []
-    for c in range(channels):
-        power = spectrum[..., c::channels, :].mean(-2)
+    flat = 1 - _SURE / math.sqrt(_looks(x, channels))
+    for y in (x, torch.fft.fft(x, norm="ortho")):
+        square = y.abs().square().to(torch.float64)
+        power = torch.stack([square[..., c::channels, :].mean(-2) for c in range(channels)], -2)
         padded = torch.nn.functional.pad(power.reshape(-1, 1, n), (half, half), mode="circular")
         smooth = torch.nn.functional.avg_pool1d(padded, 2 * half + 1, stride=1).reshape(power.shape)
         floor = smooth.kthvalue(max(1, n // 20), -1).values
-        flat = 1 - _SURE / math.sqrt((2 * half + 1) * (x.shape[-2] // channels))
-        floors.append(torch.where(floor < flat * power.mean(-1), floor, 0))
-    return torch.stack(floors, -1)
+        floors.append(torch.where(floor < flat * power.mean(-1), floor, torch.inf))
+    least = torch.minimum(*floors)
+    return torch.where(torch.isfinite(least), least, 0)
+
+
+def _looks(x: Tensor, channels: int) -> int:
+    """Number of samples over which the noise of a channel is averaged."""
+    return (2 * (x.shape[-1] // 32) + 1) * (x.shape[-2] // channels)
 
 
 def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | float | None = None) -> Estimate:
@@ -173,8 +166,8 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
     Returns:
         Estimate with `gain` of shape (..., C), 1 for channel 0, and `phase_rad` of shape (..., C)
         in radians, 0 for channel 0, which `correct_imbalance` removes. Standard deviations follow
-        from blocks of lines that are left out in turn; with fewer than four blocks they assume a
-        Gaussian scene and independent lines. Noise is measured in the part of the range band that
+        from blocks of lines that are left out in turn; with fewer than eight blocks they assume a
+        Gaussian scene. Noise is measured in the part of the range band or of the range cells that
         the signal leaves empty, and its bias of the gains is removed. Without such a part, noise
         must be weak. `quality` is the coherence of neighbouring lines. `ok`
         is False where a channel has no power (gain outside 1e-3..1e3), or the coherence is below 5
@@ -194,7 +187,7 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
             f"got {channels} channels and {x.shape[-2]} lines"
         )
     x = unit_level(x)
-    blocks = _Sums.of(x, channels, max(1, min(_BLOCKS, x.shape[-2] // (2 * channels))))
+    blocks = _Sums.of(x, channels, min(_BLOCKS, x.shape[-2] // channels - 1))
     sums = blocks.total
     return _assess(x, sums.lag, _phases(sums.lag, channels, doppler_cycles), sums.log_power, blocks)
 
@@ -228,10 +221,13 @@ def _assess(x: Tensor, lag: Tensor, phase: Tensor, log_power: Tensor, blocks: _S
     looks = x.shape[-1] * lines / channels
     some = blocks.left_out
     order = torch.arange(channels, dtype=torch.float64, device=x.device)
-    if blocks.count.shape[-2] < _LEAST_BLOCKS:  # a Gaussian scene and independent lines
-        single = torch.sqrt((1 - coherence.square()).clamp_min(0) / (2 * looks * coherence.square().clamp_min(1e-12)))
+    if blocks.count.shape[-2] < _LEAST_BLOCKS:  # a Gaussian scene
+        looks_apart = looks / (1 - coherence.square()).clamp_min(1e-3)  # neighbouring lines resemble each other
+        single = torch.sqrt(
+            (1 - coherence.square()).clamp_min(0) / (2 * looks_apart * coherence.square().clamp_min(1e-12))
+        )
         phase_std = single[..., None] * torch.sqrt(order * (channels - order) / channels)
-        gain_std = (gain * math.sqrt(0.5 / looks)) * (order > 0)
+        gain_std = gain * torch.sqrt(0.5 / looks_apart)[..., None] * (order > 0)
     else:
         turns = torch.angle(some.lag * lag.conj()[..., None, :])
         turns = turns - turns.mean(-1, keepdim=True)
@@ -239,7 +235,7 @@ def _assess(x: Tensor, lag: Tensor, phase: Tensor, log_power: Tensor, blocks: _S
         gain_std = _jackknife(torch.exp(some.log_power / 2))
     noise = (_noise(x, channels) / x.abs().square().mean((-2, -1)).clamp_min(1e-300)[..., None]).clamp_max(0.99)
     # an error of the noise level brings the powers of the channels closer together or farther apart
-    bias = torch.where(noise > 0, _NOISE_ERROR * noise / (1 - noise), _WEAK_NOISE)
+    bias = torch.where(noise > 0, _LOWEST / math.sqrt(_looks(x, channels)) * noise / (1 - noise), _WEAK_NOISE)
     gain_std = torch.hypot(gain_std, gain * log_power.abs() / 2 * bias)
     clear = (coherence > 5 / math.sqrt(looks)) & ((noise > 0).all(-1) | (coherence > _LEAST_COHERENCE))
     ok = (

@@ -8,9 +8,11 @@ with the power spectrum S, the mean <> over lines and frequencies wrapped to +-1
     <Y(f) Y*(f - k/M)> = 2j pi E_k [(f - k/M) S(f - k/M) - f S(f)].
 
 Each E_k is fitted to this relation over the band by least squares. Then the lines are corrected
-exactly and fitted again, which removes the terms of higher order. Where f - k/M is wrapped, the
-bracket jumps; this distinguishes jitter from a periodic gain, whose correlation does not jump. The
-mean offset (k = 0) cannot be observed.
+exactly and fitted again, which removes the terms of higher order. The correction gives the noise of
+the converter, which has no jitter, a correlation of its own; it is computed from the noise level
+and subtracted. Where f - k/M is wrapped, the
+bracket jumps; this distinguishes jitter from a periodic gain, whose correlation S(f) + S(f - k/M)
+is fitted along with it. The mean offset (k = 0) cannot be observed.
 """
 
 from __future__ import annotations
@@ -26,11 +28,17 @@ from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap
 
 # Largest standard deviation of an offset that is ok, in samples (-24 dB of the signal).
 _MOST_STD = 0.01
-# Systematic errors as shares of the rms offset, found by trial with lines of 512 samples: without
-# noise, and for each unit of noise over signal.
-_REST_SHARE, _NOISE_SHARE = 0.002, 0.38
-# rms offset in samples at which terms of higher order double the first, found by trial
-_LARGE = 0.15
+# Largest rms offset that is ok, in samples, found by trial: above 0.23 the fits settle on wrong
+# offsets.
+_MOST_RMS = 0.22
+# Error of the noise level: that of the lowest twentieth of a spectrum of 256 looks or more.
+_NOISE_ERROR = 0.08
+# Least power over its mean that a frequency is given: the ends of a line leak as much.
+_LEAST_POWER = 1e-5
+# Share of the standard deviation below which a further fit changes nothing of interest, by choice.
+_SETTLED = 0.1
+# Limits of the factor by which a fitted change is lengthened or shortened, by choice.
+_SHORTEST, _LONGEST = 0.3, 2.0
 
 
 @dataclass(frozen=True)
@@ -41,10 +49,12 @@ class CyclicFit:
         coefficient: Fourier coefficients E_1 to E_(M-1) of the M timing offsets in samples, shape
             (..., M - 1), complex.
         variance: Variance of each coefficient in samples^2, shape (..., M - 1).
+        noise: Share of the power of the lines that is noise, shape (...,).
     """
 
     coefficient: Tensor
     variance: Tensor
+    noise: Tensor
 
     def significance(self, primitive: bool = False) -> Tensor:
         """Return the chi-squared statistic of the Fourier coefficients of the jitter.
@@ -62,6 +72,21 @@ class CyclicFit:
         used = [k - 1 for k in range(1, m) if not primitive or math.gcd(k, m) == 1]
         return (self.coefficient.abs().square() / self.variance)[..., used].sum(-1)
 
+    def excess(self, period: int) -> Tensor:
+        """Return the mean square of jitter that a shorter period lacks, beyond what chance gives.
+
+        Args:
+            period: Shorter period, which divides M.
+
+        Returns:
+            Mean square in samples^2, less the mean and twice the standard deviation of chance,
+            shape (...,); it may be negative.
+        """
+        m = self.coefficient.shape[-1] + 1
+        other = torch.arange(1, m, device=self.variance.device) * period % m != 0
+        chance = (self.variance * other).sum(-1) + 2 * ((self.variance * other).square().sum(-1) * 2).sqrt()
+        return (self.coefficient.abs().square() * other).sum(-1) - chance
+
     @property
     def offset_samples(self) -> Tensor:
         """Timing offsets of the M converters in samples, with mean zero, shape (..., M)."""
@@ -74,7 +99,7 @@ class CyclicFit:
         return torch.sqrt(self.variance.sum(-1))
 
 
-def cyclic_fit(y: Tensor, period: int) -> CyclicFit:
+def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None) -> CyclicFit:
     """Fit the Fourier coefficients of timing jitter to correlations in the range spectrum.
 
     Jitter of period M correlates spectral components that lie k / M cycles per sample apart, with
@@ -84,35 +109,68 @@ def cyclic_fit(y: Tensor, period: int) -> CyclicFit:
     Args:
         y: Lines, shape (..., pulse, range), complex.
         period: Period M in samples.
+        corrected: Offsets in samples with which the lines were corrected, shape (..., M); lines are
+            then a multiple of M long. None: none.
 
     Returns:
-        Coefficients of the jitter and their variance.
+        Coefficients of the jitter that remains, and their variance.
     """
     n = y.shape[-1] - y.shape[-1] % period
-    spectrum = torch.fft.fft(y[..., :n]).to(torch.complex128)
+    taper = _taper(n, y.device)
+    spectrum = torch.fft.fft(y[..., :n] * taper.to(y.real.dtype)).to(torch.complex128)
+    related = n * taper.pow(4).sum() / taper.square().sum().square()  # neighbours in a tapered spectrum
     lines = y.shape[-2]
     power = _smooth(spectrum.abs().square().mean(-2), max(1, 256 // lines))
     power = power / power.mean(-1, keepdim=True).clamp_min(1e-300)
-    signal = (power - noise_floor(power)[..., None]).clamp_min(0)  # noise of the converter has no jitter
+    noise = None if corrected is None else _corrected_noise(corrected, n)
+    density = torch.ones_like(power) if noise is None else noise.abs().square().mean(-2)
+    level = noise_floor(power / density)[..., None]
+    signal = (power - level * density).clamp_min(0)  # noise of the converter has no jitter
     scale = spectrum.abs().square().mean((-2, -1)).clamp_min(1e-300)
     frequency = torch.fft.fftfreq(n, dtype=torch.float64, device=y.device)
     coefficient, variance = [], []
     for k in range(1, period // 2 + 1):
         step = k * (n // period)
         cross = (spectrum * torch.roll(spectrum, step, -1).conj()).mean(-2) / scale[..., None]
+        if noise is not None:
+            cross = cross - level * (noise * torch.roll(noise, step, -1).conj()).mean(-2)
         other = torch.roll(power, step, -1)
         slope = 2j * math.pi * (torch.roll(frequency * signal, step, -1) - frequency * signal)
-        weight = 1 / (power * other).clamp_min(1e-6)
-        information = (weight * slope.abs().square()).sum(-1).clamp_min(1e-300)
+        weight = 1 / (power.clamp_min(_LEAST_POWER) * other.clamp_min(_LEAST_POWER))
+        both = power + other  # the correlation that a periodic gain gives; its share is taken out
+        scale_both = (weight * both.square()).sum(-1, keepdim=True).clamp_min(1e-150)
+        slope = slope - both * ((weight * both * slope).sum(-1, keepdim=True) / scale_both)
+        cross = cross - both * ((weight * both * cross).sum(-1, keepdim=True) / scale_both)
+        information = (weight * slope.abs().square()).sum(-1).clamp_min(1e-150)
         value = (weight * slope.conj() * cross).sum(-1) / information
-        scatter = (weight * (cross - slope * value[..., None]).abs().square()).mean(-1)
+        scatter = (weight * slope).abs() * (cross - slope * value[..., None]).abs()
         coefficient.append(value)
-        variance.append(scatter.clamp_min(1e-300) / information)
+        variance.append(related * scatter.square().sum(-1).clamp_min(1e-300) / information.square())
     mirrored = [c.conj() for c in reversed(coefficient[: (period - 1) // 2])]
     return CyclicFit(
         torch.stack(coefficient + mirrored, -1),
         torch.stack(variance + list(reversed(variance[: (period - 1) // 2])), -1),
+        (level * density).mean(-1),
     )
+
+
+def _taper(n: int, device: torch.device) -> Tensor:
+    """Window that falls smoothly to zero over a sixteenth of a line at both ends, (n,): the ends of
+    a recorded line do not join, and would give correlations of their own.
+    """
+    end = (torch.arange(n, dtype=torch.float64, device=device) + 0.5) / (n / 16)
+    return torch.sin(math.pi / 2 * torch.minimum(end, end.flip(0)).clamp_max(1)).square()
+
+
+def _corrected_noise(offsets: Tensor, n: int) -> Tensor:
+    """Spectra of corrected impulses at the first M samples, (..., M, n).
+
+    The correction repeats every M samples, so that the means over the M impulses of their power and
+    of their products at k / M apart are those of corrected white noise of unit power.
+    """
+    m = offsets.shape[-1]
+    impulse = torch.eye(m, n, dtype=torch.complex128, device=offsets.device)
+    return torch.fft.fft(correct_jitter_exact(impulse.expand(*offsets.shape[:-1], m, n), offsets))
 
 
 def noise_floor(power: Tensor) -> Tensor:
@@ -134,7 +192,7 @@ def _smooth(power: Tensor, width: int) -> Tensor:
     return sum((torch.roll(power, i, -1) for i in range(-half, half + 1)), torch.zeros_like(power)) / (2 * half + 1)
 
 
-def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> Tensor:
+def detect_jitter_period(y: Tensor, max_period: int = 16) -> Tensor:
     """Find the shortest period that explains all significant Fourier coefficients of the jitter.
 
     For each period, only the coefficients are tested that do not occur for a shorter period; the
@@ -144,13 +202,11 @@ def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> T
     Args:
         y: Lines, shape (..., pulse, range), complex.
         max_period: Longest period that is tested.
-        lines: Approximate number of lines that are used, spread over the recording.
 
     Returns:
         Period in samples, 1 where there is no jitter, shape (...,), int64.
     """
-    stride = max(1, y.shape[-2] // lines)
-    found = {m: cyclic_fit(y[..., ::stride, :], m).significance(primitive=True) for m in range(2, max_period + 1)}
+    found = {m: cyclic_fit(_some_lines(y), m).significance(primitive=True) for m in range(2, max_period + 1)}
     leak = 0.002 * torch.stack(list(found.values())).amax(0)
     new = {m: sum(math.gcd(k, m) == 1 for k in range(1, m)) for m in found}
     counted = {m: torch.where(chi > 9 * new[m] + 16 + leak, chi, 0) for m, chi in found.items()}
@@ -161,27 +217,50 @@ def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> T
     return torch.stack(explained).argmax(0) + 1
 
 
-def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = None, passes: int = 3) -> Estimate:
+def _some_lines(y: Tensor, lines: int = 256) -> Tensor:
+    """About this number of lines, spread over the recording."""
+    return y[..., :: max(1, y.shape[-2] // lines), :]
+
+
+def _hidden(y: Tensor, period: int, offsets: Tensor, max_period: int) -> Tensor:
+    """Largest mean square in samples^2 of jitter that a multiple of the period shows beyond chance
+    in lines (trial, pulse, range) after correction of the offsets (trial, period), (trial,).
+    """
+    y = _some_lines(y)
+    most = torch.zeros(y.shape[0], dtype=torch.float64, device=y.device)
+    for p in range(2 * period, max_period + 1, period):
+        cut = y[..., : y.shape[-1] - y.shape[-1] % p]
+        tiled = offsets.repeat(1, p // period)
+        fit = cyclic_fit(correct_jitter_exact(cut, tiled), p, tiled) if period > 1 else cyclic_fit(cut, p)
+        most = torch.maximum(most, fit.excess(period))
+    return most
+
+
+def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = None, passes: int = 12) -> Estimate:
     """Estimate the period and the offsets of periodic timing jitter from clutter, without a pilot.
 
     The signal must fill most of the sampled band, but leave a twentieth of it to noise alone: noise
     that the converter adds has no jitter, and its power is measured there. A periodic gain that
-    accompanies the jitter is not modelled. Not differentiable.
+    accompanies the jitter is modelled to first order. Not differentiable.
 
     Args:
         y: Raw or range-compressed lines, shape (..., pulse, range), complex, in any order.
         max_period: Longest period that is tested.
         period: Known period in samples; None: the period is estimated.
-        passes: Number of fits; before each, lines are corrected with the offsets found so far.
+        passes: Largest number of fits; before each, lines are corrected with the offsets found so
+            far.
 
     Returns:
         Estimate with `offset_samples` of shape (..., P), in samples, with mean zero, and their
         standard deviations; and `period` of shape (...,), int64. P is the known period or
-        `max_period`; beyond the period of a trial its offsets repeat. `quality` is m / (m + v),
-        with the mean square m of the offsets and the variance v of their errors, or 1 where there
-        is no jitter. `ok` is False, and the offsets are zero, where a trial is all zero, the
-        standard deviation is 0.01 samples or more (for `max_period` where no jitter is found),
-        less than half of the power is above the noise, or sample instants would coincide or cross.
+        `max_period`; beyond the period of a trial its offsets repeat. The standard deviation
+        includes jitter that is visible, but not so far above chance that its period is certain.
+        `quality` is m / (m + v), with the mean square m of the offsets and the variance v of their
+        errors, or 1 where there is no jitter. `ok` is False, and the offsets are zero, where a
+        trial is all zero, the standard deviation is 0.01 samples or more (for `max_period` where no
+        jitter is found; so for a scene of one or few points, whose lines resemble each other), less
+        than half of the power is above the noise, the rms of the offsets is 0.22 samples or more,
+        or sample instants would coincide or cross.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -208,16 +287,19 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
     for m in torch.unique(periods).tolist():
         chosen = (periods == m).nonzero()[:, 0]
         if m == 1:
-            std[chosen] = cyclic_fit(rows[chosen], longest).std_samples[..., None].expand(-1, longest)
+            total = torch.zeros((len(chosen), 1), dtype=torch.float64, device=y.device)
+            chance, left = cyclic_fit(rows[chosen], longest).std_samples, total[:, 0]
         else:
-            fit, total = refine_offsets(rows[chosen], m, passes)
-            offsets[chosen] = total[..., tiled % m]
-            # the terms of higher order that remain, and the error of the noise level
-            share_of_noise = (1 - share[chosen]) / share[chosen].clamp_min(0.1)
-            size = total.square().mean(-1).sqrt()
-            rest = (_REST_SHARE * (1 + (size / _LARGE).square()) + _NOISE_SHARE * share_of_noise) * size
-            std[chosen] = torch.hypot(fit.std_samples, rest)[..., None].expand(-1, longest)
-    ok = ok & (std[:, 0] < _MOST_STD) & torch.isfinite(offsets).all(-1) & (smallest_gap(offsets) >= MIN_GAP)
+            total, chance, left = refine_offsets(rows[chosen], m, passes)
+        offsets[chosen] = total[..., tiled % m]
+        hidden = 0 if period else _hidden(rows[chosen], m, total, max_period)
+        std[chosen] = (chance.square() + left.square() + hidden).sqrt()[..., None].expand(-1, longest)
+    ok = (
+        ok
+        & (std[:, 0] < _MOST_STD)
+        & (offsets.square().mean(-1).sqrt() < _MOST_RMS)
+        & (smallest_gap(offsets) >= MIN_GAP)
+    )
     offsets = torch.where(ok[..., None], offsets, 0)
     size, chance = offsets.square().mean(-1), std.square().mean(-1)
     quality = torch.where(ok, size / (size + chance).clamp_min(1e-300), 0) + (ok & (periods == 1)).to(torch.float64)
@@ -231,29 +313,48 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
 def _signal_share(y: Tensor) -> Tensor:
     """Share of the power of lines (trial, pulse, range) that lies above the noise, (trial,)."""
     unit = y / y.abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(y.real.dtype).tiny)
+    unit = unit * _taper(y.shape[-1], y.device).to(y.real.dtype)
     power = torch.fft.fft(unit).abs().square().mean(-2).to(torch.float64)
     power = _smooth(power, max(1, 256 // y.shape[-2]))
     return 1 - noise_floor(power) / power.mean(-1).clamp_min(1e-300)
 
 
-def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[CyclicFit, Tensor]:
+def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor, Tensor]:
     """Fit the timing offsets, correct the recording with them, and fit what remains, repeatedly.
 
     Args:
         y: Lines, shape (trial, pulse, range), complex.
         period: Period M of the jitter in samples.
-        passes: Number of fits.
+        passes: Largest number of fits. A trial is finished when its offsets no longer change.
 
     Returns:
-        The last fit, and the total offsets in samples, shape (trial, M).
+        The total offsets in samples, shape (trial, M), the standard deviation that chance and the
+        error of the noise level give them, shape (trial,), and the rms of their last change, shape
+        (trial,).
+
+    The changes are scaled by the factor of Irons and Tuck (1969), since large jitter makes the
+    first-order fit too long or too short.
     """
     y = y[..., : y.shape[-1] - y.shape[-1] % period]
-    total = torch.zeros((y.shape[0], period), dtype=torch.float64, device=y.device)
+    total, change = (torch.zeros((y.shape[0], period), dtype=torch.float64, device=y.device) for _ in range(2))
+    factor, std = torch.ones_like(total[:, 0]), torch.zeros_like(total[:, 0])
+    active = torch.arange(y.shape[0], device=y.device)
     for i in range(passes):
-        fit = cyclic_fit(correct_jitter_exact(y, total) if i else y, period)
-        step = total + fit.offset_samples.clamp(-0.4, 0.4)
-        total = torch.where((smallest_gap(step) >= 2 * MIN_GAP)[:, None], step, total)
-    return fit, total
+        at, before = total[active], change[active]
+        fit = cyclic_fit(correct_jitter_exact(y[active], at), period, at) if i else cyclic_fit(y, period)
+        step = fit.offset_samples
+        if i:
+            turned = before - step
+            factor[active] *= (before * turned).sum(-1) / turned.square().sum(-1).clamp_min(1e-300)
+            factor[active] = factor[active].clamp(_SHORTEST, _LONGEST)
+        moved = at + factor[active, None] * step.clamp(-0.4, 0.4)
+        total[active] = torch.where((smallest_gap(moved) >= 2 * MIN_GAP)[:, None], moved, at)
+        level = _NOISE_ERROR * fit.noise / (1 - fit.noise).clamp_min(0.1) * total[active].square().mean(-1).sqrt()
+        std[active], change[active] = torch.hypot(fit.std_samples, level), step
+        active = active[step.square().mean(-1).sqrt() > _SETTLED * fit.std_samples]
+        if not len(active):
+            break
+    return total, std, change.square().mean(-1).sqrt()
 
 
 class BlindJitter(Stage):

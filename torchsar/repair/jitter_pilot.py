@@ -44,7 +44,8 @@ def estimate_jitter_pilot(
         Estimate with `offset_samples` of shape (..., P), in samples, and `period` of shape (...,),
         int64. P is the known period or `max_period`; beyond the period of a trial its offsets
         repeat. The standard deviation is the Cramer-Rao bound at the measured noise, where no
-        jitter is found for the longest period. `quality` is the share of the record's power that
+        jitter is found for the longest period, and includes jitter that is visible, but not so far
+        above chance that its period is certain. `quality` is the share of the record's power that
         belongs to the tone. `ok` is False, and the offsets are zero, where the record is not finite
         or all zero, where no tone exceeds the noise or the tone is too close to zero frequency,
         where the bound for the longest period tested is 0.01 samples or more, so that jitter may be
@@ -136,11 +137,25 @@ def _fit(x: Tensor, frequency: Tensor, m: int, steps: int = 5) -> _Fit:
 def _choose(fits: list[_Fit]) -> Tensor:
     """Index of the shortest period that explains the record, (...,).
 
-    The threshold of 20 + 8 (M - 1) keeps false alarms below 1e-6 per trial.
+    The threshold of 14 + 4 (M - 1) keeps false alarms below 1e-4 per trial.
     """
     noise = torch.stack([fit.noise for fit in fits]).amin(0)
-    gain = [fit.significance(noise) - (20 + 8 * i if i else 0) for i, fit in enumerate(fits)]
+    gain = [fit.significance(noise) - (14 + 4 * i if i else 0) for i, fit in enumerate(fits)]
     return torch.stack(gain).argmax(0)
+
+
+def _hidden(fits: list[_Fit], m: Tensor, phase_rad: Tensor) -> Tensor:
+    """Largest mean square phase in rad^2, less the mean and twice the standard deviation of chance,
+    that a multiple of the chosen period m shows beyond the phases of that period, (...,).
+    """
+    most = torch.zeros_like(phase_rad[..., 0])
+    for fit in fits:
+        p = fit.phasor.shape[-1]
+        chance = fit.noise / (2 * fit.count.sum() * fit.power).clamp_min(1e-300)
+        more = (p - m).clamp_min(0)
+        excess = (fit.phase_rad - phase_rad[..., :p]).square().mean(-1) - chance * (more + 2 * (2 * more).sqrt())
+        most = torch.where((p > m) & (p % m == 0), torch.maximum(excess, most), most)
+    return most
 
 
 def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: str) -> Estimate:
@@ -165,11 +180,12 @@ def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: st
     std = (std * torch.sqrt((m - 1) / m))[..., None].expand(offsets.shape)
     tested = (torch.sqrt(noise * (longest - 1) / (2 * n * power.clamp_min(1e-300))) / radians.abs())[..., None]
     std = torch.where((m == 1)[..., None], tested, std)
+    std = torch.hypot(std, (_hidden(fits, m, phase).sqrt() / radians.abs())[..., None])
     if origin == "first":
         offsets = offsets - offsets[..., :1]
         std = std * math.sqrt(2) * torch.sqrt(m / (m - 1).clamp_min(1))[..., None] * (tiled % m[..., None] != 0)
     detected = finite & (power * n > 50 * noise) & (power > 0) & torch.isfinite(radians)
-    ok = detected & (tested[..., 0] < _MOST_STD) & (smallest_gap(offsets) >= MIN_GAP)
+    ok = detected & (tested[..., 0] < _MOST_STD) & (std.amax(-1) < _MOST_STD) & (smallest_gap(offsets) >= MIN_GAP)
     offsets, m = torch.where(ok[..., None], offsets, 0), torch.where(ok, m, 1 if len(fits) > 1 else longest)
     quality = torch.where(ok, power / (power + noise).clamp_min(1e-300), 0)
     return Estimate(

@@ -99,6 +99,18 @@ def _nearest(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(before < 0, right, left), torch.where(after >= n, left, right)
 
 
+def _enclosed(trusted: Tensor) -> Tensor:
+    """Lines with accepted lines on both sides, or accepted themselves."""
+    return (trusted.cumsum(-1) > 0) & (trusted.flip(-1).cumsum(-1).flip(-1) > 0)
+
+
+def _lossy(offset: Tensor, trusted: Tensor) -> Tensor:
+    """Whether lines are lost between the accepted ones, (..., 1)."""
+    limit = torch.iinfo(offset.dtype)
+    last = torch.where(trusted, offset, limit.min).amax(-1, keepdim=True)
+    return last > torch.where(trusted, offset, limit.max).amin(-1, keepdim=True)
+
+
 def _inconsistent(offset: Tensor, trusted: Tensor) -> Tensor:
     """Accepted lines whose offset exceeds that of a later or is below that of an earlier one."""
     limit = torch.iinfo(offset.dtype)
@@ -155,7 +167,9 @@ def line_integrity(
 
     Repeated lines (samples equal to those of the line before) are dropped. A number that
     contradicts its neighbours is corrected if the lines beside it leave only one position for it; a
-    line that fits several positions of a gap is left out and marked as unplaced. Lines of zeros
+    line that fits several positions of a gap is left out and marked as unplaced, and so is a line
+    with a wrong number before the first or after the last accepted one, if lines were lost in this
+    recording: some may be lost there as well. Lines of zeros
     between other lines count as missing. Rows after the last received line do not, since trials of
     different lengths are padded there. A trial with fewer than half of its numbers accepted has
     `ok` False, and its lines stay in the order received.
@@ -190,7 +204,7 @@ def line_integrity(
     offset = number - (row - repeated.cumsum(-1))
     trusted = trusted_numbers(offset, single, longest_gap)
     before, after = _nearest(offset, trusted)
-    placeable = trusted | (single & (before == after))
+    placeable = trusted | (single & (before == after) & (_enclosed(trusted) | ~_lossy(offset, trusted)))
     verified = torch.where(placeable, number - offset + torch.where(trusted, offset, before), PADDING)
     share = trusted.sum(-1) / single.sum(-1).clamp_min(1)
     ok = share >= 0.5

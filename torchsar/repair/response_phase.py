@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, linear_phasor, unit_level
-from torchsar.radar import StripmapRadar
+from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.repair.response import (
     GRID,
     band_axis,
@@ -35,9 +36,11 @@ from torchsar.repair.response import (
 # Highest Legendre degrees of the stages of a fit, by choice: a large smooth phase first, then
 # ripple of up to about 20 periods over the band.
 ORDERS = (2, 4, 8, 16, 40)
+# Legendre degree to which the phase of the edges of the pulse is taken, by choice.
+_EDGE_DEGREE = 24
 
 
-def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) -> Tensor:
+def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) -> tuple[Tensor, Tensor]:
     """Cut range windows about the brightest local maxima of each trial.
 
     Maxima closer than half a window to the ends of a line are not used. If there are fewer maxima
@@ -51,7 +54,8 @@ def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) ->
             line and in the two adjacent lines.
 
     Returns:
-        Windows, shape (trial, points, width).
+        Windows, the brightest first, shape (trial, points, width), and their lines, shape (trial,
+        points).
 
     Raises:
         ValueError: If the width is below 16 samples or above half a line.
@@ -70,7 +74,7 @@ def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) ->
     windows = torch.gather(image.flatten(-2), -1, index_in_line.clamp(0, peaks.shape[-1] - 1).flatten(-2)).unflatten(
         -1, index_in_line.shape[-2:]
     )
-    return windows * (level > 0)[..., None]
+    return windows * (level > 0)[..., None], index // n
 
 
 def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: float = 100.0) -> Tensor:
@@ -94,6 +98,31 @@ def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: fl
     peak = windows.abs().amax(-1).square().to(torch.float64)
     s = peak / torch.maximum(background[..., None], 1e-5 * peak.amax(-1, keepdim=True)).clamp_min(1e-300)
     return torch.where(s > floor, s / (s + full), 0)
+
+
+def halved(windows: Tensor, weight: Tensor, line: Tensor) -> tuple[Tensor, Tensor]:
+    """Divide windows into two halves that share few targets.
+
+    A target has windows in several lines. The windows are therefore divided into quarters by their
+    line; the outer two are one half, the inner two the other.
+
+    Args:
+        windows: Windows, shape (trial, points, width).
+        weight: Weights of the windows, shape (trial, points); windows of weight 0 go anywhere.
+        line: Lines of the windows, shape (trial, points).
+
+    Returns:
+        Windows and weights, the first halves of all trials before the second ones, shapes (2 trial,
+        points // 2, width) and (2 trial, points // 2).
+    """
+    used = weight > 0
+    place = torch.where(used, line, line.amax() + 1).argsort(dim=-1, stable=True).argsort(dim=-1, stable=True)
+    quarter = 4 * place // used.sum(-1, keepdim=True).clamp_min(1)
+    inner = torch.where(used, (quarter == 1) | (quarter == 2), place % 2 == 0)
+    order = inner.to(torch.int64).argsort(dim=-1, stable=True)[..., : windows.shape[-2] // 2 * 2]
+    order = torch.cat(order.chunk(2, -1))
+    windows, weight = torch.cat([windows, windows]), torch.cat([weight, weight])
+    return windows.gather(-2, order[..., None].expand(*order.shape, windows.shape[-1])), weight.gather(-1, order)
 
 
 def window_entropy(spectra: Tensor, phase_rad: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -235,9 +264,9 @@ def estimate_response_sharpest(
 
     Sharpness is measured by the entropy of range windows about the points. After each pass the
     image is corrected and the points are chosen again. The last pass fits two halves of the points
-    separately. The estimate is the mean of both fits, with coefficients shrunk where they may be
-    due to chance; the standard deviation follows from the difference of the fits. Not
-    differentiable.
+    separately, which share few targets. The estimate is the mean of both fits; the standard
+    deviation follows from their difference and from the size of the highest two degrees, since a
+    finer ripple needs higher ones. Not differentiable.
 
     Args:
         image: Image whose pulse band is centred at zero range frequency, shape (..., azimuth,
@@ -270,23 +299,22 @@ def estimate_response_sharpest(
     total = torch.zeros((rows.shape[0], basis.shape[0]), dtype=torch.float64, device=image.device)
     for i in range(passes):
         sharper = correct_response(rows, total @ basis, None, band) if i else rows
-        windows = brightest_windows(sharper, points, min(width, sharper.shape[-1] // 4 * 2))
+        windows, line = brightest_windows(sharper, points, min(width, sharper.shape[-1] // 4 * 2))
         weight = window_weights(windows, sharper)
         if i < passes - 1:
             total = total + sharpest_coefficients(windows, weight, band, orders if i == 0 else orders[-1:])
-    halves, weights = (torch.cat([x[:, 0::2], x[:, 1::2]]) for x in (windows, weight))
+    halves, weights = halved(windows, weight, line)
     first, second = sharpest_coefficients(halves, weights, band, orders[-1:]).chunk(2)
     total = total + (first + second) / 2
     std = torch.where(
         (weights.sum(-1) > 0).reshape(2, -1).all(0), torch.linalg.vector_norm(first - second, dim=-1) / 2, torch.inf
     )
-    return _phase_estimate(_significant(total, std) @ basis, std, image.shape[:-2])
+    return _phase_estimate(total @ basis, torch.hypot(std, _beyond(total)), image.shape[:-2])
 
 
-def _significant(c: Tensor, std: Tensor, times: float = 4.0) -> Tensor:
-    """Coefficients shrunk by c max(0, 1 - (times * std / (sqrt(p) c))^2)."""
-    limit = times * std[:, None] / math.sqrt(c.shape[-1])
-    return c * (1 - (limit / c.abs().clamp_min(1e-300)).square()).clamp_min(0)
+def _beyond(c: Tensor) -> Tensor:
+    """Phase in rad, (trial,), that higher degrees may add: that of the highest two."""
+    return torch.linalg.vector_norm(c[:, -2:], dim=-1)
 
 
 def _phase_estimate(phase_rad: Tensor, std: Tensor, trials: torch.Size) -> Estimate:
@@ -369,7 +397,8 @@ def estimate_response_points(
 
     This is the simpler method. It uses one line of the image for each point and is more sensitive
     to noise than `estimate_response_sharpest`. It fails if the brightest maxima are not single
-    points, or if the response spreads them over much of the window. Not differentiable.
+    points, or if the response spreads them over much of the window. The standard deviation is
+    formed as there. Not differentiable.
 
     Args:
         image: Image whose pulse band is centred at zero range frequency, shape (..., azimuth,
@@ -401,22 +430,37 @@ def estimate_response_points(
     total = torch.zeros((rows.shape[0], basis.shape[0]), dtype=torch.float64, device=image.device)
     for i in range(passes):
         sharper = correct_response(rows, total @ basis, None, band) if i else rows
-        windows = brightest_windows(sharper, points, width, apart=width // 2)
+        windows, line = brightest_windows(sharper, points, width, apart=width // 2)
         weight = (window_weights(windows, sharper) > 0).to(torch.float64)
         total = total + point_average_coefficients(windows, weight, band, order)
-    first, second = (
-        point_average_coefficients(windows[:, part], weight[:, part], band, order)
-        for part in (slice(0, None, 2), slice(1, None, 2))
-    )
+    first, second = point_average_coefficients(*halved(windows, weight, line), band, order).chunk(2)
     std = torch.where((weight.sum(-1) > 1), torch.linalg.vector_norm(first - second, dim=-1) / 2, torch.inf)
-    return _phase_estimate(total @ basis, std, image.shape[:-2])
+    return _phase_estimate(total @ basis, torch.hypot(std, _beyond(total)), image.shape[:-2])
 
 
 _METHODS = {"sharpest": estimate_response_sharpest, "points": estimate_response_points}
 
 
+def _edge_phase(pulse: LinearFM, sampling_hz: float) -> Tensor:
+    """Phase in rad, (GRID,), that the estimators find in an echo whose edge lies on a sample.
+
+    The abrupt edges of the pulse have frequencies that alias. What they add to the phase of an echo
+    depends on where its edges lie between samples, and no image shows it apart from a response.
+    """
+    n = 4 * pulse.n_samples(sampling_hz)
+    u = band_axis(n, pulse.bandwidth_hz / sampling_hz)
+    mean = pulse.band_spectrum(n, sampling_hz)
+    phase, size = torch.angle(pulse.spectrum(n, sampling_hz) * mean.conj())[u.abs() <= 1], mean.abs()[u.abs() <= 1]
+    degree = min(_EDGE_DEGREE, phase.shape[-1] // 4)
+    fit = torch.linalg.lstsq(size[:, None] * unit_legendre(u[u.abs() <= 1], degree).mT, (size * phase)[:, None])
+    return (fit.solution[2:, 0] @ unit_legendre(band_grid(), degree)[2:]).abs()
+
+
 class EstimateResponse(Stage):
     """Estimator of the channel's phase and amplitude response from a focused image.
+
+    The standard deviation of the phase includes that of the method and the phase that the edges of
+    the pulse, which lie between samples, leave in the image.
 
     The amplitude is estimated only if the range power spectrum of scene and noise is given as
     `expected_power`.
@@ -460,6 +504,8 @@ class EstimateResponse(Stage):
         """
         band = self.radar.pulse.bandwidth_hz / self.radar.sampling_hz
         estimate = self.method(signal.data, band, valid=max(1, signal.data.shape[-1] - self.radar.pulse_samples))
+        edges = _edge_phase(self.radar.pulse, self.radar.sampling_hz).to(signal.data.device)
+        estimate = replace(estimate, std={"phase_rad": torch.hypot(estimate.std["phase_rad"], edges)})
         if self.expected_power is None:
             return estimate
         amplitude = estimate_amplitude_response(band_power(unit_level(signal.data)), self.expected_power, band)
