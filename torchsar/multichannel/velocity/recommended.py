@@ -16,7 +16,7 @@ from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell
 from torchsar.multichannel.velocity.bank import Search, bank_search
-from torchsar.multichannel.velocity.illumination import SeenAperture, lit_as_expected, seen_aperture
+from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, Found, chosen, estimate_of, point_phasor
@@ -79,9 +79,8 @@ def moving_point_velocity(
     unknowns = UNKNOWNS if u_a_m_s is None else ("u_r_m_s", "y0_m")
     if u_a_m_s is not None:
         search = replace(search, u_a_m_s=0.0)
-    job = _Job(
-        data.to(torch.complex128), radar, aperture, search, 0.0 if u_a_m_s is None else u_a_m_s, range_m, unknowns
-    )
+    coarse, u_a = aperture if isinstance(aperture, Dwell) else Dwell(_COARSE_S), 0.0 if u_a_m_s is None else u_a_m_s
+    job = _Job(data.to(torch.complex128), radar, aperture, coarse, search, u_a, range_m, unknowns)
     if whitening is not None:
         return job.estimate(
             job.centred(job.found(whitening), whitening),
@@ -110,11 +109,12 @@ class _Refined:
 
 @dataclass(frozen=True)
 class _Job:
-    """Data and settings of one estimate."""
+    """Data and settings of one estimate; `coarse` is the aperture of the search."""
 
     data: Tensor
     radar: BistaticRadar
     aperture: Aperture
+    coarse: Dwell
     search: Search
     u_a_m_s: Tensor | float
     range_m: Number | None
@@ -125,10 +125,8 @@ class _Job:
 
         The search uses the middle of the aperture, the last fit all of it.
         """
-        whole = self.aperture.aperture if isinstance(self.aperture, SeenAperture) else self.aperture
-        coarse = whole if isinstance(whole, Dwell) else Dwell(_COARSE_S)
-        start, _ = bank_search(self.data, self.radar, coarse, self.search, self.u_a_m_s, self.range_m, whitening)
-        near = maximum_likelihood(self.data, self.radar, start, coarse, self.unknowns, whitening)
+        start, _ = bank_search(self.data, self.radar, self.coarse, self.search, self.u_a_m_s, self.range_m, whitening)
+        near = maximum_likelihood(self.data, self.radar, start, self.coarse, self.unknowns, whitening)
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
 
     def as_seen(self, found: Found) -> tuple[_Job, Found]:
