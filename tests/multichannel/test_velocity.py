@@ -199,6 +199,18 @@ def test_a_second_point_acts_on_the_deviations_as_on_the_errors(name):
         assert float(((found[key] - start[key]) / std).abs().max()) < 4.5, key
 
 
+def test_a_short_dwell_resolves_the_ambiguity_or_says_that_it_does_not():
+    """Of speeds lambda PRF apart a wrong one was returned, and ok, in 20 % of the trials."""
+    radar, speed = published_radar(), torch.linspace(-11.0, 11.0, 12, dtype=F64).repeat(2)
+    clean = torch.stack([azimuth_echo(radar, 400, float(u_r), gate_s=2.0) for u_r in speed])
+    level = torch.tensor([-8.0] * 12 + [10.0] * 12, dtype=F64)
+    data = 10 ** (level / 20)[:, None, None] * clean + noise(24, 8, 400)
+    stage = MovingPointVelocity(radar, Dwell(2.0), search=Search(u_r_m_s=64.8, y0_m=60.0), u_a_m_s=0.0)
+    found = stage(Signal(data, radar.axes(400)))
+    wrong = (found["u_r_m_s"] - speed).abs() > 5 * found.std["u_r_m_s"]
+    assert not bool((wrong & found.ok).any()) and bool(found.ok[level > 0].all())
+
+
 def test_a_point_that_crosses_range_lines_is_as_certain_as_it_says():
     """Without correction of migration, the strongest line holds the middle of the aperture only."""
     clean = compressed_echo(RADAR, 720, 48, [{"u_r": 3.0, "u_a": -2.0, "y0": 20.0}], 3.5).data

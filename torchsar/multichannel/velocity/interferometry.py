@@ -55,8 +55,9 @@ def interferometry(
 
     The first pass weights all pulses equally. Later passes weight them by the expected amplitude of
     a point at the position found so far. The slant-range speed u_r is measured modulo lambda PRF
-    and returned within lambda PRF / 2 of the start. The along-track speed u_a keeps the value of
-    the start.
+    and returned within lambda PRF / 2 of the start, which must be so near; beyond it, `ok` is False
+    only where the aperture is long enough for the cubic phase to show it. The along-track speed u_a
+    keeps the value of the start.
 
     Args:
         data: Channels with the transmit range removed, shape (..., channel, pulse), complex.

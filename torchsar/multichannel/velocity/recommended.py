@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchsar.core import Estimate
 from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.motion import Number
+from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell
 from torchsar.multichannel.velocity.bank import Search, bank_search
 from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
@@ -26,6 +26,8 @@ from torchsar.radar import BistaticRadar
 # Aperture of the first search: integration time of Remote Sens. 2020, 12, 1703, Table 1.
 _COARSE_S = 4.5
 _ROUNDS = 2  # refinements of the residual covariance
+# Log-likelihood by which other ambiguity numbers must be worse, by choice: a chance of e^-10.
+_RESOLVED = 10.0
 # Refits about the position found, with so many Gauss-Newton steps each: a round reduces the bias of
 # the position to a third, four rounds to about 1 %.
 _CENTRED_ROUNDS, _CENTRED_STEPS = 4, 4
@@ -65,9 +67,12 @@ def moving_point_velocity(
         (over all samples), `noise_power` (per sample) and `coloured` (True where clutter was found,
         and everywhere if `whitening` is given). `ok` is False where `snr_db` is below 19, the
         estimate lies outside the search, the standard deviation of u_r exceeds the half width of
-        the search, as with a single channel, or the illumination of the point is not understood,
-        see `lit_as_expected`. Where it is lit in a part of the aperture only, as in a range line
-        that it crosses, this part is used, see `seen_aperture`.
+        the search, as with a single channel, a slant-range speed within the search that differs by
+        multiples of lambda PRF explains the data as well, or the illumination of the point is not
+        understood, see `lit_as_expected`. Where it is lit in a part of the aperture only, as in a
+        range line that it crosses, this part is used, see `seen_aperture`. The cubic phase, which
+        separates multiples of lambda PRF, is small for short wavelengths and dwells; the speed is
+        then `ok` only within a search of half that width.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -85,6 +90,7 @@ def moving_point_velocity(
         return job.estimate(
             job.centred(job.found(whitening), whitening),
             torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device),
+            whitening,
         )
     plain = job.found(None)
     job, plain = job.as_seen(plain)
@@ -172,21 +178,47 @@ class _Job:
             self.radar, found.motion, time_s, self.data.dtype
         )
 
-    def estimate(self, found: Found, coloured: Tensor) -> Estimate:
-        """Form the estimate and judge it."""
-        snr = found.snr_db
-        inside = found.motion.u_r_m_s.abs() <= self.search.u_r_m_s + self.search.u_r_step_m_s
+    def resolved(self, found: Found, whitening: Whitening | None) -> tuple[Found, Tensor]:
+        """Choose among slant-range speeds whole multiples of lambda PRF apart, within the search.
+
+        Returns:
+            The fit of highest likelihood, and whether it is so beyond chance, (...,).
+        """
+        whitening = sample_whitening(self.left(found), self.radar) if whitening is None else whitening
+        span, begin = self.radar.ambiguous_velocity_m_s, found.motion
+        best = maximum_likelihood(self.data, self.radar, begin, self.aperture, self.unknowns, whitening, 0)
+        noise, most, second = best.noise_power, best.energy, torch.zeros_like(best.energy)
+        reach = self.search.u_r_m_s + self.search.u_r_step_m_s
+        for number in range(-int(2 * reach / span), int(2 * reach / span) + 1):
+            there = replace(begin, u_r_m_s=begin.u_r_m_s + number * span)
+            if number == 0 or not bool(self.inside(there).any()):
+                continue
+            other = maximum_likelihood(self.data, self.radar, there, self.aperture, self.unknowns, whitening)
+            energy = torch.where(self.inside(other.motion), other.energy, 0.0)
+            better = energy > most
+            found, noise = _chosen_fit(other, found, better), torch.where(better, other.noise_power, noise)
+            most, second = torch.maximum(energy, most), torch.maximum(second, torch.minimum(energy, most))
+        return found, most - second > _RESOLVED * noise
+
+    def inside(self, motion: PointMotion) -> Tensor:
+        """Whether a motion lies within the search, bool (...,)."""
+        inside = motion.u_r_m_s.abs() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         if "u_a_m_s" in self.unknowns:
-            inside = inside & (
-                (found.motion.u_a_m_s - self.u_a_m_s).abs() <= self.search.u_a_m_s + self.search.u_a_step_m_s
-            )
+            reach = self.search.u_a_m_s + self.search.u_a_step_m_s
+            inside = inside & ((motion.u_a_m_s - self.u_a_m_s).abs() <= reach)
+        return inside
+
+    def estimate(self, found: Found, coloured: Tensor, whitening: Whitening | None = None) -> Estimate:
+        """Form the estimate and judge it."""
+        found, resolved = self.resolved(found, whitening)
+        snr = found.snr_db
         determined = (
             found.covariance[..., 0, 0].sqrt() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         )  # False for one channel, which cannot separate velocity and position
         lit = lit_as_expected(self.data, self.radar, found.motion, self.aperture)
         return estimate_of(
             found,
-            inside & determined & lit & (snr >= DETECTED_DB),
+            self.inside(found.motion) & determined & lit & resolved & (snr >= DETECTED_DB),
             torch.sigmoid((snr - DETECTED_DB) / 3),
             coloured=coloured,
         )
