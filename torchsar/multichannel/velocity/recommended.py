@@ -49,6 +49,11 @@ def moving_point_velocity(
     refined with the covariance of its own residual. In each trial, the fit of higher likelihood is
     returned.
 
+    The channels must be balanced, which the data of one point cannot show: a phase that grows
+    along the array acts as a position and a speed (0.2 rad over 1.6 m as 28 m and 1.7 m/s), and
+    standard deviations do not contain it. Nor do those of u_a contain all of the effect of a second
+    point of nearly the same strength and Doppler frequency.
+
     Args:
         data: Channels with the transmit range removed and slow time zero at pulse n // 2, shape
             (..., channel, pulse), complex.
