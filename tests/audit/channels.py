@@ -21,7 +21,6 @@ from torchsar.multichannel import (
     Detector,
     Dwell,
     ElementBeam,
-    ElementPattern,
     EstimateBalance,
     EstimateSynchronisation,
     Extraction,
@@ -46,6 +45,7 @@ from torchsar.scene import BandLimited, BistaticWorld, KSea, MovingPoints, Patte
 F64, C128 = torch.float64, torch.complex128
 RADAR, PULSES, GATE_S = published_radar(), 900, 4.5
 GATE, SEARCH = Dwell(GATE_S), Search(u_r_m_s=15.0, u_a_m_s=6.0, y0_m=100.0, u_a_step_m_s=1.0)
+FIVE = published_radar(channel_m=(-1.0, -0.5, 0.0, 0.5, 1.0))
 LONE = published_radar(channel_m=(0.0,))
 SMALL = (360, 64)  # pulses and cells of data with a range axis
 SPAN = RADAR.ambiguous_velocity_m_s
@@ -69,6 +69,12 @@ def named(move: Move) -> dict[str, Tensor]:
     return dict(zip(("u_r_m_s", "u_a_m_s", "y0_m"), move, strict=True))
 
 
+def points_of(move: Move) -> MovingPoints:
+    """One point per trial, of unit amplitude and random phase."""
+    u_r, u_a, y0 = (x[:, None] for x in move)
+    return MovingPoints(u_r, u_a, y0, torch.zeros_like(u_r), random_phase=True)
+
+
 def noise(trials: int, seed: int, *shape: int) -> Tensor:
     """Circular noise of unit power."""
     return Draws(seed, trials=range(trials)).normal("channels", shape, C128)
@@ -81,12 +87,12 @@ def line(
     gate_s: float = GATE_S,
     points: int = 1,
     known_u_a: bool = False,
-    **ranges: object,
+    u_r: tuple[float, float] = (-12.0, 12.0),
 ) -> Callable[[int, int], Batch]:
     """Draw azimuth lines of one or more moving points by direct sums."""
 
     def draw(trials: int, seed: int) -> Batch:
-        move = moves(trials, seed, **ranges)
+        move = moves(trials, seed, u_r)
         if known_u_a:
             move = (move[0], torch.zeros(trials, dtype=F64), move[2])
         clean = torch.zeros(trials, radar.channels, PULSES, dtype=C128)
@@ -102,16 +108,14 @@ def line(
     return draw
 
 
-def own(
-    snr_db: float, given: tuple[str, ...] = (), known_u_a: bool = False, **ranges: object
-) -> Callable[[int, int], Batch]:
+def own(snr_db: float, given: tuple[str, ...] = (), known_u_a: bool = False) -> Callable[[int, int], Batch]:
     """Draw azimuth lines of one moving point with our own simulator."""
 
     def draw(trials: int, seed: int) -> Batch:
-        move = moves(trials, seed, **ranges)
+        move = moves(trials, seed)
         if known_u_a:
             move = (move[0], torch.zeros(trials, dtype=F64), move[2])
-        scene = MovingPoints(*(x[:, None] for x in move), torch.zeros(trials, 1, dtype=F64), random_phase=True)
+        scene = points_of(move)
         world = BistaticWorld(scene, BandLimited(GATE_S), snr_db=snr_db)
         signal = simulate_bistatic(RADAR, world, PULSES, None, Draws(seed, trials=range(trials)), dtype=C128)[0].signal
         truth = named(move)
@@ -223,7 +227,7 @@ def seen_in_sea(snr_db: float) -> Callable[[int, int], Batch]:
 
     def draw(trials: int, seed: int) -> Batch:
         move = moves(trials, seed, (3.0, 12.0))
-        scene = MovingPoints(*(x[:, None] for x in move), torch.zeros(trials, 1, dtype=F64), random_phase=True)
+        scene = points_of(move)
         world = BistaticWorld(scene, Pattern(), KSea(shape=1.5), snr_db=snr_db)
         signal = simulate_bistatic(RADAR, world, PULSES, None, Draws(seed, trials=range(trials)), dtype=C128)[0].signal
         return Batch(signal, named(move))
@@ -232,30 +236,35 @@ def seen_in_sea(snr_db: float) -> Callable[[int, int], Batch]:
 
 
 def clutter(
-    power: Callable[[Tensor], Tensor], snr_db: float, cells: int = 96, pulses: int = 256
+    power: Callable[[Tensor], Tensor],
+    snr_db: float,
+    cells: int = 96,
+    pulses: int = 256,
+    radar: BistaticRadar = RADAR,
 ) -> Callable[[int, int], Batch]:
     """Draw Gaussian clutter of a Doppler spectrum, with errors of the channels."""
 
     def draw(trials: int, seed: int) -> Batch:
-        long, factor = 4096, 8
+        long, factor = 4096, 14
         draws = Draws(seed, trials=range(trials))
-        f = torch.fft.fftfreq(long, 1 / (factor * RADAR.prf_hz), dtype=F64)
-        level = power(f)
+        f = torch.fft.fftfreq(long, 1 / (factor * radar.prf_hz), dtype=F64)
+        level = power(f) * (f.abs() < radar.speed_m_s / radar.wavelength_m)
         spectrum = draws.normal("white", (long, cells), C128) * (level / level.mean()).sqrt()[:, None]
-        dx = torch.tensor(RADAR.channel_m, dtype=F64)[:, None]
-        delayed = spectrum[:, None] * torch.exp(-2j * math.pi * f * dx / RADAR.speed_m_s)[..., None]
+        dx = torch.tensor(radar.channel_m, dtype=F64)[:, None]
+        delayed = spectrum[:, None] * torch.exp(-2j * math.pi * f * dx / radar.speed_m_s)[..., None]
         data = torch.fft.ifft(delayed, dim=-2, norm="ortho")[..., : pulses * factor : factor, :]
         data = data + 10 ** (-snr_db / 20) * draws.normal("noise", tuple(data.shape[1:]), C128)
-        band = torch.fft.fftfreq(cells, 1 / RADAR.sampling_hz, dtype=F64).abs() < RADAR.pulse.bandwidth_hz / 2
+        band = torch.fft.fftfreq(cells, 1 / radar.sampling_hz, dtype=F64).abs() < radar.pulse.bandwidth_hz / 2
         data = torch.fft.ifft(torch.fft.fft(data) * band)
-        move = torch.tensor([1.0, 0.0, 1.0], dtype=F64)
+        move = torch.tensor([float(x != 0) for x in radar.channel_m], dtype=F64)
+        count = (len(move),)
         truth = {
-            "phase_rad": move * draws.uniform("phase", (3,), -1.0, 1.0),
-            "gain_db": move * draws.uniform("gain", (3,), -1.0, 1.0),
-            "delay_s": move * draws.uniform("delay", (3,), -1e-8, 1e-8),
+            "phase_rad": move * draws.uniform("phase", count, -1.0, 1.0),
+            "gain_db": move * draws.uniform("gain", count, -1.0, 1.0),
+            "delay_s": move * draws.uniform("delay", count, -1e-8, 1e-8),
         }
-        data = correct_balance(data, RADAR, *(-x for x in truth.values()))
-        return Batch(Signal(data, RADAR.axes(pulses, cells)), truth)
+        data = correct_balance(data, radar, -truth["phase_rad"], -truth["gain_db"], -truth["delay_s"])
+        return Batch(Signal(data, radar.axes(pulses, cells)), truth)
 
     return draw
 
@@ -339,6 +348,11 @@ def entries() -> list[Entry]:
     lone = MovingPointVelocity(LONE, GATE, search=SEARCH)
     ranged = [World("direct", lines(snr), snr) for snr in (-40.0, -30.0, -20.0, -10.0, 10.0)]
     ranged += [World("direct raw", raw(snr), snr) for snr in (-20.0, 10.0)]
+    balance = [
+        Quantity("phase_rad", 0.1, circular, 1e-3),
+        Quantity("gain_db", 1.0, floor=0.02),
+        Quantity("delay_s", 3e-9, floor=2e-11),
+    ]
     return [
         Entry("multichannel.MovingPointVelocity", moving, worlds(), [U_R, U_A, Y0], 0.5),
         Entry(
@@ -405,26 +419,28 @@ def entries() -> list[Entry]:
                 World("moving point", moving_only, 20.0),
                 World("few cells", clutter(flat, 10.0, 24, 64), 10.0),
             ],
-            [
-                Quantity("phase_rad", 0.1, circular, 1e-3),
-                Quantity("gain_db", 1.0, floor=0.02),
-                Quantity("delay_s", 3e-9, floor=2e-11),
-            ],
+            balance,
             0.3,
         ),
         Entry(
             "multichannel.EstimateBalance:pattern",
-            EstimateBalance(RADAR, ElementPattern(), 5),
+            EstimateBalance(RADAR),
             [
                 *nothing((3, 256, 96), lambda x: Signal(x, RADAR.axes(256, 96))),
                 *(World("own", clutter(beam, snr), snr) for snr in (-20.0, 0.0, 20.0, 40.0)),
                 World("other beam", clutter(flat, 20.0), 20.0),
             ],
+            balance,
+            0.3,
+        ),
+        Entry(
+            "multichannel.EstimateBalance:five channels",
+            EstimateBalance(FIVE),
             [
-                Quantity("phase_rad", 0.1, circular, 1e-3),
-                Quantity("gain_db", 1.0, floor=0.02),
-                Quantity("delay_s", 3e-9, floor=2e-11),
+                World("own", clutter(beam, 20.0, radar=FIVE), 20.0),
+                World("other beam", clutter(flat, 20.0, radar=FIVE), 20.0),
             ],
+            balance,
             0.3,
         ),
         Entry(

@@ -31,10 +31,10 @@ def clutter(radar, power_of_doppler, snr_db, trials=2, n_range=CELLS, seed=3):
     band is that of the transmitted pulse.
     """
     generator = torch.Generator().manual_seed(seed)
-    factor = 8
+    factor = 14  # up to the Doppler of a direction along track
     f = torch.fft.fftfreq(LONG, 1 / (factor * radar.prf_hz), dtype=torch.float64)
     white = torch.randn(trials, LONG, n_range, dtype=torch.complex128, generator=generator)
-    power = power_of_doppler(f)
+    power = power_of_doppler(f) * (f.abs() < radar.speed_m_s / radar.wavelength_m)
     spectrum = white * (power / power.mean()).sqrt()[:, None]
     dx = torch.tensor(radar.channel_m, dtype=torch.float64)[:, None]
     delayed = spectrum[:, None] * torch.exp(-2j * math.pi * f * dx / radar.speed_m_s)[..., None]
@@ -57,15 +57,15 @@ def pattern(f):
 
 
 @pytest.mark.parametrize(
-    "prf, chosen, power, limit_deg",
+    "prf, spacing_m, chosen, power, limit_deg",
     [
-        (180.0, (FlatBand(360.0), 2), flat, 0.1),
-        (160.0, (FlatBand(320.0), 2), flat, 0.1),
-        (180.0, (ElementPattern(), 5), pattern, 2.5),
+        (180.0, 0.8, (FlatBand(360.0), 2), flat, 0.1),
+        (160.0, 0.8, (FlatBand(320.0), 2), flat, 0.1),
+        (180.0, 0.5, (ElementPattern(),), pattern, 2.5),
     ],
 )
-def test_errors_agree_with_the_predicted_std(prf, chosen, power, limit_deg):
-    radar = published_radar(prf_hz=prf)
+def test_errors_agree_with_the_predicted_std(prf, spacing_m, chosen, power, limit_deg):
+    radar = published_radar(prf_hz=prf, channel_m=(-spacing_m, 0.0, spacing_m))
     found = estimate_balance(differed(clutter(radar, power, 40.0), radar), radar, *chosen)
     assert bool(found.ok.all())
     errors = {
@@ -74,10 +74,30 @@ def test_errors_agree_with_the_predicted_std(prf, chosen, power, limit_deg):
         "delay_s": found["delay_s"] - DELAY,
     }
     assert float(torch.rad2deg(errors["phase_rad"]).abs().max()) < limit_deg
-    assert float(errors["gain_db"].abs().max()) < (0.5 if chosen[1] > 2 else 0.1)
-    for name in ("phase_rad", "delay_s"):
+    assert float(errors["gain_db"].abs().max()) < (0.1 if limit_deg < 1 else 0.25)
+    for name in errors:
         assert bool((errors[name].abs() <= 4 * found.std[name] + 1e-15).all()), name
         assert bool((found.std[name][..., [0, 2]] > 0).all())
+
+
+def test_clutter_that_does_not_determine_a_phase_is_not_ok():
+    """Channels as far apart as their elements are long see uncorrelated clutter.
+
+    The middle phase then had a deviation of 0.04 rad and was ok, and delays were wrong by 3 ns.
+    """
+    radar = published_radar()
+    found = estimate_balance(differed(clutter(radar, pattern, 30.0, n_range=96), radar), radar, ElementPattern(), 5)
+    assert not bool(found.ok.any())
+    wrong_prior = estimate_balance(differed(clutter(radar, flat, 20.0, n_range=96), radar), radar)
+    assert not bool(wrong_prior.ok.any()), "gains of a wrong prior were wrong by 1.1 dB"
+
+
+def test_side_lobes_of_the_pattern_do_not_bias_the_gains():
+    """With five Doppler bands, they erred by 3 predicted deviations."""
+    radar = published_radar(channel_m=(-0.5, 0.0, 0.5))
+    found = estimate_balance(differed(clutter(radar, pattern, 30.0, trials=4), radar), radar)
+    error = ((found["gain_db"] - GAIN) / found.std["gain_db"])[:, [0, 2]]
+    assert bool(found.ok.all()) and float(error.square().mean().sqrt()) < 2
 
 
 def test_spread_equals_the_predicted_std():

@@ -148,6 +148,17 @@ def test_predicted_std_and_ok():
     assert float(lost.ok.to(F64).mean()) < 0.2 and float(lost.quality.mean()) < 0.2
 
 
+def test_a_second_point_displaces_the_maximum_as_much_as_it_says():
+    """A point 10 dB weaker displaced it by 4 predicted deviations in the rms."""
+    speed = torch.linspace(-9.0, 9.0, 8, dtype=F64)
+    other = (azimuth_echo(RADAR, 900, 7.0 - 2 * i, 3.0 - i, 50.0 - 12 * i) for i in range(8))
+    clean = torch.stack([azimuth_echo(RADAR, 900, float(u_r)) for u_r in speed]) + 0.3 * torch.stack(list(other))
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(4), dtype=torch.complex128)
+    found = SignalIntensityRatio(RADAR, BAND)(Signal(clean + 0.1 * noise, RADAR.axes(900)))
+    error = (found["u_r_m_s"] - speed)[found.ok] / found.std["u_r_m_s"][found.ok]
+    assert len(error) >= 6 and float(error.square().mean().sqrt()) < 1.6
+
+
 def test_a_stationary_scene_biases_the_estimate_to_zero():
     """The error then equals u_r."""
     still = sum(

@@ -161,7 +161,7 @@ def test_along_track_speed():
     assert not bool(outside.ok.any()) and bool((outside.value["u_a_m_s"].abs() <= 8).all())
 
 
-@pytest.mark.parametrize("name", ["along_track", "likelihood", "gradient", "recommended"])
+@pytest.mark.parametrize("name", ["along_track", "interferometry", "likelihood", "gradient", "recommended"])
 def test_a_point_lit_in_a_part_of_the_aperture_is_as_certain_as_it_says(name):
     """Lit for 1 s and 1.4 s of the 4.5 s that are expected: the estimates were wrong and sure."""
     lit = (azimuth_echo(RADAR, N, 5.0, 2.0, y0, gate_s=gate) for gate, y0 in ((1.0, 20.0), (1.4, -30.0)))
@@ -175,7 +175,40 @@ def test_a_point_lit_in_a_part_of_the_aperture_is_as_certain_as_it_says(name):
     found = ESTIMATORS[name](RADAR, GATE, **options)(signal, **{key: start[key] for key in taken})
     assert bool(found.ok.all())
     for key, std in found.std.items():
-        assert (0.5 if each == 5 else 0.1) < rms(found[key] - start[key]) / rms(std) < 1.6, key
+        low, high = (0.5, 1.6) if each == 5 else (0.1, 2.1)  # four trials scatter by a third
+        assert low < rms(found[key] - start[key]) / rms(std) < high, key
+
+
+@pytest.mark.parametrize("name", ["along_track", "interferometry", "likelihood"])
+def test_a_second_point_acts_on_the_deviations_as_on_the_errors(name):
+    """The energy of a point at another Doppler was taken for noise: 3.5 times too large deviations.
+
+    Where the two overlap in Doppler, it was too little: errors of 8 deviations.
+    """
+    position = torch.linspace(-20.0, 20.0, 16, dtype=F64)
+    other = [azimuth_echo(RADAR, N, -8.0 + 1.1 * i, 3.0 - 0.4 * i, -40.0 + 5 * i) for i in range(16)]
+    clean = torch.stack([azimuth_echo(RADAR, N, 5.0, 0.0, float(y0)) for y0 in position]) + 0.5 * torch.stack(other)
+    taken = {"interferometry": ("u_r_m_s", "u_a_m_s"), "along_track": ("u_r_m_s", "y0_m")}.get(name, UNKNOWNS)
+    start = {"u_r_m_s": 5.0, "u_a_m_s": 0.0, "y0_m": position}
+    found = ESTIMATORS[name](RADAR, GATE)(
+        Signal(10 * clean + noise(16, 5), RADAR.axes(N)), **{key: start[key] for key in taken}
+    )
+    assert bool(found.ok.all())
+    for key, std in found.std.items():
+        assert 0.5 < rms(found[key] - start[key]) / rms(std) < 1.5, key
+        assert float(((found[key] - start[key]) / std).abs().max()) < 4.5, key
+
+
+def test_a_short_dwell_resolves_the_ambiguity_or_says_that_it_does_not():
+    """Of speeds lambda PRF apart a wrong one was returned, and ok, in 20 % of the trials."""
+    radar, speed = published_radar(), torch.linspace(-11.0, 11.0, 12, dtype=F64).repeat(2)
+    clean = torch.stack([azimuth_echo(radar, 400, float(u_r), gate_s=2.0) for u_r in speed])
+    level = torch.tensor([-8.0] * 12 + [10.0] * 12, dtype=F64)
+    data = 10 ** (level / 20)[:, None, None] * clean + noise(24, 8, 400)
+    stage = MovingPointVelocity(radar, Dwell(2.0), search=Search(u_r_m_s=64.8, y0_m=60.0), u_a_m_s=0.0)
+    found = stage(Signal(data, radar.axes(400)))
+    wrong = (found["u_r_m_s"] - speed).abs() > 5 * found.std["u_r_m_s"]
+    assert not bool((wrong & found.ok).any()) and bool(found.ok[level > 0].all())
 
 
 def test_a_point_that_crosses_range_lines_is_as_certain_as_it_says():

@@ -47,14 +47,15 @@ _DELAY_PASSES = 2
 _COARSE_DB = 20.0
 # SNR values tried, in dB: a step of 1 dB changes the phases by 1e-3 rad, less than their errors.
 _LEVELS_DB = tuple(range(0, 61, 3))
-# Difference of the powers of balanced channels in dB that chance may cause, by choice: channels see
-# the clutter at different times.
-_CHANCE_DB = 0.25
+# Difference of the powers of balanced channels over that by chance from which the prior is taken to
+# be wrong, by choice.
+_UNLIKELY = 4.0
 # (mean square)^2 / mean fourth power of the Hann weights: independent looks per pulse.
 _HANN_LOOKS = 18 / 35
-# Convention: a linear phase error of 0.1 rad, twice as much, already makes false targets of about
-# -20 dB when three bands are reconstructed at a PRF of 180 Hz.
-_LARGEST_STD_RAD = 0.05
+# Convention: a linear phase error of 0.1 rad, three times as much, already makes false targets of
+# about -20 dB when three bands are reconstructed at a PRF of 180 Hz. So do amplitudes. Phases that
+# delays turn over the range band weigh less, since their mean is zero.
+_LARGEST_STD_RAD, _LARGEST_ACROSS_RAD = 0.033, 0.1
 
 
 def correct_balance(
@@ -119,7 +120,7 @@ def estimate_balance(
     data: Tensor,
     radar: BistaticRadar,
     prior: Prior | None = None,
-    bands: int = 5,
+    bands: int | None = None,
     delays: bool = True,
     blocks: int = 16,
 ) -> Estimate:
@@ -131,14 +132,17 @@ def estimate_balance(
     of 0.3 degree (900 pulses by 256 range cells). A phase that grows linearly along the array
     shifts all clutter in Doppler; it is determined only by the edges of the band or the shape of
     the pattern. It cannot be determined with a flat prior that fills as many bands as there are
-    channels.
+    channels. Nor can the phases of channels as far apart as their elements are long, whose clutter
+    is uncorrelated: the 3 channels of Table 1 need about 500 pulses by 200 range cells.
 
     Args:
         data: Range-compressed channels with the transmit range removed from the phase, shape (...,
             channel, pulse, range), complex, mostly stationary clutter.
         radar: Radar parameters.
         prior: Expected power of the clutter over Doppler, `ElementPattern()` by default.
-        bands: Number of Doppler bands that the clutter fills, each one PRF wide.
+        bands: Number of Doppler bands that the clutter fills, each one PRF wide; None for all at
+            which a stationary scene has echoes, 2 v / lambda for the speed v. Side lobes of a
+            pattern beyond fewer bands bias the gains by more than the standard deviation says.
         delays: False to assume zero delays.
         blocks: Number of parts into which the range band is divided; within each part a delay is
             approximated by a constant phase. A delay of two samples changes the phase across one of
@@ -151,8 +155,9 @@ def estimate_balance(
         balanced channels, as with a wrong prior. Those of delays follow from the scatter of the
         blocks.
         `info` holds `snr_db` (...,), the ratio of the clutter power at the peak of the prior to the
-        noise power. `ok` is False, and the values are zero, where a channel has no power or a phase
-        has a standard deviation above 0.05 rad.
+        noise power. `ok` is False, and the values are zero, where a channel has no power, the
+        standard deviation of a phase exceeds 0.033 rad or that of a gain 0.29 dB, or that of a
+        delay turns the phase by more than 0.1 rad rms over the range band.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -168,6 +173,7 @@ def estimate_balance(
         power = lines.abs().square().mean((-2, -1))
         own = power.mean(-1)[..., None, None, None]
         lines = lines / torch.where(own > 0, own, 1.0).sqrt()
+        bands = bands or math.ceil(2 * radar.speed_m_s / (radar.wavelength_m * radar.prf_hz))
         models = _Models.of(radar, prior or ElementPattern(), bands, data.shape[-2], data.device)
         centres, reference = frequency.view(blocks, -1).mean(-1), _reference(radar)
         no_power = (power == 0).any(-1)
@@ -185,10 +191,16 @@ def estimate_balance(
         looks = data.shape[-2] * frequency.numel() * _HANN_LOOKS
         by_snr = by_snr / math.sqrt(2 * looks)
         balanced = lines.abs().square().mean((-2, -1)) * weights.abs().square()
-        return _estimate_of(weights, hessian, (delay, delay_std), snr_db, no_power, reference, looks, by_snr, balanced)
+        log_std, phase_std = _standard_deviations(hessian, reference, looks)
+        log_std = torch.hypot(log_std, by_snr - by_snr[..., reference, None])
+        # balanced channels have equal power, but with a wrong prior other gains are more likely
+        uneven = torch.log((balanced / balanced[..., reference, None].clamp_min(1e-300)).clamp_min(1e-3)).abs() / 2
+        chance = models.chance(snr_db, reference, looks) / 2
+        log_std = torch.where(uneven > _UNLIKELY * chance, torch.hypot(log_std, uneven), log_std)
+        return _estimate_of(weights, delay, (log_std, phase_std, delay_std), snr_db, no_power, reference, radar)
 
 
-def _check_data(data: Tensor, radar: BistaticRadar, blocks: int, bands: int) -> None:
+def _check_data(data: Tensor, radar: BistaticRadar, blocks: int, bands: int | None) -> None:
     """Raise ValueError unless data, blocks and bands suit the radar."""
     if radar.channels < 2:
         raise ValueError(
@@ -199,7 +211,7 @@ def _check_data(data: Tensor, radar: BistaticRadar, blocks: int, bands: int) -> 
             f"the balance is estimated from data (..., {radar.channels}, pulse, range) with one channel for each "
             f"position in the radar's channel_m, got shape {tuple(data.shape)}"
         )
-    if bands < 1:
+    if bands is not None and bands < 1:
         raise ValueError(f"bands must be at least 1, the number of Doppler bands with clutter, got {bands}")
     inside = int(data.shape[-1] * radar.pulse.bandwidth_hz / radar.sampling_hz)
     if not 2 <= blocks <= inside:
@@ -304,6 +316,24 @@ class _Models:
             torch.where(bend > 0, torch.where(bend > 0, bend, 1).rsqrt(), 0)[..., None] * slope[..., 0],
         )
 
+    def chance(self, snr_db: Tensor, reference: int, looks: float) -> Tensor:
+        """Return by how much the powers of balanced channels differ from the reference by chance.
+
+        Args:
+            snr_db: SNR, shape (...,).
+            reference: Index of the reference channel.
+            looks: Number of independent samples in all bins.
+
+        Returns:
+            Standard deviations relative to the power, shape (..., channel).
+        """
+        eye = torch.eye(self.clutter.shape[-1], dtype=self.clutter.dtype, device=self.clutter.device)
+        model = self.clutter + 10 ** (-snr_db[..., None, None, None] / 10) * eye
+        power = model.diagonal(dim1=-2, dim2=-1).real
+        shared = model[..., reference].abs().square()
+        variance = (power.square() + power[..., reference, None].square() - 2 * shared).clamp_min(0).mean(-2)
+        return (variance / looks).sqrt() / power.mean(-2)
+
     def _start(self, products: Tensor) -> Tensor:
         """Return inverse gains as the strongest eigenvector of the data matched to the model."""
         matched = (products * self.clutter.conj()).sum(-3)
@@ -376,32 +406,28 @@ def _slope(weights: Tensor, frequency_hz: Tensor, reference: int) -> tuple[Tenso
 
 def _estimate_of(
     weights: Tensor,
-    hessian: Tensor,
-    delay: tuple[Tensor, Tensor],
+    delay: Tensor,
+    stds: tuple[Tensor, Tensor, Tensor],
     snr_db: Tensor,
     no_power: Tensor,
     reference: int,
-    looks: float,
-    by_snr: Tensor,
-    balanced: Tensor,
+    radar: BistaticRadar,
 ) -> Estimate:
     """Form the estimate relative to the reference channel and judge it."""
+    log_std, phase_std, delay_std = stds
     value = {
         "phase_rad": torch.angle(weights.conj() * weights[..., reference, None]),
         "gain_db": 20 * torch.log10(weights[..., reference, None].abs() / weights.abs()),
-        "delay_s": delay[0] - delay[0][..., reference, None],
+        "delay_s": delay - delay[..., reference, None],
     }
-    log_std, phase_std = _standard_deviations(hessian, reference, looks)
-    log_std = torch.hypot(log_std, by_snr - by_snr[..., reference, None])
-    # balanced channels have equal power, but with a wrong prior other gains are more likely
-    uneven = 10 * torch.log10((balanced / balanced[..., reference, None].clamp_min(1e-300)).clamp_min(1e-30)).abs()
-    beyond = uneven > 5 * log_std * (20 / math.log(10)) + _CHANCE_DB
-    log_std = torch.where(beyond, torch.hypot(log_std, uneven * (math.log(10) / 20)), log_std)
-    std = {"phase_rad": phase_std, "gain_db": log_std * (20 / math.log(10)), "delay_s": delay[1]}
-    worst = phase_std.amax(-1)
-    ok = torch.stack([v.isfinite().all(-1) for v in value.values()]).all(0) & ~no_power & (worst < _LARGEST_STD_RAD)
+    std = {"phase_rad": phase_std, "gain_db": log_std * (20 / math.log(10)), "delay_s": delay_std}
+    # rms phase over the range band by a delay
+    by_delay = math.pi * radar.pulse.bandwidth_hz / math.sqrt(3) * delay_std.amax(-1)
+    worst = torch.maximum(phase_std, log_std).amax(-1) / _LARGEST_STD_RAD
+    worst = torch.maximum(worst, by_delay / _LARGEST_ACROSS_RAD)
+    ok = torch.stack([v.isfinite().all(-1) for v in value.values()]).all(0) & ~no_power & (worst < 1)
     value = {name: torch.where(ok[..., None], v, 0.0) for name, v in value.items()}
-    return Estimate(value, torch.where(ok, 1 - worst / _LARGEST_STD_RAD, 0.0).clamp(0, 1), ok, std, {"snr_db": snr_db})
+    return Estimate(value, torch.where(ok, 1 - worst, 0.0).clamp(0, 1), ok, std, {"snr_db": snr_db})
 
 
 def _standard_deviations(hessian: Tensor, reference: int, looks: float) -> tuple[Tensor, Tensor]:
@@ -425,7 +451,8 @@ class EstimateBalance(Stage):
     Args:
         radar: Radar parameters.
         prior: Expected power of the clutter over Doppler, `ElementPattern()` by default.
-        bands: Number of Doppler bands that the clutter fills, each one PRF wide.
+        bands: Number of Doppler bands that the clutter fills, each one PRF wide; None for all at
+            which a stationary scene has echoes.
         delays: False to assume zero delays.
         blocks: Number of parts into which the range band is divided; within each part a delay is
             approximated by a constant phase.
@@ -436,7 +463,12 @@ class EstimateBalance(Stage):
     neutral = {"phase_rad": 0.0, "gain_db": 0.0, "delay_s": 0.0}
 
     def __init__(
-        self, radar: BistaticRadar, prior: Prior | None = None, bands: int = 5, delays: bool = True, blocks: int = 16
+        self,
+        radar: BistaticRadar,
+        prior: Prior | None = None,
+        bands: int | None = None,
+        delays: bool = True,
+        blocks: int = 16,
     ) -> None:
         super().__init__()
         self.radar, self.prior, self.bands, self.delays, self.blocks = radar, prior, bands, delays, blocks

@@ -12,20 +12,20 @@ Reference:
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate
+from torchsar.core import Estimate, unit_phasor
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
-from torchsar.multichannel.velocity.interferometry import DETECTED_DB
-from torchsar.multichannel.velocity.model import energy_ratio_db, point_phasor
+from torchsar.multichannel.velocity.interferometry import DETECTED_DB, tone_frequency
+from torchsar.multichannel.velocity.model import energy_ratio_db, noise_beside, point_phasor
 from torchsar.radar import BistaticRadar
 
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
@@ -81,6 +81,7 @@ def along_track_velocity(
     # raises ValueError for a search up to the speed of the receiver
     PointMotion.of(radar, data, 0.0, start.u_a_m_s + half_m_s)
     data = data.to(torch.complex128)
+    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     centre = start.u_a_m_s.expand(data.shape[:-2])
     count = 2 * max(1, round(half_m_s / step_m_s)) + 1
     offsets = torch.linspace(-half_m_s, half_m_s, count, dtype=torch.float64, device=data.device)
@@ -90,18 +91,25 @@ def along_track_velocity(
     if bool(uneven.any()):
         top = _best(data, radar, start, aperture, centre, offsets)
     ended = top.edge
+    # the ends of the aperture move with u_a from pulse to pulse: they are kept from here on
+    seen = _Kept(aperture.weight(radar, replace(start, u_a_m_s=top.u_a_m_s), time_s))
     for _ in range(fine):
         step = 2 * step / 5
-        top = _best(
-            data,
-            radar,
-            start,
-            aperture,
-            top.u_a_m_s,
-            step * torch.arange(-2, 3, dtype=torch.float64, device=data.device),
-        )
+        offsets = step * torch.arange(-2, 3, dtype=torch.float64, device=data.device)
+        top = _best(data, radar, start, seen, top.u_a_m_s, offsets)
     found = torch.where(top.energy > 0, top.u_a_m_s.clamp(centre - half_m_s, centre + half_m_s), centre)
-    return _estimate_at(data, radar, replace(start, u_a_m_s=found), aperture, top.energy, top.curvature, ended)
+    return _estimate_at(data, radar, replace(start, u_a_m_s=found), seen, top.energy, top.curvature, ended)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """Expected amplitude that is the same for all motions, float64 (..., pulse)."""
+
+    amplitude: Tensor
+
+    def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
+        """Return the expected amplitude, see `Aperture.weight`."""
+        return self.amplitude
 
 
 class _Top(NamedTuple):
@@ -169,10 +177,21 @@ def _estimate_at(
     snr = energy_ratio_db(energy, noise)
     value = {"u_a_m_s": motion.u_a_m_s}
     ok = (snr >= DETECTED_DB) & ~ended & lit_as_expected(data, radar, motion, aperture)
-    std = torch.where(energy > 0, torch.sqrt(noise / curvature.clamp_min(_TINY)), torch.inf)
+    beside = _noise_beside(data, radar, motion, weight).diagonal(dim1=-2, dim2=-1).mean(-1)
+    std = torch.where(energy > 0, torch.sqrt(beside / curvature.clamp_min(_TINY)), torch.inf)
     return Estimate(
         value, torch.sigmoid((snr - DETECTED_DB) / 3), ok, {"u_a_m_s": std}, {"snr_db": snr, "at_the_end": ended}
     )
+
+
+def _noise_beside(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor) -> Tensor:
+    """Return the noise beside the tone, see `noise_beside`; each channel has its amplitude."""
+    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
+    deramped = data * point_phasor(radar, motion, time_s, data.dtype).conj()
+    tone_hz = tone_frequency(deramped * weight, radar.prf_hz)
+    still = deramped * unit_phasor(-tone_hz[..., None, None] * time_s, data.dtype)
+    amplitude = (still * weight).sum(-1, keepdim=True) / weight.square().sum(-1, keepdim=True).clamp_min(_TINY)
+    return noise_beside(still - amplitude * weight, weight, amplitude, radar.channels + 2)
 
 
 def motion_from(

@@ -36,7 +36,8 @@ class SeenAperture:
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
         """Return the expected amplitude times the profile, see `Aperture.weight`."""
-        return self.aperture.weight(radar, motion, time_s) * self.profile
+        more = max(0, motion.trial_dims + 1 - self.profile.ndim)  # several hypotheses per trial
+        return self.aperture.weight(radar, motion, time_s) * self.profile[(..., *[None] * more, slice(None))]
 
 
 @torch.no_grad()

@@ -22,14 +22,21 @@ from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
 from torchsar.multichannel.velocity.aperture import Aperture
-from torchsar.multichannel.velocity.model import Found, covariance_of, estimate_of, phase_slopes, point_phasor
+from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
+from torchsar.multichannel.velocity.model import (
+    Found,
+    centred_slopes,
+    chosen,
+    covariance_in,
+    estimate_of,
+    noise_beside,
+    point_phasor,
+)
 from torchsar.radar import BistaticRadar
 
 # Zero padding: the parabola then errs by at most 0.004 of a Doppler cell, without padding by 0.23.
 _PAD = 4
-# Variance over that of the joint least-squares fit, since tone and slope are measured in turn: 1.3
-# squared in u_r and y0, from -10 to 60 dB per sample, with direct echoes and simulated ones.
-_LOSS = 1.7
+_STARTS = 9  # chosen: 3 m/s from the next one, the cubic phase loses at most 1 dB of the tone
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 # Detection threshold over all samples, -15 dB per sample with three channels and 810 pulses: below
 # it the strongest tone is often one of noise.
@@ -48,8 +55,9 @@ def interferometry(
 
     The first pass weights all pulses equally. Later passes weight them by the expected amplitude of
     a point at the position found so far. The slant-range speed u_r is measured modulo lambda PRF
-    and returned within lambda PRF / 2 of the start. The along-track speed u_a keeps the value of
-    the start.
+    and returned within lambda PRF / 2 of the start, which must be so near; beyond it, `ok` is False
+    only where the aperture is long enough for the cubic phase to show it. The along-track speed u_a
+    keeps the value of the start.
 
     Args:
         data: Channels with the transmit range removed, shape (..., channel, pulse), complex.
@@ -64,8 +72,10 @@ def interferometry(
         `u_r_m_s` (closing positive), `u_a_m_s` and `y0_m` of shape (...,). Standard deviations of
         u_r and y0 follow from the residual noise. `info` holds `snr_db` (over all samples) and
         `noise_power` (per sample), and with `check_ambiguity` also `pulse_rates`, the number of
-        PRFs to add to the Doppler (-1, 0 or 1). `ok` is False where `snr_db` is below 19 or
-        `pulse_rates` is not zero.
+        PRFs to add to the Doppler (-1, 0 or 1). `ok` is False where `snr_db` is below 19,
+        `pulse_rates` is not zero, or the illumination of the point is not understood, see
+        `lit_as_expected`. Where it is lit in a part of the aperture only, this part is used, see
+        `seen_aperture`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -79,19 +89,40 @@ def interferometry(
             "velocity; use data of more channels"
         )
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
-    motion, data = start, data.to(torch.complex128)
-    for number in range(passes):
-        weight = torch.ones_like(time_s) if number == 0 else aperture.weight(radar, motion, time_s)
-        motion = _improved(data, radar, motion, weight, time_s)
+    data = data.to(torch.complex128)
+    motion = _begun(data, radar, start, time_s)
+    aperture, _ = seen_aperture(data, radar, motion, aperture)
+    for _ in range(passes - 1):
+        motion = _improved(data, radar, motion, aperture.weight(radar, motion, time_s), time_s)
     found = _fit_at(data, radar, motion, aperture.weight(radar, motion, time_s), time_s)
     snr = found.snr_db
     estimate = estimate_of(found, snr >= DETECTED_DB, _quality(snr))
-    return warned_of_ambiguity(estimate, data, radar, motion, aperture) if check_ambiguity else estimate
+    if check_ambiguity:
+        estimate = warned_of_ambiguity(estimate, data, radar, motion, aperture)
+    return replace(estimate, ok=estimate.ok & lit_as_expected(data, radar, motion, aperture))
 
 
 def _quality(snr_db: Tensor) -> Tensor:
     """Map the SNR to 0..1, with one half at the threshold."""
     return torch.sigmoid((snr_db - DETECTED_DB) / 3)
+
+
+def _begun(data: Tensor, radar: BistaticRadar, start: PointMotion, time_s: Tensor) -> PointMotion:
+    """Take the first pass from the slant-range speed at which the strongest tone is sharpest.
+
+    The cubic phase of a point grows with its speed, and would favour weaker points of less speed.
+    """
+    span, even = radar.ambiguous_velocity_m_s, torch.ones_like(time_s)
+    best = start.each(lambda value: value.expand(data.shape[:-2]))
+    most = torch.zeros(data.shape[:-2], dtype=torch.float64, device=data.device)
+    for offset in torch.linspace(-span / 2, span / 2, _STARTS, dtype=torch.float64, device=data.device):
+        there = replace(best, u_r_m_s=(start.u_r_m_s + offset).expand(most.shape))
+        deramped = data * point_phasor(radar, there, time_s, data.dtype).conj()
+        power = torch.fft.fft(deramped, smooth_length(2 * data.shape[-1])).abs().square().sum(-2).amax(-1)
+        best, most = chosen(there, best, power > most), torch.maximum(power, most)
+    found = _improved(data, radar, best, even, time_s)
+    beyond = torch.round((found.u_r_m_s - start.u_r_m_s) / span)
+    return replace(found, u_r_m_s=found.u_r_m_s - span * beyond)
 
 
 def _improved(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor, time_s: Tensor) -> PointMotion:
@@ -157,17 +188,23 @@ def _fit_at(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Ten
     weight = weight[..., None, :]
     illuminated = (weight != 0).expand(data.shape)
     energy_of_weight = weight.square().expand(data.shape).sum((-2, -1)).clamp_min(_TINY)
-    amplitude = (weight * data * point_phasor(radar, motion, time_s, data.dtype).conj()).sum(
-        (-2, -1)
-    ) / energy_of_weight
+    deramped = data * point_phasor(radar, motion, time_s, data.dtype).conj()
+    amplitude = (weight * deramped).sum((-2, -1)) / energy_of_weight
     energy = amplitude.abs().square() * energy_of_weight
     noise = ((data.abs().square() * illuminated).sum((-2, -1)) - energy).clamp_min(0) / illuminated.sum(
         (-2, -1)
     ).clamp_min(1)
-    slopes = phase_slopes(radar, motion, time_s, ("u_r_m_s", "y0_m")) * weight[..., None, :, :]
-    total = (weight.square()[..., None, :, :] * torch.ones_like(slopes)).sum((-2, -1), keepdim=True).clamp_min(_TINY)
-    flat = (
-        slopes - weight[..., None, :, :] * (slopes * weight[..., None, :, :]).sum((-2, -1), keepdim=True) / total
-    ).flatten(-2)
-    normal = amplitude.abs().square()[..., None, None] * (flat @ flat.mT)
-    return Found(motion, amplitude, noise, _LOSS * covariance_of(normal, noise), energy, ("u_r_m_s", "y0_m"))
+    level = amplitude[..., None, None]
+    beside = noise_beside(deramped - level * weight, weight, level, 3)
+    slopes = centred_slopes(_linear_slopes(radar, motion, time_s), weight)
+    return Found(motion, amplitude, noise, covariance_in(beside, slopes, amplitude), energy, ("u_r_m_s", "y0_m"))
+
+
+def _linear_slopes(radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
+    """Return the derivatives by u_r and y0 of tone and phase slope, (..., 2, channel, pulse).
+
+    Other effects of u_r and y0 on the phase, which the estimate does not use, are left out.
+    """
+    v, near = (x[..., None, None] for x in (motion.along_m_s, motion.range_m))
+    by_y0 = (v * time_s - radar.channels_at(time_s.device)[:, None]) / near
+    return 2 * math.pi / radar.wavelength_m * torch.stack([time_s.expand_as(by_y0), by_y0], -3)

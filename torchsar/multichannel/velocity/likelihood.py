@@ -18,9 +18,12 @@ from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.model import (
     UNKNOWNS,
     Found,
+    centred_slopes,
     chosen,
+    covariance_in,
     covariance_of,
     moved,
+    noise_beside,
     phase_slopes,
     point_phasor,
     refuse_unknowns,
@@ -97,9 +100,7 @@ def maximum_likelihood(
     fit = problem.fit(motion)
     for _ in range(steps):
         motion, fit = _stepped(problem, motion, fit)
-    noise = problem.noise_power(fit)
-    covariance = covariance_of(fit.normal, noise)
-    return Found(motion, fit.amplitude, noise, covariance, fit.energy, unknowns)
+    return Found(motion, fit.amplitude, problem.noise_power(fit), problem.covariance(motion, fit), fit.energy, unknowns)
 
 
 @dataclass(frozen=True)
@@ -173,16 +174,34 @@ class PointLikelihood:
         left = (power * illuminated).sum((-2, -1)) - fit.energy
         return left.clamp_min(0) / illuminated.sum((-2, -1)).clamp_min(1)
 
+    def covariance(self, motion: PointMotion, fit: PointFit) -> Tensor:
+        """Return the covariance of the unknowns, in the noise beside the point.
+
+        With a clutter covariance, the noise is that of all samples.
+
+        Args:
+            motion: Fitted motion, shape (...,).
+            fit: Fit of the point for this motion.
+
+        Returns:
+            Covariances, shape (..., unknown, unknown).
+        """
+        if self.whitening is not None:
+            return covariance_of(fit.normal, self.noise_power(fit))
+        deramped = self.data * point_phasor(self.radar, motion, self.time_s, torch.complex128).conj()
+        amplitude = fit.amplitude[..., None, None]
+        noise = noise_beside(deramped - amplitude * self.weight, self.weight, amplitude, 1 + len(self.unknowns))
+        slopes = centred_slopes(phase_slopes(self.radar, motion, self.time_s, self.unknowns), self.weight)
+        return covariance_in(noise, slopes, fit.amplitude)
+
 
 def _white(deramped: Tensor, weight: Tensor, slopes: Tensor) -> PointFit:
     """Fit in white noise on deramped data, which are constant where the motion is right."""
-    power = weight.square().expand(deramped.shape)
-    total = power.sum((-2, -1)).clamp_min(_TINY)
+    total = weight.square().expand(deramped.shape).sum((-2, -1)).clamp_min(_TINY)
     amplitude = (weight * deramped).sum((-2, -1)) / total
-    centred = slopes - ((power[..., None, :, :] * slopes).sum((-2, -1)) / total[..., None])[..., None, None]
-    turned = (weight * (amplitude.conj()[..., None, None] * deramped).imag)[..., None, :, :]
-    gradient = (centred * turned).sum((-2, -1))
-    flat = (centred * weight[..., None, :, :]).flatten(-2)
+    centred = centred_slopes(slopes, weight)
+    gradient = (centred * (amplitude.conj()[..., None, None] * deramped).imag[..., None, :, :]).sum((-2, -1))
+    flat = centred.flatten(-2)
     return PointFit(
         amplitude,
         amplitude.abs().square() * total,

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from torchsar.core import Estimate
 from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.motion import Number
+from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell
 from torchsar.multichannel.velocity.bank import Search, bank_search
-from torchsar.multichannel.velocity.illumination import SeenAperture, lit_as_expected, seen_aperture
+from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, Found, chosen, estimate_of, point_phasor
@@ -26,6 +26,8 @@ from torchsar.radar import BistaticRadar
 # Aperture of the first search: integration time of Remote Sens. 2020, 12, 1703, Table 1.
 _COARSE_S = 4.5
 _ROUNDS = 2  # refinements of the residual covariance
+# Log-likelihood by which other ambiguity numbers must be worse, by choice: a chance of e^-10.
+_RESOLVED = 10.0
 # Refits about the position found, with so many Gauss-Newton steps each: a round reduces the bias of
 # the position to a third, four rounds to about 1 %.
 _CENTRED_ROUNDS, _CENTRED_STEPS = 4, 4
@@ -47,6 +49,11 @@ def moving_point_velocity(
     refined with the covariance of its own residual. In each trial, the fit of higher likelihood is
     returned.
 
+    The channels must be balanced, which the data of one point cannot show: a phase that grows
+    along the array acts as a position and a speed (0.2 rad over 1.6 m as 28 m and 1.7 m/s), and
+    standard deviations do not contain it. Nor do those of u_a contain all of the effect of a second
+    point of nearly the same strength and Doppler frequency.
+
     Args:
         data: Channels with the transmit range removed and slow time zero at pulse n // 2, shape
             (..., channel, pulse), complex.
@@ -65,9 +72,12 @@ def moving_point_velocity(
         (over all samples), `noise_power` (per sample) and `coloured` (True where clutter was found,
         and everywhere if `whitening` is given). `ok` is False where `snr_db` is below 19, the
         estimate lies outside the search, the standard deviation of u_r exceeds the half width of
-        the search, as with a single channel, or the illumination of the point is not understood,
-        see `lit_as_expected`. Where it is lit in a part of the aperture only, as in a range line
-        that it crosses, this part is used, see `seen_aperture`.
+        the search, as with a single channel, a slant-range speed within the search that differs by
+        multiples of lambda PRF explains the data as well, or the illumination of the point is not
+        understood, see `lit_as_expected`. Where it is lit in a part of the aperture only, as in a
+        range line that it crosses, this part is used, see `seen_aperture`. The cubic phase, which
+        separates multiples of lambda PRF, is small for short wavelengths and dwells; the speed is
+        then `ok` only within a search of half that width.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -79,13 +89,13 @@ def moving_point_velocity(
     unknowns = UNKNOWNS if u_a_m_s is None else ("u_r_m_s", "y0_m")
     if u_a_m_s is not None:
         search = replace(search, u_a_m_s=0.0)
-    job = _Job(
-        data.to(torch.complex128), radar, aperture, search, 0.0 if u_a_m_s is None else u_a_m_s, range_m, unknowns
-    )
+    coarse, u_a = aperture if isinstance(aperture, Dwell) else Dwell(_COARSE_S), 0.0 if u_a_m_s is None else u_a_m_s
+    job = _Job(data.to(torch.complex128), radar, aperture, coarse, search, u_a, range_m, unknowns)
     if whitening is not None:
         return job.estimate(
             job.centred(job.found(whitening), whitening),
             torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device),
+            whitening,
         )
     plain = job.found(None)
     job, plain = job.as_seen(plain)
@@ -110,11 +120,12 @@ class _Refined:
 
 @dataclass(frozen=True)
 class _Job:
-    """Data and settings of one estimate."""
+    """Data and settings of one estimate; `coarse` is the aperture of the search."""
 
     data: Tensor
     radar: BistaticRadar
     aperture: Aperture
+    coarse: Dwell
     search: Search
     u_a_m_s: Tensor | float
     range_m: Number | None
@@ -125,10 +136,8 @@ class _Job:
 
         The search uses the middle of the aperture, the last fit all of it.
         """
-        whole = self.aperture.aperture if isinstance(self.aperture, SeenAperture) else self.aperture
-        coarse = whole if isinstance(whole, Dwell) else Dwell(_COARSE_S)
-        start, _ = bank_search(self.data, self.radar, coarse, self.search, self.u_a_m_s, self.range_m, whitening)
-        near = maximum_likelihood(self.data, self.radar, start, coarse, self.unknowns, whitening)
+        start, _ = bank_search(self.data, self.radar, self.coarse, self.search, self.u_a_m_s, self.range_m, whitening)
+        near = maximum_likelihood(self.data, self.radar, start, self.coarse, self.unknowns, whitening)
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
 
     def as_seen(self, found: Found) -> tuple[_Job, Found]:
@@ -174,21 +183,47 @@ class _Job:
             self.radar, found.motion, time_s, self.data.dtype
         )
 
-    def estimate(self, found: Found, coloured: Tensor) -> Estimate:
-        """Form the estimate and judge it."""
-        snr = found.snr_db
-        inside = found.motion.u_r_m_s.abs() <= self.search.u_r_m_s + self.search.u_r_step_m_s
+    def resolved(self, found: Found, whitening: Whitening | None) -> tuple[Found, Tensor]:
+        """Choose among slant-range speeds whole multiples of lambda PRF apart, within the search.
+
+        Returns:
+            The fit of highest likelihood, and whether it is so beyond chance, (...,).
+        """
+        whitening = sample_whitening(self.left(found), self.radar) if whitening is None else whitening
+        span, begin = self.radar.ambiguous_velocity_m_s, found.motion
+        best = maximum_likelihood(self.data, self.radar, begin, self.aperture, self.unknowns, whitening, 0)
+        noise, most, second = best.noise_power, best.energy, torch.zeros_like(best.energy)
+        reach = self.search.u_r_m_s + self.search.u_r_step_m_s
+        for number in range(-int(2 * reach / span), int(2 * reach / span) + 1):
+            there = replace(begin, u_r_m_s=begin.u_r_m_s + number * span)
+            if number == 0 or not bool(self.inside(there).any()):
+                continue
+            other = maximum_likelihood(self.data, self.radar, there, self.aperture, self.unknowns, whitening)
+            energy = torch.where(self.inside(other.motion), other.energy, 0.0)
+            better = energy > most
+            found, noise = _chosen_fit(other, found, better), torch.where(better, other.noise_power, noise)
+            most, second = torch.maximum(energy, most), torch.maximum(second, torch.minimum(energy, most))
+        return found, most - second > _RESOLVED * noise
+
+    def inside(self, motion: PointMotion) -> Tensor:
+        """Whether a motion lies within the search, bool (...,)."""
+        inside = motion.u_r_m_s.abs() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         if "u_a_m_s" in self.unknowns:
-            inside = inside & (
-                (found.motion.u_a_m_s - self.u_a_m_s).abs() <= self.search.u_a_m_s + self.search.u_a_step_m_s
-            )
+            reach = self.search.u_a_m_s + self.search.u_a_step_m_s
+            inside = inside & ((motion.u_a_m_s - self.u_a_m_s).abs() <= reach)
+        return inside
+
+    def estimate(self, found: Found, coloured: Tensor, whitening: Whitening | None = None) -> Estimate:
+        """Form the estimate and judge it."""
+        found, resolved = self.resolved(found, whitening)
+        snr = found.snr_db
         determined = (
             found.covariance[..., 0, 0].sqrt() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         )  # False for one channel, which cannot separate velocity and position
         lit = lit_as_expected(self.data, self.radar, found.motion, self.aperture)
         return estimate_of(
             found,
-            inside & determined & lit & (snr >= DETECTED_DB),
+            self.inside(found.motion) & determined & lit & resolved & (snr >= DETECTED_DB),
             torch.sigmoid((snr - DETECTED_DB) / 3),
             coloured=coloured,
         )

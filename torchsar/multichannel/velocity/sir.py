@@ -24,6 +24,7 @@ from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
 from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
 from torchsar.multichannel.velocity.aperture import Dwell
+from torchsar.multichannel.velocity.interferometry import interferometry
 from torchsar.multichannel.velocity.model import point_phasor
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
@@ -32,9 +33,12 @@ _TOLERANCE_M_S = 1e-4  # of the maximum, well below the 0.06 m/s of error withou
 # Half step of the derivatives for the standard deviation, found by trial: at 17 dB per sample 0.5
 # m/s predicts 0.065 m/s where 0.051 m/s is measured; 0.25 and 1 m/s predict 0.12 and 0.036 m/s.
 _CURVE_M_S = 0.5
-# Systematic error without noise, from echoes beyond the reconstructed bands: 0.035 m/s rms over
-# velocities and positions, up to 0.06 m/s.
-_REST_M_S = 0.035
+# Systematic error without noise, from echoes beyond the reconstructed bands, relative to lambda
+# PRF: 0.035 m/s rms over velocities and positions, up to 0.06 m/s, of 43 m/s.
+_REST = 8e-4
+# Predicted deviations by which the interferometric speed of the strongest point may differ by
+# chance, by convention.
+_UNLIKELY = 2.0
 # Least share of the energy of a deramped line in its strongest tone: clutter that fills 800 Doppler
 # cells has 0.01; a target of ten equal points has 0.1.
 _POINT_SHARE = 0.05
@@ -240,13 +244,16 @@ class SignalIntensityRatio(Stage):
 
         Returns:
             `u_r_m_s` of shape (...,), closing positive, with a jackknife standard deviation that
-            includes 0.035 m/s of systematic error. The
+            includes a systematic error of lambda PRF / 1250. Where the interferometric speed of the
+            strongest point differs by more than two of these deviations, as beside another target,
+            the difference is the standard deviation. The
             quality is 1 - median / maximum of the intensity ratio Gamma over the grid of speeds.
             `info` holds `log_ratio`, ln Gamma over the grid, shape (..., speed), and `pulse_rates`,
             the number of PRFs to add to the Doppler (-1, 0 or 1), shape (...,). `ok` is False if
             the data are zero (the value is then the middle of the search interval), the maximum
             lies at an end of the interval, the quality is below `least_quality`, `pulse_rates` is
-            not zero, or no tone holds 5 % of the energy of the strongest line, as in clutter.
+            not zero, no tone holds 5 % of the energy of the strongest line, as in clutter, or
+            interferometry is not `ok`.
 
         Raises:
             ValueError: If the reconstruction is singular.
@@ -267,7 +274,9 @@ class SignalIntensityRatio(Stage):
         reach = (self.search_m_s[1] - self.search_m_s[0]) / 2
         coarse, costs = grid_minimum(cost, start, reach, 2 * round(reach / self.step_m_s) + 1)
         fine, _ = parabola_minimum(cost, coarse, self.step_m_s / 2, _TOLERANCE_M_S)
-        found = self._estimate(fine, coarse, costs, lines, _standard_deviation(intensity, fine))
+        found = self._estimate(
+            fine, coarse, costs, lines, _standard_deviation(intensity, fine, _REST * self.radar.ambiguous_velocity_m_s)
+        )
         return self._checked_for_ambiguity(found, lines, u_a_m_s, y0_m)
 
     def _checked_for_ambiguity(self, found: Estimate, lines: Tensor, u_a_m_s: Number, y0_m: Number) -> Estimate:
@@ -276,7 +285,12 @@ class SignalIntensityRatio(Stage):
         line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
         dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2
         found = replace(found, ok=found.ok & _is_point(line, self.radar, motion))
-        return warned_of_ambiguity(found, line, self.radar, motion, Dwell(dwell_s))
+        found = warned_of_ambiguity(found, line, self.radar, motion, Dwell(dwell_s))
+        # clutter and other targets displace the maximum of the ratio, but not the tone of a point
+        tone = interferometry(line, self.radar, motion, Dwell(dwell_s), check_ambiguity=False)
+        apart, std = (found["u_r_m_s"] - tone["u_r_m_s"]).abs(), found.std["u_r_m_s"]
+        std = torch.where(apart > _UNLIKELY * std, apart, std)
+        return replace(found, ok=found.ok & tone.ok, std={"u_r_m_s": std})
 
     def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
         """Return the motion with a candidate of u_r."""
@@ -306,17 +320,17 @@ def _is_point(line: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor
     return power.amax(-1) > _POINT_SHARE * power.sum(-1)
 
 
-def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor) -> Tensor:
+def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor, rest_m_s: float) -> Tensor:
     """Return the jackknife standard deviation (...,) of the maximum of log Gamma.
 
     Each of _GROUPS interleaved groups of alias frequencies, whose noise is independent, is left out
-    in turn.
+    in turn. The systematic error `rest_m_s` is included.
     """
     low, middle, high = (_left_out(intensity(value + shift)) for shift in (-_CURVE_M_S, 0.0, _CURVE_M_S))
     slope, curvature = (high - low) / (2 * _CURVE_M_S), (low - 2 * middle + high).mean(-1) / _CURVE_M_S**2
     spread = (slope - slope.mean(-1, keepdim=True)).square().sum(-1) * (_GROUPS - 1) / _GROUPS
     noise = torch.where(curvature < 0, spread.sqrt() / torch.where(curvature < 0, -curvature, 1), torch.inf)
-    return torch.hypot(noise, torch.full_like(noise, _REST_M_S))
+    return torch.hypot(noise, torch.full_like(noise, rest_m_s))
 
 
 def _left_out(bins: Intensity) -> Tensor:

@@ -94,14 +94,15 @@ def rebuild_bands(
 
 
 def channel_balance(
-    radar: BistaticRadar, band_hz: float | None = None, bands: int = 5, delays: bool = True
+    radar: BistaticRadar, band_hz: float | None = None, bands: int | None = None, delays: bool = True
 ) -> EstimateBalance:
     """Estimator of phase, gain and delay errors of the channels from stationary clutter.
 
     Args:
         band_hz: Width in Hz of the flat Doppler spectrum of the clutter; None for the spectrum that
             the antenna pattern of the channels gives.
-        bands: Number of Doppler bands of the clutter, each as wide as the PRF.
+        bands: Number of Doppler bands of the clutter, each as wide as the PRF; None for all in
+            which a stationary scene has echoes.
         delays: Whether delays are estimated as well.
     """
     return EstimateBalance(radar, _prior(band_hz), bands, delays)
