@@ -79,12 +79,17 @@ class Bands:
         """Multiply the up sweeps by the conjugate of the mirrored down sweeps.
 
         Samples of equal optical frequency are multiplied, so that the scene cancels from the phase
-        and the radial velocity remains, see `mirror_product`.
+        and the radial velocity remains, see `mirror_product`. The removed shift s leaves the phase
+        factor exp(-2j pi s K u / fc (1 - 2u / T)), with carrier frequency fc and chirp rate K; it
+        is removed too.
 
         Returns:
             The product, shape (..., pulse, m), complex.
         """
-        return self.up * self.down.conj()
+        u, radar = self.time_s, self.radar
+        small = 2 * math.pi * radar.chirp_rate_hz_s * u / radar.carrier_hz * (1 - 2 * u / radar.sweep_s)
+        turn = cis((self.shift.to(torch.float64)[..., None] * small).to(self.up.real.dtype))
+        return self.up * self.down.conj() * turn
 
     @property
     def inner(self) -> slice:
