@@ -21,6 +21,8 @@ LEAST_SNR_DB = 16.0
 LEAST_SQUARED_DB = 15.0  # the same for a product of sweeps, after the squaring loss, found by trial
 # SNR after the squaring loss below which a period has faded: noise may exceed its peak
 _FADED_DB = 12.0
+# share of the mean power below which it has faded too: interference then spoils the phase
+_DEEP = 0.05
 # A difference from the peaks of the product of this share of wavelength over sweep length
 # contradicts a velocity where the peak is higher by this factor, which is that of a tone at this
 # difference; if it occurs in more than a twentieth of the periods, it contradicts the estimate;
@@ -37,7 +39,7 @@ _GROSS = 4.0
 _EXPECTED = 4.0
 # standard deviation, in halves of wavelength over sweep length, beyond which a velocity is of no
 # use; noise alone gives 0.05 where the SNR is just enough
-_USELESS = 0.07
+_USELESS = 0.055
 
 
 def signal_and_noise(bands: Bands, residual_m_s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -221,7 +223,7 @@ def velocity_estimate(
         with its standard deviation. `quality` is the share of the power in the window that both
         sweeps have in common. `ok` is False where the SNR after compression is below 16 dB (with
         `intercept`, where this SNR less the squaring loss is below 15 dB), where the standard
-        deviation exceeds 0.035 lambda / T, where the product of up and mirrored down sweeps
+        deviation exceeds 0.0275 lambda / T, where the product of up and mirrored down sweeps
         contradicts the velocities, where no scatterer is illuminated in any period, or where a
         velocity is not finite. `info` holds "snr_db", the SNR after compression, and "noise_m_s",
         the standard deviation that is due to noise, shape (...,) each; "shift", the Doppler shift
@@ -240,7 +242,9 @@ def velocity_estimate(
     snr_db, squared_db = 10 * torch.log10(after), 10 * torch.log10(after / loss)
     enough = squared_db >= LEAST_SQUARED_DB if intercept else snr_db >= LEAST_SNR_DB
     own = (common / noise.clamp_min(tiny)[..., None]).clamp(1e-6, 1e18)
-    clear = lit & (10 * torch.log10(own * product.noise_lines / (1 + 1 / (2 * own))) >= _FADED_DB)
+    mean = _mean(common, lit | ~lit.any(-1, keepdim=True))
+    share = (common / mean.clamp_min(tiny)).clamp_min(1e-6)  # power of a period over the mean
+    clear = lit & (share > _DEEP) & (10 * torch.log10(own * product.noise_lines / (1 + 1 / (2 * own))) >= _FADED_DB)
     velocity = filled(measured, clear)
 
     # deviation: noise and interference, jerk, and differences from the peaks of the product
@@ -250,13 +254,13 @@ def velocity_estimate(
         spread, jerk = product_spread(product, residual, intercept)
     else:
         spread = slope / loss.sqrt()[..., None] if spread_m_s is None else spread_m_s
-    mean = _mean(common, lit | ~lit.any(-1, keepdim=True))
-    share = (common / mean.clamp_min(tiny)).clamp_min(1e-6)  # power of a period over the mean
     count = clear.sum(-1, keepdim=True)
 
     def variance(of: Tensor, expected: Tensor) -> Tensor:
-        counted = count * _mean(of.square() * share, clear) + _EXPECTED * expected.square()[..., None]
-        return counted / (count + _EXPECTED)
+        # a constant part is that of the detector or of the laser: sweeps that differ in power
+        changes = of - _mean(of * share, clear) / _mean(share, clear).clamp_min(tiny)
+        counted = count * _mean(changes.square() * share, clear) + _EXPECTED * expected.square()[..., None]
+        return counted / ((count - 1).clamp_min(0) + _EXPECTED)
 
     differences = [_rms_difference(measured.detach(), clear, order) for order in (1, 2)]
     square = filled(variance(spread, expected) / share, clear) + _interpolated(clear, *differences).square()
