@@ -25,6 +25,8 @@ _FAINT = 0.3
 # correlation coefficient of the envelopes of one period above which they overrule those of the
 # neighbouring periods, found by trial
 _SURELY_ALIKE = 0.7
+# bins by which the shift of a single period may differ from those of its neighbours
+_ALONE = 3
 # lag in bins beyond which a match belongs to another scatterer, illuminated in one sweep only
 _FURTHEST = 14
 
@@ -403,7 +405,10 @@ def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int,
     """The shift of every period, corrected by its own envelopes, and where it is certain.
 
     It is corrected where the envelopes are similar and their lag is two bins or more. Eight periods
-    together have a higher SNR; one period alone follows a vibration of a few periods.
+    together have a higher SNR; one period alone follows a vibration of a few periods. A single
+    period that differs from both neighbours by three bins or more takes the shift of one of them: a
+    scatterer that enters the beam between its two sweeps is seen in one of them only. The search
+    for the velocity reaches further than that.
     """
     n = spectrum.shape[-1]
     sides = torch.stack([shift, -shift], -2)
@@ -419,7 +424,9 @@ def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int,
     likeness, lag = torch.fft.irfft(transform[..., 0, :, :] * transform[..., 1, :, :].conj(), length).max(-1)
     lag = torch.where(lag >= length // 2, lag - length, lag)
     certain = (likeness > _SURELY_ALIKE) & (lag.abs() <= _FURTHEST)
-    return shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0), certain
+    own = shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0)
+    typical = _median_of_three(own)
+    return torch.where((own - typical).abs() >= _ALONE, typical, own), certain
 
 
 def _line_phase(
