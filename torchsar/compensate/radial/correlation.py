@@ -50,7 +50,7 @@ def spectrum_correlation(
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
         positive, with its standard deviation, see `mirror_product`. `ok` is False where the SNR
-        after compression is below 16 dB, the standard deviation exceeds 0.0275 lambda / T, the
+        after compression is below 16 dB, the standard deviation exceeds 0.035 lambda / T, the
         product of up and mirrored down sweeps contradicts the velocities in many periods, or no
         scatterer is illuminated in any period.
 

@@ -65,7 +65,7 @@ def mirror_product(
         changes of power between both sweeps give it. Where many scatterers have equal phases, the
         error may be four times as large. `ok` is False where the SNR after
         compression, less the squaring loss, is below 15 dB, where the standard deviation exceeds
-        0.0275 lambda / T, where the peaks of the product over all velocities contradict the result,
+        0.035 lambda / T, where the peaks of the product over all velocities contradict the result,
         or no scatterer is illuminated in any period. `info` holds "snr_db" (after compression) and
         "noise_m_s" (standard deviation that noise explains), shape (...,); "shift" (Doppler shift
         in whole bins) and "lit" (True in periods with an echo), shape (..., pulse); and, with

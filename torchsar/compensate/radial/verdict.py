@@ -39,7 +39,7 @@ _GROSS = 4.0
 _EXPECTED = 4.0
 # standard deviation, in halves of wavelength over sweep length, beyond which a velocity is of no
 # use; noise alone gives 0.05 where the SNR is just enough
-_USELESS = 0.055
+_USELESS = 0.07
 
 
 def signal_and_noise(bands: Bands, residual_m_s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -223,7 +223,7 @@ def velocity_estimate(
         with its standard deviation. `quality` is the share of the power in the window that both
         sweeps have in common. `ok` is False where the SNR after compression is below 16 dB (with
         `intercept`, where this SNR less the squaring loss is below 15 dB), where the standard
-        deviation exceeds 0.0275 lambda / T, where the product of up and mirrored down sweeps
+        deviation exceeds 0.035 lambda / T, where the product of up and mirrored down sweeps
         contradicts the velocities, where no scatterer is illuminated in any period, or where a
         velocity is not finite. `info` holds "snr_db", the SNR after compression, and "noise_m_s",
         the standard deviation that is due to noise, shape (...,) each; "shift", the Doppler shift
