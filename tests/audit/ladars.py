@@ -116,7 +116,7 @@ WORLDS = (
     *(World("own", own(snr_db=snr), snr) for snr in SNR_DB),
     World("clutter", own(Speckle(300, 0.1, 1.2, range_m=0.9)), 10.0),
     World("one point", own(Points([0.0], [0.4], random_phase=True)), 10.0),
-    World("letter", own(LetterE()), 10.0),
+    World("letter", own(LetterE(spine_azimuth_m=-45 * 0.08 / 62)), 10.0),  # velocities are those of its centre
     World("aliased", own(motion=FASTER), 10.0),
     *(World("direct", emitted(snr), snr) for snr in (-10.0, 10.0)),
 )

@@ -25,6 +25,8 @@ _FAINT = 0.3
 # correlation coefficient of the envelopes of one period above which they overrule those of the
 # neighbouring periods, found by trial
 _SURELY_ALIKE = 0.7
+# bins by which the shift of a single period may differ from those of its neighbours
+_ALONE = 3
 # lag in bins beyond which a match belongs to another scatterer, illuminated in one sweep only
 _FURTHEST = 14
 
@@ -79,12 +81,17 @@ class Bands:
         """Multiply the up sweeps by the conjugate of the mirrored down sweeps.
 
         Samples of equal optical frequency are multiplied, so that the scene cancels from the phase
-        and the radial velocity remains, see `mirror_product`.
+        and the radial velocity remains, see `mirror_product`. The removed shift s leaves the phase
+        factor exp(-2j pi s K u / fc (1 - 2u / T)), with carrier frequency fc and chirp rate K; it
+        is removed too.
 
         Returns:
             The product, shape (..., pulse, m), complex.
         """
-        return self.up * self.down.conj()
+        u, radar = self.time_s, self.radar
+        small = 2 * math.pi * radar.chirp_rate_hz_s * u / radar.carrier_hz * (1 - 2 * u / radar.sweep_s)
+        turn = cis((self.shift.to(torch.float64)[..., None] * small).to(self.up.real.dtype))
+        return self.up * self.down.conj() * turn
 
     @property
     def inner(self) -> slice:
@@ -398,7 +405,10 @@ def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int,
     """The shift of every period, corrected by its own envelopes, and where it is certain.
 
     It is corrected where the envelopes are similar and their lag is two bins or more. Eight periods
-    together have a higher SNR; one period alone follows a vibration of a few periods.
+    together have a higher SNR; one period alone follows a vibration of a few periods. A single
+    period that differs from both neighbours by three bins or more takes the shift of one of them: a
+    scatterer that enters the beam between its two sweeps is seen in one of them only. The search
+    for the velocity reaches further than that.
     """
     n = spectrum.shape[-1]
     sides = torch.stack([shift, -shift], -2)
@@ -414,7 +424,9 @@ def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int,
     likeness, lag = torch.fft.irfft(transform[..., 0, :, :] * transform[..., 1, :, :].conj(), length).max(-1)
     lag = torch.where(lag >= length // 2, lag - length, lag)
     certain = (likeness > _SURELY_ALIKE) & (lag.abs() <= _FURTHEST)
-    return shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0), certain
+    own = shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0)
+    typical = _median_of_three(own)
+    return torch.where((own - typical).abs() >= _ALONE, typical, own), certain
 
 
 def _line_phase(

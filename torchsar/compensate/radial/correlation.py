@@ -49,8 +49,10 @@ def spectrum_correlation(
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
-        positive, with its standard deviation. `ok` is False where the SNR after compression is
-        below 16 dB, or no scatterer is illuminated in any period.
+        positive, with its standard deviation, see `mirror_product`. `ok` is False where the SNR
+        after compression is below 16 dB, the standard deviation exceeds 0.035 lambda / T, the
+        product of up and mirrored down sweeps contradicts the velocities in many periods, or no
+        scatterer is illuminated in any period.
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -69,7 +71,12 @@ def spectrum_correlation(
         bands = bands_of(sweeps, radar, window_m, taper=0.0)
         doppler = envelope_lag(bands, upsampling) / (2 * radar.sweep_s)
         return velocity_estimate(
-            from_beats(doppler, -doppler, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m, floor_m_s=floor
+            from_beats(doppler, -doppler, bands),
+            bands_of(sweeps, radar, window_m, taper=0.5, oversampling=2),
+            pulse,
+            factor=3.0,
+            azimuth_m=azimuth_m,
+            floor_m_s=floor,
         )
 
     return by_trials(estimator, sweeps, azimuth_m)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from torch import Tensor
@@ -11,11 +11,10 @@ from torch import Tensor
 from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.newton import climbed, step_uphill
-from torchsar.compensate.radial.verdict import velocity_estimate
+from torchsar.compensate.radial.verdict import Intercept, velocity_estimate
 from torchsar.core import Axis, Estimate, cis, take
 from torchsar.radar import TriangularLadar
 
-Intercept = Literal["known", "record", "free"]
 _PAD = 2  # zero-padding of the transform, enough for the Newton steps to converge
 _NEWTON = 3  # Newton steps, found by trial: enough to converge from the parabola
 _REACH = 6  # bins about the removed shift that are searched; the shift is right to a bin or two
@@ -58,14 +57,19 @@ def mirror_product(
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
-        positive. Its standard deviation is predicted from the measured SNR and includes the
-        squaring loss, but not the interference of many scatterers in a range cell, by which the
-        error may be several times as large. `ok` is False where the SNR after compression, less the
-        squaring loss, is below 15 dB, where the peaks of the product over all velocities contradict
-        the result, or no scatterer is illuminated in any period. `info` holds "snr_db" (after
-        compression), shape (...,); "shift" (Doppler shift in whole bins) and "lit" (True in periods
-        with an echo), shape (..., pulse); and, with intercept "record", "intercept_rad", the
-        estimated phase, shape (...,).
+        positive. In periods without an echo, or whose echo has faded, it is interpolated. The
+        velocity is that of the centre of power of the echo: a centre at another azimuth than
+        `azimuth_m` adds a nearly constant velocity, which displaces the image and is not part of
+        the standard deviation. The standard deviation is measured: noise and the interference of
+        scatterers of random phases change the power of the echo as much as its phase, so that the
+        changes of power between both sweeps give it. Where many scatterers have equal phases, the
+        error may be four times as large. `ok` is False where the SNR after
+        compression, less the squaring loss, is below 15 dB, where the standard deviation exceeds
+        0.035 lambda / T, where the peaks of the product over all velocities contradict the result,
+        or no scatterer is illuminated in any period. `info` holds "snr_db" (after compression) and
+        "noise_m_s" (standard deviation that noise explains), shape (...,); "shift" (Doppler shift
+        in whole bins) and "lit" (True in periods with an echo), shape (..., pulse); and, with
+        intercept "record", "intercept_rad", the estimated phase, shape (...,).
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -113,7 +117,7 @@ def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: 
         pulse,
         factor=3.0 if intercept == "free" else 0.75,
         azimuth_m=azimuth_m,
-        squared=True,
+        intercept=intercept,
         info=info,
     )
 
@@ -135,7 +139,6 @@ def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[st
     u = bands.time_s[inner]
     z = bands.product()[..., inner]
     z = z / z.detach().abs().mean(-1, keepdim=True).clamp_min(torch.finfo(z.real.dtype).tiny)
-    z = z * _of_shift(bands, u, z)
     free = _slope(z, u, bands, 1 if intercept == "known" else _NEWTON)
     if intercept == "free":
         return bands.shift_m_s + free, {}
@@ -144,13 +147,6 @@ def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[st
     offset = torch.angle((_turned(z, u, free, bands).sum(-1).to(torch.complex128)).sum(-1, keepdim=True))
     steady = z * cis(-offset[..., None]).to(z.dtype)
     return bands.shift_m_s + _through_zero(steady, u, free, bands), {"intercept_rad": offset[..., 0]}
-
-
-def _of_shift(bands: Bands, u: Tensor, like: Tensor) -> Tensor:
-    """Phase factor that the removed shift s leaves: exp(2j pi s K u / fc (1 - 2u / T))."""
-    radar = bands.radar
-    small = 2 * math.pi * radar.chirp_rate_hz_s * u / radar.carrier_hz * (1 - 2 * u / radar.sweep_s)
-    return cis((bands.shift.to(torch.float64)[..., None] * small).to(like.real.dtype))
 
 
 def _weights(u: Tensor, bands: Bands) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,7 +11,7 @@ from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_oth
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.newton import climbed
 from torchsar.compensate.radial.verdict import velocity_estimate
-from torchsar.core import Axis, Estimate
+from torchsar.core import Axis, Estimate, cis
 from torchsar.radar import TriangularLadar
 
 _PAD = 2  # zero-padding of the transform, enough for the Newton steps to converge
@@ -50,8 +49,10 @@ def ml_peak(
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
-        positive, with its standard deviation. `ok` is False where the SNR after compression is
-        below 16 dB, or no scatterer is illuminated in any period.
+        positive, with its standard deviation, see `mirror_product`. `ok` is False where the SNR
+        after compression is below 16 dB, the standard deviation exceeds 0.035 lambda / T (T is the
+        length of a sweep), the product of up and mirrored down sweeps contradicts the velocities in
+        many periods, or no scatterer is illuminated in any period.
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -63,9 +64,15 @@ def ml_peak(
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
         bands = bands_of(sweeps, radar, video=True)
         up, down, lit = peak_frequencies(bands, window_m)
-        bands = replace(bands, lit=bands.lit & lit)
+        changes = [_amplitude_slope(x, hz.detach(), bands) for x, hz in ((bands.up, up), (bands.down, down))]
         return velocity_estimate(
-            from_beats(up, down, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m, window_m=window_m
+            from_beats(up, down, bands),
+            bands_of(sweeps, radar, window_m, taper=0.5, oversampling=2),
+            pulse,
+            factor=3.0,
+            azimuth_m=azimuth_m,
+            spread_m_s=radar.wavelength_m / 2 * (changes[0] - changes[1]) / 2,
+            lit=bands.lit & lit,
         )
 
     return by_trials(estimator, sweeps, azimuth_m)
@@ -88,6 +95,17 @@ def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:
     radar = bands.radar
     doppler = bands.shift.to(torch.float64) / radar.sweep_s + (up_hz - down_hz) / 2
     return radar.wavelength_m / 2 * doppler * (1 + radar.bandwidth_hz / (2 * radar.carrier_hz))
+
+
+@torch.no_grad()
+def _amplitude_slope(x: Tensor, beat_hz: Tensor, bands: Bands) -> Tensor:
+    """Slope in Hz (..., pulse) of the amplitude of a tone, taken as a phase."""
+    u = bands.time_s
+    tone = x * cis((-2 * math.pi * beat_hz[..., None] * u).to(x.real.dtype))
+    level = tone.mean(-1)
+    slope = (level.conj() * (tone * u.to(x.real.dtype)).mean(-1)).real
+    power = (level.real.square() + level.imag.square()).clamp_min(torch.finfo(x.real.dtype).tiny)
+    return (slope / power).to(torch.float64) / float(2 * math.pi * u.square().mean())
 
 
 def shining(up: Tensor, down: Tensor) -> Tensor:

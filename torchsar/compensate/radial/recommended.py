@@ -19,7 +19,7 @@ from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.verdict import occupied_band
-from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
+from torchsar.compensate.radial.bands import Bands, bands_of, filled, refuse_other_sweeps
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
 from torchsar.compensate.radial.dense import linked_walk, phase_difference
@@ -137,6 +137,7 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
     image_cells, range_cells = (count.reshape(pulses.trials) for count in found)
     enough = pulses.present.sum(-1) > 2  # two cannot distinguish a phase error from a shift of the image
     phase = torch.where(enough[:, None], phase, 0).to(torch.float64).reshape(*pulses.trials, pulses.n)
+    phase = _unwrapped(phase, coarse.info["lit"])
     std = (1 / torch.sqrt(2 * 10 ** (coarse.info["snr_db"] / 10))).clamp_max(math.pi)
     return _judged(
         cells,
@@ -157,62 +158,63 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
 
 
 def _judged(cells: Tensor, per_velocity: float, sharpest: Estimate) -> Estimate:
-    """The estimate with linked phases in trials of dense scenes, and with stricter verdicts.
+    """The estimate with the verdict on its phases, and with linked phases where the scene is dense.
 
     An error of the velocity in m/s times `per_velocity` is the step of the phase in rad between
-    periods. In dense scenes, in which scatterers interfere, the linked phases thus show the errors
-    of the velocities but for a constant, which is taken to be as large, and the estimate is ok
-    where `linked_walk` is ok. In other scenes, where the phases exceed the random walk of the
-    velocities by far or the power of the pulses is modulated, it is ok where least entropy has
-    nearly the same phases. In a scene of one range cell the interference of scatterers cannot be
-    distinguished from motion; the power of the pulses must then be constant.
+    periods. Each trial that is ok so far belongs to one of four cases:
+
+    - Few periods: the estimate is kept.
+    - A single range cell whose power is modulated: the interference of scatterers cannot be
+      distinguished from motion, and the estimate is not ok.
+    - A dense scene: `linked_walk` gives the phases and the verdict.
+    - Other scenes: where the power of the pulses is modulated, or the phases exceed the random walk
+      of the velocities by far, `_confirmed` gives the verdict; else the estimate is kept.
     """
-    n, phase = cells.shape[-2], sharpest["phase_rad"].reshape(-1, cells.shape[-2])
+    n = cells.shape[-2]
     if n < _FEW_PERIODS or not bool(sharpest.ok.any()):
         return sharpest
-    lines, std, ok = (
-        cells.reshape(-1, *cells.shape[-2:]),
-        sharpest.std["phase_rad"].reshape(-1, n),
-        sharpest.ok.flatten(),
-    )
+    lines = cells.reshape(-1, *cells.shape[-2:])
+    phase, std = sharpest["phase_rad"].reshape(-1, n), sharpest.std["phase_rad"].reshape(-1, n)
+    lit, ok = sharpest.info["lit"].reshape(-1, n), sharpest.ok.flatten()
     range_cells, image_cells = (sharpest.info[name].flatten() for name in ("range_cells", "image_cells"))
-    lit = sharpest.info["lit"].reshape(-1, n)
     step_rad = per_velocity * sharpest.info["noise_m_s"].detach().flatten()
-    velocity_std = sharpest.std["velocity_m_s"].reshape(-1, n)
-    expected = step_rad * math.sqrt(n / 15)
-    dense = ok & (image_cells > _DENSE_CELLS)
     modulated = _modulation(lines.detach(), lit) > _MODULATION + _SURE * math.sqrt(2) * std[:, 0].detach()
-    far = modulated | (_rms_without_line(phase.detach(), lit) > _UNEXPECTED * expected + _FAR_RAD)
+    walk_rad = _UNEXPECTED * step_rad * math.sqrt(n / 15) + _FAR_RAD
     ok = ok & ~(modulated & (range_cells < _ONE_CELL))
-    far = ok & ~dense & far
+    dense = ok & (image_cells > _DENSE_CELLS)
+    doubtful = ok & ~dense & (modulated | (_rms_without_line(phase.detach(), lit) > walk_rad))
     if bool(dense.any()):
         at = dense.nonzero()[:, 0]
         linked = linked_walk(lines[at], phase[at], step_rad[at])
         phase = phase.index_copy(0, at, linked["phase_rad"].to(phase.dtype))
         std = std.index_copy(0, at, linked.std["phase_rad"].to(std.dtype))
-        ok = ok.index_put((at,), ok[at] & linked.ok)
-        steps = torch.diff(linked["phase_rad"].detach()).square().mean(-1, keepdim=True)
-        spread = (velocity_std[at].square() + 2 * steps / per_velocity**2).sqrt()
-        velocity_std = velocity_std.index_put((at,), spread)
-    if bool(far.any()):
-        at = far.nonzero()[:, 0]
-        with torch.no_grad():
-            pulses = prepare(lines[at], "radial_motion")
-            other = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
-            own = phase[at].to(other.dtype)
-            # the coherence of neighbouring pulses is measured over range cells of similar power
-            coherent = describe(pulses.rows, own, occupied_band(pulses.rows)).ratio > 0
-            coherent = coherent | (range_cells[at] < LEAST_LOOKS)
-        apart = phase_difference(phase[at].detach(), other.to(phase.dtype), lit[at])
-        std = std.index_put((at,), (std[at].square() + (2 * apart[:, None]).square()).sqrt())
-        ok = ok.index_put((at,), ok[at] & coherent & (2 * apart < _ENOUGH_APART_RAD))
-    stds = {"velocity_m_s": velocity_std, "phase_rad": std}
+        ok = ok.index_put((at,), linked.ok)
+    if bool(doubtful.any()):
+        at = doubtful.nonzero()[:, 0]
+        confirmed, apart = _confirmed(lines[at], phase[at].detach(), lit[at], range_cells[at])
+        std = std.index_put((at,), (std[at].square() + apart[:, None].square()).sqrt())
+        ok = ok.index_put((at,), confirmed)
+    shape = sharpest["phase_rad"].shape
     return replace(
         sharpest,
-        value={**sharpest.value, "phase_rad": phase.reshape(sharpest["phase_rad"].shape)},
-        std={name: one.reshape(sharpest["phase_rad"].shape) for name, one in stds.items()},
+        value={**sharpest.value, "phase_rad": phase.reshape(shape)},
+        std={**sharpest.std, "phase_rad": std.reshape(shape)},
         ok=ok.reshape(sharpest.ok.shape),
     )
+
+
+@torch.no_grad()
+def _confirmed(lines: Tensor, phase: Tensor, lit: Tensor, range_cells: Tensor) -> tuple[Tensor, Tensor]:
+    """Whether least entropy confirms phases, and twice the rms difference in rad, (trial,) each.
+
+    The pulses must also be coherent with the phases, which is measured over range cells of similar
+    power.
+    """
+    pulses = prepare(lines, "radial_motion")
+    other = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
+    coherent = describe(pulses.rows, phase.to(other.dtype), occupied_band(pulses.rows)).ratio > 0
+    apart = 2 * phase_difference(phase, other.to(phase.dtype), lit)
+    return (coherent | (range_cells < LEAST_LOOKS)) & (apart < _ENOUGH_APART_RAD), apart
 
 
 def _modulation(lines: Tensor, lit: Tensor) -> Tensor:
@@ -225,6 +227,15 @@ def _modulation(lines: Tensor, lit: Tensor) -> Tensor:
     mean = (power * lit).sum(-1, keepdim=True) / count
     square = ((power / mean.clamp_min(tiny) - 1).square() * lit).sum(-1) / count[:, 0]
     return square.sqrt()
+
+
+def _unwrapped(phase: Tensor, lit: Tensor) -> Tensor:
+    """Phases (..., pulse) in rad without steps of whole turns, interpolated between lit pulses."""
+    at = torch.arange(phase.shape[-1], device=phase.device).expand(phase.shape)
+    last = torch.where(lit, at, -1).cummax(-1).values
+    held = phase.detach().gather(-1, torch.where(last < 0, lit.to(torch.int8).argmax(-1, keepdim=True), last))
+    turns = torch.round(held.diff(dim=-1) / (2 * math.pi)).cumsum(-1)
+    return filled(phase - 2 * math.pi * torch.nn.functional.pad(turns, (1, 0)), lit)
 
 
 def _rms_without_line(phase: Tensor, lit: Tensor) -> Tensor:

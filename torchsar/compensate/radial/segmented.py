@@ -70,8 +70,10 @@ def segmented_interference(
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
-        positive, with its standard deviation. `ok` is False where the SNR after compression is
-        below 16 dB, or no scatterer is illuminated in any period. `info` holds
+        positive, with its standard deviation, see `mirror_product`. `ok` is False where the SNR
+        after compression is below 16 dB, the standard deviation exceeds 0.035 lambda / T, the
+        product of up and mirrored down sweeps contradicts the velocities in many periods, or no
+        scatterer is illuminated in any period. `info` holds
 
         - "phase_rad" and "integer" (whole turns), shape (..., pulse);
         - "slips", the number of changes between periods in which "gradient" and "per_pulse" differ
@@ -107,7 +109,7 @@ def segmented_interference(
         coarse = envelope_lag(windowed, _SUM_UPSAMPLING if bins == "sum" else 4) / 2 + (windowed.shift - bands.shift)
         spectra = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
         searched = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
-        phases, weights = (
+        phases, weights, changes = (
             _summed(spectra, searched, coarse) if bins == "sum" else _at_peaks(spectra, searched, padding, scatterers)
         )
         bands = replace(bands, lit=bands.lit & (weights > 0).any(-2))
@@ -122,11 +124,12 @@ def segmented_interference(
         }
         return velocity_estimate(
             from_beats(doppler, -doppler, bands),
-            bands,
+            bands_of(sweeps, radar, window_m, taper=0.5, oversampling=2),
             pulse,
             factor=4.0,
             azimuth_m=azimuth_m,
-            window_m=window_m,
+            spread_m_s=_weighted(changes, weights) * (radar.ambiguous_velocity_m_s / (2 * math.pi)),
+            lit=bands.lit,
             info=info,
         )
 
@@ -162,8 +165,10 @@ def _shifted(bands: Bands, shift: Tensor) -> Bands:
     return replace(bands, up=bands.up * turn.conj(), down=bands.down * turn)
 
 
-def _summed(halves: tuple[Tensor, ...], searched: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor]:
+def _summed(halves: tuple[Tensor, ...], searched: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Phase (..., 1, pulse) between the halves from products summed over bins, and weights of one.
+
+    The third result is the phase that the changes of power would give, see `product_spread`.
 
     Up and down spectra are multiplied and summed before the halves are combined: each sum is then
     the power spectrum of the scene times one phasor, for any scene, after the Doppler shift
@@ -171,29 +176,38 @@ def _summed(halves: tuple[Tensor, ...], searched: Tensor, coarse: Tensor) -> tup
     is read. The removed phase is added again.
     """
     up1, up2, down1, down2 = (x[..., searched] for x in halves)
-    product = (up1 * down2.conj()).sum(-1) * (up2 * down1.conj()).sum(-1).conj()
-    phase = (torch.angle(product).to(torch.float64) - 2 * math.pi * coarse)[..., None, :]
-    return phase, torch.ones_like(phase)
+    first, second = ((up * down.conj()).sum(-1) for up, down in ((up1, down2), (up2, down1)))
+    phase = (torch.angle(first * second.conj()).to(torch.float64) - 2 * math.pi * coarse)[..., None, :]
+    changes = [
+        (_power(up).sum(-1) - _power(down).sum(-1)) / (2 * both.abs()).clamp_min(torch.finfo(up.real.dtype).tiny)
+        for up, down, both in ((up1, down2, first.detach()), (up2, down1, second.detach()))
+    ]
+    return phase, torch.ones_like(phase), (changes[0] - changes[1]).to(torch.float64)[..., None, :]
 
 
-def _at_peaks(halves: tuple[Tensor, ...], searched: Tensor, padding: int, scatterers: int) -> tuple[Tensor, Tensor]:
+def _at_peaks(
+    halves: tuple[Tensor, ...], searched: Tensor, padding: int, scatterers: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """Phases at the peaks of up and of down spectra, and the weights of Eq. (18).
 
-    Both are (..., scatterer, pulse). A weight is zero in periods where the scatterer is not
-    illuminated.
+    The third result is the phase that the changes of power would give, see `product_spread`. All
+    are (..., scatterer, pulse). A weight is zero in periods where the scatterer is not illuminated.
     """
     up1, up2, down1, down2 = halves
     up, down = _power(up1, up2), _power(down1, down2)
     peaks = _strongest(torch.where(searched, (up + down).detach().mean(-2), -1), scatterers, padding)
-    reach = max(1, padding)
-    phases, weights = [], []
+    reach, tiny = max(1, padding), torch.finfo(up.dtype).tiny
+    phases, weights, changes = [], [], []
     for peak in peaks.unbind(-1):
         at_up, at_down = (_own_peak(power.detach(), peak, reach) for power in (up, down))
         turn = _picked(up1 * up2.conj(), at_up) * _picked(down1 * down2.conj(), at_down)
         phases.append(torch.angle(turn).to(torch.float64))
+        levels = [_picked(_power(x), at) for x, at in ((up1, at_up), (up2, at_up), (down1, at_down), (down2, at_down))]
+        first, second, third, fourth = (x.to(torch.float64).clamp_min(tiny).log() / 2 for x in levels)
+        changes.append(first - second + third - fourth)
         weight = _contrast_about((up + down).detach().sqrt(), peak, reach).to(torch.float64)
         weights.append(weight[..., None] * shining(_picked(up, at_up), _picked(down, at_down)))
-    return torch.stack(phases, -2), torch.stack(weights, -2)
+    return torch.stack(phases, -2), torch.stack(weights, -2), torch.stack(changes, -2)
 
 
 def _strongest(profile: Tensor, count: int, spacing: int) -> Tensor:
