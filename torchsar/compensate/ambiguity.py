@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.aperture import complete_aperture_centroid
-from torchsar.compensate.doppler import MOST_STD, phase_increment, wrap_hz
+from torchsar.compensate.doppler import MOST_STD, phase_increment, swept_band, wrap_hz
 from torchsar.compensate.group import (
     RangeGroup,
     aperture_s,
@@ -371,7 +371,8 @@ class DopplerCentroid(Stage):
             - "coherence": coherence of adjacent lines, 0..1.
         """
         raw, radar = signal.data, self.radar
-        first = phase_increment(raw, radar.prf_hz, self.blocks)
+        rate, dwell = swept_band(radar, raw.shape[-1])
+        first = phase_increment(raw, radar.prf_hz, self.blocks, rate_hz_s=rate, dwell_s=dwell)
         base, coarse_std = first["doppler_baseband_hz"], first.std["doppler_baseband_hz"]
         evidence = ambiguity_evidence(raw, radar, base, self.spectrum(raw.shape[-1], raw.device), self.reach)
         turns = candidate_turns(self.reach, raw.device)
