@@ -33,6 +33,9 @@ _FINE = (2, 4)  # parts of a block along pulses and range, for the power at its 
 # Least number of range blocks whose scatter is taken as the standard deviation; with fewer, it is
 # the scatter of all blocks, which the sweep of the targets makes too large.
 _LEAST_BLOCKS = 4
+# Energy at which the weight of a range block in a fit is halved, over the energy that three
+# quarters of the blocks do not exceed.
+_FAINT = 0.1
 # Relative scatter of the first moment of a cut target about its mean over targets of even density,
 # for a beam of constant gain: sqrt(1/5).
 _UNEVEN = 0.45
@@ -499,13 +502,16 @@ def energy_centre(
     )
 
 
-def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12) -> tuple[Tensor, Tensor, Tensor]:
+def fit_over_range(
+    products: Tensor, power: Tensor, order: int, rounds: int = 12
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Fit a robust polynomial to the phase increment over range blocks.
 
     The polynomial is a sum of Legendre polynomials of the position of the block, which runs from -1
-    to 1 across the swath. Blocks are weighted with the square of their coherence. Blocks whose
-    residuals are large compared with the median residual are weighted down (Cauchy weights), so
-    that a few very bright targets do not bend the curve.
+    to 1 across the swath. Blocks are weighted with the square of their coherence, and those of much
+    less energy than most, such as the sidelobes of others, count less. Blocks whose residuals are
+    large compared with the median residual are weighted down (Cauchy weights), so that a few very
+    bright targets do not bend the curve.
 
     Args:
         products: Block products, shape (..., b), complex.
@@ -516,7 +522,7 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
     Returns:
         The coefficients of the Legendre polynomials in rad, shape (..., order + 1); their
         covariance in rad^2, shape (..., order + 1, order + 1), from the residuals of the blocks
-        with their weights; and the residuals in rad, shape (..., b).
+        with their weights; the residuals in rad, shape (..., b); and the weights, shape (..., b).
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -530,8 +536,10 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
     mean = torch.angle(products.sum(-1))
     angle = torch.angle(products * torch.polar(torch.ones_like(mean), -mean)[..., None])
     basis = legendre(block_centres(count, products.device), order)
-    coherence = products.abs() / torch.where(power > 0, power, 1)
-    weight = coherence.square()
+    energy = products.abs()
+    coherence = energy / torch.where(power > 0, power, 1)
+    usual = energy.quantile(0.75, dim=-1, keepdim=True)
+    weight = coherence.square() * energy / (energy + _FAINT * usual + 1e-300)
     coefficients, residual = _weighted_fit(basis, angle, weight)
     final = weight
     for _ in range(rounds):
@@ -540,13 +548,14 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
         coefficients, residual = _weighted_fit(basis, angle, final)
     constant = torch.zeros_like(coefficients)
     constant[..., 0] = mean
-    return coefficients + constant, _fit_covariance(basis, final, residual), residual
+    return coefficients + constant, _fit_covariance(basis, final, residual), residual, final
 
 
 def _fit_covariance(basis: Tensor, weight: Tensor, residual: Tensor) -> Tensor:
     """Covariance of the coefficients of `_weighted_fit` from its residuals, whatever their spread.
 
-    Each residual is divided by 1 minus its leverage, the share that the block has in its own fit.
+    The square of each residual is divided by 1 minus its leverage, the share that the block has in
+    its own fit.
     """
     normal = (basis * weight[..., None]).mT @ basis
     size = normal.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None] + 1e-30
@@ -555,7 +564,7 @@ def _fit_covariance(basis: Tensor, weight: Tensor, residual: Tensor) -> Tensor:
         / size
     )
     leverage = weight * ((basis @ inverse) * basis).sum(-1)
-    influence = (basis @ inverse) * (weight * residual / (1 - leverage).clamp_min(0.1))[..., None]
+    influence = (basis @ inverse) * (weight * residual / (1 - leverage).clamp_min(0.1).sqrt())[..., None]
     return influence.mT @ influence
 
 
@@ -567,6 +576,15 @@ def _weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Ten
     eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
     coefficients = torch.linalg.solve(normal + ridge[..., None, None] * eye, (weighted * y[..., None]).sum(-2))
     return coefficients, y - coefficients @ basis.mT
+
+
+def _cut_shift_rad(found: Increments, phase_rad: Tensor) -> Tensor:
+    """Shift (..., b) in rad of the increment of each range block by apertures that the ends cut."""
+    turn = cis(-phase_rad)[..., None]
+    ends = (found.ends * turn[..., None]).real.diff(dim=-2)[..., 0, :]
+    total = (found.products.sum(-2) * turn).real
+    shift = found.lines[..., None] * ends / torch.where(total > 0, total, 1)
+    return torch.where(total > 0, shift.clamp(-1, 1), 0)
 
 
 def block_centres(count: int, device: torch.device | None = None) -> Tensor:
@@ -711,9 +729,10 @@ class RangeDependentCentroid(Stage):
 
         Returns:
             `doppler_range_hz` of every range cell, shape (..., range), and `doppler_baseband_hz` in
-            the middle of the swath, shape (...,), in Hz. The latter has a standard deviation. `ok`
-            is False where there is no energy, where that standard deviation is 1.5 % of the PRF or
-            more, or where the energy fills less than 0.3 of the record, see `reliable_increment`.
+            the middle of the swath, shape (...,), in Hz. The latter has a standard deviation, which
+            includes the shift by apertures that the ends of the record cut. `ok` is False under the
+            conditions of `reliable_increment`, and where fewer than order + 2 range blocks carry
+            the weight of the fit: one target alone shows no slope over range.
             `info` holds "block_hz" (centroid of each of the b range blocks), shape
             (..., b), and "coefficients_hz" (of the Legendre polynomials), shape (..., order + 1).
 
@@ -724,15 +743,18 @@ class RangeDependentCentroid(Stage):
         prf_hz = self.radar.prf_hz
         found = increments(signal.data, prf_hz, self.blocks, *swept_band(self.radar, signal.data.shape[-1]))
         products, power = found.products.sum(-2), found.power.sum(-2)
-        coefficients, covariance, _ = fit_over_range(products, power, self.order)
+        coefficients, _, residual, weight = fit_over_range(products, power, self.order)
         scale = prf_hz / (2 * math.pi)
+        basis = legendre(block_centres(self.blocks[1], products.device), self.order)
         at_middle = legendre(torch.zeros(1, dtype=torch.float64, device=products.device), self.order)[0]
         middle = coefficients @ at_middle
-        # blocks share targets, by which the residuals of neighbours are alike
-        std = ((covariance @ at_middle) @ at_middle).clamp_min(0).sqrt()
-        scatter, shift = increment_std_rad(found, middle)
-        scatter = torch.maximum(std, scatter)
-        ok = reliable_increment(found, middle, scatter, shift)
+        # cut apertures shift each block; the rest of its residual is scatter
+        cut, rest = _weighted_fit(basis, residual - _cut_shift_rad(found, middle), weight)
+        shift = -cut @ at_middle
+        scatter = ((_fit_covariance(basis, weight, rest) @ at_middle) @ at_middle).clamp_min(0).sqrt()
+        square = weight.square().sum(-1)
+        count = weight.sum(-1).square() / torch.where(square > 0, square, 1)
+        ok = reliable_increment(found, middle, scatter, shift) & (count >= self.order + 2)
         middle, std = scale * middle, scale * torch.hypot(scatter, shift)
         curve = scale * coefficients @ legendre(block_centres(signal.data.shape[-1], products.device), self.order).mT
         if doppler_hz is not None:
