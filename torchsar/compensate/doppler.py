@@ -539,7 +539,8 @@ def fit_over_range(
     energy = products.abs()
     coherence = energy / torch.where(power > 0, power, 1)
     usual = energy.quantile(0.75, dim=-1, keepdim=True)
-    weight = coherence.square() * energy / (energy + _FAINT * usual + 1e-300)
+    floor = energy + _FAINT * usual
+    weight = coherence.square() * energy / torch.where(floor > 0, floor, 1)
     coefficients, residual = _weighted_fit(basis, angle, weight)
     final = weight
     for _ in range(rounds):
