@@ -359,8 +359,9 @@ class DopplerCentroid(Stage):
             `doppler_hz` (absolute) and `doppler_baseband_hz`, with their standard deviations in Hz,
             `ambiguity` (whole number of PRFs) and `squint_deg`, shape (...,) each. `quality` is the
             probability that the ambiguity is right. `ok` is False where that probability is 0.9 or
-            less, or where the baseband centroid is unreliable or the phases of the lines are random
-            (`coherent_lines`). A smooth phase error of the lines shifts the centroid and cannot be
+            less, where the baseband centroid is unreliable, where the apertures that the ends of
+            the record cut shift it by an eighth of the band of the beam or more, or where the
+            phases of the lines are random (`coherent_lines`). A smooth phase error of the lines shifts the centroid and cannot be
             distinguished from motion. `info` holds
 
             - "block_hz" and "block_power", see `baseband_estimate`;
@@ -381,6 +382,9 @@ class DopplerCentroid(Stage):
         absolute = base + radar.prf_hz * turns[ranked.indices[..., 0]]
         absolute, std = complete_aperture_centroid(raw, radar, absolute, coarse_std, self.reference)
         refined = (std < coarse_std) & (std < MOST_STD * radar.prf_hz)
+        if dwell is not None:
+            # where almost all targets are cut, what seems to be a whole one is a part of another
+            refined = refined & (first.info["cut_hz"].abs() < rate * dwell / 8)
         reliable = (first.ok | refined) & coherent_lines(raw)
         probability = torch.softmax(joint, -1).amax(-1)
         info = {

@@ -29,6 +29,9 @@ _CHUNK_COLUMNS = 2048  # bounds the memory of an image on wide swaths
 # Share of the energy of targets that are left out that leaks into the chosen tiles. Its Doppler is
 # half way to the edge of the beam.
 _LEAK = 0.005
+# Least share of the energy in lines whose targets have complete apertures; what is less may be
+# nothing but the sidelobes of other targets.
+_LEAST_SHARE = 0.1
 _GUARD = 0.02  # share of the dwell by which it is widened at each end, found by trial
 
 
@@ -100,9 +103,10 @@ def _refined(
         delta = wrap_hz(scale * phase - total, radar.prf_hz)
         enough = chosen.sum((-2, -1)).abs() > 0
         total = torch.where(enough, total + delta, total)
-        leak = _LEAK * half_way * (energy - chosen.abs().sum((-2, -1))).clamp_min(0)
+        kept = chosen.abs().sum((-2, -1))
+        leak = _LEAK * half_way * (energy - kept).clamp_min(0)
         noisy = (noise * whole.square()).sum((-2, -1))
-        std = torch.where(enough, scale * _std_rad(chosen, noisy, phase, leak), math.inf)
+        std = torch.where(kept > _LEAST_SHARE * energy, scale * _std_rad(chosen, noisy, phase, leak), math.inf)
     return total, std
 
 
