@@ -361,8 +361,8 @@ class DopplerCentroid(Stage):
             probability that the ambiguity is right. `ok` is False where that probability is 0.9 or
             less, where the baseband centroid is unreliable, where the apertures that the ends of
             the record cut shift it by an eighth of the band of the beam or more, or where the
-            phases of the lines are random (`coherent_lines`). A smooth phase error of the lines shifts the centroid and cannot be
-            distinguished from motion. `info` holds
+            phases of the lines are random (`coherent_lines`). A smooth phase error of the lines
+            shifts the centroid and cannot be distinguished from motion. `info` holds
 
             - "block_hz" and "block_power", see `baseband_estimate`;
             - "looks", "lines", "entropy", "line_doppler_hz" and "line_doppler_std_hz", see
