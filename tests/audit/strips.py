@@ -102,8 +102,8 @@ def direct(snr_db: float, radar: StripmapRadar = RADAR) -> Callable[[int, int], 
             return low + (high - low) * torch.rand(*shape, generator=generator, dtype=F64)
 
         t = (torch.arange(LINES, dtype=F64) - LINES // 2) / radar.prf_hz
-        tau = 2 * radar.near_range_m / LIGHT_M_S + torch.arange(CELLS, dtype=F64) / radar.sampling_hz
         wavelength, length = LIGHT_M_S / radar.carrier_hz, radar.pulse.duration_s
+        rate, window = radar.pulse.bandwidth_hz / length, torch.arange(math.ceil(length * radar.sampling_hz) + 4)
         data, doppler, speed = [], uniform(-40, 40, trials), 120 + uniform(-3, 3, trials)
         for centroid, v in zip(doppler, speed, strict=True):
             total = torch.zeros(LINES, CELLS, dtype=torch.complex128)
@@ -111,11 +111,14 @@ def direct(snr_db: float, radar: StripmapRadar = RADAR) -> Callable[[int, int], 
                 t0, r0 = uniform(-1.0, 1.0, 1), radar.near_range_m + uniform(40, 340, 1)
                 r = torch.sqrt(r0**2 + (v * (t - t0)) ** 2)
                 centre_t = t0 - centroid * wavelength * r0 / (2 * v**2)
-                u = tau - 2 * r[:, None] / LIGHT_M_S - length / 2
+                since = 2 * (r - radar.near_range_m) / LIGHT_M_S * radar.sampling_hz
+                columns = int(since.min()) + window  # the range changes by less than two samples
+                u = (columns - since[:, None]) / radar.sampling_hz - length / 2
                 inside = (u.abs() <= length / 2) & ((t - centre_t).abs() <= DWELL_S / 2)[:, None]
-                rate = radar.pulse.bandwidth_hz / length
                 turns = rate / 2 * u**2 - 2 * (r / wavelength)[:, None] + uniform(0, 1, 1)
-                total += inside * torch.polar(torch.ones_like(turns), 2 * math.pi * torch.remainder(turns, 1))
+                total[:, columns] += inside * torch.polar(
+                    torch.ones_like(turns), 2 * math.pi * torch.remainder(turns, 1)
+                )
             power = total.abs().square()
             level = power[power > 0].mean()
             noise = torch.view_as_complex(torch.randn(LINES, CELLS, 2, generator=generator, dtype=F64)) / math.sqrt(2)
@@ -199,7 +202,7 @@ def image(scene: Scene) -> Callable[[int, int], Batch]:
 POINT_WORLDS = (
     *nothing((512, 192), lambda x: Signal(x, FAST.image_axes(FAST.raw_axes(512, 192)))),
     *(World("own", points(snr), snr) for snr in (-30.0, -20.0, -10.0, 0.0, 20.0, 40.0)),
-    World("clutter", image(Speckle(6000, 900.0, 60.0)), 10.0),
+    World("clutter", image(Speckle(2400, 900.0, 60.0)), 10.0),
 )
 
 

@@ -15,10 +15,12 @@ from torchsar.compensate import (
     PhaseIncrement,
     RangeDependentCentroid,
     energy_centre,
+    lag_products,
     phase_increment,
     point_doppler,
     velocity_objective,
 )
+from torchsar.compensate.aperture import _noise_variance
 from torchsar.core import Chain, Draws, Recording, Signal, use
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK
@@ -307,6 +309,52 @@ def test_velocity_without_an_image_is_not_ok() -> None:
     world = StripmapWorld(RandomPoints(24, 230.0, 150.0), Dwell(1.0), doppler_hz=doppler * 0, snr_db=10.0)
     signal = simulate(AIRCRAFT, world, 230, 192, Draws(13, trials=range(6)))[0].signal
     assert not bool(EffectiveVelocity(OmegaK(AIRCRAFT), 25.0)(signal, doppler * 0).ok.any())
+
+
+def aircraft(scene: Scene, trials: int = 16, seed: int = 15, snr_db: float = 20.0) -> tuple[Signal, torch.Tensor]:
+    doppler = torch.linspace(-40, 40, trials, dtype=torch.float64)
+    world = StripmapWorld(scene, Dwell(1.0), velocity_m_s=120.0, doppler_hz=doppler, snr_db=snr_db)
+    return simulate(AIRCRAFT, world, 768, 192, Draws(seed, trials=range(trials)))[0].signal, doppler
+
+
+@pytest.mark.parametrize("dwell_s", [1.0, None])
+def test_the_deviation_of_an_increment_includes_apertures_cut_at_one_end(dwell_s: float | None) -> None:
+    """All targets are seen near the end of the record, where half of them are cut."""
+    signal, doppler = aircraft(RandomPoints(40, 150.0, 200.0, azimuth_m=60.0, spread_db=6.0))
+    for stage in (PhaseIncrement, EnergyCentre, RangeDependentCentroid):
+        found = stage(replace(AIRCRAFT, integration_s=dwell_s))(signal)
+        error = found["doppler_baseband_hz"] - doppler
+        rms = error.square().mean().sqrt()
+        assert float(rms) > 3 and bool(found.ok.any())
+        assert 0.67 < float(rms / found.std["doppler_baseband_hz"].square().mean().sqrt()) < 1.43
+        if "cut_hz" in found.info:
+            assert float((error - found.info["cut_hz"]).square().mean().sqrt()) < 0.4 * float(rms)
+
+
+def test_the_increment_of_one_whole_target_is_reliable() -> None:
+    signal, doppler = aircraft(Points([0.0], [0.0], random_phase=True))
+    found = PhaseIncrement(AIRCRAFT)(signal)
+    assert bool(found.ok.all())
+    assert float((found["doppler_baseband_hz"] - doppler).abs().max()) < 0.5
+    assert float(found.std["doppler_baseband_hz"].max()) < 0.5
+    assert not bool(RangeDependentCentroid(AIRCRAFT)(signal).ok.any())  # one target shows no slope over range
+
+
+def test_faint_range_cells_do_not_bend_the_centroid_over_range() -> None:
+    """Without noise, the sidelobes of the pulses are as coherent as the targets."""
+    rms = []
+    for snr_db in (20.0, 80.0):
+        signal, doppler = aircraft(RandomPoints(24, 230.0, 150.0, spread_db=6.0), snr_db=snr_db)
+        error = RangeDependentCentroid(AIRCRAFT)(signal)["doppler_baseband_hz"] - doppler
+        rms.append(float(error.square().mean().sqrt()))
+    assert rms[1] < 1.2 * rms[0]
+
+
+def test_variance_of_the_products_of_noise_in_a_tile() -> None:
+    noise = Draws(16, trials=range(20)).normal("alone", (129, 256), torch.complex64)
+    radar = replace(AIRCRAFT, pulse=LinearFM(50e6, 0.5e-6))
+    products, power = lag_products(noise, (8, 8))
+    assert 0.8 < float(_noise_variance(power, radar).mean() / products.imag.square().mean()) < 1.1
 
 
 def test_a_wide_search_with_an_unknown_dwell_takes_few_images() -> None:

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.aperture import complete_aperture_centroid
-from torchsar.compensate.doppler import MOST_STD, phase_increment, wrap_hz
+from torchsar.compensate.doppler import MOST_STD, phase_increment, swept_band, wrap_hz
 from torchsar.compensate.group import (
     RangeGroup,
     aperture_s,
@@ -359,9 +359,10 @@ class DopplerCentroid(Stage):
             `doppler_hz` (absolute) and `doppler_baseband_hz`, with their standard deviations in Hz,
             `ambiguity` (whole number of PRFs) and `squint_deg`, shape (...,) each. `quality` is the
             probability that the ambiguity is right. `ok` is False where that probability is 0.9 or
-            less, or where the baseband centroid is unreliable or the phases of the lines are random
-            (`coherent_lines`). A smooth phase error of the lines shifts the centroid and cannot be
-            distinguished from motion. `info` holds
+            less, where the baseband centroid is unreliable, where the apertures that the ends of
+            the record cut shift it by an eighth of the band of the beam or more, or where the
+            phases of the lines are random (`coherent_lines`). A smooth phase error of the lines
+            shifts the centroid and cannot be distinguished from motion. `info` holds
 
             - "block_hz" and "block_power", see `baseband_estimate`;
             - "looks", "lines", "entropy", "line_doppler_hz" and "line_doppler_std_hz", see
@@ -371,7 +372,8 @@ class DopplerCentroid(Stage):
             - "coherence": coherence of adjacent lines, 0..1.
         """
         raw, radar = signal.data, self.radar
-        first = phase_increment(raw, radar.prf_hz, self.blocks)
+        rate, dwell = swept_band(radar, raw.shape[-1])
+        first = phase_increment(raw, radar.prf_hz, self.blocks, rate_hz_s=rate, dwell_s=dwell)
         base, coarse_std = first["doppler_baseband_hz"], first.std["doppler_baseband_hz"]
         evidence = ambiguity_evidence(raw, radar, base, self.spectrum(raw.shape[-1], raw.device), self.reach)
         turns = candidate_turns(self.reach, raw.device)
@@ -380,6 +382,9 @@ class DopplerCentroid(Stage):
         absolute = base + radar.prf_hz * turns[ranked.indices[..., 0]]
         absolute, std = complete_aperture_centroid(raw, radar, absolute, coarse_std, self.reference)
         refined = (std < coarse_std) & (std < MOST_STD * radar.prf_hz)
+        if dwell is not None:
+            # where almost all targets are cut, what seems to be a whole one is a part of another
+            refined = refined & (first.info["cut_hz"].abs() < rate * dwell / 8)
         reliable = (first.ok | refined) & coherent_lines(raw)
         probability = torch.softmax(joint, -1).amax(-1)
         info = {

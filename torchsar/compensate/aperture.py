@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchsar.compensate.doppler import lag_products, wrap_hz
 from torchsar.compensate.group import RangeGroup, compress, full_columns, full_spectrum, stays_inside
-from torchsar.core import checked_samples, settle, unit_level
+from torchsar.core import checked_samples, cis, settle, unit_level
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -26,6 +26,12 @@ from torchsar.radar import StripmapRadar
 # the end of the complete lines
 _TILE_LINES, _TILE_COLUMNS = 16, 32
 _CHUNK_COLUMNS = 2048  # bounds the memory of an image on wide swaths
+# Share of the energy of targets that are left out that leaks into the chosen tiles. Its Doppler is
+# half way to the edge of the beam.
+_LEAK = 0.005
+# Least share of the energy in lines whose targets have complete apertures; what is less may be
+# nothing but the sidelobes of other targets.
+_LEAST_SHARE = 0.1
 _GUARD = 0.02  # share of the dwell by which it is widened at each end, found by trial
 
 
@@ -50,7 +56,7 @@ def complete_aperture_centroid(
 
     Returns:
         The refined centroid and its standard deviation in Hz, shape (...,) each. Where the new
-        standard deviation is twice `std_hz` or more, or the targets migrate out of the swath in
+        standard deviation is 1.5 times `std_hz` or more, or the targets migrate out of the swath in
         more than half of the range cells, `doppler_hz` and `std_hz` are returned instead.
 
     Raises:
@@ -66,8 +72,8 @@ def complete_aperture_centroid(
     raw, value, std = unit_level(raw), doppler_hz, std_hz
     for _ in range(rounds):
         found, found_std = _refined(raw, radar, value, dwell, reference)
-        # the standard deviation of the first estimate does not include the effect of cut apertures
-        better = found_std < 2 * std_hz
+        # targets that are not cut are preferred when both are about as sure
+        better = found_std < 1.5 * std_hz
         value, std = torch.where(better, found, doppler_hz), torch.where(better, found_std, std_hz)
     return value, std
 
@@ -81,10 +87,12 @@ def _refined(
     rate = torch.cat([r.expand(p.shape[-1]) for p, _, r in parts])
     power = torch.cat([q for _, q, _ in parts], -1)
     weight = _above_noise(products, power)
-    products, noise = products * weight, weight.square() * _noise_variance(power)
+    products, noise = products * weight, weight.square() * _noise_variance(power, radar)
+    energy = products.abs().sum((-2, -1))
     tile = raw.shape[-2] / products.shape[-2]
     line = (torch.arange(products.shape[-2], dtype=torch.float64, device=raw.device) + 0.5) * tile
     total, scale = doppler_hz, radar.prf_hz / (2 * math.pi)
+    half_way = math.pi / 2 * float(rate[0]) * dwell / radar.prf_hz**2  # rad, between centre and edge of the beam
     std = torch.full_like(doppler_hz, math.inf)
     for _ in range(8):
         # in a frame with an error d, targets appear late by d / rate
@@ -95,7 +103,10 @@ def _refined(
         delta = wrap_hz(scale * phase - total, radar.prf_hz)
         enough = chosen.sum((-2, -1)).abs() > 0
         total = torch.where(enough, total + delta, total)
-        std = torch.where(enough, scale * _std_rad(chosen, (noise * whole.square()).sum((-2, -1)), phase), math.inf)
+        kept = chosen.abs().sum((-2, -1))
+        leak = _LEAK * half_way * (energy - kept).clamp_min(0)
+        noisy = (noise * whole.square()).sum((-2, -1))
+        std = torch.where(kept > _LEAST_SHARE * energy, scale * _std_rad(chosen, noisy, phase, leak), math.inf)
     return total, std
 
 
@@ -147,28 +158,34 @@ def _tiles(
     return products * scale, power * scale, rate[None]
 
 
-def _noise_variance(power: Tensor) -> Tensor:
+def _noise_variance(power: Tensor, radar: StripmapRadar) -> Tensor:
     """Variance that noise adds to the imaginary part of the products of a tile.
 
     It includes noise times noise and noise times signal. The noise power is that of the tile at the
-    lowest tenth.
+    lowest tenth. Compression leaves noise in the band of the pulse only, so that neighbouring range
+    cells are alike.
     """
     flat = power.flatten(-2)
     floor = torch.where(flat > 0, flat, torch.inf).kthvalue(max(1, flat.shape[-1] // 10), dim=-1).values
     floor = settle(floor, 0.0)[0][..., None, None]
-    return floor * (0.5 * floor + power) / (_TILE_LINES * _TILE_COLUMNS)
+    alike = max(1.0, radar.sampling_hz / radar.pulse.bandwidth_hz)
+    return alike * floor * (power - 0.5 * floor).clamp_min(0) / (_TILE_LINES * _TILE_COLUMNS)
 
 
-def _std_rad(products: Tensor, noise: Tensor, phase_rad: Tensor) -> Tensor:
-    """Standard deviation of the common phase, from noise and the scatter over columns of tiles.
+def _std_rad(products: Tensor, noise: Tensor, phase_rad: Tensor, leak: Tensor) -> Tensor:
+    """Standard deviation of the common phase: that of noise or of the scatter, the larger of both.
 
-    The scatter is taken in four parts of the strip. They are much longer than the response of a
-    point, whose tiles differ in Doppler when the nominal velocity is wrong.
+    The scatter has two parts, with weights found by trial. Columns of tiles are independent, but
+    few of them may hold most of the energy. Twelfths of columns are many, but those of one target
+    may differ in Doppler, since a wrong nominal velocity smears it. `leak` is the imaginary part of
+    the products that may leak into the chosen tiles from targets that are cut.
     """
-    parts = torch.stack([part.sum(-2) for part in products.tensor_split(4, -2)], -2).flatten(-2)
-    turned = parts * torch.polar(torch.ones_like(phase_rad), -phase_rad)[..., None]
-    total = turned.real.sum(-1)
-    return torch.sqrt(turned.imag.square().sum(-1) + noise) / torch.where(total > 0, total, 1e-300)
+    parts = torch.stack([part.sum(-2) for part in products.tensor_split(12, -2)], -2) * cis(-phase_rad)[..., None, None]
+    columns = parts.sum(-2)
+    total = columns.real.sum(-1).clamp_min(1e-300)
+    share = (columns.real / total[..., None]).clamp(0, 0.9)
+    scatter = 0.5 * (columns.imag.square() / (1 - share)).sum(-1) + 0.25 * parts.imag.square().sum((-2, -1))
+    return torch.hypot(torch.maximum(scatter, noise).sqrt() / total, leak / total)
 
 
 def _above_noise(products: Tensor, power: Tensor) -> Tensor:

@@ -14,11 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples, fft_lines, legendre, settle, unit_level
+from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, fft_lines, legendre, settle, unit_level
 from torchsar.radar import StripmapRadar
 
 OVER = ("mean", "median")  # how `combine_blocks` combines the blocks
@@ -28,6 +29,16 @@ MOST_STD = 0.015
 # Least extent of the energy along the record, as a share of its length: targets seen for less are
 # cut by the end of the record, or nearly as short as their own drift of Doppler.
 _LEAST_EXTENT = 0.3
+_FINE = (2, 4)  # parts of a block along pulses and range, for the power at its edges
+# Least number of range blocks whose scatter is taken as the standard deviation; with fewer, it is
+# the scatter of all blocks, which the sweep of the targets makes too large.
+_LEAST_BLOCKS = 4
+# Energy at which the weight of a range block in a fit is halved, over the energy that three
+# quarters of the blocks do not exceed.
+_FAINT = 0.1
+# Relative scatter of the first moment of a cut target about its mean over targets of even density,
+# for a beam of constant gain: sqrt(1/5).
+_UNEVEN = 0.45
 
 
 def wrap_hz(frequency_hz: Tensor, prf_hz: float) -> Tensor:
@@ -73,8 +84,7 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
             than blocks.
     """
     x = unit_level(checked_samples(x, "lag_products", "pulse, range", finite=False))
-    peak = x.detach().abs().amax((-2, -1), keepdim=True)
-    x = x / torch.where(peak > 0, peak, 1)
+    x = x / _peak(x)
     columns = [last - first for first, last in _bounds(x.shape[-1], blocks[1], "range samples")]
     products, powers = [], []
     for first, last in _bounds(x.shape[-2] - 1, blocks[0], "pairs of lines"):
@@ -87,6 +97,12 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
         products.append(_sums(product.to(torch.complex128), columns))
         powers.append(_sums(power.to(torch.float64), columns))
     return torch.stack(products, -2), torch.stack(powers, -2)
+
+
+def _peak(x: Tensor) -> Tensor:
+    """Peak modulus (..., 1, 1) of lines (..., pulse, range); 1 where it is 0."""
+    peak = x.detach().abs().amax((-2, -1), keepdim=True)
+    return torch.where(peak > 0, peak, 1)
 
 
 def _sums(x: Tensor, sizes: list[int]) -> Tensor:
@@ -188,60 +204,182 @@ def combine_blocks(products: Tensor, over: str = "mean") -> Tensor:
     return mean + settle(torch.nanquantile(offset, 0.5, dim=-1), 0.0)[0]
 
 
-def increment_std_rad(products: Tensor, phase_rad: Tensor) -> Tensor:
-    """Predict the standard deviation of a combined phase increment from the scatter of the blocks.
-
-    It includes everything that makes blocks differ: noise, speckle and scene content.
+class Increments(NamedTuple):
+    """Products of adjacent lines, and what the error of their phase depends on.
 
     Args:
-        products: Block products, shape (..., a, b), complex.
+        products: Sums over blocks, shape (..., a, b), complex128, see `lag_products`.
+        power: Mean power of the same pairs of lines, shape (..., a, b).
+        ends: Mean product of a pair of lines at the first and at the last line, shape (..., 2, b).
+        sides: Products, summed over pulses, of a narrow strip of range cells at the b + 1 edges of
+            the range blocks, shape (..., b + 1), in any unit.
+        lines: What the power of a pair of lines at an end adds to the sum of the phase increments,
+            see `cut_lines`; in lines, shape (...,).
+        half_band_rad: Half of the band that a target sweeps in the beam, as a phase increment in
+            rad, shape (...,).
+    """
+
+    products: Tensor
+    power: Tensor
+    ends: Tensor
+    sides: Tensor
+    lines: Tensor
+    half_band_rad: Tensor
+
+
+def increments(
+    x: Tensor, prf_hz: float, blocks: tuple[int, int], rate_hz_s: float | None = None, dwell_s: float | None = None
+) -> Increments:
+    """Compute the products of adjacent lines, and what the error of their phase depends on.
+
+    Args:
+        x: Lines, shape (..., pulse, range), complex.
+        prf_hz: Pulse repetition frequency in Hz.
+        blocks: Number of blocks a along pulses and b along range.
+        rate_hz_s: Magnitude of the Doppler rate of the targets in Hz/s. If it is None, targets are
+            assumed to be seen for half of the record.
+        dwell_s: Time that a target stays in the beam, in seconds. If it or the rate is None, the
+            band that targets sweep is measured from the products of lines two apart.
+
+    Returns:
+        The products.
+    """
+    pairs, columns = x.shape[-2] - 1, x.shape[-1]
+    split = [max(1, min(most, n // (2 * b))) for most, n, b in zip(_FINE, (pairs, columns), blocks, strict=True)]
+    fine, power = lag_products(x, (split[0] * blocks[0], split[1] * blocks[1]))
+    sizes = [last - first for first, last in _bounds(pairs, fine.shape[-2], "pairs of lines")]
+    ends = torch.stack([fine[..., i, :] / sizes[i] for i in (0, -1)], -2)
+    strips, k = fine.sum(-2), split[1]
+    sides = [strips[..., :1], 0.5 * (strips[..., k - 1 : -1 : k] + strips[..., k::k]), strips[..., -1:]]
+    total = fine.sum((-2, -1))
+    if rate_hz_s is None or dwell_s is None:
+        half_band = _half_band_rad(x, total)
+    else:
+        half_band = torch.full_like(total.real, math.pi * rate_hz_s * dwell_s / prf_hz)
+    half_band = half_band.clamp(1e-3, 0.95 * math.pi)
+    if rate_hz_s is None:
+        dwell_lines: Tensor | float = pairs / 2
+    else:
+        dwell_lines = half_band * prf_hz**2 / (math.pi * rate_hz_s)
+    return Increments(
+        _grouped(_grouped(fine, split[0], -2), k, -1),
+        _grouped(_grouped(power, split[0], -2), k, -1),
+        _grouped(ends, k, -1),
+        torch.cat(sides, -1),
+        cut_lines(half_band, dwell_lines),
+        half_band,
+    )
+
+
+def _grouped(x: Tensor, count: int, dim: int) -> Tensor:
+    """Sums of `count` neighbours along a dimension."""
+    return x.unflatten(dim, (-1, count)).sum(dim)
+
+
+def _half_band_rad(x: Tensor, total: Tensor) -> Tensor:
+    """Half width (...,) of a band of constant density, from products of lines two apart.
+
+    total: Sum of the products of adjacent lines, as from `lag_products`, shape (...,).
+    """
+    x = unit_level(x)
+    x = x / _peak(x)
+    second = torch.linalg.vecdot(x[..., :-2, :].flatten(-2), x[..., 2:, :].flatten(-2)).to(torch.complex128)
+    size = total.abs()
+    direction = total / torch.where(size > 0, size, 1)
+    return torch.acos(((second * direction.conj().square()).real / torch.where(size > 0, size, 1)).clamp(-1, 1))
+
+
+def cut_lines(half_band_rad: Tensor, dwell_lines: Tensor | float) -> Tensor:
+    """Compute how strongly apertures cut by an end of a record shift the sum of phase increments.
+
+    A target whose aperture is cut shows only a part of its band. For targets of even density on
+    both sides of an end of the record, which cross a beam of constant gain in N lines with phase
+    increments up to b rad from the centroid, the imaginary part of the products of adjacent lines,
+    turned by the centroid and summed over the record, is (1 - b cot b) N / (2 b) times the real
+    part of one pair of lines at the last line, and minus this at the first line.
+
+    Args:
+        half_band_rad: b in rad, shape (...,).
+        dwell_lines: N in lines, shape (...,) or a number.
+
+    Returns:
+        The factor in lines, shape (...,); b N / 6 for a small band.
+    """
+    return (1 - half_band_rad / torch.tan(half_band_rad)) * dwell_lines / (2 * half_band_rad)
+
+
+def increment_std_rad(found: Increments, phase_rad: Tensor) -> tuple[Tensor, Tensor]:
+    """Predict the scatter of a combined phase increment, and its shift by cut apertures.
+
+    The scatter is that of the range blocks, which is due to noise, speckle and the apertures of
+    single targets, without the shifts of the blocks by cut apertures and without what a change of
+    Doppler along the pulse and along the range walk of a target adds to a block and takes from the
+    next. Where few blocks hold most of the energy, the difference of few cut targets from an even
+    density is added. With fewer than four range blocks it is the scatter of all blocks.
+
+    Args:
+        found: Products of adjacent lines.
         phase_rad: Combined increment in rad, shape (...,).
 
     Returns:
-        The standard deviation in rad, shape (...,); pi where there is no energy.
+        The standard deviation that the scatter causes, and the shift, in rad, shape (...,) each; pi
+        and 0 where there is no energy.
     """
-    flat = products.flatten(-2) * torch.polar(torch.ones_like(phase_rad), -phase_rad)[..., None]
-    count = (flat.abs() > 0).sum(-1)
-    gain = torch.where(count > 1, count / (count - 1).clamp_min(1), 1)
-    total = flat.real.sum(-1)
-    return torch.where(
-        total > 0, torch.sqrt(gain * flat.imag.square().sum(-1)) / torch.where(total > 0, total, 1), math.pi
-    ).clamp_max(math.pi)
+    total = (found.products.sum((-2, -1)) * cis(-phase_rad)).real
+    some = total > 0
+    total = torch.where(some, total, 1)
+
+    def by_ends(phase: Tensor) -> Tensor:
+        power = (found.ends * cis(-phase)[..., None, None]).real
+        return power * (found.lines / total)[..., None, None]
+
+    shift = by_ends(phase_rad).sum(-1).diff(dim=-1)[..., 0].clamp(-1, 1)
+    turn = cis(shift - phase_rad)
+    cut = by_ends(phase_rad - shift)
+    turned = found.products * (turn / total)[..., None, None]
+    blocks, count = turned.sum(-2), turned.shape[-1]
+    if count < _LEAST_BLOCKS:
+        variance = turned.imag.square().sum((-2, -1))
+    else:
+        residual = blocks.imag - cut.diff(dim=-2)[..., 0, :]
+        along = (found.sides * turn[..., None]).real.diff(dim=-1)
+        size = along.square().sum(-1, keepdim=True)
+        slope = (residual * along).sum(-1, keepdim=True) / torch.where(size > 0, size, 1)
+        variance = count / (count - 2) * (residual - slope * along).square().sum(-1)
+    share = blocks.real.clamp(0, 1).square().sum(-1).clamp_max(1)
+    variance = variance + (_UNEVEN * share).square() * cut.square().sum((-2, -1))
+    return torch.where(some, variance.sqrt().clamp_max(math.pi), math.pi), torch.where(some, shift, 0)
 
 
-def reliable_increment(products: Tensor, phase_rad: Tensor, std_rad: Tensor) -> Tensor:
+def reliable_increment(found: Increments, phase_rad: Tensor, scatter_rad: Tensor, shift_rad: Tensor) -> Tensor:
     """Decide whether a phase increment between adjacent lines shows the Doppler centroid.
 
-    The standard deviation must be below 1.5 % of the PRF. If the record is divided into four blocks
-    or more along pulses, the energy must also fill 0.3 of the record: the increment of targets that
-    are seen only at an end of the record differs from that of the centre of the beam, and nothing
-    in the increments shows by how much. Targets that are cut, but fill more of the record, are not
-    recognised; `DopplerCentroid` avoids them where the dwell of the beam is known.
+    The scatter must be below 1.5 % of the PRF, and the shift by cut apertures below an eighth of
+    the band of the beam. If the record is divided into four blocks or more along pulses, the energy
+    must also fill 0.3 of the record: where targets are seen only at an end of the record, nothing
+    shows how much of their apertures is cut.
 
     Args:
-        products: Products of adjacent lines, summed over range, shape (..., a), complex, for a
-            blocks of pulses.
+        found: Products of adjacent lines.
         phase_rad: Phase increment in rad, shape (...,).
-        std_rad: Its predicted standard deviation in rad, shape (...,).
+        scatter_rad: Its standard deviation from the scatter of the blocks in rad, shape (...,).
+        shift_rad: Its shift by cut apertures in rad, shape (...,).
 
     Returns:
         Bool, shape (...,).
     """
-    real = (products * torch.polar(torch.ones_like(phase_rad), -phase_rad)[..., None]).real.clamp_min(0)
+    real = (found.products.sum(-1) * cis(-phase_rad)[..., None]).real.clamp_min(0)
     square = real.square().sum(-1)
-    extent = real.sum(-1).square() / torch.where(square > 0, square, 1) / products.shape[-1]
-    return (std_rad < 2 * math.pi * MOST_STD) & (square > 0) & ((extent >= _LEAST_EXTENT) | (products.shape[-1] < 4))
+    extent = real.sum(-1).square() / torch.where(square > 0, square, 1) / real.shape[-1]
+    filled = (square > 0) & ((extent >= _LEAST_EXTENT) | (real.shape[-1] < 4))
+    return filled & (scatter_rad < 2 * math.pi * MOST_STD) & (shift_rad.abs() < found.half_band_rad / 4)
 
 
-def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz: float, **info: Tensor) -> Estimate:
+def baseband_estimate(found: Increments, phase_rad: Tensor, prf_hz: float, **info: Tensor) -> Estimate:
     """Convert a phase increment between adjacent lines to a baseband Doppler centroid.
 
-    The standard deviation and the quality follow from the products of adjacent lines, summed over
-    blocks.
-
     Args:
-        products: Block products, shape (..., a, b), complex, as from `lag_products`.
-        power: Mean power of the same pairs of lines, shape (..., a, b).
+        found: Products of adjacent lines, from which the standard deviation and the quality follow.
         phase_rad: Phase increment from line to line, combined from all blocks, in rad, shape
             (...,).
         prf_hz: Pulse repetition frequency in Hz.
@@ -249,26 +387,40 @@ def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz
 
     Returns:
         `doppler_baseband_hz` of shape (...,), positive when closing, with its standard deviation in
-        Hz. `quality` is the coherence of adjacent lines. `ok` is False where there is no energy,
-        where the standard deviation is 1.5 % of the PRF or more, or where the energy fills less
-        than 0.3 of the record, see `reliable_increment`. `info` holds
-        "block_hz" (centroid of each block) and "block_power", both of shape (..., a, b), and the
-        entries given.
+        Hz, which includes the shift by apertures that the ends of the record cut. `quality` is the
+        coherence of adjacent lines. `ok` is False where there is no energy, where the scatter of
+        the blocks gives a standard deviation of 1.5 % of the PRF or more, where the shift by cut
+        apertures is an eighth of the band of the beam or more, or where the energy fills less than
+        0.3 of the record, see `reliable_increment`. `info` holds "block_hz" (centroid of each
+        block) and "block_power", both of shape (..., a, b), "cut_hz" (the estimated shift by cut
+        apertures, which the value still contains), shape (...,), and the entries given.
     """
     scale = prf_hz / (2 * math.pi)
-    std = increment_std_rad(products, phase_rad)
-    total = power.sum((-2, -1))
-    quality = (products.sum((-2, -1)).abs() / torch.where(total > 0, total, 1)).clamp(0, 1)
+    scatter, shift = increment_std_rad(found, phase_rad)
+    total = found.power.sum((-2, -1))
+    quality = (found.products.sum((-2, -1)).abs() / torch.where(total > 0, total, 1)).clamp(0, 1)
     return Estimate(
         {"doppler_baseband_hz": wrap_hz(scale * phase_rad, prf_hz)},
         quality,
-        reliable_increment(products.sum(-1), phase_rad, std),
-        {"doppler_baseband_hz": scale * std},
-        {"block_hz": scale * torch.angle(products), "block_power": power, **info},
+        reliable_increment(found, phase_rad, scatter, shift),
+        {"doppler_baseband_hz": scale * torch.hypot(scatter, shift)},
+        {
+            "block_hz": scale * torch.angle(found.products),
+            "block_power": found.power,
+            "cut_hz": scale * shift,
+            **info,
+        },
     )
 
 
-def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), over: str = "mean") -> Estimate:
+def phase_increment(
+    x: Tensor,
+    prf_hz: float,
+    blocks: tuple[int, int] = (8, 8),
+    over: str = "mean",
+    rate_hz_s: float | None = None,
+    dwell_s: float | None = None,
+) -> Estimate:
     """Estimate the baseband Doppler centroid from the mean phase increment between adjacent lines.
 
     The centroid is PRF * dphi / (2 pi), where dphi is the phase increment in rad. It is ambiguous
@@ -279,6 +431,10 @@ def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), 
         prf_hz: Pulse repetition frequency in Hz.
         blocks: Number of blocks along pulses and along range.
         over: "mean" or "median" over the blocks, see `combine_blocks`.
+        rate_hz_s: Magnitude of the Doppler rate of the targets in Hz/s. It serves for the standard
+            deviation only. If it is None, targets are assumed to be seen for half of the record.
+        dwell_s: Time that a target stays in the beam, in seconds. It serves for the standard
+            deviation only. If it is None, it follows from the rate and the width of the spectrum.
 
     Returns:
         `doppler_baseband_hz` in Hz, shape (...,), positive when closing, with its standard
@@ -295,11 +451,17 @@ def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), 
         Tsvetkov 2017, text before Fig. 5.
     """
     x = checked_samples(x, "phase_increment", "pulse, range")
-    products, power = lag_products(x, blocks)
-    return baseband_estimate(products, power, combine_blocks(products, over), prf_hz)
+    found = increments(x, prf_hz, blocks, rate_hz_s, dwell_s)
+    return baseband_estimate(found, combine_blocks(found.products, over), prf_hz)
 
 
-def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) -> Estimate:
+def energy_centre(
+    x: Tensor,
+    prf_hz: float,
+    blocks: tuple[int, int] = (8, 8),
+    rate_hz_s: float | None = None,
+    dwell_s: float | None = None,
+) -> Estimate:
     """Estimate the baseband Doppler centroid as the circular energy centre of the azimuth spectrum.
 
     The power spectrum is averaged over range. The result agrees with `phase_increment` to
@@ -309,6 +471,10 @@ def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) ->
         x: Lines, shape (..., pulse, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
         blocks: Number of blocks along pulses and along range.
+        rate_hz_s: Magnitude of the Doppler rate of the targets in Hz/s. It serves for the standard
+            deviation only. If it is None, targets are assumed to be seen for half of the record.
+        dwell_s: Time that a target stays in the beam, in seconds. It serves for the standard
+            deviation only. If it is None, it follows from the rate and the width of the spectrum.
 
     Returns:
         `doppler_baseband_hz` in Hz, shape (...,), positive when closing, with its standard
@@ -326,12 +492,9 @@ def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) ->
         Tsvetkov 2017, energy centre of the azimuth spectrum.
     """
     x = checked_samples(x, "energy_centre", "pulse, range")
-    spectra = block_spectra(x, blocks)
-    products, power = circular_centre(spectra), spectra.mean(-1)
-    spectrum = spectra.sum((-3, -2))
+    spectrum = block_spectra(x, blocks).sum((-3, -2))
     return baseband_estimate(
-        products,
-        power,
+        increments(x, prf_hz, blocks, rate_hz_s, dwell_s),
         torch.angle(circular_centre(spectrum)),
         prf_hz,
         spectrum=spectrum,
@@ -339,13 +502,16 @@ def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) ->
     )
 
 
-def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12) -> tuple[Tensor, Tensor, Tensor]:
+def fit_over_range(
+    products: Tensor, power: Tensor, order: int, rounds: int = 12
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Fit a robust polynomial to the phase increment over range blocks.
 
     The polynomial is a sum of Legendre polynomials of the position of the block, which runs from -1
-    to 1 across the swath. Blocks are weighted with the square of their coherence. Blocks whose
-    residuals are large compared with the median residual are weighted down (Cauchy weights), so
-    that a few very bright targets do not bend the curve.
+    to 1 across the swath. Blocks are weighted with the square of their coherence, and those of much
+    less energy than most, such as the sidelobes of others, count less. Blocks whose residuals are
+    large compared with the median residual are weighted down (Cauchy weights), so that a few very
+    bright targets do not bend the curve.
 
     Args:
         products: Block products, shape (..., b), complex.
@@ -356,7 +522,7 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
     Returns:
         The coefficients of the Legendre polynomials in rad, shape (..., order + 1); their
         covariance in rad^2, shape (..., order + 1, order + 1), from the residuals of the blocks
-        with their weights; and the residuals in rad, shape (..., b).
+        with their weights; the residuals in rad, shape (..., b); and the weights, shape (..., b).
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -370,8 +536,11 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
     mean = torch.angle(products.sum(-1))
     angle = torch.angle(products * torch.polar(torch.ones_like(mean), -mean)[..., None])
     basis = legendre(block_centres(count, products.device), order)
-    coherence = products.abs() / torch.where(power > 0, power, 1)
-    weight = coherence.square()
+    energy = products.abs()
+    coherence = energy / torch.where(power > 0, power, 1)
+    usual = energy.quantile(0.75, dim=-1, keepdim=True)
+    floor = energy + _FAINT * usual
+    weight = coherence.square() * energy / torch.where(floor > 0, floor, 1)
     coefficients, residual = _weighted_fit(basis, angle, weight)
     final = weight
     for _ in range(rounds):
@@ -380,13 +549,14 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
         coefficients, residual = _weighted_fit(basis, angle, final)
     constant = torch.zeros_like(coefficients)
     constant[..., 0] = mean
-    return coefficients + constant, _fit_covariance(basis, final, residual), residual
+    return coefficients + constant, _fit_covariance(basis, final, residual), residual, final
 
 
 def _fit_covariance(basis: Tensor, weight: Tensor, residual: Tensor) -> Tensor:
     """Covariance of the coefficients of `_weighted_fit` from its residuals, whatever their spread.
 
-    Each residual is divided by 1 minus its leverage, the share that the block has in its own fit.
+    The square of each residual is divided by 1 minus its leverage, the share that the block has in
+    its own fit.
     """
     normal = (basis * weight[..., None]).mT @ basis
     size = normal.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None] + 1e-30
@@ -395,7 +565,7 @@ def _fit_covariance(basis: Tensor, weight: Tensor, residual: Tensor) -> Tensor:
         / size
     )
     leverage = weight * ((basis @ inverse) * basis).sum(-1)
-    influence = (basis @ inverse) * (weight * residual / (1 - leverage).clamp_min(0.1))[..., None]
+    influence = (basis @ inverse) * (weight * residual / (1 - leverage).clamp_min(0.1).sqrt())[..., None]
     return influence.mT @ influence
 
 
@@ -407,6 +577,15 @@ def _weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Ten
     eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
     coefficients = torch.linalg.solve(normal + ridge[..., None, None] * eye, (weighted * y[..., None]).sum(-2))
     return coefficients, y - coefficients @ basis.mT
+
+
+def _cut_shift_rad(found: Increments, phase_rad: Tensor) -> Tensor:
+    """Shift (..., b) in rad of the increment of each range block by apertures that the ends cut."""
+    turn = cis(-phase_rad)[..., None]
+    ends = (found.ends * turn[..., None]).real.diff(dim=-2)[..., 0, :]
+    total = (found.products.sum(-2) * turn).real
+    shift = found.lines[..., None] * ends / torch.where(total > 0, total, 1)
+    return torch.where(total > 0, shift.clamp(-1, 1), 0)
 
 
 def block_centres(count: int, device: torch.device | None = None) -> Tensor:
@@ -437,6 +616,22 @@ def nominal_doppler(radar: StripmapRadar) -> dict[str, float]:
     return {"doppler_hz": nominal, "doppler_baseband_hz": float(wrapped)}
 
 
+def swept_band(radar: StripmapRadar, n_range: int) -> tuple[float, float | None]:
+    """Return the Doppler rate of targets in the middle of the swath, and their time in the beam.
+
+    Args:
+        radar: Radar parameters.
+        n_range: Number of range samples.
+
+    Returns:
+        The magnitude of the rate in Hz/s, for the pointing of the radar, and `integration_s` of the
+        radar in seconds, which may be None.
+    """
+    middle = radar.near_range_m + n_range / 2 * radar.range_step_m
+    cos_square = 1 - min(1.0, float(radar.sin_squint(radar.pointing_doppler_hz or 0.0)) ** 2)
+    return float(radar.azimuth_rate_hz_s(middle)) * max(cos_square, 1e-6), radar.integration_s
+
+
 def _nominal_baseband(radar: StripmapRadar, names: Iterable[str]) -> dict[str, float]:
     return dict.fromkeys(names, nominal_doppler(radar)["doppler_baseband_hz"])
 
@@ -447,7 +642,7 @@ class PhaseIncrement(Stage):
     Provides `doppler_baseband_hz` and leaves the signal unchanged. See `phase_increment`.
 
     Args:
-        radar: Radar parameters, of which the PRF is used.
+        radar: Radar parameters. The value depends on the PRF only.
         blocks: Number of blocks along pulses and along range.
         over: How the phase increments of the blocks are combined: "mean" (weighted by energy) or
             "median" (robust against bright blocks).
@@ -462,7 +657,7 @@ class PhaseIncrement(Stage):
         super().__init__()
         if over not in OVER:
             raise ValueError(f"over must be one of {OVER} (how blocks are combined), got {over!r}")
-        self.prf_hz, self.blocks, self.over = radar.prf_hz, blocks, over
+        self.radar, self.blocks, self.over = radar, blocks, over
         self.neutral = _nominal_baseband(radar, self.provides)
 
     def forward(self, signal: Signal) -> Estimate:
@@ -472,7 +667,8 @@ class PhaseIncrement(Stage):
             `Estimate` by the function `phase_increment` with `doppler_baseband_hz` in Hz, shape
             (...,).
         """
-        return phase_increment(signal.data, self.prf_hz, self.blocks, self.over)
+        rate, dwell = swept_band(self.radar, signal.data.shape[-1])
+        return phase_increment(signal.data, self.radar.prf_hz, self.blocks, self.over, rate, dwell)
 
 
 class EnergyCentre(Stage):
@@ -481,7 +677,7 @@ class EnergyCentre(Stage):
     Provides `doppler_baseband_hz` and leaves the signal unchanged. See `energy_centre`.
 
     Args:
-        radar: Radar parameters, of which the PRF is used.
+        radar: Radar parameters. The value depends on the PRF only.
         blocks: Number of blocks along pulses and along range.
     """
 
@@ -489,7 +685,7 @@ class EnergyCentre(Stage):
 
     def __init__(self, radar: StripmapRadar, blocks: tuple[int, int] = (8, 8)) -> None:
         super().__init__()
-        self.prf_hz, self.blocks = radar.prf_hz, blocks
+        self.radar, self.blocks = radar, blocks
         self.neutral = _nominal_baseband(radar, self.provides)
 
     def forward(self, signal: Signal) -> Estimate:
@@ -499,7 +695,8 @@ class EnergyCentre(Stage):
             `Estimate` by the function `energy_centre` with `doppler_baseband_hz` in Hz, shape
             (...,).
         """
-        return energy_centre(signal.data, self.prf_hz, self.blocks)
+        rate, dwell = swept_band(self.radar, signal.data.shape[-1])
+        return energy_centre(signal.data, self.radar.prf_hz, self.blocks, rate, dwell)
 
 
 class RangeDependentCentroid(Stage):
@@ -511,7 +708,7 @@ class RangeDependentCentroid(Stage):
     nearest to `doppler_hz` in the middle of the swath. Otherwise it is baseband.
 
     Args:
-        radar: Radar parameters, of which the PRF is used.
+        radar: Radar parameters. The values depend on the PRF only.
         order: Order of the polynomial over range, see `fit_over_range`.
         blocks: Number of blocks along pulses and along range.
     """
@@ -520,7 +717,7 @@ class RangeDependentCentroid(Stage):
 
     def __init__(self, radar: StripmapRadar, order: int = 1, blocks: tuple[int, int] = (8, 16)) -> None:
         super().__init__()
-        self.prf_hz, self.order, self.blocks = radar.prf_hz, order, blocks
+        self.radar, self.order, self.blocks = radar, order, blocks
         self.neutral = _nominal_baseband(radar, self.provides)
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None) -> Estimate:
@@ -533,9 +730,10 @@ class RangeDependentCentroid(Stage):
 
         Returns:
             `doppler_range_hz` of every range cell, shape (..., range), and `doppler_baseband_hz` in
-            the middle of the swath, shape (...,), in Hz. The latter has a standard deviation. `ok`
-            is False where there is no energy, where that standard deviation is 1.5 % of the PRF or
-            more, or where the energy fills less than 0.3 of the record, see `reliable_increment`.
+            the middle of the swath, shape (...,), in Hz. The latter has a standard deviation, which
+            includes the shift by apertures that the ends of the record cut. `ok` is False under the
+            conditions of `reliable_increment`, and where fewer than order + 2 range blocks hold
+            most of the energy: one target alone shows no slope over range.
             `info` holds "block_hz" (centroid of each of the b range blocks), shape
             (..., b), and "coefficients_hz" (of the Legendre polynomials), shape (..., order + 1).
 
@@ -543,24 +741,30 @@ class RangeDependentCentroid(Stage):
             ValueError: If there are too few lines or range cells for the blocks, or too few blocks
                 for the order.
         """
-        all_products, all_power = lag_products(signal.data, self.blocks)
-        products, power = all_products.sum(-2), all_power.sum(-2)
-        coefficients, covariance, _ = fit_over_range(products, power, self.order)
-        scale = self.prf_hz / (2 * math.pi)
+        prf_hz = self.radar.prf_hz
+        found = increments(signal.data, prf_hz, self.blocks, *swept_band(self.radar, signal.data.shape[-1]))
+        products, power = found.products.sum(-2), found.power.sum(-2)
+        coefficients, _, residual, weight = fit_over_range(products, power, self.order)
+        scale = prf_hz / (2 * math.pi)
+        basis = legendre(block_centres(self.blocks[1], products.device), self.order)
         at_middle = legendre(torch.zeros(1, dtype=torch.float64, device=products.device), self.order)[0]
         middle = coefficients @ at_middle
-        # blocks share targets, by which the residuals of neighbours are alike
-        std = ((covariance @ at_middle) @ at_middle).clamp_min(0).sqrt()
-        std = torch.maximum(std, increment_std_rad(all_products, middle))
-        ok = reliable_increment(all_products.sum(-1), middle, std)
-        middle, std = scale * middle, scale * std
+        # cut apertures shift each block; the rest of its residual is scatter
+        cut, rest = _weighted_fit(basis, residual - _cut_shift_rad(found, middle), weight)
+        shift = -cut @ at_middle
+        scatter = ((_fit_covariance(basis, weight, rest) @ at_middle) @ at_middle).clamp_min(0).sqrt()
+        energy = products.abs()
+        square = energy.square().sum(-1)
+        count = energy.sum(-1).square() / torch.where(square > 0, square, 1)
+        ok = reliable_increment(found, middle, scatter, shift) & (count >= self.order + 2)
+        middle, std = scale * middle, scale * torch.hypot(scatter, shift)
         curve = scale * coefficients @ legendre(block_centres(signal.data.shape[-1], products.device), self.order).mT
         if doppler_hz is not None:
-            curve = curve + (self.prf_hz * torch.round((doppler_hz - middle) / self.prf_hz))[..., None]
+            curve = curve + (prf_hz * torch.round((doppler_hz - middle) / prf_hz))[..., None]
         total = power.sum(-1)
         quality = (products.abs().sum(-1) / torch.where(total > 0, total, 1)).clamp(0, 1)
         return Estimate(
-            {"doppler_range_hz": curve, "doppler_baseband_hz": wrap_hz(middle, self.prf_hz)},
+            {"doppler_range_hz": curve, "doppler_baseband_hz": wrap_hz(middle, prf_hz)},
             quality,
             ok,
             {"doppler_baseband_hz": std},
