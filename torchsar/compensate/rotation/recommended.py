@@ -345,10 +345,9 @@ def _standard_deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
     seen, predicted = (c.diagonal(dim1=-2, dim2=-1) for c in (fit.disagreement, covariance))
     # what the scatterers would differ by if the fit did not take up a part of it as well
     taken_up = (predicted.shape[-1] / fit.scatterers.effective_number().clamp_min(1)).clamp_max(1)[:, None]
-    wider = (taken_up + (seen + fit.change.square()) / predicted.clamp_min(torch.finfo(torch.float64).tiny)).clamp_min(
-        1
-    )
-    wider = wider.sqrt()
+    to_go = (_TO_GO * fit.change).square()
+    wider = taken_up + (seen + to_go) / predicted.clamp_min(torch.finfo(torch.float64).tiny)
+    wider = wider.clamp_min(1).sqrt()
     covariance = torch.where(known[:, None, None], covariance * wider[:, :, None] * wider[:, None], math.inf)
     k = covariance.diagonal(dim1=-2, dim2=-1)[:, :order].clamp_min(0).sqrt()
     w = torch.where(motion.w > 0, motion.w, 0)
