@@ -13,7 +13,14 @@ describes it: a population of 10 per unknown, one line per Doppler cell, and 170
 published run time allows 162. Every trial of a genetic algorithm has random numbers of its own.
 Published errors stand beside them. SNR: mean power of all samples over the variance of the noise.
 
-READING
+The published errors of the rate, of one full satellite, fall from 9.18 % at -10 dB to 1.56 % at
+5 dB. In four scenes of the small satellite the rms error of the genetic algorithm at -10, -5 and
+0 dB is 9.3, 7.6 and 4.8 % with one line per Doppler cell and 3.7, 3.0 and 2.5 % with four; four
+scenes show the trend, not its size. With one line per cell the least entropy itself lies beside the
+true rotation (see `EntropyObjective`), so that the errors stop falling at several percent, and
+errors in a box of +-10 % are 5.8 % even of random guesses. The published error at 5 dB thus agrees
+with the reading that the image is zero-padded or finely gridded in Doppler, which the paper does
+not state, and not with one line per pulse.
 """
 
 from __future__ import annotations

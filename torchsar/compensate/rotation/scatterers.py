@@ -189,6 +189,18 @@ class Fit:
     change: Tensor
 
 
+def usual_count(sampling: Sampling) -> int:
+    """Compute the largest number of scatterers by default: one for every 1000 samples of a trial.
+
+    Args:
+        sampling: Sampling of the data.
+
+    Returns:
+        The number, within 128..800.
+    """
+    return min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH))
+
+
 def fit_scatterers(
     data: Tensor,
     sampling: Sampling,
@@ -217,7 +229,7 @@ def fit_scatterers(
     Returns:
         The fit: rotation, scatterers, covariance and noise power.
     """
-    count = min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH)) if count is None else count
+    count = usual_count(sampling) if count is None else count
     unknowns = _Unknowns(start.k.shape[-1], free_centre)
     present = (data != 0).any(-1)
     trials, device = data.shape[0], data.device
