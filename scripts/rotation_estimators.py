@@ -252,19 +252,21 @@ def draw(bench: Bench, path: Path) -> None:
 def draw_starts(bench: Bench, path: Path) -> None:
     """Figures 10 to 12: images after compensation with what Newton's method finds from its starts.
 
-    The middle of the target is drawn in Doppler, since a wrong rate gives a wrong scale.
+    Above the middle of the target, below a part of it. Drawn in Doppler, since a wrong rate gives a
+    wrong scale.
     """
-    shown = {}
+    whole, parts = {}, {}
     for figure, factor in ((10, 0.9), (11, 1.0), (12, 1.1)):
         found = bench.runs[f"Newton x{factor:g} raw"].found
         omega, k, yc = (found[name] for name in ("omega_rad_s", "warp_k", "yc_m"))
         image = MatchedFourier(bench.radar)(RangePhase(bench.radar)(bench.signal, omega, k, yc), k)
-        middle, part = image.axes[0].n // 2, image.axes[0].n // 8
-        lines = slice(middle - part, middle + part)
-        doppler = image.axes[0]
-        axis = Axis(doppler.name, 2 * part, doppler.start + (middle - part) * doppler.step, doppler.step, doppler.unit)
-        shown[f"figure {figure}: start x{factor:g}"] = Signal(image.data[lines], (axis, image.axes[1]))
-    plot.save(plot.images(shown, 40, percentile=100), path)
+        doppler, range_ = image.axes
+        axis = Axis("Doppler", doppler.n, 1e-3 * doppler.start, 1e-3 * doppler.step, "kHz")
+        half = -0.25 * axis.start  # a quarter of the band
+        image = Signal(image.data, (axis, range_))
+        whole[f"figure {figure}a: start x{factor:g}"] = plot.within(image, {"Doppler": (-half, half)})
+        parts[f"figure {figure}b: part"] = plot.within(image, {"Doppler": (0.3 * half, 0.5 * half)})
+    plot.save(plot.images(whole | parts, 40, percentile=100), path, columns=3)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -44,7 +44,9 @@ def rms(x: Tensor) -> float:
 
 
 @pytest.mark.parametrize("snr_db", [0.0, 20.0])
-def test_foreign_satellites_are_estimated_near_the_bound_and_errors_are_predicted(snr_db: float) -> None:
+def test_satellites_of_the_direct_generator_reach_the_bound_and_their_errors_are_predicted(
+    snr_db: float,
+) -> None:
     """A range response that is not periodic, scatterers between cells, motion within the pulse."""
     data, bounds = scenes(5, snr_db)
     found = uneven_rotation(data, **SMALL.options)

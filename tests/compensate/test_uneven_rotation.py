@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from tests.compensate.turning import (
+    BINS,
     F64,
     OMEGA,
     OPTIONS,
@@ -31,16 +32,19 @@ from torchsar.compensate import (
     PhaseFitRotation,
     RotationAutofocus,
     UnevenRotation,
+    autofocus,
     coarse_rotation,
     phase_fit_rotation,
     rotating_autofocus,
     uneven_rotation,
 )
 from torchsar.compensate.rotation.coarse import coarse_warp
-from torchsar.core import Alternate, Chain, Estimate, Signal, Turn, use
+from torchsar.core import Alternate, Chain, Draws, Estimate, Signal, Turn, use
 from torchsar.core.warp import least_rate, warp
+from torchsar.echo import simulate_turntable
 from torchsar.focus import RangePhase
 from torchsar.metrics import rotation_bounds
+from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
 ESTIMATORS = {"coarse": coarse_rotation, "phase_fit": phase_fit_rotation, "uneven": uneven_rotation}
 
@@ -109,9 +113,17 @@ def test_few_scatterers_are_judged_as_well_as_many() -> None:
         data.append(clean + noise_std(clean, 10.0) * noise(3000 + seed, *clean.shape))
     found = uneven_rotation(torch.stack(data).to(torch.complex64), **OPTIONS)
     assert found.ok.double().mean() > 0.4
-    for name, true in {"omega_rad_s": OMEGA, "k1_per_s": 10.0, "k2_per_s2": 1000.0}.items():
-        error, std = (found[name] - true)[found.ok], found.std[name][found.ok]
-        assert 0.5 < float((error.square().mean() / std.square().mean()).sqrt()) < 1.7, name
+    over_std = z_scores(found, K)[found.ok, :3].square().mean(0).sqrt()
+    # of a few scenes one value scatters by a third, all three by less
+    assert (over_std < 1.7).all() and 0.6 < float(over_std.square().mean().sqrt()) < 1.4
+
+
+def test_a_target_of_many_weak_scatterers_is_fitted_with_more_of_them() -> None:
+    """The usual number explains 39 % of the energy of 800 scatterers."""
+    clean = echo(*points(9000, 800))
+    data = (clean + noise_std(clean, 10.0) * noise(9000, *clean.shape)).to(torch.complex64)
+    found = uneven_rotation(data, **OPTIONS)
+    assert found.ok and found.info["scatterers"] > 200 and z_scores(found, K).abs().max() < 4
 
 
 def test_a_peak_of_the_noise_does_not_show_the_rate() -> None:
@@ -282,6 +294,17 @@ def test_stages_equal_the_functions() -> None:
     assert torch.equal(held["warp_k"], found["warp_k"])
 
 
+def test_steps_without_noise_do_not_go_back_and_forth() -> None:
+    """Pairs of scatterers in one cell contradict the model. Steps of the rate of 0.5 to
+    3 % reversed each other to the last, and the deviation was as large.
+    """
+    turning = PolynomialRotation(OMEGA, K.tolist())
+    world = TurntableWorld(Satellite(60, 0.3, 2.6), rotation=turning, snr_db=40.0)
+    data = simulate_turntable(RADAR, world, PULSES, BINS, Draws(7200, trials=[17, 18]))[0].signal.data
+    before, after = (uneven_rotation(data, **OPTIONS, rounds=rounds)["omega_rad_s"] for rounds in (10, 11))
+    assert (after / before - 1).abs().max() < 0.003
+
+
 def pulse_phases() -> Tensor:
     return torch.cumsum(0.15 * torch.randn(PULSES, dtype=F64, generator=torch.Generator().manual_seed(9)), 0)
 
@@ -299,6 +322,16 @@ def test_the_autofocus_compensates_the_rotation() -> None:
         signal_of(impaired), omega_rad_s=torch.tensor(OMEGA, dtype=F64), warp_k=K, yc_m=torch.tensor(0.0, dtype=F64)
     )
     torch.testing.assert_close(known["phase_rad"], found["phase_rad"], atol=1e-6, rtol=0)
+
+
+def test_the_autofocus_keeps_its_numbers_of_iterations_without_a_rotation() -> None:
+    data = target(0, k=0 * K, n_pulse=160) * torch.exp(1j * pulse_phases()[:160])[:, None]
+    found = RotationAutofocus(RADAR, 3, 0)(signal_of(data))["phase_rad"]
+    assert torch.equal(found, autofocus(data, search=3, polish=0)["phase_rad"])
+    assert not torch.equal(found, autofocus(data)["phase_rad"])
+    for rotation in ({}, {"warp_k": K}):
+        with pytest.raises(ValueError, match="search must be a whole number of 0 or more, got -1"):
+            RotationAutofocus(RADAR, -1)(signal_of(data), **rotation)
 
 
 def off_the_warp(error: Tensor, phi: Tensor) -> float:

@@ -161,7 +161,7 @@ class Motion:
         turns = sampling.turns_per_square * (self.w[:, None] * ends + self.offset[:, None]).abs() * whole.square()
         return torch.isfinite(self.k).all(-1) & (turns < sampling.pulses / 4).all(-1)
 
-    def part(self, trials: slice) -> Motion:
+    def part(self, trials: slice | Tensor) -> Motion:
         """Select trials.
 
         Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import torch
@@ -17,7 +17,7 @@ from torchsar.compensate.rotation.histories import (
     warp_phase_error,
 )
 from torchsar.compensate.rotation.motion import LEAST_PULSES, Motion, Sampling, image_of
-from torchsar.compensate.rotation.scatterers import ROUNDS, Fit, fit_scatterers
+from torchsar.compensate.rotation.scatterers import MOST, ROUNDS, Fit, fit_scatterers, usual_count
 from torchsar.compensate.rotation.unknowns import k_name
 from torchsar.core import Estimate, block_bytes_of, checked_samples, level_of, over_blocks, refuse_non_finite, settle
 from torchsar.core.warp import k_of_shape, shape_of
@@ -73,7 +73,8 @@ def uneven_rotation(
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
             rotation centre), if known a priori, a number or shape (...,); None estimates it.
         scatterers: Largest number of scatterers; more are more accurate and take longer. By default
-            one for every 1000 samples of a trial, within 128..800.
+            one for every 1000 samples of a trial, within 128..800, and twice as many in trials
+            where these explain less than 40 % of the energy.
         rounds: Largest number of maximum-likelihood steps.
 
     Returns:
@@ -90,8 +91,10 @@ def uneven_rotation(
         over the whole aperture, the entropy is not higher than without compensation, and the fit
         has converged. `ok` is True where, in addition, the
         standard deviation of the rate is below 5 %, also without the scatterers that may be peaks
-        of the noise. Where only `ok` is False, the cross-range scale
-        of the image is unknown. Further info: scatterers (their number), noise_power, steps,
+        of the noise. Where only `ok` is False, the cross-range scale of the image is unknown. A
+        target of so many scatterers that twice the usual number explain less than 40 % of the
+        energy is not ok either; a larger `scatterers` helps. Further info: scatterers (their
+        number), noise_power, steps,
         entropy_nats, uncompensated_entropy_nats.
 
     Raises:
@@ -106,7 +109,10 @@ def uneven_rotation(
             rows, sampling, _start(rows, sampling, order, known), free_centre=known is None
         )
         fit = fit_scatterers(rows, sampling, motion, free_centre=known is None, count=scatterers, rounds=rounds)
-        return _estimate(rows, sampling, fit, known is None)
+        found = _estimate(rows, sampling, fit, known is None)
+        if scatterers is None:
+            return _with_more_scatterers(rows, sampling, fit.motion, found, known is None, rounds)
+        return found
 
     return _over_trials("uneven_rotation", find, data, wavelength_m, prf_hz, range_m, yc_m)
 
@@ -328,6 +334,33 @@ def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> 
     return Estimate(found.value, quality, focused & scaled, std, info)
 
 
+def _with_more_scatterers(
+    rows: Tensor, sampling: Sampling, motion: Motion, found: Estimate, free_centre: bool, rounds: int
+) -> Estimate:
+    """The estimate with twice as many scatterers in trials whose energy has many more than the
+    usual number.
+    """
+    count = usual_count(sampling)
+    at = ((found.quality < _LEAST_EXPLAINED) & (2 * found.info["scatterers"] > count)).nonzero()[:, 0]
+    if not len(at):
+        return found
+    fit = fit_scatterers(
+        rows[at], sampling, motion.part(at), free_centre=free_centre, count=min(MOST, 2 * count), rounds=rounds
+    )
+    again = _estimate(rows[at], sampling, fit, free_centre)
+
+    def mixed(all_of: Mapping[str, Tensor], some_of: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {name: whole.index_copy(0, at, some_of[name]) for name, whole in all_of.items()}
+
+    return Estimate(
+        mixed(found.value, again.value),
+        quality=found.quality.index_copy(0, at, again.quality),
+        ok=found.ok.index_copy(0, at, again.ok),
+        std=mixed(found.std, again.std),
+        info=mixed(found.info, again.info),
+    )
+
+
 def _energy(rows: Tensor, noise: Tensor, present: Tensor) -> Tensor:
     """Energy above the noise of the pulses that are present (their number, (trial,)), (trial,)."""
     power = torch.view_as_real(rows).double().square().sum((-3, -2, -1))
@@ -345,10 +378,9 @@ def _standard_deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
     seen, predicted = (c.diagonal(dim1=-2, dim2=-1) for c in (fit.disagreement, covariance))
     # what the scatterers would differ by if the fit did not take up a part of it as well
     taken_up = (predicted.shape[-1] / fit.scatterers.effective_number().clamp_min(1)).clamp_max(1)[:, None]
-    wider = (taken_up + (seen + fit.change.square()) / predicted.clamp_min(torch.finfo(torch.float64).tiny)).clamp_min(
-        1
-    )
-    wider = wider.sqrt()
+    to_go = (_TO_GO * fit.change).square()
+    wider = taken_up + (seen + to_go) / predicted.clamp_min(torch.finfo(torch.float64).tiny)
+    wider = wider.clamp_min(1).sqrt()
     covariance = torch.where(known[:, None, None], covariance * wider[:, :, None] * wider[:, None], math.inf)
     k = covariance.diagonal(dim1=-2, dim2=-1)[:, :order].clamp_min(0).sqrt()
     w = torch.where(motion.w > 0, motion.w, 0)

@@ -189,6 +189,18 @@ class Fit:
     change: Tensor
 
 
+def usual_count(sampling: Sampling) -> int:
+    """Compute the largest number of scatterers by default: one for every 1000 samples of a trial.
+
+    Args:
+        sampling: Sampling of the data.
+
+    Returns:
+        The number, within 128..800.
+    """
+    return min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH))
+
+
 def fit_scatterers(
     data: Tensor,
     sampling: Sampling,
@@ -217,7 +229,7 @@ def fit_scatterers(
     Returns:
         The fit: rotation, scatterers, covariance and noise power.
     """
-    count = min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH)) if count is None else count
+    count = usual_count(sampling) if count is None else count
     unknowns = _Unknowns(start.k.shape[-1], free_centre)
     present = (data != 0).any(-1)
     trials, device = data.shape[0], data.device
@@ -328,7 +340,7 @@ class _Step:
 
     moments: (trial, scatterer, base), sums over pulses of base * conj(echo) * residual at the range
     of the scatterer, for the bases 1, u, du/dk..., phi^2. shift: the same of base 1 with the
-    derivative of the envelope.
+    derivative of the envelope. last: the change of the common unknowns in the step before.
     """
 
     sampling: Sampling
@@ -342,6 +354,7 @@ class _Step:
     response: RangeResponse
     envelopes: Envelopes
     share: Tensor
+    last: Tensor
 
     @staticmethod
     def of(
@@ -407,6 +420,7 @@ class _Step:
             fit.response,
             envelopes,
             share,
+            fit.change,
         )
 
     def taken(self, noise: Tensor | None = None) -> _Taken:
@@ -427,7 +441,7 @@ class _Step:
         found = self._solved(slopes, factor)
         if noise is None:
             return found
-        return self._solved(slopes * self._agreement(slopes, found[2], noise)[..., None, None], factor)
+        return self._solved(slopes * self._agreement(slopes, found[2], noise)[..., None, None], factor, damped=True)
 
     def _agreement(self, slopes: Tensor, change: Tensor, noise: Tensor) -> Tensor:
         """Weights 0..1 (trial, scatterer) by how well the phase of a scatterer fits the step.
@@ -447,8 +461,11 @@ class _Step:
         usual = (size.nanmedian(-1, keepdim=True).values / curved.shape[-1]).nan_to_num(1.0).clamp_min(1)
         return 1 / (1 + (size / (usual * _AGREES**2)).nan_to_num(0.0))
 
-    def _solved(self, slopes: Tensor, factor: _Factor) -> _Taken:
-        """The step for these coefficients of the common unknowns."""
+    def _solved(self, slopes: Tensor, factor: _Factor, damped: bool = False) -> _Taken:
+        """The step for these coefficients of the common unknowns.
+
+        damped: shorten a step that reverses the one before.
+        """
         found = self.found
         cross, shared = self._shared(slopes)
         turned = found.amplitude.conj()[..., None] * self.moments
@@ -468,6 +485,8 @@ class _Step:
         informed = torch.einsum("bpij,bin,bjn->bpn", curvature, inverse, inverse)
         rest = pull - torch.einsum("bpij,bj->bpi", curvature, change)
         change = change * self._within_reach((joint[..., :-1] @ change[..., None])[..., 0])[:, None]
+        if damped:
+            change = change * self._without_reversal(change, normal)[:, None]
         grow, turn, line, row = (
             (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
         )
@@ -481,6 +500,16 @@ class _Step:
             sandwich(normal, rest.mT @ found.alike() @ rest),
             informed / or_one(informed.sum(1, keepdim=True)),
         )
+
+    def _without_reversal(self, change: Tensor, normal: Tensor) -> Tensor:
+        """Factor (trial,) of a step that goes back a part of the last one.
+
+        Such steps would go back and forth, since the curvature is an approximation. The factor is
+        that which ends a geometric sequence of steps, at least a half.
+        """
+        size = torch.einsum("bi,bij,bj->b", self.last, normal, self.last)
+        ratio = torch.einsum("bi,bij,bj->b", self.last, normal, change) / or_one(size)
+        return 1 / (1 - ratio.nan_to_num(0.0).clamp(-1, 0))
 
     def _within_reach(self, moved: Tensor) -> Tensor:
         """Factor (trial,) of the common step that limits the Doppler by which it moves scatterers.

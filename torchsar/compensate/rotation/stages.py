@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase import autofocus
-from torchsar.compensate.pulse_phase.data import prepare, starting_phase
+from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, starting_phase
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
@@ -189,9 +189,9 @@ class RotationAutofocus(Stage):
 
     Args:
         radar: Radar parameters.
-        search: Largest number of fixed-point iterations of `rotating_autofocus` that minimise the
-            image entropy.
-        polish: Largest number of its further iterations, which compare each pulse with a Wiener
+        search: Largest number of fixed-point iterations that minimise the image entropy, with and
+            without a rotation.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
             estimate of the scene.
     """
 
@@ -225,9 +225,13 @@ class RotationAutofocus(Stage):
         Returns:
             `phase_rad` of shape (..., pulse), to be removed: the estimate of `rotating_autofocus`,
             or of `autofocus` if `warp_k` is None.
+
+        Raises:
+            TypeError: If the data are not complex or the start is not a tensor.
+            ValueError: As from the two functions.
         """
         if warp_k is None:
-            return autofocus(signal.data, start=phase_rad)
+            return autofocus(signal.data, start=phase_rad, search=self.search, polish=self.polish)
         prf_hz, data = 1 / signal.axis("pulse").step, signal.data
         if omega_rad_s is not None:
             data = range_phase(
@@ -272,10 +276,11 @@ def rotating_autofocus(
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
-        ValueError: If the data are empty or not finite, or the start does not have one phase per
-            pulse.
+        ValueError: If the data are empty or not finite, the start does not have one phase per
+            pulse, or a number of iterations is not a whole number of 0 or more.
     """
     pulses = prepare(data, "rotating_autofocus", empty=False)
+    refuse_odd_counts("rotating_autofocus", 0, search=search, polish=polish)
     through = Through(
         MatchedFourierOperator(
             warp_k, pulses.n, prf_hz, dtype=data.dtype, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS)
