@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
 import pytest
 import torch
 
-from tests.helpers import kondor_radar, small_recording
+from tests.helpers import kondor_radar, small_radar, small_recording
 from torchsar.core import Chain, Draws, Recording, Signal, use
 from torchsar.echo import Quantiser, Tone, WideInterferer, simulate
 from torchsar.focus import OmegaK
@@ -292,3 +293,14 @@ def test_a_clean_signal_is_returned_unchanged() -> None:
     signal = Signal(Draws(1).normal("x", (16, 128), torch.complex64), RADAR.raw_axes(16, 128))
     out, estimate = SubtractInterference()(signal)
     assert torch.equal(out.data, signal.data) and out.axes == signal.axes and not bool(estimate["missing"].any())
+
+
+@pytest.mark.parametrize("stage", [SubtractInterference, NotchInterference, DropInterference])
+def test_interference_that_is_not_narrowband_is_not_ok(stage):
+    generator = torch.Generator().manual_seed(1)
+    clean = torch.randn(2, 64, 128, dtype=torch.complex64, generator=generator)
+    n = torch.arange(128, dtype=torch.float64) - 64
+    chirp = 30 * torch.polar(torch.ones_like(n), math.pi * 0.5 * n.square() / 128).to(clean.dtype)
+    hit = torch.rand(64, 1, generator=generator) < 0.3
+    data = torch.stack([clean[0], clean[1] + hit * chirp])
+    assert stage()(Signal(data, small_radar().raw_axes(64, 128)))[1].ok.tolist() == [True, False]

@@ -243,6 +243,16 @@ def _uncorrected(lines: Tensor, level: Level, threshold: float) -> Tensor:
     return left > level.density.sum(-1)
 
 
+def _disturbed(lines: Tensor, reach: int = 8) -> Tensor:
+    """Trials in which lines that stand out among their neighbours hold more power than the rest."""
+    power = lines.abs().to(torch.float64).square().mean(-1)
+    row = torch.arange(power.shape[-1], device=power.device)
+    near = (row[:, None] + torch.arange(-reach, reach + 1, device=power.device)).clamp(0, power.shape[-1] - 1)
+    usual = torch.where(power > 0, power, torch.nan)[..., near].nanmedian(-1).values.nan_to_num(0)
+    excess = torch.where(power > 4 * usual, power - usual, 0)
+    return excess.sum(-1) > (power - excess).sum(-1)
+
+
 def _no_tone(touched: Tensor) -> Tensor:
     """Zero frequency of every line."""
     return torch.zeros(touched.shape, dtype=torch.float64, device=touched.device)
@@ -291,14 +301,16 @@ class _InterferenceCorrection(Stage):
             The corrected signal, and an Estimate with `missing` of shape (..., pulse), bool: lines
             that were missing before, or that this stage could not correct and set to zero.
             `quality` is the share of lines that this stage did not set to zero; `ok` is False where
-            it is below one half, and for data that are all zero. `info` holds, for each trial, the
+            it is below one half, for data that are all zero, and where lines with more than four
+            times the median power of their neighbours hold more power than the rest: interference
+            that is not narrowband, or too short to be found. `info` holds, for each trial, the
             numbers of corrected lines, `lines_touched`, and of contaminated frequency cells,
             `cells_touched`; and for each line whether it was corrected, `touched`, and the
             frequency of its strongest tone, `tone_cycles_per_sample`.
         """
         result = type(self).repair(signal.data, self.threshold)
         quality = 1 - result.missing.to(torch.float64).mean(-1)
-        ok = (quality >= 0.5) & (signal.data != 0).any(-1).any(-1)
+        ok = (quality >= 0.5) & (signal.data != 0).any(-1).any(-1) & ~_disturbed(result.data)
         given_up = result.missing if missing is None else result.missing | missing.bool()
         info = {
             "lines_touched": result.touched.sum(-1),
