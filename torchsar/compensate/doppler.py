@@ -732,8 +732,8 @@ class RangeDependentCentroid(Stage):
             `doppler_range_hz` of every range cell, shape (..., range), and `doppler_baseband_hz` in
             the middle of the swath, shape (...,), in Hz. The latter has a standard deviation, which
             includes the shift by apertures that the ends of the record cut. `ok` is False under the
-            conditions of `reliable_increment`, and where fewer than order + 2.5 range blocks hold
-            most of the energy: one or two targets show no slope over range.
+            conditions of `reliable_increment`, and where fewer than order + 2 range blocks hold
+            most of the energy: one target alone shows no slope over range.
             `info` holds "block_hz" (centroid of each of the b range blocks), shape
             (..., b), and "coefficients_hz" (of the Legendre polynomials), shape (..., order + 1).
 
@@ -756,7 +756,7 @@ class RangeDependentCentroid(Stage):
         energy = products.abs()
         square = energy.square().sum(-1)
         count = energy.sum(-1).square() / torch.where(square > 0, square, 1)
-        ok = reliable_increment(found, middle, scatter, shift) & (count >= self.order + 2.5)
+        ok = reliable_increment(found, middle, scatter, shift) & (count >= self.order + 2)
         middle, std = scale * middle, scale * torch.hypot(scatter, shift)
         curve = scale * coefficients @ legendre(block_centres(signal.data.shape[-1], products.device), self.order).mT
         if doppler_hz is not None:
