@@ -158,11 +158,14 @@ def _mean(x: Tensor, weight: Tensor) -> Tensor:
     return torch.where(weight, x, 0).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp_min(1)
 
 
-def _rms_difference(velocity: Tensor, known: Tensor, order: int) -> Tensor:
-    """Rms first or second difference of velocities (..., pulse) in known periods, (..., 1)."""
+def _rms_difference(velocity: Tensor, known: Tensor, order: int, noise: Tensor) -> Tensor:
+    """Rms first or second difference of velocities (..., pulse) in known periods beyond that of
+    noise with the variance (..., 1); (..., 1).
+    """
     if velocity.shape[-1] <= order:
         return torch.zeros_like(velocity[..., :1])
-    return _mean(velocity.diff(n=order).square(), known.unfold(-1, order + 1, 1).all(-1)).sqrt()
+    square = _mean(velocity.diff(n=order).square(), known.unfold(-1, order + 1, 1).all(-1))
+    return (square - math.comb(2 * order, order) * noise).clamp_min(0).sqrt()
 
 
 def _interpolated(known: Tensor, slope: Tensor, bend: Tensor) -> Tensor:
@@ -262,8 +265,9 @@ def velocity_estimate(
         counted = count * _mean(changes.square() * share, clear) + _EXPECTED * expected.square()[..., None]
         return counted / ((count - 1).clamp_min(0) + _EXPECTED)
 
-    differences = [_rms_difference(measured.detach(), clear, order) for order in (1, 2)]
-    square = filled(variance(spread, expected) / share, clear) + _interpolated(clear, *differences).square()
+    square = filled(variance(spread, expected) / share, clear)
+    differences = [_rms_difference(measured.detach(), clear, order, _mean(square, clear)) for order in (1, 2)]
+    square = square + _interpolated(clear, *differences).square()
     bend = differences[1] * (radar.period_s / pulse.step) ** 2
     square = square + (_mean(jerk * share, clear) * bend).square() + floor_m_s**2
     peaks, shared, echo = _product_peaks(product)
