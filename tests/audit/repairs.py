@@ -84,15 +84,20 @@ def imbalance(
     return draw
 
 
-def jitter(snr_db: float, size: float = 0.1, band: float = 0.77, lines: int = 64) -> Callable[[int, int], Batch]:
-    """Draw clutter sampled with a periodic jitter of four samples."""
+def jitter(
+    snr_db: float, size: float = 0.1, band: float = 0.77, lines: int = 64, converter: bool = True
+) -> Callable[[int, int], Batch]:
+    """Draw clutter sampled with a periodic jitter of four samples, and noise of the converter, or
+    noise that is sampled with the jitter.
+    """
 
     def draw(trials: int, seed: int) -> Batch:
         draws = Draws(seed, trials=range(trials))
         offsets = size * draws.normal("offsets", (4,)).clamp(-2, 2)
         offsets = offsets - offsets.mean(-1, keepdim=True)
-        x = sample_unevenly(speckle(draws, lines, 512, band=band), offsets)
-        x = 10 ** (snr_db / 20) * x + draws.normal("noise", (lines, 512), C128)
+        x = 10 ** (snr_db / 20) * speckle(draws, lines, 512, band=band)
+        noise = draws.normal("noise", (lines, 512), C128)
+        x = sample_unevenly(x, offsets) + noise if converter else sample_unevenly(x + noise, offsets)
         return Batch(signal(cast(x)), {"offset_samples": offsets.repeat(1, 2)})
 
     return draw
@@ -310,6 +315,7 @@ def entries() -> list[Entry]:
                 *none_of((64, 512)),
                 *(World("own", jitter(snr), snr) for snr in SNR_DB),
                 World("small jitter", jitter(20.0, 0.005), 20.0),
+                World("noise with jitter", jitter(10.0, converter=False), 10.0),
                 World("narrow band", jitter(20.0, band=0.2), 20.0),
                 World("one row", jitter(20.0, lines=1), 20.0),
                 World("one tone", one_tone, 20.0),

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.audit.frame import audit, estimators
-from tests.audit.table import OTHER, SAME, covered, entries
+from tests.audit.frame import audit, doubted, estimators, verdict
+from tests.audit.table import LIMITS, OTHER, SAME, covered, entries
 from tests.scripting import script
 
 ENTRIES = entries()
+RECORD = Path(__file__).resolve().parents[2] / "docs" / "sweeps" / "verdict_audit.json"
 
 
 def test_every_estimator_is_in_the_table() -> None:
@@ -21,6 +22,16 @@ def test_every_estimator_is_in_the_table() -> None:
     assert not public - covered(ENTRIES), "estimators without an entry in tests/audit and without a written reason"
     assert not covered(ENTRIES) - public, "entries of estimators that are not public"
     assert set(SAME) <= public and not set(SAME) & set(SAME.values())
+
+
+def test_the_record_is_complete_and_misses_no_bar_without_a_reason() -> None:
+    rows = json.loads(RECORD.read_text(encoding="utf-8"))["rows"]
+    cells = [(row["estimator"], row["world"], row["snr_db"]) for row in rows]
+    assert sorted(cells, key=str) == sorted(((e.name, w.name, w.snr_db) for e in ENTRIES for w in e.worlds), key=str)
+    missed = [*(row for row in rows if verdict(row)), *doubted(rows)]
+    assert {(row["estimator"], row["world"], row["snr_db"]) for row in missed} == {
+        cell for explained in LIMITS.values() for cell in explained
+    }
 
 
 def test_the_script_writes_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

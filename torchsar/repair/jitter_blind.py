@@ -8,11 +8,11 @@ with the power spectrum S, the mean <> over lines and frequencies wrapped to +-1
     <Y(f) Y*(f - k/M)> = 2j pi E_k [(f - k/M) S(f - k/M) - f S(f)].
 
 Each E_k is fitted to this relation over the band by least squares. Then the lines are corrected
-exactly and fitted again, which removes the terms of higher order. The correction gives the noise of
-the converter, which has no jitter, a correlation of its own; it is computed from the noise level
-and subtracted. Where f - k/M is wrapped, the
-bracket jumps; this distinguishes jitter from a periodic gain, whose correlation S(f) + S(f - k/M)
-is fitted along with it. The mean offset (k = 0) cannot be observed.
+exactly and fitted again, which removes the terms of higher order. The converter adds noise that has
+no jitter; to such noise the correction gives a correlation of its own, with which its share of all
+noise is fitted. Noise that reaches the converter has the jitter of the signal. Where f - k/M is
+wrapped, the bracket jumps; this distinguishes jitter from a periodic gain, whose correlation
+S(f) + S(f - k/M) is fitted along with it. The mean offset (k = 0) cannot be observed.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ _MOST_RMS = 0.22
 _NOISE_ERROR = 0.08
 # Least power over its mean that a frequency is given: the ends of a line leak as much.
 _LEAST_POWER = 1e-5
+# Standard deviation of a share that may be anything between 0 and 1.
+_MOST_SHARE = 0.3
 # Share of the standard deviation below which a further fit changes nothing of interest, by choice.
 _SETTLED = 0.1
 # Limits of the factor by which a fitted change is lengthened or shortened, by choice.
@@ -50,11 +52,16 @@ class CyclicFit:
             (..., M - 1), complex.
         variance: Variance of each coefficient in samples^2, shape (..., M - 1).
         noise: Share of the power of the lines that is noise, shape (...,).
+        converter: Share of the noise that the converter adds, fitted to corrected lines, shape
+            (...,).
+        converter_std: Standard deviation of this share, shape (...,); infinite without correction.
     """
 
     coefficient: Tensor
     variance: Tensor
     noise: Tensor
+    converter: Tensor
+    converter_std: Tensor
 
     def significance(self, primitive: bool = False) -> Tensor:
         """Return the chi-squared statistic of the Fourier coefficients of the jitter.
@@ -99,7 +106,7 @@ class CyclicFit:
         return torch.sqrt(self.variance.sum(-1))
 
 
-def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None) -> CyclicFit:
+def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None, converter: Tensor | float = 1.0) -> CyclicFit:
     """Fit the Fourier coefficients of timing jitter to correlations in the range spectrum.
 
     Jitter of period M correlates spectral components that lie k / M cycles per sample apart, with
@@ -111,6 +118,7 @@ def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None) -> Cycli
         period: Period M in samples.
         corrected: Offsets in samples with which the lines were corrected, shape (..., M); lines are
             then a multiple of M long. None: none.
+        converter: Share of the noise that the converter adds, shape (...,) or a number.
 
     Returns:
         Coefficients of the jitter that remains, and their variance.
@@ -124,16 +132,21 @@ def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None) -> Cycli
     power = power / power.mean(-1, keepdim=True).clamp_min(1e-300)
     noise = None if corrected is None else _corrected_noise(corrected, n)
     density = torch.ones_like(power) if noise is None else noise.abs().square().mean(-2)
-    level = noise_floor(power / density)[..., None]
+    floor = noise_floor(power / density)[..., None]
+    share = torch.as_tensor(converter, dtype=torch.float64, device=y.device).expand(floor.shape[:-1])[..., None]
+    level = floor * share
     signal = (power - level * density).clamp_min(0)  # noise of the converter has no jitter
     scale = spectrum.abs().square().mean((-2, -1)).clamp_min(1e-300)
     frequency = torch.fft.fftfreq(n, dtype=torch.float64, device=y.device)
     coefficient, variance = [], []
+    seen, information_seen = torch.zeros_like(level[..., 0]), torch.zeros_like(level[..., 0])
+    scatter_seen = torch.zeros_like(seen)
     for k in range(1, period // 2 + 1):
         step = k * (n // period)
         cross = (spectrum * torch.roll(spectrum, step, -1).conj()).mean(-2) / scale[..., None]
-        if noise is not None:
-            cross = cross - level * (noise * torch.roll(noise, step, -1).conj()).mean(-2)
+        own = None if noise is None else floor * (noise * torch.roll(noise, step, -1).conj()).mean(-2)
+        if own is not None:
+            cross = cross - share * own
         other = torch.roll(power, step, -1)
         slope = 2j * math.pi * (torch.roll(frequency * signal, step, -1) - frequency * signal)
         weight = 1 / (power.clamp_min(_LEAST_POWER) * other.clamp_min(_LEAST_POWER))
@@ -143,14 +156,25 @@ def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None) -> Cycli
         cross = cross - both * ((weight * both * cross).sum(-1, keepdim=True) / scale_both)
         information = (weight * slope.abs().square()).sum(-1).clamp_min(1e-150)
         value = (weight * slope.conj() * cross).sum(-1) / information
-        scatter = (weight * slope).abs() * (cross - slope * value[..., None]).abs()
+        rest = cross - slope * value[..., None]
+        scatter = (weight * slope).abs() * rest.abs()
         coefficient.append(value)
         variance.append(related * scatter.square().sum(-1).clamp_min(1e-300) / information.square())
+        if own is not None:  # the part of the noise's correlation that jitter and gain do not explain
+            own = own - both * ((weight * both * own).sum(-1, keepdim=True) / scale_both)
+            own = own - slope * ((weight * slope.conj() * own).sum(-1) / information)[..., None]
+            seen = seen + (weight * (own.conj() * rest).real).sum(-1)
+            information_seen = information_seen + (weight * own.abs().square()).sum(-1)
+            scatter_seen = scatter_seen + (weight * own.abs() * rest.abs()).square().sum(-1)
     mirrored = [c.conj() for c in reversed(coefficient[: (period - 1) // 2])]
     return CyclicFit(
         torch.stack(coefficient + mirrored, -1),
         torch.stack(variance + list(reversed(variance[: (period - 1) // 2])), -1),
-        (level * density).mean(-1),
+        (floor * density).mean(-1),
+        share[..., 0] + seen / information_seen.clamp_min(1e-150),
+        torch.where(
+            information_seen > 1e-150, (related * scatter_seen).sqrt() / information_seen.clamp_min(1e-150), math.inf
+        ),
     )
 
 
@@ -222,7 +246,7 @@ def _some_lines(y: Tensor, lines: int = 256) -> Tensor:
     return y[..., :: max(1, y.shape[-2] // lines), :]
 
 
-def _hidden(y: Tensor, period: int, offsets: Tensor, max_period: int) -> Tensor:
+def _hidden(y: Tensor, period: int, offsets: Tensor, converter: Tensor, max_period: int) -> Tensor:
     """Largest mean square in samples^2 of jitter that a multiple of the period shows beyond chance
     in lines (trial, pulse, range) after correction of the offsets (trial, period), (trial,).
     """
@@ -231,7 +255,7 @@ def _hidden(y: Tensor, period: int, offsets: Tensor, max_period: int) -> Tensor:
     for p in range(2 * period, max_period + 1, period):
         cut = y[..., : y.shape[-1] - y.shape[-1] % p]
         tiled = offsets.repeat(1, p // period)
-        fit = cyclic_fit(correct_jitter_exact(cut, tiled), p, tiled) if period > 1 else cyclic_fit(cut, p)
+        fit = cyclic_fit(correct_jitter_exact(cut, tiled), p, tiled, converter) if period > 1 else cyclic_fit(cut, p)
         most = torch.maximum(most, fit.excess(period))
     return most
 
@@ -239,9 +263,10 @@ def _hidden(y: Tensor, period: int, offsets: Tensor, max_period: int) -> Tensor:
 def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = None, passes: int = 12) -> Estimate:
     """Estimate the period and the offsets of periodic timing jitter from clutter, without a pilot.
 
-    The signal must fill most of the sampled band, but leave a twentieth of it to noise alone: noise
-    that the converter adds has no jitter, and its power is measured there. A periodic gain that
-    accompanies the jitter is modelled to first order. Not differentiable.
+    The signal must fill most of the sampled band, but leave a twentieth of it to noise alone, where
+    the power of the noise is measured: noise that the converter adds has no jitter, and its share
+    of the noise is estimated. A periodic gain that accompanies the jitter is modelled to first
+    order. Not differentiable.
 
     Args:
         y: Raw or range-compressed lines, shape (..., pulse, range), complex, in any order.
@@ -288,12 +313,16 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
         chosen = (periods == m).nonzero()[:, 0]
         if m == 1:
             total = torch.zeros((len(chosen), 1), dtype=torch.float64, device=y.device)
+            converter = total[:, 0]
             chance, left = cyclic_fit(rows[chosen], longest).std_samples, total[:, 0]
         else:
-            total, chance, left = refine_offsets(rows[chosen], m, passes)
+            total, chance, left, converter = refine_offsets(rows[chosen], m, passes)
         offsets[chosen] = total[..., tiled % m]
-        hidden = 0 if period else _hidden(rows[chosen], m, total, max_period)
-        std[chosen] = (chance.square() + left.square() + hidden).sqrt()[..., None].expand(-1, longest)
+        hidden = left.square() * 0 if period else _hidden(rows[chosen], m, total, converter, max_period)
+        chance = chance.square()
+        # offsets of zero err by the jitter alone
+        square = torch.maximum(chance, hidden) if m == 1 else chance + left.square() + hidden
+        std[chosen] = square.sqrt()[..., None].expand(-1, longest)
     ok = (
         ok
         & (std[:, 0] < _MOST_STD)
@@ -319,7 +348,7 @@ def _signal_share(y: Tensor) -> Tensor:
     return 1 - noise_floor(power) / power.mean(-1).clamp_min(1e-300)
 
 
-def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor, Tensor]:
+def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Fit the timing offsets, correct the recording with them, and fit what remains, repeatedly.
 
     Args:
@@ -329,8 +358,8 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor,
 
     Returns:
         The total offsets in samples, shape (trial, M), the standard deviation that chance and the
-        error of the noise level give them, shape (trial,), and the rms of their last change, shape
-        (trial,).
+        unknown share of the converter in the noise give them, the rms of their last change, and the
+        share of the converter in the noise, shape (trial,) each.
 
     The changes are scaled by the factor of Irons and Tuck (1969), since large jitter makes the
     first-order fit too long or too short.
@@ -338,10 +367,12 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor,
     y = y[..., : y.shape[-1] - y.shape[-1] % period]
     total, change = (torch.zeros((y.shape[0], period), dtype=torch.float64, device=y.device) for _ in range(2))
     factor, std = torch.ones_like(total[:, 0]), torch.zeros_like(total[:, 0])
+    converter = torch.ones_like(std)
     active = torch.arange(y.shape[0], device=y.device)
     for i in range(passes):
         at, before = total[active], change[active]
-        fit = cyclic_fit(correct_jitter_exact(y[active], at), period, at) if i else cyclic_fit(y, period)
+        given = (correct_jitter_exact(y[active], at), period, at, converter[active]) if i else (y, period)
+        fit = cyclic_fit(*given)
         step = fit.offset_samples
         if i:
             turned = before - step
@@ -349,12 +380,14 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor,
             factor[active] = factor[active].clamp(_SHORTEST, _LONGEST)
         moved = at + factor[active, None] * step.clamp(-0.4, 0.4)
         total[active] = torch.where((smallest_gap(moved) >= 2 * MIN_GAP)[:, None], moved, at)
-        level = _NOISE_ERROR * fit.noise / (1 - fit.noise).clamp_min(0.1) * total[active].square().mean(-1).sqrt()
+        converter[active] = torch.where(fit.converter_std < _MOST_SHARE, fit.converter.clamp(0, 1), converter[active])
+        unknown = torch.hypot(fit.converter_std.clamp_max(_MOST_SHARE), torch.full_like(factor[active], _NOISE_ERROR))
+        level = unknown * fit.noise / (1 - fit.noise).clamp_min(0.1) * total[active].square().mean(-1).sqrt()
         std[active], change[active] = torch.hypot(fit.std_samples, level), step
         active = active[step.square().mean(-1).sqrt() > _SETTLED * fit.std_samples]
         if not len(active):
             break
-    return total, std, change.square().mean(-1).sqrt()
+    return total, std, change.square().mean(-1).sqrt(), converter
 
 
 class BlindJitter(Stage):

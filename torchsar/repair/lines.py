@@ -204,14 +204,16 @@ def line_integrity(
     offset = number - (row - repeated.cumsum(-1))
     trusted = trusted_numbers(offset, single, longest_gap)
     before, after = _nearest(offset, trusted)
-    placeable = trusted | (single & (before == after) & (_enclosed(trusted) | ~_lossy(offset, trusted)))
-    verified = torch.where(placeable, number - offset + torch.where(trusted, offset, before), PADDING)
+    fits = trusted | (single & (before == after))
+    verified = torch.where(fits, number - offset + torch.where(trusted, offset, before), PADDING)
     share = trusted.sum(-1) / single.sum(-1).clamp_min(1)
     ok = share >= 0.5
     _check_consistency(ok, trusted, single)
     verified = torch.where(ok[..., None], verified, torch.where(present, row, PADDING))
     # row 0 is the first received line, whether its own number is right or wrong
     origin = _first(verified) if first_number is None else torch.full_like(verified[..., 0], first_number)
+    outside = ok[..., None] & ~_enclosed(trusted) & _lossy(offset, trusted)
+    verified = torch.where(outside, PADDING, verified)
     slot = verified - origin[..., None]
     rows = n_lines if n_lines is not None else _rows(slot, verified, n)
     inside = (verified != PADDING) & (slot >= 0) & (slot < rows)
