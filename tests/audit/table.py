@@ -62,6 +62,36 @@ OTHER = {
     "multichannel.multichannel_limits": _LIMIT,
 }
 
+# Cells of the recorded audit that miss a bar, as (estimator, world, SNR), by the reason.
+LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
+    "no more than chance beside the bar": [
+        ("compensate.DopplerCentroid:fast", "own", -10.0),
+        ("compensate.PointDoppler", "own", -20.0),
+        ("multichannel.GradientVelocity", "two points", 10.0),
+    ],
+    "three targets that the ends of the record cut do not determine a line over range": [
+        ("compensate.RangeDependentCentroid", "few points", 10.0),
+    ],
+    "the deviation is that of speckle, up to twice the error of separate points, which is 0.02 cell": [
+        *(("compensate.align_running", "direct", snr_db) for snr_db in (0.0, 10.0, 20.0, 40.0, 60.0)),
+        ("compensate.align_running", "far", 10.0),
+        *(("compensate.align_mean", "direct", snr_db) for snr_db in (40.0, 60.0)),
+        *(("compensate.align_envelopes:single", "direct", snr_db) for snr_db in (40.0, 60.0)),
+    ],
+    "shifts are judged by the autofocus alone, which does not see them": [
+        *(("compensate.refine_alignment", "direct", snr_db) for snr_db in (10.0, 20.0)),
+    ],
+    "for homogeneous scenes: `ok` is False where a sparse description is more likely": [
+        *(("compensate.LinkPhases", "own", snr_db) for snr_db in (20.0, 60.0)),
+    ],
+    "a second point of the same Doppler is taken for clutter": [
+        ("multichannel.MovingPointVelocity", "two points", 10.0),
+    ],
+    "at the threshold the curvature of the ratio is noisy": [
+        ("multichannel.SignalIntensityRatio", "own", 10.0),
+    ],
+}
+
 
 def entries() -> list[Entry]:
     """All entries of the audit."""
