@@ -371,8 +371,8 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor,
     active = torch.arange(y.shape[0], device=y.device)
     for i in range(passes):
         at, before = total[active], change[active]
-        given = (correct_jitter_exact(y[active], at), period, at, converter[active]) if i else (y, period)
-        fit = cyclic_fit(*given)
+        corrected = correct_jitter_exact(y[active], at) if i else y
+        fit = cyclic_fit(corrected, period, at if i else None, converter[active])
         step = fit.offset_samples
         if i:
             turned = before - step
