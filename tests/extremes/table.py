@@ -156,6 +156,16 @@ def waves(n_pulse: int, n: int) -> FarField:
     return FarField.turntable(9.3e9 + 8e6 * torch.arange(n, dtype=F64), torch.linspace(0.2, 0.35, n_pulse, dtype=F64))
 
 
+@lru_cache(None)
+def tile_plan(n_pulse: int, n: int) -> focus.TilePlan:
+    """A plan of a few pixels for pulses from a straight path."""
+    x = torch.linspace(-50, 50, n_pulse, dtype=F64)
+    place = torch.stack([x, torch.full_like(x, -900.0), torch.full_like(x, 500.0)], -1)
+    grid = focus.ImageGrid(torch.zeros(3), torch.eye(3)[:2], (5, 4), 0.5)
+    frequency_hz = 9.3e9 + 4e6 * torch.arange(n, dtype=F64)
+    return focus.TilePlan(frequency_hz, place, None, 2 * torch.linalg.vector_norm(place, dim=-1), grid)
+
+
 def size(x: Tensor) -> Tensor:
     """Modulus; of bool, which has none, the values themselves."""
     return x if x.dtype == torch.bool else x.abs()
@@ -594,6 +604,7 @@ FUNCTIONS = [
         "raw",
         lambda x: focus.backproject_spotlight(x, waves(*x.shape[-2:]), ramp(5, 1.0), ramp(5, 1.0)),
     ),
+    _entry("focus.image_tiles", "raw", lambda x: tile_plan(*x.shape[-2:]).image(x)),
     _entry("focus.omega_k", "raw", lambda x: focus.omega_k(x, RADAR, **DOPPLER)),
     _entry("focus.omega_k_stolt", "raw", lambda x: focus.omega_k_stolt(x, RADAR, **DOPPLER)),
     _entry("focus.range_doppler", "raw", lambda x: focus.range_doppler(x, RADAR, **DOPPLER)),

@@ -6,6 +6,7 @@ from torchsar.focus.coordinates import ClosestRange, PaddedLines, closest_range
 from torchsar.focus.dechirped import AzimuthTransform, CompressDechirped, azimuth_transform, compress_dechirped
 from torchsar.focus.defocus import InvertibleOmegaK, defocus_omega_k
 from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, quicklook_looks, to_db
+from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.image_lines import CrossRangeLines, DopplerLines, cross_range_of, lines_for, mean_rate
 from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
@@ -26,6 +27,7 @@ from torchsar.focus.spotlight import GroundGrid, SpotlightBackprojection, backpr
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
 from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
 from torchsar.focus.target import TargetImage
+from torchsar.focus.tiles import TilePlan, image_tiles
 from torchsar.focus.transforms import CompiledNufft, ExplicitSum, Gridding, Resampling
 from torchsar.focus.triangular import (
     AzimuthMatchedFilter,
@@ -54,6 +56,7 @@ __all__ = [
     "ExplicitSum",
     "Gridding",
     "GroundGrid",
+    "ImageGrid",
     "Integration",
     "InvertibleOmegaK",
     "Limit",
@@ -75,6 +78,7 @@ __all__ = [
     "StoredOmegaK",
     "StripPlan",
     "TargetImage",
+    "TilePlan",
     "amplitude",
     "azimuth_matched_filter",
     "azimuth_transform",
@@ -89,6 +93,7 @@ __all__ = [
     "deramp_azimuth",
     "flat_reference",
     "focus_strip",
+    "image_tiles",
     "inverse_requirements",
     "keystone",
     "ladar_limits",

@@ -1,0 +1,279 @@
+"""Images by tiles against the direct sum, over random geometries, with gradients and batches."""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsar.focus import ImageGrid, TilePlan
+
+C, F64, C128 = 299792458.0, torch.float64, torch.complex128
+
+
+@dataclass(frozen=True)
+class Case:
+    """A geometry and a history of white noise."""
+
+    frequency_hz: Tensor
+    transmitter_m: Tensor
+    receiver_m: Tensor | None
+    reference_m: Tensor
+    grid: ImageGrid
+    history: Tensor
+
+    def plan(self, error_db: float = -70.0) -> TilePlan:
+        return TilePlan(self.frequency_hz, self.transmitter_m, self.receiver_m, self.reference_m, self.grid, error_db)
+
+    def direct(self, pixels_m: Tensor) -> Tensor:
+        """The sum over all samples at pixels (pixel, 3), by its definition."""
+        receiver = self.transmitter_m if self.receiver_m is None else self.receiver_m
+        path = sum(
+            torch.linalg.vector_norm(pixels_m[:, None] - place, dim=-1) for place in (self.transmitter_m, receiver)
+        )
+        turns = (path - self.reference_m)[..., None] * self.frequency_hz / C
+        return (self.history.to(C128) * torch.exp(2j * math.pi * (turns - turns.detach().round()))).sum((-2, -1))
+
+    def error_db(self, image: Tensor, pixels: int = 60) -> float:
+        """Rms error of an image at random pixels, relative to their rms, in dB."""
+        source = torch.Generator().manual_seed(1)
+        i, j = (torch.randint(0, n, (pixels,), generator=source) for n in self.grid.counts)
+        truth = self.direct(self.grid.pixels_m()[i, j])
+        return 10 * math.log10(float((image[i, j] - truth).abs().square().mean() / truth.abs().square().mean()))
+
+
+def case(seed: int) -> Case:
+    """Draw range, aperture, bandwidth, squint, path, receiver and grid."""
+    draw, source = random.Random(seed), torch.Generator().manual_seed(seed)
+
+    def log(low: float, high: float) -> float:
+        return math.exp(draw.uniform(math.log(low), math.log(high)))
+
+    range_m, aperture, carrier = log(200, 700e3), math.radians(log(1, 20)), log(1e9, 35e9)
+    bandwidth, squint, grazing = carrier * log(0.01, 0.4), math.radians(draw.uniform(0, 45)), draw.uniform(0.26, 1.05)
+    pulses, frequencies = draw.randrange(64, 200), draw.randrange(64, 200)
+    counts = draw.randrange(20, 120), draw.randrange(20, 120)
+    cells = C / 2 / bandwidth / math.cos(grazing), C / carrier / (2 * aperture)
+    step = draw.uniform(0.4, 1.0) * draw.choice([min(cells), max(cells)])
+    step = min(step, 0.5 * range_m / max(counts), 0.45 * C * frequencies / (2 * bandwidth) / max(counts))
+    angle = (torch.arange(pulses, dtype=F64) / pulses - 0.5) * aperture
+    ground = range_m * math.cos(grazing)
+    x, y = ground * torch.sin(angle), -ground * torch.cos(angle)
+    if draw.random() < 0.5:
+        x, y = range_m * torch.tan(angle), torch.full_like(angle, -ground)
+    place = torch.stack([x, y, torch.full_like(x, range_m * math.sin(grazing))], -1)
+    cos, sin = math.cos(squint), math.sin(squint)
+    place = place @ torch.tensor([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]], dtype=F64)
+    kind, scale = draw.choice(["straight", "sway", "rough"]), min(1.0, range_m / 2000)
+    if kind == "sway":
+        turns, start = 4 * torch.rand(3, generator=source, dtype=F64), torch.rand(3, generator=source, dtype=F64)
+        time = torch.linspace(0, 1, pulses, dtype=F64)[:, None]
+        place = place + draw.uniform(0.1, 3) * scale * torch.sin(2 * math.pi * (time * turns + start))
+    if kind == "rough":
+        place = place + log(0.003, 0.3) * scale * torch.randn(pulses, 3, generator=source, dtype=F64)
+    transmitter, receiver = place, None
+    radar = draw.choice(["one antenna", "fixed transmitter", "two in motion"])
+    if radar == "fixed transmitter":
+        fixed = [draw.uniform(-1, 1), -draw.uniform(0.3, 1.5), draw.uniform(0.1, 1)]
+        transmitter, receiver = range_m * torch.tensor(fixed, dtype=F64).expand(pulses, 3), place
+    if radar == "two in motion":
+        offset = [draw.uniform(-0.3, 0.3), -draw.uniform(0, 0.3), draw.uniform(0, 0.3)]
+        receiver = place + range_m * torch.tensor(offset, dtype=F64)
+    ends = (transmitter, place if receiver is None else receiver)
+    centre = torch.tensor([-(counts[0] - 1) / 2 * step, -(counts[1] - 1) / 2 * step, 0.0], dtype=F64)
+    return Case(
+        carrier + (torch.arange(frequencies, dtype=F64) - frequencies // 2) * (bandwidth / frequencies),
+        transmitter,
+        receiver,
+        torch.stack([torch.linalg.vector_norm(end, dim=-1) for end in ends]).sum(0),
+        ImageGrid(centre, torch.eye(3, dtype=F64)[:2], counts, step),
+        torch.randn(pulses, frequencies, generator=source, dtype=C128),
+    )
+
+
+@pytest.mark.parametrize("seed", range(1000, 1016))
+def test_the_promised_error_holds_in_any_geometry(seed: int) -> None:
+    drawn, wanted = case(seed), (-50.0, -70.0, -90.0)[seed % 3]
+    try:
+        plan = drawn.plan(wanted)
+    except ValueError as refusal:
+        assert "tiles reach" in str(refusal)
+        return
+    assert plan.choice.error_db <= wanted
+    assert drawn.error_db(plan.image(drawn.history)) < wanted + 3
+    assert drawn.error_db(plan.image(drawn.history.to(torch.complex64))) < wanted + 3
+
+
+def test_most_geometries_are_accepted() -> None:
+    def refused(seed: int) -> bool:
+        try:
+            case(seed).plan(-60.0)
+        except ValueError:
+            return True
+        return False
+
+    assert sum(map(refused, range(1100, 1112))) <= 1
+
+
+def test_a_point_has_the_number_of_samples_as_peak_and_phase_zero() -> None:
+    drawn = case(1003)
+    at = drawn.grid.pixels_m()[7, 11]
+    receiver = drawn.transmitter_m if drawn.receiver_m is None else drawn.receiver_m
+    path = sum(torch.linalg.vector_norm(place - at, dim=-1) for place in (drawn.transmitter_m, receiver))
+    turns = (path - drawn.reference_m)[:, None] * drawn.frequency_hz / C
+    echo = torch.exp(-2j * math.pi * (turns - turns.round()))
+    assert abs(complex(drawn.plan().image(echo)[7, 11]) / echo.numel() - 1) < 1e-3
+
+
+def test_the_example_of_the_readme_finds_its_target(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (Path(__file__).resolve().parents[2] / "README.md").read_text(encoding="utf-8")
+    block = next(b for b in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "TilePlan" in b)
+    exec(compile(block, "README.md", "exec"), {})
+    found = re.match(r"\((\d+), (\d+)\) tensor\((\d\.\d+)", capsys.readouterr().out)
+    assert found and found.groups()[:2] == ("94", "56") and abs(float(found[3]) - 1) < 1e-3
+
+
+def test_trials_share_a_path_or_have_their_own() -> None:
+    drawn = case(1004)
+    plan, histories = drawn.plan(), torch.stack([drawn.history, drawn.history.flip(0).conj(), 2j * drawn.history])
+    together = plan.image(histories.view(3, 1, *drawn.history.shape))
+    assert together.shape == (3, 1, *drawn.grid.counts)
+    scale = float(together.abs().max())
+    for one, history in zip(together[:, 0], histories, strict=True):
+        torch.testing.assert_close(one, plan.image(history), rtol=0, atol=1e-12 * scale)
+    moved = drawn.transmitter_m + 0.01 * torch.randn(3, *drawn.transmitter_m.shape, dtype=F64)
+    own = replace(drawn, transmitter_m=moved).plan().image(histories)
+    for one, path, history in zip(own, moved, histories, strict=True):
+        assert replace(drawn, transmitter_m=path, history=history).error_db(one) < -67
+
+
+def test_several_threads_and_a_second_image_give_the_same() -> None:
+    drawn, threads = case(1006), torch.get_num_threads()
+    plan = drawn.plan(-90.0)
+    first = plan.image(drawn.history)
+    try:
+        torch.set_num_threads(2)
+        assert torch.equal(first, plan.image(drawn.history))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_the_axis_of_the_range_may_be_the_first() -> None:
+    drawn = case(1005)
+    grid = drawn.grid
+    turned = replace(drawn, grid=replace(grid, axes=grid.axes.flip(0), counts=grid.counts[::-1]))
+    image = turned.plan().image(drawn.history)
+    assert turned.error_db(image) < -67
+    assert drawn.error_db(image.mT) < -67
+
+
+def test_gradients_are_those_of_the_direct_sum() -> None:
+    drawn = case(1007)
+    i, j = (torch.arange(0, n, 3) for n in drawn.grid.counts)
+    pixels = drawn.grid.pixels_m()[i][:, j].reshape(-1, 3)
+    weight = torch.randn(len(pixels), dtype=C128)
+    found = []
+    for tiles in (True, False):
+        given = {
+            "transmitter_m": drawn.transmitter_m.clone().requires_grad_(),
+            "reference_m": drawn.reference_m.clone().requires_grad_(),
+            "history": drawn.history.clone().requires_grad_(),
+        }
+        tried = replace(drawn, **given)
+        image = tried.plan().image(tried.history)[i][:, j].flatten() if tiles else tried.direct(pixels)
+        cost = (image * weight).real.sum() + image.abs().square().mean()
+        found.append(torch.autograd.grad(cost, list(given.values())))
+    for ours, truth in zip(*found, strict=True):
+        assert float((ours - truth).norm() / truth.norm()) < 1e-3
+
+
+def test_gradcheck_in_history_and_positions() -> None:
+    drawn = case(1008)
+    few = replace(
+        drawn,
+        transmitter_m=drawn.transmitter_m[:6],
+        receiver_m=None,
+        reference_m=2 * torch.linalg.vector_norm(drawn.transmitter_m[:6], dim=-1),
+        frequency_hz=drawn.frequency_hz[:7],
+        history=drawn.history[:6, :7],
+        grid=replace(drawn.grid, counts=(4, 3)),
+    )
+    k = 2 * math.pi * float(few.frequency_hz.mean()) / C  # positions in radians
+
+    def image(history: Tensor, shift: Tensor) -> Tensor:
+        return plan.moved(few.transmitter_m + shift / k, None, few.reference_m).image(history)
+
+    plan = few.plan(-60.0)
+    inputs = few.history.clone().requires_grad_(), torch.zeros(6, 3, dtype=F64, requires_grad=True)
+    assert torch.autograd.gradcheck(image, inputs, eps=1e-3, rtol=1e-4, atol=1e-4)
+
+
+def test_a_plan_moves_with_its_path() -> None:
+    drawn = case(1009)
+    plan, far = drawn.plan(), torch.tensor([0.1 * float(drawn.reference_m.mean()), 0.0, 0.0], dtype=F64)
+    for shift in (0.01 * torch.randn(len(drawn.transmitter_m), 3, dtype=F64), far):
+        moved = replace(drawn, transmitter_m=drawn.transmitter_m + shift)
+        image = plan.moved(moved.transmitter_m, moved.receiver_m, moved.reference_m).image(moved.history)
+        assert moved.error_db(image) < -67
+    assert drawn.error_db(plan.image(drawn.history)) < -67
+
+
+def test_an_error_that_tiles_do_not_reach_is_refused_with_the_figure() -> None:
+    drawn = case(1001)
+    near = replace(drawn, grid=replace(drawn.grid, step_m=float(drawn.reference_m.mean())))
+    with pytest.raises(ValueError, match=r"tiles reach .* wanted were -70 dB.*direct sum"):
+        near.plan()
+    with pytest.raises(ValueError, match="error_db"):
+        drawn.plan(-300.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "text"),
+    [
+        ({"transmitter_m": torch.zeros(5, 3)}, TypeError, "transmitter_m must be a float64 tensor"),
+        ({"frequency_hz": torch.tensor([1e9, 2e9, 4e9], dtype=F64)}, ValueError, "equal steps"),
+        ({"transmitter_m": torch.zeros(5, 3, dtype=F64)}, ValueError, "positions of shape"),
+        ({"reference_m": torch.full((3,), math.nan, dtype=F64)}, ValueError, "NaN"),
+    ],
+)
+def test_geometries_that_make_no_sense_are_refused(change: dict, error: type, text: str) -> None:
+    with pytest.raises(error, match=text):
+        replace(case(1002), **change).plan()
+
+
+def test_histories_of_another_size_or_type_are_refused() -> None:
+    drawn = case(1002)
+    plan = drawn.plan(-50.0)
+    with pytest.raises(ValueError, match="the plan was made for histories of"):
+        plan.image(drawn.history[:, 1:])
+    with pytest.raises(TypeError):
+        plan.image(drawn.history.real)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"origin_m": torch.zeros(2)},
+        {"axes": torch.ones(2, 3)},
+        {"counts": (0, 3)},
+        {"step_m": 0.0},
+        {"step_m": math.nan},
+    ],
+)
+def test_grids_that_make_no_sense_are_refused(change: dict) -> None:
+    with pytest.raises(ValueError, match="image grid|pixel spacing"):
+        replace(ImageGrid(torch.zeros(3), torch.eye(3)[:2], (2, 3), 1.0), **change)
+
+
+def test_pixels_of_a_grid() -> None:
+    grid = ImageGrid(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]), (3, 4), 0.5)
+    pixels = grid.pixels_m()
+    assert pixels.shape == (3, 4, 3) and pixels.dtype == F64
+    assert pixels[2, 3].tolist() == [2.5, 3.0, 3.0]
+    assert torch.equal(grid.pixels_m(slice(1, 2), slice(0, 2)), pixels[1:2, 0:2])

@@ -1,0 +1,69 @@
+"""Grid of the pixels of an image in space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+# two axes count as perpendicular unit vectors within this deviation of their products
+_UNIT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ImageGrid:
+    """Pixels of a plane in local Cartesian coordinates.
+
+    Pixel (i, j) lies at origin_m + step_m (i axes[0] + j axes[1]).
+
+    Args:
+        origin_m: Position of pixel (0, 0) in metres, float64 (3,).
+        axes: Unit vectors along which the first and the second index grow, perpendicular to each
+            other, float64 (2, 3).
+        counts: Number of pixels along either axis.
+        step_m: Pixel spacing in metres.
+
+    Raises:
+        ValueError: If a shape is wrong, the axes are not perpendicular unit vectors, a count is
+            below 1, or the spacing is not positive and finite.
+    """
+
+    origin_m: Tensor
+    axes: Tensor
+    counts: tuple[int, int]
+    step_m: float
+
+    def __post_init__(self) -> None:
+        origin, axes = (torch.as_tensor(v, dtype=torch.float64) for v in (self.origin_m, self.axes))
+        if origin.shape != (3,) or axes.shape != (2, 3) or not bool(torch.isfinite(origin).all()):
+            raise ValueError(
+                "an image grid needs a finite origin_m of shape (3,) and axes of shape (2, 3), got "
+                f"{tuple(origin.shape)} and {tuple(axes.shape)}"
+            )
+        products = axes @ axes.mT
+        if not float((products - torch.eye(2, dtype=torch.float64, device=axes.device)).abs().max()) <= _UNIT:
+            raise ValueError(
+                "the axes of an image grid must be perpendicular unit vectors, got products of "
+                f"{[[round(v, 6) for v in row] for row in products.tolist()]}; divide them by their lengths"
+            )
+        counts = tuple(self.counts)
+        if len(counts) != 2 or not all(isinstance(n, int) and n >= 1 for n in counts):
+            raise ValueError(f"an image grid needs two counts of at least 1 pixel, got {self.counts}")
+        if not 0 < float(self.step_m) < float("inf"):
+            raise ValueError(f"the pixel spacing step_m must be positive and finite, got {self.step_m} m")
+        for name, value in {"origin_m": origin, "axes": axes, "counts": counts, "step_m": float(self.step_m)}.items():
+            object.__setattr__(self, name, value)
+
+    def pixels_m(self, rows: slice = slice(None), columns: slice = slice(None)) -> Tensor:
+        """Return positions of pixels in metres, float64 (i, j, 3).
+
+        Args:
+            rows: Pixels along the first axis.
+            columns: Pixels along the second axis.
+        """
+        i, j = (
+            torch.arange(n, dtype=torch.float64, device=self.origin_m.device)[part, None]
+            for n, part in zip(self.counts, (rows, columns), strict=True)
+        )
+        return self.origin_m + self.step_m * ((i * self.axes[0])[:, None] + j * self.axes[1])

@@ -1,0 +1,330 @@
+"""Choice of the cheapest tile, sub-apertures, kernel and window that meet a wanted error."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.focus.image_grid import ImageGrid
+from torchsar.focus.nufft import smooth_length
+from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
+from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, kernel_error, rise_for, taps_for, window_error
+
+# sizes that are tried
+_WIDTHS = (16, 32, 64, 128)
+_DEPTHS = (8, 16, 32, 64, 128)
+_RANGE_OVERSAMPLING = (1.25, 1.5, 2.0, 3.0)
+# tiles that share one expansion
+TILES_OF_ZONE = 256
+# pulses that one product of the spreading joins
+CHUNK = 64
+# most error of the kernel and of the window, as shares of the whole
+_SHARE = 0.4
+# smallest error that is offered, where the rounding of complex64 begins
+_LEAST_DB = -140.0
+# an expansion gains at most this from halving a size or doubling the sub-apertures, by its order
+_MOST_GAIN_DB = 24.0
+_FIT_PULSES, _JUDGED_PULSES = 24, 16
+# time of the operations in ns, measured on one core: per sample of a window and of a spectrum, per
+# flop of a product, per element of the expansion
+_NS_WINDOW, _NS_SPECTRUM, _NS_FLOP, _NS_ELEMENT = 2.8, 4.0, 0.027, 0.8
+# |eps| of all pulses over the largest that is sampled
+_MARGIN = 1.1
+# pulses of which the extent of s is found, and least pulses of a sub-aperture
+_SPAN_PULSES, _LEAST_PULSES = 512, 8
+# longest window that is tried, in samples
+_LONGEST = 4096
+# what the cost assumes: oversampling of the profiles, and depth of a tile in resolution cells
+_USUAL_OVERSAMPLING, _CELLS = 1.5, 24
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Sizes of a tile plan.
+
+    Args:
+        width: Pixels of a tile across the range.
+        depth: Pixels of a tile along the range.
+        parts: Number of sub-apertures.
+        order: Highest power of the range coordinate in the expansion, 1 or 2.
+        taps: Width of the kernel over cross range in nodes.
+        rise: Samples of either slope of the window over range.
+        oversampling: Fineness of the range profiles relative to the resolution.
+        error_db: Predicted error relative to the image of white noise in dB.
+    """
+
+    width: int
+    depth: int
+    parts: int
+    order: int
+    taps: int
+    rise: int
+    oversampling: float
+    error_db: float
+
+
+def even_length(n: float) -> int:
+    """Return the least even FFT length of at least n without prime factors above 5.
+
+    Args:
+        n: Least length, at least 1.
+
+    Returns:
+        Length.
+    """
+    return 2 * smooth_length(math.ceil(n / 2))
+
+
+def profile_length(n: int, oversampling: float) -> int:
+    """Return the length of a range profile.
+
+    Args:
+        n: Number of frequencies.
+        oversampling: Least number of samples per frequency.
+
+    Returns:
+        Number of samples.
+    """
+    return smooth_length(math.ceil(n * oversampling))
+
+
+def part_bounds(pulses: int, parts: int) -> list[tuple[int, int]]:
+    """Divide pulses into sub-apertures.
+
+    Args:
+        pulses: Number of pulses.
+        parts: Number of sub-apertures.
+
+    Returns:
+        First pulse of each sub-aperture and the pulse after its last.
+    """
+    return [(k * pulses // parts, (k + 1) * pulses // parts) for k in range(parts)]
+
+
+def zones(counts: tuple[int, int], width: int, depth: int) -> list[tuple[slice, slice]]:
+    """Divide the tiles of an image into zones of about the same extent along both axes.
+
+    Args:
+        counts: Pixels of the image along either axis.
+        width: Pixels of a tile along the first axis.
+        depth: Pixels of a tile along the second axis.
+
+    Returns:
+        Slices of the tile numbers along either axis.
+    """
+    tiles = (-(-counts[0] // width), -(-counts[1] // depth))
+    total = math.sqrt(TILES_OF_ZONE * width * depth)
+    steps = [max(1, min(n, round(total / size))) for n, size in zip(tiles, (width, depth), strict=True)]
+    return [
+        (slice(i, min(i + steps[0], tiles[0])), slice(j, min(j + steps[1], tiles[1])))
+        for i in range(0, tiles[0], steps[0])
+        for j in range(0, tiles[1], steps[1])
+    ]
+
+
+def tile_centres(grid: ImageGrid, width: int, depth: int, rows: Tensor, columns: Tensor) -> Tensor:
+    """Compute the centres of tiles.
+
+    Args:
+        grid: Pixels of the image.
+        width: Pixels of a tile along the first axis.
+        depth: Pixels of a tile along the second axis.
+        rows: Numbers of the tiles along the first axis, (i,).
+        columns: Numbers of the tiles along the second axis, (j,).
+
+    Returns:
+        Positions in metres, float64 (i * j, 3).
+    """
+    x = (rows.to(torch.float64) * width + (width - 1) / 2) * grid.step_m
+    y = (columns.to(torch.float64) * depth + (depth - 1) / 2) * grid.step_m
+    return (grid.origin_m + (x[:, None] * grid.axes[0])[:, None] + y[:, None] * grid.axes[1]).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Geometry for which sizes are chosen.
+
+    Args:
+        frequency_hz: Frequencies, float64 (frequency,).
+        speed_m_s: Propagation speed in m/s.
+        places: Nominal positions of one or two antennas, each float64 (pulse, 3).
+        judged: Positions of all trials, each float64 (trial, pulse, 3).
+        grid: Pixels, with the second axis nearer to the range direction.
+    """
+
+    frequency_hz: Tensor
+    speed_m_s: float
+    places: Sequence[Tensor]
+    judged: Sequence[Tensor]
+    grid: ImageGrid
+
+    @property
+    def waves(self) -> tuple[float, float, float]:
+        """Wave numbers in rad/m: lowest, of the carrier (sample n // 2), highest."""
+        f = self.frequency_hz * (2 * math.pi / self.speed_m_s)
+        return float(f[0]), float(f[len(f) // 2]), float(f[-1])
+
+    def expansion_error(self, width: int, depth: int, parts: int, order: int) -> tuple[float, float]:
+        """Rms error of the expansion relative to 1, and the largest |eps|, over a sample of zones
+        and sub-apertures.
+        """
+        every = zones(self.grid.counts, width, depth)
+        bounds = part_bounds(len(self.places[0]), parts)
+        x, y = (_gauss(size, self.grid) for size in (width, depth))
+        low, carrier, high = self.waves
+        wave = (low + high) / 2 + (high - low) / 2 * _GAUSS.to(x)
+        squares, stretches = [], []
+        for zone, (first, last) in itertools.product(_ends(every), _ends(bounds)):
+            rows, columns = (_gauss_numbers(s.start, s.stop).to(x.device) for s in zone)
+            centre = tile_centres(self.grid, width, depth, rows, columns)
+            middle, fitted = (first + last) // 2, _sampled(first, last, _FIT_PULSES)
+            expansion = Expansion.of(
+                [v[fitted] for v in self.places],
+                [v[middle, None] for v in self.places],
+                centre,
+                self.grid.axes,
+                carrier,
+            )
+            judged = _between(first, last, _JUDGED_PULSES)
+            places = [v[:: max(1, len(v) // 2)][:, judged].flatten(0, 1) for v in self.judged]
+            error = expansion.error(places, wave, x, y, order)
+            squares.append(float(error.abs().square().mean()))
+            stretches.append(float((slopes(places, centre, self.grid.axes)[2] / expansion.b - 1).abs().max()))
+        return math.sqrt(sum(squares) / len(squares)), max(stretches)
+
+
+# nodes of the Gauss-Legendre rule of three points
+_GAUSS = torch.tensor([-math.sqrt(0.6), 0.0, math.sqrt(0.6)], dtype=torch.float64)
+
+
+def _gauss(size: int, grid: ImageGrid) -> Tensor:
+    """Three positions in a tile, whose mean square is close to that of all."""
+    return (_GAUSS * (size * grid.step_m / 2)).to(grid.origin_m.device)
+
+
+def _ends(items: Sequence) -> list:
+    """First, middle and last item, each once."""
+    return [items[i] for i in sorted({0, len(items) // 2, len(items) - 1})]
+
+
+def _sampled(first: int, last: int, n: int) -> Tensor:
+    """At most n whole numbers of first..last - 1, with both ends."""
+    return torch.linspace(first, last - 1, min(n, last - first), dtype=torch.float64).round().long()
+
+
+def _gauss_numbers(first: int, last: int) -> Tensor:
+    """Up to three whole numbers of first..last - 1, whose mean square is close to that of all."""
+    at = (first + last - 1) / 2 + _GAUSS * ((last - first) / 2)
+    return at.round().long().clamp(first, last - 1).unique()
+
+
+def _between(first: int, last: int, n: int) -> Tensor:
+    """At most n whole numbers of first..last - 1, at irregular places."""
+    at = torch.remainder(torch.arange(min(n, last - first), dtype=torch.float64) * 0.6180339887 + 0.31, 1)
+    return (first + at * (last - first)).long()
+
+
+def choose(scene: Scene, error_db: float) -> Choice:
+    """Choose the cheapest sizes whose predicted error is at most `error_db`.
+
+    Args:
+        scene: Geometry.
+        error_db: Wanted error relative to the image of white noise in dB.
+
+    Returns:
+        The sizes.
+
+    Raises:
+        ValueError: If none meets the error.
+    """
+    wanted = 10 ** (error_db / 20)
+    taps = taps_for(_SHARE * wanted)
+    if taps is None:
+        raise ValueError(f"error_db of the tile imager must be -10 to {_LEAST_DB:g} dB, got {error_db:g} dB")
+    best = math.inf
+    failed: list[tuple[tuple[int, int, int, int], float]] = []
+    for sizes, _ in sorted(_costs(scene, taps, wanted), key=lambda pair: pair[1]):
+        if any(_hopeless(sizes, *other, wanted) for other in failed):
+            continue
+        error, stretch = scene.expansion_error(*sizes)
+        slope = _choose_slope(scene, stretch, wanted)
+        total = math.hypot(error, kernel_error(taps), slope[2] if slope else math.inf)
+        if slope is not None and total <= wanted:
+            return Choice(*sizes, taps, slope[0], slope[1], 20 * math.log10(total))
+        failed.append((sizes, error))
+        best = min(best, math.hypot(error, _SHARE * wanted))
+    reach = f"{20 * math.log10(best):.0f} dB" if best < 1 else "no error below 0 dB"
+    raise ValueError(
+        f"tiles reach {reach} in this geometry, wanted were {error_db:g} dB; ask for a larger error_db, turn the "
+        "axes of the grid to the direction of the range, or use the direct sum"
+    )
+
+
+def _choose_slope(scene: Scene, stretch: float, wanted: float) -> tuple[int, float, float] | None:
+    """Slope of the window in samples, oversampling of the profiles and error of the window."""
+    found = []
+    for oversampling in _RANGE_OVERSAMPLING:
+        guard = _guard_of(scene, oversampling, stretch * _MARGIN)
+        rise = rise_for(_SHARE * wanted, guard)
+        if rise is not None:
+            found.append((oversampling * _CELLS + rise, (rise, oversampling, window_error(rise, guard))))
+    return min(found)[1] if found else None
+
+
+def _guard_of(scene: Scene, oversampling: float, stretch: float) -> float:
+    """Share of the sampled band that no wave number of a stretched pulse enters."""
+    low, carrier, high = scene.waves
+    n = len(scene.frequency_hz)
+    band = profile_length(n, oversampling) * (high - low) / max(1, n - 1)
+    return 1 - 2 * (max(high - carrier, carrier - low) + carrier * stretch) / band
+
+
+def _hopeless(sizes: tuple[int, int, int, int], other: tuple[int, int, int, int], error: float, wanted: float) -> bool:
+    """Whether sizes cannot meet the error, since another failed by more than any gain."""
+    if sizes[3] != other[3]:
+        return False
+    gain = sum(max(0.0, math.log2(b / a)) for a, b in zip(sizes[:2], other[:2], strict=True))
+    gain += max(0.0, math.log2(sizes[2] / other[2]))
+    return not error * 10 ** (-_MOST_GAIN_DB * gain / 20) <= wanted
+
+
+def _costs(scene: Scene, taps: int, wanted: float) -> Iterator[tuple[tuple[int, int, int, int], float]]:
+    """Sizes (width, depth, parts, order) and about the time of an image in ns."""
+    grid, pulses = scene.grid, len(scene.places[0])
+    low, _, high = scene.waves
+    corners = grid.pixels_m(*(slice(None, None, max(1, n - 1)) for n in grid.counts)).reshape(-1, 3)
+    some = [v[_sampled(0, pulses, _SPAN_PULSES)] for v in scene.places]
+    n = len(some[0])
+    _, a, b = slopes(some, corners, grid.axes)
+    s = a / (b / b[:, n // 2, None]) - a[:, n // 2, None]
+    bend = float(curvatures([v[:1] for v in some], corners, grid.axes).abs().max())
+    per_metre = _USUAL_OVERSAMPLING * (high - low) / (2 * math.pi)
+    rise = rise_for(_SHARE * wanted, 1 - 1 / _USUAL_OVERSAMPLING) or _CELLS
+    number = [2**k for k in range(int(math.log2(max(1, pulses // _LEAST_PULSES))) + 1)]
+    blocks = {parts: [s[:, i:j] for i, j in part_bounds(n, min(parts, n))] for parts in number}
+    spans = {parts: max(float((v.amax(-1) - v.amin(-1)).max()) for v in of) for parts, of in blocks.items()}
+    widths, depths = (
+        [size for size in sizes if size < 2 * n or size == sizes[0]]
+        for sizes, n in zip((_WIDTHS, _DEPTHS), grid.counts, strict=True)
+    )
+    for width, depth, parts, order in itertools.product(widths, depths, number, (1, 2)):
+        half = width * grid.step_m / 2, depth * grid.step_m / 2
+        reach = float((a.abs() * half[0] + b.abs() * half[1]).max()) + bend * (half[0] + half[1]) ** 2 / 2
+        flat = 2 * reach * per_metre + 1
+        if not flat <= _LONGEST:
+            continue
+        length, samples = even_length(flat + rise), flat + 2 * rise
+        nodes = spans[parts] * high * width * grid.step_m * CROSS_OVERSAMPLING / (2 * math.pi) + taps + 1
+        joined = taps + CHUNK * nodes / max(1, pulses / parts)
+        tiles = -(-grid.counts[0] // width) * -(-grid.counts[1] // depth)
+        pairs = parts * tiles
+        flops = 4 * tiles * pulses * joined * length
+        flops += 8 * pairs * length * width * (MOMENTS * nodes + (order + 1) * depth)
+        time = tiles * pulses * (samples * _NS_WINDOW + length * _NS_SPECTRUM) + flops * _NS_FLOP
+        time += pairs * length * width * MOMENTS * (order + 1) * _NS_ELEMENT
+        yield (width, depth, parts, order), time

@@ -1,0 +1,226 @@
+"""Path lengths about the centres of tiles: exact slopes, and the parts that a tile approximates.
+
+A pixel lies at (x, y) from the centre of its tile along the axes of the image. For pulse p, l_p is
+the path from the transmitter over the pixel to the receiver, a and b are its derivatives along x
+and y at the centre. With a reference place in the middle of the sub-aperture (index 0),
+
+    eps = b / b_0 - 1,    s = a / (1 + eps) - a_0,
+
+the wave number k = k_c / (1 + eps) + q of pulse p has the phase
+
+    k (l_p(x, y) - l_p(0, 0)) = k_c (l_0(x, y) - l_0(0, 0)) + (k_c + q) x s
+                                + q (a_0 x + b_0 y) + small terms in x, y, q and s,
+
+in which the pulse enters through s alone. The small terms are polynomials of second order in x and
+y, whose coefficients are fitted as polynomials of s: second derivatives of the path, divided by 1 +
+eps, and eps itself. Those common to all tiles are exact functions of s and x; those of a single
+tile, and all that multiply y, are expanded to second order (`remainders`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+# powers of s whose sums over the pulses are formed
+MOMENTS = 3
+
+
+def slopes(places: Sequence[Tensor], centre: Tensor, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Path length and its derivatives along the axes of the image.
+
+    Args:
+        places: Positions of the antenna (monostatic, the path is twice its range) or of transmitter
+            and receiver in metres, each float64 (..., pulse, 3).
+        centre: Positions of the centres in metres, float64 (tile, 3).
+        axes: Unit vectors, float64 (2, 3).
+
+    Returns:
+        Path in metres, and derivatives along either axis, float64 (tile, ..., pulse).
+    """
+    path = along_x = along_y = torch.zeros((), dtype=centre.dtype, device=centre.device)
+    for place in places:
+        away = centre.reshape(-1, *(1,) * (place.ndim - 1), 3) - place
+        length = torch.linalg.vector_norm(away, dim=-1)
+        inverse = 1 / length
+        path, along_x, along_y = (
+            path + length,
+            along_x + (away @ axes[0]) * inverse,
+            along_y + (away @ axes[1]) * inverse,
+        )
+    scale = 3 - len(places)
+    return scale * path, scale * along_x, scale * along_y
+
+
+def curvatures(places: Sequence[Tensor], centre: Tensor, axes: Tensor) -> Tensor:
+    """Second derivatives of the path length along the axes of the image.
+
+    Args:
+        places: Positions of one or two antennas in metres, as in `slopes`.
+        centre: Positions of the centres in metres, float64 (tile, 3).
+        axes: Unit vectors, float64 (2, 3).
+
+    Returns:
+        Derivatives xx, xy, yy in 1/m, float64 (tile, ..., pulse, 3).
+    """
+    total = torch.zeros((), dtype=centre.dtype, device=centre.device)
+    for place in places:
+        away = centre.reshape(-1, *(1,) * (place.ndim - 1), 3) - place
+        length = torch.linalg.vector_norm(away, dim=-1)
+        p, t = ((away @ axis) / length for axis in axes)
+        total = total + torch.stack([1 - p * p, -p * t, 1 - t * t], -1) / length[..., None]
+    return (3 - len(places)) * total
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """Polynomials of s that describe the path lengths of tiles.
+
+    Args:
+        centre: Centres of the tiles in metres, float64 (tile, 3).
+        axes: Axes of the image, float64 (2, 3).
+        reference: Reference place of each antenna in metres, float64 (1, 3).
+        path_m: Path of the reference, float64 (tile, 1).
+        a: Derivative of the path of the reference along x, float64 (tile, 1).
+        b: Derivative of the path of the reference along y, float64 (tile, 1).
+        curvature: Second derivatives xx, xy, yy of the reference, float64 (tile, 3).
+        fit: Coefficients of s and s^2 for (xx, xy, yy, eps), float64 (tile, 2, 4).
+        common: Means of a and of the coefficients over the tiles, float64 (), (2, 4).
+        carrier: Wave number k_c in rad/m.
+    """
+
+    centre: Tensor
+    axes: Tensor
+    reference: Sequence[Tensor]
+    path_m: Tensor
+    a: Tensor
+    b: Tensor
+    curvature: Tensor
+    fit: Tensor
+    common: tuple[Tensor, Tensor]
+    carrier: float
+
+    @classmethod
+    def of(
+        cls, places: Sequence[Tensor], reference: Sequence[Tensor], centre: Tensor, axes: Tensor, carrier: float
+    ) -> Expansion:
+        """Fit the polynomials to sampled places.
+
+        Args:
+            places: Sampled positions of one or two antennas, each float64 (pulse, 3).
+            reference: Reference place of each antenna, float64 (1, 3).
+            centre: Centres of the tiles, float64 (tile, 3).
+            axes: Axes of the image, float64 (2, 3).
+            carrier: Wave number k_c in rad/m.
+        """
+        path, a0, b0 = slopes(reference, centre, axes)
+        h0 = curvatures(reference, centre, axes)[:, 0]
+        _, a, b = slopes(places, centre, axes)
+        stretch = b / b0
+        s = a / stretch - a0
+        scale = s.abs().amax(-1, keepdim=True).clamp_min(1e-30)
+        t = s / scale
+        wanted = torch.cat(
+            [curvatures(places, centre, axes) / stretch[..., None] - h0[:, None], (stretch - 1)[..., None]], -1
+        )
+        powers = torch.stack([t, t * t], -1)
+        fit = torch.linalg.pinv(powers, rtol=1e-8) @ wanted
+        fit = fit / torch.stack([scale, scale * scale], -2)
+        return cls(centre, axes, reference, path, a0, b0, h0, fit, (a0.mean(), fit.mean(0)), carrier)
+
+    def common_phase(self, s: Tensor, q: Tensor, x: Tensor) -> Tensor:
+        """Phase in rad that all tiles share, of mutually broadcasting s, q in rad/m and x in m."""
+        a, fit = self.common
+        bend = 0.5 * (fit[0, 0] * s + fit[1, 0] * s * s)
+        stretch = fit[0, 3] * s + fit[1, 3] * s * s
+        return (self.carrier + q) * (x * s + x * x * bend) + q * x * (a + s) * stretch
+
+    def tile_phase(self, q: Tensor, x: Tensor) -> Tensor:
+        """Phase in rad of each tile over q (wave number, 1, 1) and x, (wave number, tile, x)."""
+        return q * (self.a * x + 0.5 * self.curvature[:, :1] * x * x)
+
+    def range_phase(self, q: Tensor, y: Tensor) -> Tensor:
+        """Phase in rad of each tile over q (wave number,) and y (y,), (tile, wave number, y)."""
+        return q[:, None] * (self.b[..., None] * y + 0.5 * self.curvature[:, 2, None, None] * y * y)
+
+    def remainders(self, q: Tensor, x: Tensor, order: int, dims: int = 1) -> list[list[Tensor]]:
+        """Complex weights of the moments of s: a list over powers of y of lists over powers of s.
+
+        The remaining phase of a tile is alpha(s) + y beta(s) + y^2 gamma(s); its exponential is
+        expanded to second order, with the powers of s up to the second and those of y up to
+        `order`.
+
+        Args:
+            q: Wave numbers relative to the carrier in rad/m.
+            x: Positions in m.
+            order: Highest power of y, 1 or 2.
+            dims: Dimensions of the weights behind that of the tiles, with which q and x broadcast.
+
+        Returns:
+            Weights, complex128.
+        """
+        behind = (-1, *(1,) * dims)
+        (xx1, xy1, yy1, e1), (xx2, xy2, yy2, e2) = (
+            tuple(v.reshape(behind) for v in part.unbind(-1)) for part in self.fit.unbind(1)
+        )
+        a, b, xy0 = (v.reshape(behind) for v in (self.a, self.b, self.curvature[:, 1]))
+        mean_a, mean = self.common
+        k = self.carrier + q
+        # what the terms common to all tiles leave
+        alpha1 = 0.5 * k * (xx1 - mean[0, 0]) * x * x + q * (a * e1 - mean_a * mean[0, 3]) * x
+        alpha2 = 0.5 * k * (xx2 - mean[1, 0]) * x * x + q * (a * e2 - mean_a * mean[1, 3] + e1 - mean[0, 3]) * x
+        beta0, beta1, beta2 = q * xy0 * x, k * xy1 * x + q * b * e1, k * xy2 * x + q * b * e2
+        weights = [
+            [torch.ones_like(beta0), 1j * alpha1, 1j * alpha2 - alpha1 * alpha1 / 2],
+            [1j * beta0, 1j * beta1 - alpha1 * beta0, 1j * beta2 - alpha1 * beta1 - alpha2 * beta0],
+        ]
+        if order == 2:
+            gamma1, gamma2 = 0.5 * k * yy1, 0.5 * k * yy2
+            weights.append(
+                [
+                    -beta0 * beta0 / 2,
+                    1j * gamma1 - beta0 * beta1,
+                    1j * gamma2 - beta1 * beta1 / 2 - beta0 * beta2,
+                ]
+            )
+        return weights
+
+    def error(self, places: Sequence[Tensor], wave: Tensor, x: Tensor, y: Tensor, order: int) -> Tensor:
+        """Phasor that a tile gives to a single sample, relative to the exact one, less 1.
+
+        Args:
+            places: Positions of one or two antennas, each float64 (pulse, 3).
+            wave: Wave numbers in rad/m, float64 (wave number,).
+            x: Positions from the centre in m, float64 (x,).
+            y: Positions from the centre in m, float64 (y,).
+            order: Highest power of y, 1 or 2.
+
+        Returns:
+            Errors, complex128 (tile, pulse, wave number, x, y).
+        """
+        path, a, b = slopes(places, self.centre, self.axes)
+        stretch = b / self.b
+        pixels = (self.centre[:, None, None] + x[:, None, None] * self.axes[0] + y[:, None] * self.axes[1]).flatten(
+            0, 2
+        )
+        shape = (len(self.centre), len(x), len(y))
+
+        def excess(of: Sequence[Tensor], centre_m: Tensor) -> Tensor:
+            far = slopes(of, pixels, self.axes)[0].unflatten(0, shape).movedim(-1, 1)
+            return (far - centre_m[..., None, None])[:, :, None]
+
+        x, (a0, b0) = x[:, None], (v[..., None, None, None] for v in (self.a, self.b))
+        s = (a / stretch - self.a)[..., None, None, None]
+        q = wave[:, None, None] - (self.carrier / stretch)[..., None, None, None]
+        xx0, _, yy0 = (v.reshape(-1, 1, 1, 1, 1) for v in self.curvature.unbind(-1))
+        phase = self.common_phase(s, q, x) + self.carrier * excess(self.reference, self.path_m)
+        phase = phase + q * (a0 * x + 0.5 * xx0 * x * x + b0 * y + 0.5 * yy0 * y * y)
+        phase = phase - wave[:, None, None] * excess(places, path)
+        parts = (
+            y**power * sum(weight * s**moment for moment, weight in enumerate(weights))
+            for power, weights in enumerate(self.remainders(q, x, order, 4))
+        )
+        return torch.exp(1j * phase) * sum(parts) - 1
