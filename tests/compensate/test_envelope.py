@@ -390,3 +390,11 @@ def test_a_wrong_maximum_of_rows_at_even_spacing_is_noticed(seed: int) -> None:
     found = align_mean(x)
     wrong = off(found["shift_cells"], shift, 96).abs().amax(-1) > 1
     assert bool(wrong.any()) and not bool((found.ok & wrong).any()) and bool(found.ok.any())
+
+
+def test_the_envelopes_confirm_a_refined_alignment_of_a_homogeneous_target() -> None:
+    """The entropy of such a target does not show shifts."""
+    rows = 24 * torch.rand(1, 200, generator=torch.Generator().manual_seed(1)).double()
+    x, shift = points(rows, 20.0, 1.0, 32)
+    found = refine_alignment(x, shift + 0.2 * unit_time(96) ** 2, rounds=1, steps=3)
+    assert found.ok.all() and float(rms(off(found["shift_cells"], shift, 32))[0]) < 0.2
