@@ -354,3 +354,47 @@ def test_no_trials_give_no_shifts(settings: dict) -> None:
 def test_a_non_finite_shift_is_rejected() -> None:
     with pytest.raises(ValueError, match="shift_range: .*NaN"):
         shift_range(torch.ones(3, 8, dtype=torch.complex64), torch.tensor([0.0, math.nan, 0.0]))
+
+
+def points(rows: Tensor, snr_db: float, size: float = 2.0, n: int = 96) -> tuple[Tensor, Tensor]:
+    """Pulses (trial, 96, n) of points in the given rows (trial, point), and their shifts."""
+    trials, count = rows.shape
+    u = unit_time(96)
+    shift = size * circular(trials, 2, seed=6).real @ torch.stack([u, u**2])
+    pulse = torch.arange(96, dtype=torch.float64)
+    turns = torch.rand(trials, count, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(7)) - 0.5
+    echo = circular(trials, count, 1, seed=8) * torch.exp(1j * math.pi * turns * pulse)
+    at = torch.exp(-2j * math.pi * torch.fft.fftfreq(n, dtype=torch.float64) * rows[..., None])
+    x = torch.fft.ifft(torch.einsum("tkp,tkf->tpf", echo, at))
+    noise = 10 ** (-snr_db / 20) * x.abs().square().mean((-2, -1), keepdim=True).sqrt()
+    return shift_range(x, shift) + noise * circular(*x.shape, seed=9), shift
+
+
+@pytest.mark.parametrize("count, snr_db", [(12, 0.0), (12, 40.0), (160, 20.0), (160, 40.0)])
+@pytest.mark.parametrize("method", [align_running, align_mean])
+def test_deviation_of_single_shifts(method, count: int, snr_db: float) -> None:
+    """It holds for separate points as for speckle, at any SNR."""
+    x, shift = points(24 + 48 * torch.rand(10, count, generator=torch.Generator().manual_seed(5)).double(), snr_db)
+    found = method(x)
+    error = rms(off(found["shift_cells"], shift, 96) - off(found["shift_cells"], shift, 96).mean(-1, keepdim=True))
+    ok = found.ok
+    ratio = float(rms(error[ok]) / rms(found.std["shift_cells"][ok, 0]))
+    assert float(ok.double().mean()) >= 0.6 and 0.7 < ratio < 1.5, ratio
+
+
+@pytest.mark.parametrize("seed", [100, 103])
+def test_a_wrong_maximum_of_rows_at_even_spacing_is_noticed(seed: int) -> None:
+    """Their likelihood has maxima at the spacing, and a faded row makes a wrong one the highest."""
+    rows = 16 + 8 * torch.randint(8, (40, 20), generator=torch.Generator().manual_seed(seed)).double()
+    x, shift = points(rows, 12.0)
+    found = align_mean(x)
+    wrong = off(found["shift_cells"], shift, 96).abs().amax(-1) > 1
+    assert bool(wrong.any()) and not bool((found.ok & wrong).any()) and bool(found.ok.any())
+
+
+def test_the_envelopes_confirm_a_refined_alignment_of_a_homogeneous_target() -> None:
+    """The entropy of such a target does not show shifts."""
+    rows = 24 * torch.rand(1, 200, generator=torch.Generator().manual_seed(1)).double()
+    x, shift = points(rows, 20.0, 1.0, 32)
+    found = refine_alignment(x, shift + 0.2 * unit_time(96) ** 2, rounds=1, steps=3)
+    assert found.ok.all() and float(rms(off(found["shift_cells"], shift, 32))[0]) < 0.2

@@ -39,6 +39,19 @@ def test_error_reaches_the_bound_of_a_tone_below_the_papers_curve(snr_db: float,
     assert bool(found.ok.all()) and float(found.std["doppler_hz"].median()) == pytest.approx(bound, rel=0.35)
 
 
+def test_a_weak_point_has_the_std_of_its_bound() -> None:
+    """Its image is 27 lines wide, and the highest of these lines holds 1.5 times its power."""
+    radar = StripmapRadar(
+        3.2e9, LinearFM(100e6, 0.4e-6), 125e6, 4000.0, 7000.0, 700e3, pointing_doppler_hz=652.0, integration_s=0.1
+    )
+    world = StripmapWorld(Points([0.0], [0.0], random_phase=True), Dwell(0.1), doppler_hz=652.0, snr_db=-20.0)
+    recording, truth = simulate(radar, world, 512, 192, Draws(3, trials=range(12)))
+    q = float((target_energy(truth, world, radar, 512).sum(-1) / truth.values["noise_std"].square()).mean())
+    found = PointDoppler(radar)(OmegaK(radar)(recording.signal))
+    std = float(found.std["doppler_hz"].square().mean().sqrt())
+    assert found.ok.all() and std == pytest.approx(float(tone_frequency_bound_hz(q, 0.1)), rel=0.1)
+
+
 def test_noise_alone_is_not_ok() -> None:
     noise = Draws(4, trials=range(20)).normal("n", (512, 192), torch.complex64)
     found = PointDoppler(RADAR)(Signal(noise, RADAR.image_axes(RADAR.raw_axes(512, 192))))

@@ -28,9 +28,11 @@ from torchsar.compensate.envelope_fit import (
     Match,
     about_circular_mean,
     expected_outliers,
+    refined_shifts,
     robust_std,
     running_shifts,
     single_shifts,
+    single_std,
     smooth_shifts,
     unit_time,
     with_tones,
@@ -54,10 +56,10 @@ from torchsar.optim.descent import lbfgs
 # standard deviation of a shift in cells from which on an alignment is not ok: a convention
 GOOD_CELLS = 0.5
 # Expected number of pulses aligned at a wrong maximum from which on single pulses are not ok: found
-# by trial on targets of separate rows, where 1 % of the trials have one such pulse unnoticed.
+# by trial on targets of evenly spaced rows, where 0.3 % of the trials have one unnoticed.
 _OUTLIERS = 3e-3
 # error of single pulses without noise, by the parabola through samples a quarter of a cell apart
-_INTERPOLATION_CELLS = 3e-3
+_INTERPOLATION_CELLS = 1e-3
 
 
 def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
@@ -152,7 +154,8 @@ def align_mean(
         start = (
             running_shifts(pulses, 0.1) if first == "running" else torch.zeros_like(pulses.present, dtype=torch.float64)
         )
-        return single_shifts(pulses, start, match, iterations), None
+        shift = single_shifts(pulses, start, match, iterations)
+        return refined_shifts(pulses, shift) if match == "likelihood" else shift, None
 
     return _estimated(data, "align_mean", find)
 
@@ -186,12 +189,13 @@ def align_envelopes(
         `shift_cells` in range cells, shape (..., pulse), positive towards greater range, of mean
         zero; `shift_range(data, -shift_cells)` removes these shifts. A pulse of zeros has the shift
         of the fitted history. The standard deviation of a polynomial follows from the scatter of
-        the blocks about it. That of single pulses follows from the shifts estimated from the lower
-        and from the upper half of the band, and from the distance by which three more iterations of
-        `align_mean` move them. `quality` is 1 / (1 + (2 std)^2). `ok` is False where the standard
-        deviation reaches half a cell (a quarter of a polynomial), fewer than two pulses hold
-        samples, the halves of the band do not confirm the polynomial, or single pulses may be
-        aligned at a wrong maximum of their likelihood, as with scatterers in evenly spaced range
+        the blocks about it. That of single pulses follows from the scatter, over the pulses, of the
+        terms of the range cells in the slope of their likelihood, and from the distance by which
+        three more iterations of `align_mean` move them; where pulses may be aligned at a wrong
+        maximum of their likelihood, it contains their distance. `quality` is 1 / (1 + (2 std)^2).
+        `ok` is False where the standard deviation reaches half a cell (a quarter of a polynomial),
+        fewer than two pulses hold samples, the halves of the band do not confirm the polynomial, or
+        single pulses may be aligned at a wrong maximum, as with scatterers in evenly spaced range
         cells. info["present"] is True for the pulses that hold samples.
 
     Raises:
@@ -211,7 +215,7 @@ def align_envelopes(
     def find(pulses: Envelopes) -> Course:
         smooth, std = smooth_shifts(pulses, 2 if degree is None else degree, passes, blocks)
         if degree is None:
-            return single_shifts(pulses, smooth, "likelihood", 3), None
+            return refined_shifts(pulses, single_shifts(pulses, smooth, "likelihood", 3)), None
         return with_tones(pulses, smooth, tones, degree), std
 
     return _estimated(data, "align_envelopes", find)
@@ -237,7 +241,9 @@ def refine_alignment(
 
     Returns:
         `shift_cells` in range cells, shape (..., pulse). `quality` and `ok` are those of the last
-        `autofocus`, but `ok` is False in homogeneous scenes, whose entropy does not show shifts.
+        `autofocus`, but the entropy of homogeneous scenes does not show shifts: there `ok` is False
+        unless `align_envelopes` is ok for the refined pulses and moves them by less than half a
+        cell rms.
         info["entropy_nats"], shape (...,), is the entropy of the image.
 
     Raises:
@@ -263,10 +269,12 @@ def refine_alignment(
         reached = entropy(_focused(flat, moved, phase["phase_rad"]))
         shift, least = torch.where((reached < least)[:, None], moved, shift), torch.minimum(reached, least)
     shape = data.shape[:-2]
+    rest = align_envelopes(shift_range(flat, -shift), degree=degree)
+    confirmed = rest.ok & (rest["shift_cells"].square().mean(-1).sqrt() < GOOD_CELLS)
     return Estimate(
         {"shift_cells": shift.reshape(data.shape[:-1])},
         phase.quality.reshape(shape),
-        (phase.ok & ~phase.info["homogeneous"]).reshape(shape),
+        (phase.ok & (confirmed | ~phase.info["homogeneous"])).reshape(shape),
         info={"entropy_nats": least.reshape(shape)},
     )
 
@@ -323,26 +331,25 @@ def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Course]) -> 
 
 
 def _judged_shifts(lines: Tensor, find: Callable[[Envelopes], Course]) -> tuple[Tensor, Tensor, Tensor]:
-    """Shifts (trial, pulse), their standard deviation (trial,) in cells, and whether they are sure.
-
-    The speckle and the noise of the lower and the upper half of the band are independent. A half
-    has cells twice as wide, so that the mean of both errs twice as much as the whole band.
-    """
+    """Shifts (trial, pulse) in cells, standard deviation (trial,), and whether they are sure."""
     envelopes, n = Envelopes.of(lines), lines.shape[-1]
     shift, std = find(envelopes)
     if n < 4:
         return shift, shift.new_full(shift.shape[:1], n / math.sqrt(12)), shift[:, 0] != shift[:, 0]
     present = envelopes.present
+    if std is None:  # single pulses, of which some may be aligned at a wrong maximum
+        likeliest = refined_shifts(envelopes, single_shifts(envelopes, shift, "likelihood", 3))
+        drift = robust_std(about_circular_mean(likeliest - shift, present, n).abs(), present).squeeze(-1)
+        std = (single_std(envelopes, likeliest).square() + drift.square() + _INTERPOLATION_CELLS**2).sqrt()
+        wrong, window = expected_outliers(envelopes, shift), n / math.sqrt(12)
+        far = torch.hypot(std, window * (wrong / present.sum(-1).clamp_min(1)).sqrt()).clamp_max(window)
+        return shift, torch.where(wrong < _OUTLIERS, std, far), wrong < _OUTLIERS
+    # The speckle and the noise of the lower and the upper half of the band are independent. A half
+    # has cells twice as wide, so that the mean of both errs twice as much as the whole band.
     lower, upper = (find(Envelopes.of(half))[0] * (n / half.shape[-1]) for half in _band_halves(lines))
     apart = about_circular_mean(lower - upper, present, n) / 4
-    if std is not None:
-        confirmed = (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt() < GOOD_CELLS
-        return shift, std, confirmed & (std < GOOD_CELLS / 2)
-    # single pulses, of which some may be aligned at a wrong maximum
-    drift = about_circular_mean(single_shifts(envelopes, shift, "likelihood", 3) - shift, present, n)
-    first, second = (robust_std(of.abs(), present).squeeze(-1) for of in (apart, drift))
-    std = (first.square() + second.square() + _INTERPOLATION_CELLS**2).sqrt()
-    return shift, std, expected_outliers(envelopes, shift) < _OUTLIERS
+    confirmed = (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt() < GOOD_CELLS
+    return shift, std, confirmed & (std < GOOD_CELLS / 2)
 
 
 def _band_halves(lines: Tensor) -> list[Tensor]:

@@ -21,6 +21,12 @@ _HALF = 2  # samples per cell: |s|^2 has twice the band of s
 _QUARTER = 4  # samples per cell in correlations, whose other factor is not band-limited
 # least power of a cell in the likelihood, over the mean power: empty cells must not dominate
 _FLOOR = 1e-2
+# Sidelobes of all cells, beyond this distance in cells and times this factor, are the least power
+# too: they repeat the speckle of the cells that they come from. Found by trial, on 1 to 200 points.
+_SIDELOBE_CELLS, _SIDELOBES = 1.5, 1.5
+# Range cells over which errors of the shift may depend on each other; least share of the variance
+# that is left after the shift was fitted.
+_NEAR_CELLS, _LEAST_LEFT = 8, 0.2
 # cycles in the window of the finest features used for the mean drift, found by trial: finer
 # features agree only close to the right drift, coarser ones measure it less well
 _COARSE = 16
@@ -102,7 +108,7 @@ class Envelopes:
         """
         return torch.fft.irfft(spectra, per_cell * self.n) * (per_cell / _HALF)
 
-    def likelihood(self, mean: Tensor) -> Tensor:
+    def likelihood(self, mean: Tensor, sidelobes: bool = True) -> Tensor:
         """Compute the spectrum of -1 / T within the band of the envelopes, for a mean envelope T.
 
         The correlation of -1 / T with the power envelope of a pulse is the log-likelihood of the
@@ -110,20 +116,44 @@ class Envelopes:
 
         Args:
             mean: One-sided spectrum of T, shape (..., frequency).
+            sidelobes: Whether cells count that hold no more than sidelobes, see `floored`.
 
         Returns:
             The one-sided spectrum of -1 / T, shape (..., frequency).
         """
-        weight = -1 / self.on_grid(mean, _QUARTER).clamp_min(_FLOOR)
+        power = self.on_grid(mean, _QUARTER)
+        weight = -1 / (power.clamp_min(_FLOOR) if sidelobes else self.floored(power))
         return torch.fft.rfft(weight)[..., : self.spectra.shape[-1]] * (_HALF / _QUARTER)
 
-    def peak(self, spectra: Tensor) -> Tensor:
+    def floored(self, power: Tensor) -> Tensor:
+        """Raise mean powers to the least power of a cell in the likelihood.
+
+        It is 1 % of the mean power, and the level of the sidelobes of all other cells, which repeat
+        the speckle of those cells and are no evidence of their own.
+
+        Args:
+            power: Samples of a mean envelope, shape (..., sample).
+
+        Returns:
+            The powers, same shape.
+        """
+        samples = power.shape[-1]
+        at = torch.arange(samples, dtype=power.dtype, device=power.device) * (self.n / samples)
+        # upper limit of the power of a sinc pulse in a circular window
+        limit = (samples / self.n) * (self.n * torch.sin(math.pi * at / self.n)).square()
+        far = torch.minimum(at, self.n - at) >= _SIDELOBE_CELLS
+        kernel = torch.where(far, _SIDELOBES / torch.where(far, limit, 1), 0)
+        level = torch.fft.irfft(torch.fft.rfft(power) * torch.fft.rfft(kernel), samples)
+        return torch.maximum(power, level).clamp_min(_FLOOR)
+
+    def peak(self, spectra: Tensor, within: float = math.inf) -> Tensor:
         """Find the position of the maximum of a correlation, by a parabola through three samples.
 
         The samples are a quarter of a cell apart.
 
         Args:
             spectra: One-sided spectrum of the correlation, shape (..., frequency).
+            within: Largest magnitude of the sample at the maximum, in cells.
 
         Returns:
             The position in cells, -n/2..n/2 for n range cells, shape (...,), float64.
@@ -131,7 +161,8 @@ class Envelopes:
         # the mean does not affect the maximum; without it, rounding errors are smaller
         samples = self.on_grid(torch.cat([torch.zeros_like(spectra[..., :1]), spectra[..., 1:]], -1), _QUARTER)
         length = samples.shape[-1]
-        at = samples.argmax(-1, keepdim=True)
+        outside = wrapped(torch.arange(length, device=samples.device) / _QUARTER, self.n).abs() > within
+        at = samples.masked_fill(outside, -torch.inf).argmax(-1, keepdim=True)
         left, top, right = (samples.gather(-1, (at + step) % length).to(torch.float64) for step in (-1, 0, 1))
         bend = left - 2 * top + right
         part = torch.where(bend < 0, 0.5 * (left - right) / torch.where(bend < 0, bend, -1), 0)
@@ -206,6 +237,28 @@ def single_shifts(pulses: Envelopes, start: Tensor, match: Match, iterations: in
     return shift
 
 
+def refined_shifts(pulses: Envelopes, shift: Tensor, iterations: int = 2) -> Tensor:
+    """Refine the shifts of single pulses by the likelihood of the cells that exceed the sidelobes.
+
+    Sidelobes help to tell the maxima of the likelihood apart, but they depend on each other over
+    many cells, and without them the shift of a pulse errs less where noise is weak.
+
+    Args:
+        pulses: Envelopes.
+        shift: Shifts in cells, right within a cell, shape (trial, pulse).
+        iterations: Number of times that the mean envelope is formed anew.
+
+    Returns:
+        The shifts in cells, shape (trial, pulse), float64, of mean zero.
+    """
+    for _ in range(iterations):
+        moved = pulses.moved(shift)
+        against = pulses.likelihood(moved.sum(-2, keepdim=True) / pulses.count, sidelobes=False)
+        found = pulses.peak(moved * against.conj(), within=1.0)
+        shift = centred(shift + torch.where(pulses.present, found, 0), pulses.present)
+    return shift
+
+
 def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> tuple[Tensor, Tensor]:
     """Fit a polynomial of slow time to the shifts of blocks of pulses.
 
@@ -244,8 +297,9 @@ def expected_outliers(pulses: Envelopes, shift: Tensor) -> Tensor:
     """Predict how many pulses are aligned at a wrong maximum of their likelihood.
 
     It is the sum over pulses of the probability that the shift of the pulse is wrong by more than a
-    cell, given the mean envelope. The log-likelihood is halved, because it takes the power of every
-    cell for independent and exponential.
+    cell, given the mean envelope. The log-likelihood takes the power of every cell for independent
+    and exponential. It is divided by the factor by which the powers of the pulses, in units of the
+    mean envelope and summed over the cells, vary more than such powers would.
 
     Args:
         pulses: Envelopes.
@@ -257,10 +311,68 @@ def expected_outliers(pulses: Envelopes, shift: Tensor) -> Tensor:
     moved = pulses.moved(shift)
     mean = moved.sum(-2, keepdim=True) / pulses.count
     # two samples per cell, of which one is independent
-    gain = pulses.on_grid(moved * pulses.likelihood(mean).conj(), _QUARTER).to(torch.float64) / (2 * _HALF)
+    power = pulses.on_grid(moved) / pulses.floored(pulses.on_grid(mean))
+    total = power.sum(-1, keepdim=True, dtype=torch.float64) / _HALF
+    apart = torch.where(pulses.present[..., None], total - total.sum(-2, keepdim=True) / pulses.count, 0)
+    dispersion = apart.square().sum(-2, keepdim=True) / (pulses.count - 1).clamp_min(1) / pulses.n
+    gain = pulses.on_grid(moved * pulses.likelihood(mean, sidelobes=False).conj(), _QUARTER)
+    gain = gain.to(torch.float64) / _HALF / dispersion.clamp_min(1)
     at = wrapped(torch.arange(gain.shape[-1], dtype=torch.float64, device=gain.device) / _QUARTER, pulses.n)
     wrong = (torch.softmax(gain, -1) * (at.abs() > 1)).sum(-1)
     return torch.where(pulses.present, wrong, 0).sum(-1)
+
+
+def single_std(pulses: Envelopes, shift: Tensor) -> Tensor:
+    """Predict the standard deviation of the shifts of single pulses that `refined_shifts` finds.
+
+    A shift errs by the slope of the log-likelihood at the true shift over its curvature. The
+    variance of the slope is that of the terms of the range cells between the pulses, with the
+    covariances of terms up to 8 cells apart, and half of those 12 cells apart. (The slope itself is
+    zero at the shift found, which takes away the share of its variance that is added again.) The
+    mean envelope is that of the other pulses, whose speckle does not follow the pulse.
+
+    Args:
+        pulses: Envelopes.
+        shift: Shifts in cells, shape (trial, pulse).
+
+    Returns:
+        The standard deviation in cells, shape (trial,), float64; infinite without curvature.
+    """
+    power = pulses.on_grid(pulses.moved(shift), _QUARTER).to(torch.float64)
+    count, total = pulses.count.to(torch.float64), power.sum(-2, keepdim=True)
+    weight = -1 / pulses.floored((total - power) / (count - 1).clamp_min(1))
+    before, after = weight.roll(1, -1), weight.roll(-1, -1)
+    slope, bend = (after - before) * (_QUARTER / 2), (2 * weight - before - after) * _QUARTER**2
+    # The gain of a pulse is that of the cells which fix its shift, not that of the noise.
+    mean, least = total / count, pulses.floored(total / count)
+    telling = (slope.sum(-2, keepdim=True) / count * mean).square() / least
+    gain = (power * telling).sum(-1, keepdim=True) / _positive((mean * telling).sum(-1, keepdim=True))
+    term = torch.where(pulses.present[..., None], power * slope / _positive(gain), 0)
+    term = torch.where(pulses.present[..., None], term - term.sum(-2, keepdim=True) / count, 0)
+    curvature = (power * bend).sum(-2, keepdim=True) / count
+    whole = curvature.sum(-1, keepdim=True)
+    share = curvature / torch.where(whole > 0, whole, torch.inf)
+    variance, taken = torch.zeros_like(whole), torch.zeros_like(whole)
+    for cells, sign in ((_NEAR_CELLS, -1), (2 * _NEAR_CELLS, 2)):
+        of_share = _running_sums(share, cells * _QUARTER)
+        rest = _running_sums(term, cells * _QUARTER) - of_share * term.sum(-1, keepdim=True)
+        scale = sign / (cells * _QUARTER)
+        variance = variance + scale * rest.square().sum((-2, -1), keepdim=True) / count
+        taken = taken + scale * of_share.square().sum(-1, keepdim=True)
+    variance = variance.clamp_min(0) / (1 - taken).clamp_min(_LEAST_LEFT)
+    return torch.where(whole > 0, variance.sqrt() / _positive(whole), torch.inf)[:, 0, 0]
+
+
+def _positive(value: Tensor) -> Tensor:
+    """The values, and 1 where they are not positive."""
+    return torch.where(value > 0, value, 1)
+
+
+def _running_sums(terms: Tensor, length: int) -> Tensor:
+    """Sums over `length` neighbours on a circle, (..., sample)."""
+    length = min(length, terms.shape[-1])
+    sums = torch.nn.functional.pad(torch.cat([terms, terms[..., : length - 1]], -1).cumsum(-1), (1, 0))
+    return sums[..., length:] - sums[..., :-length]
 
 
 def mean_drift(pulses: Envelopes) -> Tensor:

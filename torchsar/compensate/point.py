@@ -99,13 +99,30 @@ def peak_time_s(
         ValueError: If there are no samples or a sample is not finite.
     """
     image = checked_samples(image, "peak_time_s", "azimuth, range")
+    rate = torch.as_tensor(rate_hz_s, dtype=torch.float64, device=image.device)
+    tone, _ = _history(image, prf_hz, sample, rate, seen_s, doppler_hz, start_s)
+    return start_s + (point_doppler(tone, prf_hz, centre_hz=doppler_hz) - doppler_hz) / rate
+
+
+def _history(
+    image: Tensor,
+    prf_hz: float,
+    sample: Tensor,
+    rate_hz_s: Tensor,
+    seen_s: tuple[float, float],
+    doppler_hz: Tensor,
+    start_s: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Azimuth history of a point without its Doppler rate, (..., azimuth), zero where it was not
+    observed; and the phasor of its Doppler. The arguments are those of `peak_time_s`.
+    """
     n = image.shape[-2]
     weights = torch.sinc(torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - sample[..., None])
     spectrum = torch.fft.fft((image * weights[..., None, :].to(image.real.dtype)).sum(-1).to(torch.complex128))
     offset = wrap_hz(
         torch.fft.fftfreq(n, 1 / prf_hz, dtype=torch.float64, device=image.device) - doppler_hz[..., None], prf_hz
     )
-    rate = torch.as_tensor(rate_hz_s, dtype=torch.float64, device=image.device)[..., None]
+    rate = rate_hz_s[..., None]
     history = torch.fft.ifft(spectrum * cis(math.pi * offset.square() / rate))
     lines = (
         torch.round(start_s[..., None] * prf_hz) - n // 2 + torch.arange(n, dtype=torch.float64, device=image.device)
@@ -117,7 +134,7 @@ def peak_time_s(
         * (since >= seen_s[0])
         * (since <= seen_s[1])
     )
-    return start_s + (point_doppler(tone, prf_hz, centre_hz=doppler_hz) - doppler_hz) / rate[..., 0]
+    return tone, cis(2 * math.pi * torch.remainder(doppler_hz[..., None] * since, 1))
 
 
 def _rival(power: Tensor, line: Tensor, sample: Tensor, lines: Tensor, samples: float) -> Tensor:
@@ -233,8 +250,12 @@ class PointDoppler(Stage):
             _POINT_CELLS * radar.range_resolution_m / slant.step,
         )
         leads = found["peak"].abs().square() > _LEAST_LEAD * (rival.double() - strongest_noise * floor)
-        # the image contains the noise of the whole PRF, not only that of the band of the point
-        q = peak_to_noise * (radar.prf_hz / (rate * visible)).clamp_min(1)
+        # The peak is the highest of many samples with noise of the whole PRF; the sum of the
+        # history has that of its own band. Noise alone gives it a power of 1.
+        tone, phasor = _history(image, radar.prf_hz, slant.index_of(position), rate, seen, value, at_s)
+        lit = (tone != 0).sum(-1).clamp_min(1)
+        power_sum = (tone * phasor.conj()).sum(-1).abs().square()
+        q = (power_sum / (lit * torch.where(floor > 0, floor, 1)) - 1).clamp_min(0)
         std = torch.hypot(tone_frequency_bound_hz(q.clamp_min(1e-12), visible), q.new_tensor(_REST_CYCLES / visible))
         return Estimate(
             {"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)},

@@ -74,7 +74,8 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         times the standard deviation is below 0.8, the gain in likelihood below twice that of noise,
         a single range cell holds nearly all of the energy, adjacent pulses are not coherent in any
         ten range cells of similar power, or a sparse description of the scene with the phases that
-        sharpen it is more likely. `info` holds "gain_nats" of shape
+        sharpen it is more likely: in sparse scenes the spectrum adapts to phase errors, which the
+        standard deviation does not contain. `info` holds "gain_nats" of shape
         (...,): log likelihood minus that of white noise.
 
     Raises:
