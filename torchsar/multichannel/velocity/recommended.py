@@ -152,6 +152,11 @@ class _Job:
         """
         start, _ = bank_search(self.data, self.radar, self.coarse, self.search, self.u_a_m_s, self.range_m, whitening)
         near = maximum_likelihood(self.data, self.radar, start, self.coarse, self.unknowns, whitening)
+        # half a step beside the nearest hypothesis, the fit may end beside the maximum
+        for side in (-0.5, 0.5) if "u_a_m_s" in self.unknowns else ():
+            beside = replace(start, u_a_m_s=start.u_a_m_s + side * self.search.u_a_step_m_s)
+            other = maximum_likelihood(self.data, self.radar, beside, self.coarse, self.unknowns, whitening)
+            near = _chosen_fit(other, near, other.energy > near.energy)
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
 
     def as_seen(self, found: Found) -> tuple[_Job, Found]:
