@@ -354,20 +354,18 @@ def entries() -> list[Entry]:
         Quantity("delay_s", 3e-9, floor=2e-11),
     ]
     return [
-        Entry("multichannel.MovingPointVelocity", moving, worlds(), [U_R, U_A, Y0], 0.5),
+        Entry("multichannel.MovingPointVelocity", moving, worlds(), [U_R, U_A, Y0]),
         Entry(
             "multichannel.MovingPointVelocity:one channel",
             lone,
             [World("direct", line(snr, LONE), snr) for snr in (0.0, 20.0)],
             [U_R, U_A, Y0],
-            0.5,
         ),
         Entry(
             "multichannel.MovingPointVelocity:beam",
             MovingPointVelocity(RADAR, ElementBeam(), search=SEARCH),
             [World("sea and point", seen_in_sea(snr), snr) for snr in (10.0, 30.0)],
             [U_R, U_A, Y0],
-            0.2,
         ),
         Entry("multichannel.interferometry", bare_interferometry, known, [U_R, Y0]),
         Entry("multichannel.Interferometry", Interferometry(RADAR, GATE), known, [U_R, Y0]),
@@ -378,8 +376,8 @@ def entries() -> list[Entry]:
             [U_A],
         ),
         Entry("multichannel.LikelihoodVelocity", LikelihoodVelocity(RADAR, GATE), near, [U_R, U_A, Y0]),
-        Entry("multichannel.GradientVelocity", GradientVelocity(RADAR, GATE), near, [U_R, U_A, Y0], 0.3),
-        Entry("multichannel.SignalIntensityRatio", SignalIntensityRatio(RADAR, 337.5), known, [U_R], 0.5),
+        Entry("multichannel.GradientVelocity", GradientVelocity(RADAR, GATE), near, [U_R, U_A, Y0]),
+        Entry("multichannel.SignalIntensityRatio", SignalIntensityRatio(RADAR, 337.5), known, [U_R]),
         Entry(
             "multichannel.WalkAmbiguity",
             WalkAmbiguity(RADAR),
@@ -389,14 +387,12 @@ def entries() -> list[Entry]:
                 *(World("aliased", lines(snr, number=1), snr) for snr in (-30.0, -20.0, 10.0)),
             ],
             [Quantity("ambiguity", 0.5)],
-            0.3,
         ),
         Entry(
             "multichannel.MigratingLines",
             MigratingLines(RADAR, MovingPointVelocity(RADAR, Dwell(1.8), search=SEARCH), one_line=True),
             [*in_range, *ranged],
             [U_R, U_A, Y0],
-            0.2,
         ),
         Entry(
             "multichannel.MoversImage",
@@ -406,7 +402,6 @@ def entries() -> list[Entry]:
                 *(World("direct", ship(snr), snr) for snr in (-10.0, 0.0, 10.0, 20.0)),
             ],
             [Quantity("u_r_m_s", DEFOCUS_M_S, first_target, 0.01, predicted=False)],
-            0.05,
         ),
         Entry(
             "multichannel.EstimateBalance",
@@ -420,7 +415,6 @@ def entries() -> list[Entry]:
                 World("few cells", clutter(flat, 10.0, 24, 64), 10.0),
             ],
             balance,
-            0.3,
         ),
         Entry(
             "multichannel.EstimateBalance:pattern",
@@ -431,7 +425,6 @@ def entries() -> list[Entry]:
                 World("other beam", clutter(flat, 20.0), 20.0),
             ],
             balance,
-            0.3,
         ),
         Entry(
             "multichannel.EstimateBalance:five channels",
@@ -441,7 +434,6 @@ def entries() -> list[Entry]:
                 World("other beam", clutter(flat, 20.0, radar=FIVE), 20.0),
             ],
             balance,
-            0.3,
         ),
         Entry(
             "multichannel.EstimateSynchronisation",

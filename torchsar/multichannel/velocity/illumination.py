@@ -61,7 +61,7 @@ def lit_as_expected(data: Tensor, radar: BistaticRadar, motion: PointMotion, ape
     Returns:
         True where this share is at least 0.8, bool (...,).
     """
-    amplitude, _ = _amplitudes(data, radar, motion, aperture, _PARTS)
+    amplitude = _Pulses.of(data, radar, motion, aperture, _PARTS).amplitudes(_PARTS)
     squares = _PARTS * amplitude.square().sum(-1)
     return (amplitude.sum(-1).square() >= _LEAST_SHARE * squares) | (squares == 0)
 
@@ -79,29 +79,78 @@ def seen_aperture(
         aperture: Expected amplitude over slow time.
 
     Returns:
-        The aperture, in these trials times the amplitudes of 32 parts relative to the strongest, or
-        zero for parts below 0.35; and where this is so, bool (...,).
+        The aperture, in these trials times the amplitudes of 32 parts relative to the strongest,
+        and zero beyond the nearest parts below 0.35 on either side of it; and where this is so,
+        bool (...,). The ends are those pulses between which the point explains most energy.
     """
     uneven = ~lit_as_expected(data, radar, motion, aperture)
     if not bool(uneven.any()):
         return aperture, uneven
-    amplitude, part = _amplitudes(data, radar, motion, aperture, _FINE)
+    pulses = _Pulses.of(data, radar, motion, aperture, _FINE)
+    amplitude = pulses.amplitudes(_FINE)
     level = amplitude / amplitude.amax(-1, keepdim=True).clamp_min(_TINY)
-    level = torch.where(level >= _DARK, level, 0)
-    profile = torch.where(uneven[..., None], level.gather(-1, part), 1.0)
-    return SeenAperture(aperture, profile), uneven
+    # beyond a dark part there is noise, whose phase far from the point would bend the fit
+    gaps = (level < _DARK).cumsum(-1)
+    lit = (level >= _DARK) & (gaps == gaps.gather(-1, level.argmax(-1, keepdim=True)))
+    return SeenAperture(aperture, torch.where(uneven[..., None], pulses.ended(level, lit), 1.0)), uneven
 
 
-def _amplitudes(
-    data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture, parts: int
-) -> tuple[Tensor, Tensor]:
-    """Modulus of the amplitude in parts of equal expected energy, and the part of each pulse."""
-    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
-    weight = aperture.weight(radar, motion, time_s).expand(*data.shape[:-2], -1)
-    energy = weight.square()
-    before = energy.cumsum(-1) - energy / 2
-    part = (parts * before / energy.sum(-1, keepdim=True).clamp_min(_TINY)).floor().clamp(0, parts - 1).long()
-    inside = (part[..., None] == torch.arange(parts, device=data.device)).to(torch.float64)
-    deramped = data.to(torch.complex128) * point_phasor(radar, motion, time_s, torch.complex128).conj()
-    level = ((deramped.sum(-2) * weight)[..., None, :] @ inside.to(torch.complex128)).abs()[..., 0, :]
-    return level / (energy[..., None, :] @ inside)[..., 0, :].clamp_min(_TINY), part
+@dataclass(frozen=True)
+class _Pulses:
+    """Deramped pulses summed over channels times the expected amplitude, its square, and parts.
+
+    The parts have equal expected energy. Each tensor has the shape (..., pulse).
+    """
+
+    value: Tensor
+    energy: Tensor
+    part: Tensor
+
+    @staticmethod
+    def of(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture, parts: int) -> _Pulses:
+        """Deramp the data with a motion, and divide the aperture."""
+        time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
+        weight = aperture.weight(radar, motion, time_s).expand(*data.shape[:-2], -1)
+        energy = weight.square()
+        before = energy.cumsum(-1) - energy / 2
+        part = (parts * before / energy.sum(-1, keepdim=True).clamp_min(_TINY)).floor().clamp(0, parts - 1).long()
+        deramped = data.to(torch.complex128) * point_phasor(radar, motion, time_s, torch.complex128).conj()
+        return _Pulses(deramped.sum(-2) * weight, energy, part)
+
+    def amplitudes(self, parts: int) -> Tensor:
+        """Modulus of the amplitude in each part, (..., part)."""
+        inside = (self.part[..., None] == torch.arange(parts, device=self.part.device)).to(torch.float64)
+        level = (self.value[..., None, :] @ inside.to(torch.complex128)).abs()[..., 0, :]
+        return level / (self.energy[..., None, :] @ inside)[..., 0, :].clamp_min(_TINY)
+
+    def ended(self, level: Tensor, lit: Tensor) -> Tensor:
+        """Profile (..., pulse) of the lit parts, which follow each other, with levels (..., part).
+
+        If there are three or more, the ends are those pulses of the first and last part and of the
+        parts beside them between which the point explains most energy. There the level is that of
+        the next part inside.
+        """
+        index = torch.arange(level.shape[-1], device=level.device)
+        first = lit.to(torch.int8).argmax(-1, keepdim=True)
+        last = first + lit.sum(-1, keepdim=True) - 1
+        inner = torch.minimum(torch.maximum(index, first + 1), last - 1).clamp_min(0)
+        wide = level.gather(-1, inner).gather(-1, self.part)
+        phase = (self.value * lit.gather(-1, self.part)).sum(-1, keepdim=True).angle()
+        near = (self.part >= first - 1) & (self.part <= last + 1)
+        match = torch.where(near, wide * (self.value * torch.polar(torch.ones_like(phase), -phase)).real, 0)
+        power = torch.where(near, wide.square() * self.energy, 0)
+
+        def from_to(begin: Tensor, end: Tensor, tried: Tensor) -> Tensor:
+            """Index of the tried pulse with most explained energy, given sums (2, ..., pulse)."""
+            found, power = (end - begin).unbind(0)
+            explained = found.clamp_min(0).square() / power.clamp_min(_TINY)
+            return torch.where(tried, explained, -1).argmax(-1, keepdim=True)
+
+        both, pulse = torch.stack([match, power]), torch.arange(self.part.shape[-1], device=self.part.device)
+        sums = both.cumsum(-1)
+        to_last = (both * (self.part <= last)).sum(-1, keepdim=True)
+        begin = from_to(sums - both, to_last, (self.part == first) | (self.part == first - 1))
+        before = (both * (pulse < begin)).sum(-1, keepdim=True)
+        end = from_to(before, sums, (self.part == last) | (self.part == last + 1))
+        ended = torch.where((pulse >= begin) & (pulse <= end), wide, 0)
+        return torch.where(last - first >= 2, ended, torch.where(lit, level, 0).gather(-1, self.part))

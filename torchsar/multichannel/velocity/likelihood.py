@@ -8,6 +8,7 @@ known covariance. In white noise the estimate reaches the Cramer-Rao bound of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -40,6 +41,9 @@ _HALVINGS = 4  # trials of a step: whole, half, quarter, eighth; then it is omit
 class PointFit:
     """Least-squares fit of the amplitude of a point for a given motion, per trial.
 
+    Several points that are fitted together have amplitudes (..., point), and the unknowns of all
+    of them follow each other.
+
     Args:
         amplitude: Complex amplitude, shape (...,).
         energy: Energy of the data that the point explains, shape (...,).
@@ -52,6 +56,14 @@ class PointFit:
     energy: Tensor
     gradient: Tensor
     normal: Tensor
+
+
+class Likelihood(Protocol):
+    """Likelihood of the motion of one or several points."""
+
+    def fit(self, motion: PointMotion) -> PointFit:
+        """Return the least-squares amplitudes for a motion, with derivatives by the unknowns."""
+        ...
 
 
 def maximum_likelihood(
@@ -99,7 +111,7 @@ def maximum_likelihood(
     motion = start.each(lambda value: value.expand(data.shape[:-2]))
     fit = problem.fit(motion)
     for _ in range(steps):
-        motion, fit = _stepped(problem, motion, fit)
+        motion, fit = stepped(problem, motion, fit, unknowns)
     return Found(motion, fit.amplitude, problem.noise_power(fit), problem.covariance(motion, fit), fit.energy, unknowns)
 
 
@@ -223,15 +235,29 @@ def _coloured(data: Tensor, model: Tensor, columns: Tensor) -> PointFit:
     )
 
 
-def _stepped(problem: PointLikelihood, motion: PointMotion, fit: PointFit) -> tuple[PointMotion, PointFit]:
-    """Take one Gauss-Newton step, halved in trials where it explains less energy."""
-    step = _bounded(solved(fit.normal, fit.gradient[..., None])[..., 0], motion, problem.unknowns)
+def stepped(
+    problem: Likelihood, motion: PointMotion, fit: PointFit, unknowns: tuple[str, ...]
+) -> tuple[PointMotion, PointFit]:
+    """Take one Gauss-Newton step, halved or omitted in trials where it explains less energy.
+
+    Args:
+        problem: Likelihood of one point, or of several that are fitted together.
+        motion: Motion, shape (...,), or (..., point) for several points.
+        fit: Fit for this motion, with the unknowns of all points in its gradient.
+        unknowns: Names of the parameters to estimate.
+
+    Returns:
+        Motion after the step, and the fit for it.
+    """
+    more = (None,) * (motion.u_r_m_s.ndim - fit.energy.ndim)
+    step = solved(fit.normal, fit.gradient[..., None])[..., 0].reshape(*motion.u_r_m_s.shape, len(unknowns))
+    step = _bounded(step, motion, unknowns)
     pending = torch.ones_like(fit.energy, dtype=torch.bool)
     for _ in range(_HALVINGS):
-        there = moved(motion, step, problem.unknowns)
+        there = moved(motion, step, unknowns)
         fit_there = problem.fit(there)
         better = pending & (fit_there.energy > fit.energy)
-        motion = chosen(there, motion, better)
+        motion = chosen(there, motion, better[(..., *more)])
         fit = PointFit(
             *(
                 torch.where(better[(...,) + (None,) * (new.ndim - better.ndim)], new, old)
@@ -241,7 +267,7 @@ def _stepped(problem: PointLikelihood, motion: PointMotion, fit: PointFit) -> tu
         pending = pending & ~better
         if not bool(pending.any()):
             break
-        step = torch.where(pending[..., None], step / 2, 0.0)
+        step = torch.where(pending[(..., *more, None)], step / 2, 0.0)
     return motion, fit
 
 

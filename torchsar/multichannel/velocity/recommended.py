@@ -16,16 +16,26 @@ from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell
 from torchsar.multichannel.velocity.bank import Search, bank_search
-from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
+from torchsar.multichannel.velocity.illumination import SeenAperture, lit_as_expected, seen_aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, Found, chosen, estimate_of, point_phasor
+from torchsar.multichannel.velocity.several import fitted_together, joined
 from torchsar.multichannel.velocity.whitening import Whitening, sample_whitening
 from torchsar.radar import BistaticRadar
 
 # Aperture of the first search: integration time of Remote Sens. 2020, 12, 1703, Table 1.
 _COARSE_S = 4.5
 _ROUNDS = 2  # refinements of the residual covariance
+# Least share of the energy of a further point in what is left: clutter that fills 800 Doppler cells
+# gives 0.01 to its strongest tone; a point just detected in noise gives 0.03.
+_POINT_SHARE = 0.02
+# Share from which it is a point rather than clutter, and Doppler cells within which it then bends
+# the fit unless it is separated, by choice.
+_CLEAR_SHARE, _OVERLAP = 0.05, 8.0
+_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
+_PASSES = 2  # of their fit: the second has the expected amplitudes at the positions found
+_OTHERS = 3  # points fitted besides the strongest, by choice: each takes a search of its own
 # Log-likelihood by which other ambiguity numbers must be worse, by choice: a chance of e^-10.
 _RESOLVED = 10.0
 # Refits about the position found, with so many Gauss-Newton steps each: a round reduces the bias of
@@ -51,8 +61,10 @@ def moving_point_velocity(
 
     The channels must be balanced, which the data of one point cannot show: a phase that grows
     along the array acts as a position and a speed (0.2 rad over 1.6 m as 28 m and 1.7 m/s), and
-    standard deviations do not contain it. Nor do those of u_a contain all of the effect of a second
-    point of nearly the same strength and Doppler frequency.
+    standard deviations do not contain it.
+
+    Up to three further points are fitted together with the strongest, if the residual is then white
+    noise. Standard deviations then contain their effect.
 
     Args:
         data: Channels with the transmit range removed and slow time zero at pulse n // 2, shape
@@ -73,8 +85,9 @@ def moving_point_velocity(
         and everywhere if `whitening` is given). `ok` is False where `snr_db` is below 19, the
         estimate lies outside the search, the standard deviation of u_r exceeds the half width of
         the search, as with a single channel, a slant-range speed within the search that differs by
-        multiples of lambda PRF explains the data as well, or the illumination of the point is not
-        understood, see `lit_as_expected`. Where it is lit in a part of the aperture only, as in a
+        multiples of lambda PRF explains the data as well, the illumination of the point is not
+        understood, see `lit_as_expected`, or a further point of nearly the same Doppler frequency
+        cannot be separated. Where it is lit in a part of the aperture only, as in a
         range line that it crosses, this part is used, see `seen_aperture`. The cubic phase, which
         separates multiples of lambda PRF, is small for short wavelengths and dwells; the speed is
         then `ok` only within a search of half that width.
@@ -99,13 +112,14 @@ def moving_point_velocity(
         )
     plain = job.found(None)
     job, plain = job.as_seen(plain)
+    job, plain, hidden = job.separated(plain, aperture)
     plain = job.refined(plain)
     if not bool(plain.coloured.any()):
-        return job.estimate(plain.found, plain.coloured)
+        return job.estimate(plain.found, plain.coloured, hidden=hidden)
     other = job.refined(job.found(sample_whitening(job.data, radar)))
     first = ~plain.coloured | (plain.log_det <= other.log_det)  # independent of the other trials
     return job.estimate(
-        _chosen_fit(plain.found, other.found, first), torch.where(first, plain.coloured, other.coloured)
+        _chosen_fit(plain.found, other.found, first), torch.where(first, plain.coloured, other.coloured), hidden=hidden
     )
 
 
@@ -138,6 +152,11 @@ class _Job:
         """
         start, _ = bank_search(self.data, self.radar, self.coarse, self.search, self.u_a_m_s, self.range_m, whitening)
         near = maximum_likelihood(self.data, self.radar, start, self.coarse, self.unknowns, whitening)
+        # half a step beside the nearest hypothesis, the fit may end beside the maximum
+        for side in (-0.5, 0.5) if "u_a_m_s" in self.unknowns else ():
+            beside = replace(start, u_a_m_s=start.u_a_m_s + side * self.search.u_a_step_m_s)
+            other = maximum_likelihood(self.data, self.radar, beside, self.coarse, self.unknowns, whitening)
+            near = _chosen_fit(other, near, other.energy > near.energy)
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
 
     def as_seen(self, found: Found) -> tuple[_Job, Found]:
@@ -148,6 +167,51 @@ class _Job:
         job = replace(self, aperture=aperture)
         again = maximum_likelihood(self.data, self.radar, found.motion, aperture, self.unknowns)
         return job, _chosen_fit(again, found, uneven)
+
+    def separated(self, found: Found, aperture: Aperture) -> tuple[_Job, Found, Tensor]:
+        """Fit up to three further points together with the first, where these leave white noise.
+
+        Their echo is then removed from the data. A point of the same Doppler frequency is otherwise
+        taken for clutter, whose covariance over several Doppler bins does not describe it. Returns
+        also where there is such a point that cannot be separated.
+        """
+        job, whole = self, replace(self, aperture=aperture)
+        tried = sample_whitening(self.left(found), self.radar).coloured
+        hidden = torch.zeros_like(tried)
+        if not bool(tried.any()):
+            return job, found, hidden
+        # with a slant-range speed that is wrong by lambda PRF, one point leaves others over
+        found = _chosen_fit(self.resolved(found, None)[0], found, tried)
+        tried = tried & sample_whitening(self.left(found), self.radar).coloured
+        points, left = found.motion.each(lambda value: value.expand(tried.shape)[..., None]), whole.left(found)
+        for _ in range(_OTHERS):
+            further = replace(whole, data=left).found(None)
+            share = further.energy / left.abs().square().sum((-2, -1)).clamp_min(_TINY)
+            tried = tried & (share > _POINT_SHARE)
+            if not bool(tried.any()):
+                break
+            hidden = hidden | (tried & (share > _CLEAR_SHARE) & self._overlap(found.motion, further.motion))
+            points = joined(points, further.motion)
+            for _ in range(_PASSES):
+                fit = fitted_together(self.data, self.radar, points, aperture, self.unknowns)
+                points, left = fit.motion, fit.left
+            done = tried & ~sample_whitening(left, self.radar).coloured
+            found, job, tried = _chosen_fit(fit.found, found, done), job.without(fit.others, done), tried & ~done
+            hidden = hidden & ~done
+        return job, found, hidden
+
+    def _overlap(self, motion: PointMotion, other: PointMotion) -> Tensor:
+        """Whether the Doppler frequencies of two points differ by few Doppler cells."""
+        doppler_hz = [(m.u_r_m_s + m.along_m_s * m.y0_m / m.range_m) / self.radar.wavelength_m for m in (motion, other)]
+        return (doppler_hz[0] - doppler_hz[1]).abs() < _OVERLAP / self.coarse.duration_s
+
+    def without(self, echo: Tensor, where: Tensor) -> _Job:
+        """Remove the echo of other points in some trials, which then use the whole aperture."""
+        aperture = self.aperture
+        if isinstance(aperture, SeenAperture):
+            aperture = replace(aperture, profile=torch.where(where[..., None], 1.0, aperture.profile))
+        data = torch.where(where[..., None, None], self.data - echo, self.data)
+        return replace(self, data=data, aperture=aperture)
 
     def centred(self, found: Found, whitening: Whitening) -> Found:
         """Repeat the fit four times, with the expected amplitude about the last position found.
@@ -213,14 +277,17 @@ class _Job:
             inside = inside & ((motion.u_a_m_s - self.u_a_m_s).abs() <= reach)
         return inside
 
-    def estimate(self, found: Found, coloured: Tensor, whitening: Whitening | None = None) -> Estimate:
-        """Form the estimate and judge it."""
+    def estimate(
+        self, found: Found, coloured: Tensor, whitening: Whitening | None = None, hidden: Tensor | None = None
+    ) -> Estimate:
+        """Form the estimate and judge it; it is not ok where another point is hidden in it."""
         found, resolved = self.resolved(found, whitening)
         snr = found.snr_db
         determined = (
             found.covariance[..., 0, 0].sqrt() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         )  # False for one channel, which cannot separate velocity and position
         lit = lit_as_expected(self.data, self.radar, found.motion, self.aperture)
+        lit = lit if hidden is None else lit & ~hidden
         return estimate_of(
             found,
             self.inside(found.motion) & determined & lit & resolved & (snr >= DETECTED_DB),
