@@ -15,7 +15,7 @@ from torchsar.echo import ChannelResponse, apply_impairments, simulate
 from torchsar.focus import OmegaK
 from torchsar.focus.reference import matched_reference
 from torchsar.metrics import error_db
-from torchsar.radar import LinearFM
+from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.repair import (
     CorrectResponse,
     EstimateResponse,
@@ -24,6 +24,7 @@ from torchsar.repair import (
     estimate_response_sharpest,
 )
 from torchsar.repair.response import band_grid, band_power, on_axis, unit_legendre, without_line
+from torchsar.repair.response_phase import brightest_windows, minimise
 from torchsar.scene import Dwell, RandomPoints, StripmapWorld
 
 
@@ -123,11 +124,14 @@ def _image(data: torch.Tensor):
     return Signal(data, radar.image_axes(radar.raw_axes(*data.shape[-2:])))
 
 
-@pytest.mark.parametrize("ripple, most", [(3.0, 1.5), (6.0, 2.0)])
-def test_the_deviation_covers_few_targets_the_edges_of_the_pulse_and_fine_ripple(ripple, most):
-    radar = kondor_radar()
+def ripple_phase(u: torch.Tensor, ripple: float) -> torch.Tensor:
+    return without_line(0.4 * torch.sin(ripple * math.pi * u))
+
+
+def few_targets(ripple: float) -> tuple[StripmapRadar, Signal]:
+    """Four images of twelve targets, with a phase ripple along range."""
     pulse, fs, n = LinearFM(200e6, 1e-6), 250e6, 640
-    radar = replace(radar, pulse=pulse, sampling_hz=fs)
+    radar = replace(kondor_radar(), pulse=pulse, sampling_hz=fs)
     generator = torch.Generator().manual_seed(3)
     f = torch.fft.fftfreq(n, dtype=torch.float64)
     at = 80 + 230 * torch.rand(4, 12, 1, dtype=torch.float64, generator=generator)
@@ -135,16 +139,80 @@ def test_the_deviation_covers_few_targets_the_edges_of_the_pulse_and_fine_ripple
         torch.polar(torch.ones_like(f), -2 * math.pi * f * at) * pulse.spectrum(n, fs) * matched_reference(pulse, n, fs)
     )
     shape = torch.sinc((torch.arange(72, dtype=torch.float64)[:, None] - 6 * torch.arange(12) - 3) / 1.5)
-
-    def phase(u):
-        return without_line(0.4 * torch.sin(ripple * math.pi * u))
-
     u = f * 2 * fs / pulse.bandwidth_hz
-    response = torch.polar(torch.ones_like(u), on_axis(phase(band_grid()), u))
+    response = torch.polar(torch.ones_like(u), on_axis(ripple_phase(band_grid(), ripple), u))
     image = torch.fft.ifft(shape.to(echo.dtype) @ (echo * response))
     image = image + 0.003 * torch.randn(image.shape, dtype=image.dtype, generator=generator)
-    found = EstimateResponse(
-        radar, partial(estimate_response_sharpest, width=128, points=40, orders=(4, 16), passes=2)
-    )(Signal(image, radar.image_axes(radar.raw_axes(72, n))))
-    error = rms(without_line(found["phase_rad"] - phase(band_grid())))
-    assert not bool(found.ok.all()) or 0.6 < error / rms(found.std["phase_rad"]) < most
+    return radar, Signal(image, radar.image_axes(radar.raw_axes(72, n)))
+
+
+FEW = partial(estimate_response_sharpest, width=128, points=40, orders=(4, 16), passes=2)
+
+
+@pytest.mark.parametrize("ripple", [3.0, 5.0])
+def test_the_deviation_covers_few_targets_the_edges_of_the_pulse_and_fine_ripple(ripple):
+    radar, image = few_targets(ripple)
+    found = EstimateResponse(radar, FEW)(image)
+    error = rms(without_line(found["phase_rad"] - ripple_phase(band_grid(), ripple)))
+    assert bool(found.ok.all()) and 0.6 < error / rms(found.std["phase_rad"]) < 1.5
+
+
+@pytest.mark.parametrize("method, ripple", [(FEW, 6.0), (FEW, 9.0), (estimate_response_points, 12.0)])
+def test_ripple_finer_than_the_highest_degree_is_not_ok(method, ripple):
+    radar, image = few_targets(ripple)
+    found = EstimateResponse(radar, method)(image)
+    assert not bool(found.ok.any()) and rms(found["phase_rad"]) == 0
+
+
+def test_two_weak_points_that_agree_are_not_ok():
+    """The same line twice: both halves find the same phase, which is that of the noise."""
+    x = torch.randn(16, 72, 400, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    x[:, 30:42] *= 0.5
+    x[:, 30, 200] = 8
+    x[:, 40] = x[:, 30]
+    x[:, [29, 31, 39, 41]] = 0
+    found = FEW(x, 0.8)
+    assert not bool(found.ok.any()) and rms(found["phase_rad"]) == 0
+
+
+@pytest.mark.parametrize("method", [FEW, estimate_response_points])
+def test_a_trial_gives_alone_what_it_gives_beside_others(method):
+    """Also beside a trial without windows, and one whose search ends at another step."""
+    radar, image = few_targets(3.0)
+    image.data[2] = 0
+    image.data[3] += 0.2 * torch.randn(72, 640, dtype=image.data.dtype, generator=torch.Generator().manual_seed(8))
+    together = EstimateResponse(radar, method)(image)
+    assert together.ok.tolist() == [True, True, False, False]
+    for trial in range(4):
+        alone = EstimateResponse(radar, method)(image.with_data(image.data[trial]))
+        torch.testing.assert_close(alone["phase_rad"], together["phase_rad"][trial], atol=1e-9, rtol=0)
+        torch.testing.assert_close(alone.std["phase_rad"], together.std["phase_rad"][trial], atol=1e-9, rtol=1e-6)
+
+
+def test_the_search_costs_only_the_trials_that_go_on():
+    """One cost whose minimum lies along its slope, and one that takes many steps."""
+    curvature = torch.stack([torch.ones(30), torch.logspace(-1, 1, 30)]).to(torch.float64)
+    asked = []
+
+    def cost(c: torch.Tensor, trials: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        asked.append(trials.tolist())
+        return 1 + (curvature[trials] * c.square()).sum(-1) / 2, curvature[trials] * c
+
+    start = torch.full((2, 30), 0.3, dtype=torch.float64)
+    assert float(minimise(cost, start, 60).abs().max()) < 1e-2
+    assert asked[0] == [0, 1] and asked[-1] == [1] and sum(0 in trials for trials in asked) < len(asked) / 2
+
+
+def test_the_brightest_maxima_are_apart():
+    image = torch.rand(1, 12, 64, generator=torch.Generator().manual_seed(0)).to(torch.complex64)
+    windows, line = brightest_windows(image, 5, 16, apart=5)
+    size = image[0].abs()
+    wanted = [
+        (float(size[i, j]), i)
+        for i in range(12)
+        for j in range(8, 56)
+        if size[i, j] == size[max(0, i - 1) : i + 2, max(8, j - 5) : min(56, j + 6)].max()
+    ]
+    wanted = sorted(wanted, reverse=True)[:5]
+    assert line[0].tolist() == [i for _, i in wanted]
+    assert windows[0, :, 8].abs().tolist() == [value for value, _ in wanted]

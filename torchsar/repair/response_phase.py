@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -36,8 +36,16 @@ from torchsar.repair.response import (
 # Highest Legendre degrees of the stages of a fit, by choice: a large smooth phase first, then
 # ripple of up to about 20 periods over the band.
 ORDERS = (2, 4, 8, 16, 40)
-# Legendre degree to which the phase of the edges of the pulse is taken, by choice.
-_EDGE_DEGREE = 24
+# Samples of a compressed echo in which the phase of the edges of its pulse is sought, by choice.
+_EDGE_WIDTH = 256
+# Least curvature of the entropy in nats per rad^2, by measurement: 5 to 20 in sharp windows.
+_CURVATURE = 4.0
+# Ratio of the power of a peak to that of the noise at which its weight is one half, by choice.
+_FULL = 100.0
+# Bound in rad up to which the search finds the right minimum, by measurement: wrong from 0.09 on.
+_MOST_NOISE = 0.08
+# Windows computed at once, by measurement: so few that they stay in the cache of a processor.
+_BLOCK = 128
 
 
 def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) -> tuple[Tensor, Tensor]:
@@ -67,7 +75,7 @@ def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) ->
             f"got {width}; give longer lines"
         )
     size = torch.nn.functional.pad(image.abs()[..., half:-half], (half, half))
-    highest = torch.nn.functional.max_pool2d(size[:, None], (3, 2 * apart + 1), 1, (1, apart))[:, 0]
+    highest = _running_maximum(_running_maximum(size, apart).mT, 1).mT
     peaks = torch.where((size == highest) & (size > 0), size, 0).flatten(-2)
     level, index = peaks.topk(min(points, peaks.shape[-1]), -1)
     index_in_line = index[..., None] + torch.arange(-half, width - half, device=image.device)
@@ -77,10 +85,19 @@ def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) ->
     return windows * (level > 0)[..., None], index // n
 
 
-def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: float = 100.0) -> Tensor:
+def _running_maximum(x: Tensor, reach: int) -> Tensor:
+    """Largest of the values, 0 or more, up to `reach` samples away along the last dimension."""
+    x, span = torch.nn.functional.pad(x, (reach, reach)), 1
+    while span < 2 * reach + 1:
+        more = min(span, 2 * reach + 1 - span)
+        x, span = torch.maximum(x[..., :-more], x[..., more:]), span + more
+    return x
+
+
+def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0) -> Tensor:
     """Weight each window by the ratio s of its peak power to the background power of the image.
 
-    The weight is s / (s + full), and 0 where s is below `floor`. The background is the mean power
+    The weight is s / (s + 100), and 0 where s is below `floor`. The background is the mean power
     of Gaussian speckle that has the median power of the image; the floor is so high that hardly one
     of a million speckle pixels exceeds it. The background is taken to be 1e-5 (-50 dB) of the
     brightest peak or more, since weaker maxima are side lobes of that peak.
@@ -89,7 +106,6 @@ def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: fl
         windows: Windows, shape (..., point, width), complex.
         image: Image, shape (..., azimuth, range), complex.
         floor: Lowest ratio s with a weight above zero.
-        full: Ratio s at which the weight is one half.
 
     Returns:
         Weights 0..1, shape (..., point), float64.
@@ -97,7 +113,7 @@ def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: fl
     background = image.abs().flatten(-2).median(-1).values.square().to(torch.float64) / math.log(2)
     peak = windows.abs().amax(-1).square().to(torch.float64)
     s = peak / torch.maximum(background[..., None], 1e-5 * peak.amax(-1, keepdim=True)).clamp_min(1e-300)
-    return torch.where(s > floor, s / (s + full), 0)
+    return torch.where(s > floor, s / (s + _FULL), 0)
 
 
 def halved(windows: Tensor, weight: Tensor, line: Tensor) -> tuple[Tensor, Tensor]:
@@ -125,7 +141,46 @@ def halved(windows: Tensor, weight: Tensor, line: Tensor) -> tuple[Tensor, Tenso
     return windows.gather(-2, order[..., None].expand(*order.shape, windows.shape[-1])), weight.gather(-1, order)
 
 
-def window_entropy(spectra: Tensor, phase_rad: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+@dataclass(frozen=True)
+class _Spectra:
+    """Spectra of the windows with a weight, those of a trial after those of the trial before.
+
+    Args:
+        unit: Spectra of unit energy, shape (window, n), complex128.
+        weight: Weights, with the sum 1 in each trial, shape (window,), float64.
+        trial: Number of the trial of each window, rising, shape (window,).
+    """
+
+    unit: Tensor
+    weight: Tensor
+    trial: Tensor
+
+    @staticmethod
+    def of(windows: Tensor, weight: Tensor) -> _Spectra:
+        """Spectra of windows (trial, point, n) with a weight (trial, point) above zero."""
+        used = (weight > 0) & (windows != 0).any(-1)
+        spectra = _transformed(windows[used].to(torch.complex128))
+        spectra = spectra / torch.linalg.vector_norm(spectra, dim=-1, keepdim=True)
+        share = weight / weight.sum(-1, keepdim=True).clamp_min(1e-300)
+        return _Spectra(spectra, share[used], used.nonzero()[:, 0])
+
+    def part(self, trials: Tensor, count: int) -> _Spectra:
+        """Spectra of some of `count` trials, which are numbered anew in this order, rising."""
+        if trials.numel() == count:
+            return self
+        number = torch.full((count,), -1, device=trials.device).scatter(
+            0, trials, torch.arange(trials.numel(), device=trials.device)
+        )[self.trial]
+        kept = number >= 0
+        return _Spectra(self.unit[kept], self.weight[kept], number[kept])
+
+
+def _transformed(windows: Tensor) -> Tensor:
+    """Unitary FFT of windows (window, n), of which there may be none."""
+    return torch.fft.fft(windows, norm="ortho") if windows.shape[0] else windows
+
+
+def window_entropy(spectra: _Spectra, phase_rad: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the mean entropy of windows after removal of a phase, and its gradient.
 
     The entropy of a window is H = -sum p ln p with p = |y|^2, where y is the range response,
@@ -133,28 +188,39 @@ def window_entropy(spectra: Tensor, phase_rad: Tensor, weight: Tensor) -> tuple[
     influence. Since the removal of a phase is unitary, p sums to one and dH/dy* = -(ln p + 1) y.
 
     Args:
-        spectra: Spectra of unit energy, or zero, shape (trial, point, n), complex128.
+        spectra: Windows of the trials.
         phase_rad: Phase to be removed, in radians, FFT order, shape (trial, n), float64.
-        weight: Weights of the windows, shape (trial, point), float64.
 
     Returns:
         Weighted mean entropy in nats, shape (trial,), and its derivative with respect to the phase
-        of each frequency, shape (trial, n).
+        of each frequency, shape (trial, n); zeros for trials without windows.
     """
-    n = spectra.shape[-1]
-    turned = spectra * cis(-phase_rad)[:, None]
-    zeros = torch.zeros_like(turned)
-    y = torch.fft.ifft(torch.cat([turned[..., : n // 2], zeros, turned[..., n // 2 :]], -1), norm="ortho")
+    total, gradient = torch.zeros_like(phase_rad[:, 0]), torch.zeros_like(phase_rad)
+    turn = cis(-phase_rad)
+    for first in range(0, spectra.trial.numel(), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        trial, weight = spectra.trial[block], spectra.weight[block]
+        entropy, slope = _entropy_slope(spectra.unit[block] * turn[trial])
+        total.index_add_(0, trial, weight * entropy)
+        gradient.index_add_(0, trial, weight[:, None] * slope)
+    return total, gradient
+
+
+def _entropy_slope(turned: Tensor) -> tuple[Tensor, Tensor]:
+    """Entropy (window,) of spectra (window, n), and its slope (window, n) over a removed phase."""
+    n = turned.shape[-1]
+    y = torch.fft.ifft(
+        torch.cat([turned[:, : n // 2], torch.zeros_like(turned), turned[:, n // 2 :]], -1), norm="ortho"
+    )
     p = y.real.square() + y.imag.square()
     log = torch.log(p.clamp_min(1e-30))
     slope = torch.fft.fft(-log * y, norm="ortho")
-    slope = torch.cat([slope[..., : n // 2], slope[..., -(n - n // 2) :]], -1)
-    weight = (weight / weight.sum(-1, keepdim=True).clamp_min(1e-300))[..., None]
-    return -(weight * p * log).sum((-2, -1)), 2 * (weight * (slope.conj() * turned).imag).sum(-2)
+    slope = torch.cat([slope[:, : n // 2], slope[:, -(n - n // 2) :]], -1)
+    return -(p * log).sum(-1), 2 * (slope.real * turned.imag - slope.imag * turned.real)
 
 
 def minimise(
-    cost: Callable[[Tensor], tuple[Tensor, Tensor]],
+    cost: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
     start: Tensor,
     steps: int,
     first_step: float = 0.3,
@@ -163,11 +229,12 @@ def minimise(
     """Minimise a cost by quasi-Newton (BFGS) descent, for each trial separately.
 
     A step is halved until the cost falls enough (Armijo rule). A trial stops when no step lowers
-    its cost, or when a step lowers the cost by less than the fraction rtol.
+    its cost, or when a step lowers the cost by less than the fraction rtol. The cost is computed
+    for the trials that go on alone.
 
     Args:
-        cost: Function of parameters (trial, p) that returns costs (trial,) and gradients (trial,
-            p).
+        cost: Function of parameters (k, p) and of the numbers (k,) of their trials, rising, that
+            returns costs (k,) and gradients (k, p).
         start: First parameters, shape (trial, p), float64.
         steps: Largest number of steps.
         first_step: Length of the first step.
@@ -176,32 +243,39 @@ def minimise(
     Returns:
         Parameters, shape (trial, p).
     """
-    x, (value, slope) = start, cost(start)
+    found, running = start.clone(), torch.arange(start.shape[0], device=start.device)
+    x, (value, slope) = start, cost(start, running)
     eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
     inverse = eye * (first_step / torch.linalg.vector_norm(slope, dim=-1).clamp_min(1e-12))[:, None, None]
-    active = torch.ones_like(value, dtype=torch.bool)
-    for _ in range(steps):
+    for number in range(steps):
         step = -(inverse @ slope[..., None])[..., 0]
         fall = (step * slope).sum(-1)
-        taken, new, new_value, new_slope = torch.zeros_like(active), x, value, slope
+        new, new_value, new_slope = x.clone(), value.clone(), slope.clone()
+        left = torch.arange(running.numel(), device=x.device)
         for halving in range(12):
-            here = x + step * 0.5**halving
-            v, g = cost(here)
-            good = active & ~taken & (v <= value + 1e-4 * 0.5**halving * fall)
-            new, new_value, new_slope = (
-                torch.where(good[:, None], here, new),
-                torch.where(good, v, new_value),
-                torch.where(good[:, None], g, new_slope),
-            )
-            taken = taken | good
-            if bool((taken | ~active).all()):
+            share = 0.5**halving
+            here = x[left] + share * step[left]
+            v, g = cost(here, running[left])
+            good = v <= value[left] + 1e-4 * share * fall[left]
+            new[left[good]], new_value[left[good]], new_slope[left[good]] = here[good], v[good], g[good]
+            left = left[~good]
+            if not left.numel():
                 break
-        inverse = _bfgs(inverse, new - x, new_slope - slope, eye)
-        active = taken & (value - new_value > rtol * value.abs())
-        x, value, slope = new, new_value, new_slope
-        if not bool(active.any()):
+        found[running] = new
+        on = value - new_value > rtol * value.abs()
+        if not bool(on.any()):
             break
-    return x
+        moved, turned = (new - x)[on], (new_slope - slope)[on]
+        scaled = inverse[on] if number else _curvature(moved, turned)[:, None, None] * eye
+        inverse = _bfgs(scaled, moved, turned, eye)
+        running, x, value, slope = running[on], new[on], new_value[on], new_slope[on]
+    return found
+
+
+def _curvature(moved: Tensor, turned: Tensor) -> Tensor:
+    """Inverse curvature along the change of the gradient, (trial,); 1 where it is not positive."""
+    curvature, square = (moved * turned).sum(-1), turned.square().sum(-1)
+    return torch.where(curvature > 0, curvature / square.clamp_min(1e-300), 1)
 
 
 def _bfgs(inverse: Tensor, moved: Tensor, turned: Tensor, eye: Tensor) -> Tensor:
@@ -234,17 +308,14 @@ def sharpest_coefficients(
     Returns:
         Coefficients in radians of the degrees 2 to orders[-1], shape (trial, orders[-1] - 1).
     """
-    n = windows.shape[-1]
-    spectra = torch.fft.fft(windows.to(torch.complex128), norm="ortho")
-    energy = torch.linalg.vector_norm(spectra, dim=-1, keepdim=True)
-    spectra = spectra / torch.where(energy > 0, energy, 1)
-    basis = unit_legendre(band_axis(n, band, windows.device).clamp(-1, 1), orders[-1])[2:]
+    spectra = _Spectra.of(windows, weight)
+    basis = unit_legendre(band_axis(windows.shape[-1], band, windows.device).clamp(-1, 1), orders[-1])[2:]
     c = torch.zeros((windows.shape[0], 0), dtype=torch.float64, device=windows.device)
     for order in orders:
         part = basis[: order - 1]
 
-        def cost(c: Tensor, part: Tensor = part) -> tuple[Tensor, Tensor]:
-            value, slope = window_entropy(spectra, c @ part, weight)
+        def cost(c: Tensor, trials: Tensor, part: Tensor = part) -> tuple[Tensor, Tensor]:
+            value, slope = window_entropy(spectra.part(trials, windows.shape[0]), c @ part)
             return value, slope @ part.mT
 
         c = minimise(cost, torch.nn.functional.pad(c, (0, order - 1 - c.shape[-1])), steps)
@@ -265,8 +336,8 @@ def estimate_response_sharpest(
     Sharpness is measured by the entropy of range windows about the points. After each pass the
     image is corrected and the points are chosen again. The last pass fits two halves of the points
     separately, which share few targets. The estimate is the mean of both fits; the standard
-    deviation follows from their difference and from the size of the highest two degrees, since a
-    finer ripple needs higher ones. Not differentiable.
+    deviation follows from their difference, and from what both have in common that a finer ripple
+    of up to twice the highest degree would explain. Not differentiable.
 
     Args:
         image: Image whose pulse band is centred at zero range frequency, shape (..., azimuth,
@@ -284,8 +355,11 @@ def estimate_response_sharpest(
         Estimate with `phase_rad` in radians and its standard deviation, at GRID = 1025 equally
         spaced frequencies of the pulse band, shape (..., GRID), without constant and linear part;
         and `amplitude` of the same shape, all ones. `quality` is 1 / (1 + variance in rad^2). `ok`
-        is False, and the phase is zero, where the fits of the two halves differ by more than 0.25
-        rad rms: the image has too few bright points.
+        is False, and the phase is zero, where the standard deviation is 0.125 rad or more: the
+        image has too few bright points, or the response has a ripple finer than the degrees; and
+        where noise alone would leave more than 0.08 rad, since such fits may be far off. A
+        ripple finer than twice the highest degree cannot be told from targets side by side, and
+        is not noticed.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -304,17 +378,50 @@ def estimate_response_sharpest(
         if i < passes - 1:
             total = total + sharpest_coefficients(windows, weight, band, orders if i == 0 else orders[-1:])
     halves, weights = halved(windows, weight, line)
-    first, second = sharpest_coefficients(halves, weights, band, orders[-1:]).chunk(2)
-    total = total + (first + second) / 2
-    std = torch.where(
-        (weights.sum(-1) > 0).reshape(2, -1).all(0), torch.linalg.vector_norm(first - second, dim=-1) / 2, torch.inf
+    found = sharpest_coefficients(halves, weights, band, orders[-1:])
+    phase_rad = (total + sum(found.chunk(2)) / 2) @ basis
+    std = _deviation(halves, weights, band, found, _bound(weight, found.shape[-1]))
+    return _phase_estimate(phase_rad, std, image.shape[:-2])
+
+
+def _bound(weight: Tensor, count: int) -> Tensor:
+    """Cramer-Rao bound in rad, (trial,), of `count` coefficients from weights (trial, point).
+
+    A window whose peak has s times the power of the noise gives each coefficient a variance of
+    1 / (2 s).
+    """
+    s = _FULL * weight / (1 - weight)
+    return (count / (2 * s.sum(-1))).sqrt()
+
+
+def _deviation(halves: Tensor, weights: Tensor, band: float, found: Tensor, bound: Tensor) -> Tensor:
+    """Standard deviation in rad, (trial,), of the mean of coefficients (2 trial, p) of two halves.
+
+    It is the bound or more, and infinite where the bound is too large for any trust, or a half has
+    no window.
+    """
+    first, second = found.chunk(2)
+    std = torch.hypot(torch.linalg.vector_norm(first - second, dim=-1) / 2, _finer(halves, weights, band, found))
+    return torch.where(
+        (weights.sum(-1) > 0).reshape(2, -1).all(0) & (bound < _MOST_NOISE), torch.maximum(std, bound), torch.inf
     )
-    return _phase_estimate(total @ basis, torch.hypot(std, _beyond(total)), image.shape[:-2])
 
 
-def _beyond(c: Tensor) -> Tensor:
-    """Phase in rad, (trial,), that higher degrees may add: that of the highest two."""
-    return torch.linalg.vector_norm(c[:, -2:], dim=-1)
+def _finer(halves: Tensor, weights: Tensor, band: float, found: Tensor) -> Tensor:
+    """Phase in rad, (trial,), that degrees up to twice the highest one would add in both halves.
+
+    One step of descent from the coefficients found, (2 trial, p), of length slope over curvature.
+    """
+    spectra, count = _Spectra.of(halves, weights), found.shape[-1]
+    basis = unit_legendre(band_axis(halves.shape[-1], band, halves.device).clamp(-1, 1), 2 * (count + 1))[2:]
+    slope = window_entropy(spectra, found @ basis[:count])[1] @ basis[count:].mT
+    both = sum(slope.chunk(2))
+    step = 0.05 * both / torch.linalg.vector_norm(both, dim=-1, keepdim=True).clamp_min(1e-300)
+    moved = torch.cat([found, step.repeat(2, 1)], -1)
+    change = window_entropy(spectra, moved @ basis)[1] @ basis[count:].mT - slope
+    first, second = slope.chunk(2)
+    curvature = (sum(change.chunk(2)) / 2 * step).sum(-1) / step.square().sum(-1).clamp_min(1e-300)
+    return (first * second).sum(-1).clamp_min(0).sqrt() / curvature.clamp_min(_CURVATURE)
 
 
 def _phase_estimate(phase_rad: Tensor, std: Tensor, trials: torch.Size) -> Estimate:
@@ -356,16 +463,18 @@ def point_average_coefficients(
     inside = (u.abs() <= 1).nonzero()[:, 0]
     away = (torch.arange(n, device=windows.device) - n // 2).abs() / n
     taper = torch.cos(math.pi / 2 * ((away - 0.3) / 0.2).clamp(0, 1)).square()
-    spectra = torch.fft.fftshift(
-        torch.fft.fft(torch.fft.ifftshift((windows * taper).to(torch.complex128), dim=-1)), dim=-1
-    )[..., inside]
-    norm = torch.linalg.vector_norm(spectra, dim=-1, keepdim=True)
-    spectra = spectra / torch.where(norm > 0, norm, 1) * weight[..., None]
-    average = spectra[..., :1, :]
-    for _ in range(rounds):
-        spectra = _align(spectra, average)
-        average = spectra.mean(-2, keepdim=True)
-    average = average[..., 0, :]
+    used = (weight > 0) & (windows != 0).any(-1)
+    trial = used.nonzero()[:, 0]
+    spectra = torch.fft.ifftshift((windows[used] * taper).to(torch.complex128), dim=-1)
+    spectra = torch.fft.fftshift(_transformed(spectra), dim=-1)[:, inside]
+    spectra = spectra / torch.linalg.vector_norm(spectra, dim=-1, keepdim=True)
+    # the first window of each trial
+    average = spectra.new_zeros(windows.shape[0], spectra.shape[-1])
+    first = torch.diff(trial, prepend=trial.new_full((1,), -1)) > 0
+    average[trial[first]] = spectra[first]
+    for _ in range(rounds if trial.numel() else 0):
+        spectra = _align(spectra, average[trial])
+        average = torch.zeros_like(average).index_add(0, trial, spectra * weight[used][:, None])
     steps = torch.angle(average[..., 1:] * average[..., :-1].conj())
     phase = torch.nn.functional.pad(torch.cumsum(steps, -1), (1, 0))
     magnitude = (average.abs() + 1e-12)[..., None]
@@ -375,10 +484,10 @@ def point_average_coefficients(
 
 
 def _align(spectra: Tensor, reference: Tensor) -> Tensor:
-    """Spectra (..., point, n), with linear and constant phase aligned with the reference."""
+    """Spectra (window, n), with linear and constant phase aligned with the references."""
     n = 8 * spectra.shape[-1]
     correlation = torch.fft.fft(spectra * reference.conj(), n)
-    index = correlation.abs().argmax(-1, keepdim=True)
+    index = (correlation.real.square() + correlation.imag.square()).argmax(-1, keepdim=True)
     slope = (index - n * (2 * index >= n)).to(torch.float64) / n
     turned = torch.gather(correlation, -1, index)
     return spectra * linear_phasor(-slope[..., 0], 0, spectra.shape[-1], spectra.dtype) * cis(-torch.angle(turned))
@@ -415,7 +524,7 @@ def estimate_response_points(
         Estimate with `phase_rad` in radians and its standard deviation, at GRID = 1025 equally
         spaced frequencies of the pulse band, shape (..., GRID), and `amplitude` of the same shape,
         all ones. `quality` is 1 / (1 + variance in rad^2). `ok` is False, and the phase is zero,
-        where the results of two halves of the points differ by more than 0.25 rad rms.
+        where the standard deviation is 0.125 rad or more, as there.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -431,29 +540,32 @@ def estimate_response_points(
     for i in range(passes):
         sharper = correct_response(rows, total @ basis, None, band) if i else rows
         windows, line = brightest_windows(sharper, points, width, apart=width // 2)
-        weight = (window_weights(windows, sharper) > 0).to(torch.float64)
+        strength = window_weights(windows, sharper)
+        weight = (strength > 0).to(torch.float64)
         total = total + point_average_coefficients(windows, weight, band, order)
-    first, second = point_average_coefficients(*halved(windows, weight, line), band, order).chunk(2)
-    std = torch.where((weight.sum(-1) > 1), torch.linalg.vector_norm(first - second, dim=-1) / 2, torch.inf)
-    return _phase_estimate(total @ basis, torch.hypot(std, _beyond(total)), image.shape[:-2])
+    halves, weights = halved(windows, weight, line)
+    found = point_average_coefficients(halves, weights, band, order)
+    std = _deviation(halves, weights, band, found, _bound(strength, order - 1))
+    return _phase_estimate(total @ basis, std, image.shape[:-2])
 
 
 _METHODS = {"sharpest": estimate_response_sharpest, "points": estimate_response_points}
 
 
-def _edge_phase(pulse: LinearFM, sampling_hz: float) -> Tensor:
-    """Phase in rad, (GRID,), that the estimators find in an echo whose edge lies on a sample.
+def _edge_phase(pulse: LinearFM, sampling_hz: float, flat: bool) -> Tensor:
+    """Size in rad, (GRID,), of the phase that is found in an echo whose edge lies on a sample.
 
     The abrupt edges of the pulse have frequencies that alias. What they add to the phase of an echo
     depends on where its edges lie between samples, and no image shows it apart from a response.
     """
-    n = 4 * pulse.n_samples(sampling_hz)
-    u = band_axis(n, pulse.bandwidth_hz / sampling_hz)
-    mean = pulse.band_spectrum(n, sampling_hz)
-    phase, size = torch.angle(pulse.spectrum(n, sampling_hz) * mean.conj())[u.abs() <= 1], mean.abs()[u.abs() <= 1]
-    degree = min(_EDGE_DEGREE, phase.shape[-1] // 4)
-    fit = torch.linalg.lstsq(size[:, None] * unit_legendre(u[u.abs() <= 1], degree).mT, (size * phase)[:, None])
-    return (fit.solution[2:, 0] @ unit_legendre(band_grid(), degree)[2:]).abs()
+    n = max(4 * pulse.n_samples(sampling_hz), 2 * _EDGE_WIDTH)
+    band, mean = pulse.bandwidth_hz / sampling_hz, pulse.band_spectrum(n, sampling_hz)
+    compressed = pulse.spectrum(n, sampling_hz) * mean.conj()
+    if flat:
+        compressed = torch.where(band_axis(n, band).abs() <= 1, compressed / mean.abs().square(), 0)
+    echo = torch.fft.ifft(compressed).roll(_EDGE_WIDTH // 2)[:_EDGE_WIDTH]
+    found = sharpest_coefficients(echo[None, None], torch.ones(1, 1, dtype=torch.float64), band)
+    return (found[0] @ unit_legendre(band_grid(), ORDERS[-1])[2:]).abs()
 
 
 class EstimateResponse(Stage):
@@ -502,16 +614,19 @@ class EstimateResponse(Stage):
             of the pulse band. The amplitude is one unless the constructor received
             `expected_power`.
         """
-        band = self.radar.pulse.bandwidth_hz / self.radar.sampling_hz
-        estimate = self.method(signal.data, band, valid=max(1, signal.data.shape[-1] - self.radar.pulse_samples))
-        edges = _edge_phase(self.radar.pulse, self.radar.sampling_hz).to(signal.data.device)
+        return self._estimated(signal, self.expected_power)
+
+    def _estimated(self, signal: Signal, expected: Tensor | None, flat: bool = False) -> Estimate:
+        """Estimate, with the amplitude if a power spectrum is expected."""
+        pulse, fs, columns = self.radar.pulse, self.radar.sampling_hz, signal.data.shape[-1]
+        band = pulse.bandwidth_hz / fs
+        estimate = self.method(signal.data, band, valid=max(1, columns - self.radar.pulse_samples))
+        edges = _edge_phase(pulse, fs, flat).to(signal.data.device)
         estimate = replace(estimate, std={"phase_rad": torch.hypot(estimate.std["phase_rad"], edges)})
-        if self.expected_power is None:
+        if expected is None:
             return estimate
-        amplitude = estimate_amplitude_response(band_power(unit_level(signal.data)), self.expected_power, band)
-        return Estimate(
-            {**estimate.value, "amplitude": amplitude}, estimate.quality, estimate.ok, estimate.std, estimate.info
-        )
+        amplitude = estimate_amplitude_response(band_power(unit_level(signal.data)), expected, band)
+        return replace(estimate, value={**estimate.value, "amplitude": amplitude})
 
 
 class EstimateFlatResponse(EstimateResponse):
@@ -543,4 +658,4 @@ class EstimateFlatResponse(EstimateResponse):
             1025 equally spaced frequencies of the pulse band.
         """
         flat = torch.ones(signal.data.shape[-1], dtype=torch.float64, device=signal.data.device)
-        return EstimateResponse(self.radar, self.method, flat)(signal)
+        return self._estimated(signal, flat, flat=True)
