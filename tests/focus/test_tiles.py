@@ -233,12 +233,27 @@ def test_an_error_that_tiles_do_not_reach_is_refused_with_the_figure() -> None:
         drawn.plan(-300.0)
 
 
+@pytest.mark.parametrize(("pulses", "frequencies"), [(1, 2), (1, 40), (2, 2), (3, 3), (60, 2), (5, 64)])
+def test_few_pulses_or_frequencies(pulses: int, frequencies: int) -> None:
+    drawn = case(1010)
+    few = replace(
+        drawn,
+        transmitter_m=drawn.transmitter_m[:pulses],
+        receiver_m=None,
+        reference_m=2 * torch.linalg.vector_norm(drawn.transmitter_m[:pulses], dim=-1),
+        frequency_hz=drawn.frequency_hz[:frequencies],
+        history=drawn.history[:pulses, :frequencies],
+    )
+    assert few.error_db(few.plan().image(few.history)) < -65
+
+
 @pytest.mark.parametrize(
     ("change", "error", "text"),
     [
         ({"transmitter_m": torch.zeros(5, 3)}, TypeError, "transmitter_m must be a float64 tensor"),
         ({"frequency_hz": torch.tensor([1e9, 2e9, 4e9], dtype=F64)}, ValueError, "equal steps"),
         ({"transmitter_m": torch.zeros(5, 3, dtype=F64)}, ValueError, "positions of shape"),
+        ({"transmitter_m": torch.zeros(0, 175, 3, dtype=F64)}, ValueError, "positions of shape"),
         ({"reference_m": torch.full((3,), math.nan, dtype=F64)}, ValueError, "NaN"),
     ],
 )
@@ -250,7 +265,7 @@ def test_geometries_that_make_no_sense_are_refused(change: dict, error: type, te
 def test_histories_of_another_size_or_type_are_refused() -> None:
     drawn = case(1002)
     plan = drawn.plan(-50.0)
-    with pytest.raises(ValueError, match="the plan was made for histories of"):
+    with pytest.raises(ValueError, match="the plan was made for histories"):
         plan.image(drawn.history[:, 1:])
     with pytest.raises(TypeError):
         plan.image(drawn.history.real)

@@ -16,17 +16,19 @@ from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slope
 from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, kernel_error, rise_for, taps_for, window_error
 
 # sizes that are tried
-_WIDTHS = (16, 32, 64, 128)
-_DEPTHS = (8, 16, 32, 64, 128)
-_RANGE_OVERSAMPLING = (1.25, 1.5, 2.0, 3.0)
+_WIDTHS = (8, 16, 32, 64, 128)
+_DEPTHS = (4, 8, 16, 32, 64, 128)
+_RANGE_OVERSAMPLING = (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+# windows are tabulated at multiples of this share of the band
+_GUARD_STEP = 1 / 64
 # tiles that share one expansion
 TILES_OF_ZONE = 256
 # pulses that one product of the spreading joins
 CHUNK = 64
 # most error of the kernel and of the window, as shares of the whole
 _SHARE = 0.4
-# smallest error that is offered, where the rounding of complex64 begins
-_LEAST_DB = -140.0
+# errors that are offered: the kernels reach the least
+_LEAST_DB, _MOST_DB = -130.0, -20.0
 # an expansion gains at most this from halving a size or doubling the sub-apertures, by its order
 _MOST_GAIN_DB = 24.0
 _FIT_PULSES, _JUDGED_PULSES = 24, 16
@@ -39,8 +41,9 @@ _MARGIN = 1.1
 _SPAN_PULSES, _LEAST_PULSES = 512, 8
 # longest window that is tried, in samples
 _LONGEST = 4096
-# what the cost assumes: oversampling of the profiles, and depth of a tile in resolution cells
-_USUAL_OVERSAMPLING, _CELLS = 1.5, 24
+# what the cost assumes: oversampling of the profiles with the guard that is left, and depth of a
+# tile in resolution cells
+_USUAL_OVERSAMPLING, _USUAL_GUARD, _CELLS = 1.5, 20 / 64, 24
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class Choice:
         order: Highest power of the range coordinate in the expansion, 1 or 2.
         taps: Width of the kernel over cross range in nodes.
         rise: Samples of either slope of the window over range.
+        guard: Share of the band that the slopes of the window may fill.
         oversampling: Fineness of the range profiles relative to the resolution.
         error_db: Predicted error relative to the image of white noise in dB.
     """
@@ -64,6 +68,7 @@ class Choice:
     order: int
     taps: int
     rise: int
+    guard: float
     oversampling: float
     error_db: float
 
@@ -240,12 +245,13 @@ def choose(scene: Scene, error_db: float) -> Choice:
         The sizes.
 
     Raises:
-        ValueError: If none meets the error.
+        ValueError: If none meets the error, or it is not offered.
     """
+    if not _LEAST_DB <= error_db <= _MOST_DB:
+        raise ValueError(f"error_db of an image by tiles must be {_LEAST_DB:g} to {_MOST_DB:g} dB, got {error_db:g} dB")
     wanted = 10 ** (error_db / 20)
     taps = taps_for(_SHARE * wanted)
-    if taps is None:
-        raise ValueError(f"error_db of the tile imager must be -10 to {_LEAST_DB:g} dB, got {error_db:g} dB")
+    assert taps is not None
     best = math.inf
     failed: list[tuple[tuple[int, int, int, int], float]] = []
     for sizes, _ in sorted(_costs(scene, taps, wanted), key=lambda pair: pair[1]):
@@ -253,11 +259,12 @@ def choose(scene: Scene, error_db: float) -> Choice:
             continue
         error, stretch = scene.expansion_error(*sizes)
         slope = _choose_slope(scene, stretch, wanted)
-        total = math.hypot(error, kernel_error(taps), slope[2] if slope else math.inf)
-        if slope is not None and total <= wanted:
-            return Choice(*sizes, taps, slope[0], slope[1], 20 * math.log10(total))
+        if slope is not None:
+            total = math.hypot(error, kernel_error(taps), window_error(*slope[:2]))
+            if total <= wanted:
+                return Choice(*sizes, taps, *slope, 20 * math.log10(total))
+            best = min(best, total)
         failed.append((sizes, error))
-        best = min(best, math.hypot(error, _SHARE * wanted))
     reach = f"{20 * math.log10(best):.0f} dB" if best < 1 else "no error below 0 dB"
     raise ValueError(
         f"tiles reach {reach} in this geometry, wanted were {error_db:g} dB; ask for a larger error_db, turn the "
@@ -266,22 +273,25 @@ def choose(scene: Scene, error_db: float) -> Choice:
 
 
 def _choose_slope(scene: Scene, stretch: float, wanted: float) -> tuple[int, float, float] | None:
-    """Slope of the window in samples, oversampling of the profiles and error of the window."""
+    """Slope of the window in samples, its share of the band, and oversampling of the profiles."""
     found = []
     for oversampling in _RANGE_OVERSAMPLING:
         guard = _guard_of(scene, oversampling, stretch * _MARGIN)
         rise = rise_for(_SHARE * wanted, guard)
         if rise is not None:
-            found.append((oversampling * _CELLS + rise, (rise, oversampling, window_error(rise, guard))))
+            found.append((oversampling * _CELLS + rise, (rise, guard, oversampling)))
     return min(found)[1] if found else None
 
 
 def _guard_of(scene: Scene, oversampling: float, stretch: float) -> float:
-    """Share of the sampled band that no wave number of a stretched pulse enters."""
+    """Share of the sampled band that no wave number of a stretched pulse enters, rounded down so
+    that few windows are tabulated.
+    """
     low, carrier, high = scene.waves
     n = len(scene.frequency_hz)
     band = profile_length(n, oversampling) * (high - low) / max(1, n - 1)
-    return 1 - 2 * (max(high - carrier, carrier - low) + carrier * stretch) / band
+    share = 1 - 2 * (max(high - carrier, carrier - low) + carrier * stretch) / band
+    return math.floor(share / _GUARD_STEP) * _GUARD_STEP
 
 
 def _hopeless(sizes: tuple[int, int, int, int], other: tuple[int, int, int, int], error: float, wanted: float) -> bool:
@@ -304,7 +314,7 @@ def _costs(scene: Scene, taps: int, wanted: float) -> Iterator[tuple[tuple[int, 
     s = a / (b / b[:, n // 2, None]) - a[:, n // 2, None]
     bend = float(curvatures([v[:1] for v in some], corners, grid.axes).abs().max())
     per_metre = _USUAL_OVERSAMPLING * (high - low) / (2 * math.pi)
-    rise = rise_for(_SHARE * wanted, 1 - 1 / _USUAL_OVERSAMPLING) or _CELLS
+    rise = rise_for(_SHARE * wanted, _USUAL_GUARD) or _CELLS
     number = [2**k for k in range(int(math.log2(max(1, pulses // _LEAST_PULSES))) + 1)]
     blocks = {parts: [s[:, i:j] for i, j in part_bounds(n, min(parts, n))] for parts in number}
     spans = {parts: max(float((v.amax(-1) - v.amin(-1)).max()) for v in of) for parts, of in blocks.items()}

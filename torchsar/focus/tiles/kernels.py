@@ -13,8 +13,6 @@ CROSS_OVERSAMPLING = 1.5
 # width and guard of the windows, and taps of the kernels, that are offered
 _RISES = range(4, 65, 2)
 _TAPS = range(3, 13)
-# the error of a window is tabulated at multiples of this share of the band
-_GUARD_STEP = 1 / 64
 # ridge of the fit of the nodes; beta relative to that of a kernel whose band just ends at the
 # oversampling, found by trial; 1 - u^2 below which the slope of the kernel is cut
 _RIDGE, _SHARPNESS, _EDGE = 1e-13, 0.96, 1e-12
@@ -103,6 +101,7 @@ def window_slope(rise: int, guard: float) -> Tensor:
     return (total[below] + (at - below) * (total[below + 1] - total[below])) / total[-1]
 
 
+@functools.cache
 def window_error(rise: int, guard: float) -> float:
     """Compute the error of a signal between the samples in the flat part of a window.
 
@@ -113,11 +112,6 @@ def window_error(rise: int, guard: float) -> float:
     Returns:
         Rms error relative to 1.
     """
-    return _window_error(rise, math.floor(guard / _GUARD_STEP) * _GUARD_STEP)
-
-
-@functools.cache
-def _window_error(rise: int, guard: float) -> float:
     flat = 24
     slope = window_slope(rise, guard)
     weights = torch.cat([slope, slope.new_ones(flat), slope.flip(0)])
@@ -154,6 +148,6 @@ def rise_for(error: float, guard: float) -> int | None:
     Returns:
         Samples of either slope, None if no window meets the error.
     """
-    if guard < 2 * _GUARD_STEP:
+    if guard <= 0:
         return None
     return next((rise for rise in _RISES if window_error(rise, guard) <= error), None)

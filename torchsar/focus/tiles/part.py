@@ -117,9 +117,7 @@ class Part:
         self.extent = extent
         flat = 2 * self._reach(every) + 1
         self.length = even_length(flat + choice.rise)
-        stretch = float((slopes(every, centre, axes)[2] / self.expansion.b[..., None] - 1).abs().max())
-        guard = 1 - band.n / band.length - stretch * band.carrier * band.step_m / math.pi
-        self.slope = window_slope(choice.rise, max(guard, 1 / 64)).to(centre.device)
+        self.slope = window_slope(choice.rise, choice.guard).to(centre.device)
         self.samples = self.length + choice.rise
         self._across(extent)
 

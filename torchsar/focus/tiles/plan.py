@@ -84,12 +84,13 @@ class TilePlan:
         refuse_non_finite_values("TilePlan", **given)
         places = [given[name] for name in ("transmitter_m", "receiver_m") if name in given]
         pulses = reference_m.shape[-1:]
-        if not pulses or pulses[0] < 1 or any(place.shape[-2:] != (*pulses, 3) for place in places):
+        lead = _common([reference_m.shape[:-1], *(place.shape[:-2] for place in places)])
+        if lead is None or 0 in (*lead, *reference_m.shape) or any(v.shape[-2:] != (*pulses, 3) for v in places):
             raise ValueError(
-                "a tile plan needs positions of shape (..., pulse, 3) and reference_m of shape (..., pulse), got "
+                "a tile plan needs positions of shape (..., pulse, 3) and reference_m of shape (..., pulse), with "
+                "leading dimensions that broadcast, got "
                 + ", ".join(f"{name} {tuple(value.shape)}" for name, value in given.items())
             )
-        lead = torch.broadcast_shapes(*(place.shape[:-2] for place in places), reference_m.shape[:-1])
         self._lead = lead
         self._places = [place.expand(*lead, *pulses, 3).reshape(-1, *pulses, 3) for place in places]
         self._reference_m = reference_m.expand(*lead, *pulses).reshape(-1, *pulses)
@@ -179,11 +180,12 @@ class TilePlan:
         """
         history = checked_samples(history, "TilePlan.image", "pulse, frequency", finite=False)
         size = self._reference_m.shape[-1], len(self.frequency_hz)
-        if history.shape[-2:] != size:
+        lead = _common([history.shape[:-2], self._lead])
+        if history.shape[-2:] != size or lead is None:
             raise ValueError(
-                f"the plan was made for histories of (pulse, frequency) = {size}, got {tuple(history.shape[-2:])}"
+                f"the plan was made for histories (..., pulse, frequency) of shape {(*self._lead, *size)}, got "
+                f"{tuple(history.shape)}"
             )
-        lead = torch.broadcast_shapes(history.shape[:-2], self._lead)
         paths = len(self._reference_m)
         data = history.expand(*lead, *size).reshape(paths, -1, *size) if paths > 1 else history.reshape(1, -1, *size)
         trials = data.shape[1]
@@ -218,7 +220,7 @@ class TilePlan:
         for k, (first, last) in enumerate(self._bounds):
             x = self._band.profiles(data[:, first:last])
             longest = max(zone[k].samples for zone in self._zones)
-            out.append(torch.cat([x, x[..., :longest]], -1))
+            out.append(x[..., torch.arange(x.shape[-1] + longest, device=x.device) % x.shape[-1]])
         return out
 
     def _pixels(self, zone: Sequence[Part], rows: slice, profiles: Sequence[Tensor]) -> Tensor:
@@ -276,6 +278,14 @@ def image_tiles(
             equal steps, or tiles do not reach the error in this geometry.
     """
     return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db).image(history)
+
+
+def _common(shapes: Sequence[torch.Size]) -> torch.Size | None:
+    """Shape to which shapes broadcast, None if they do not."""
+    try:
+        return torch.broadcast_shapes(*shapes)
+    except RuntimeError:
+        return None
 
 
 def _refuse_other_than_float64(**values: Tensor) -> None:
