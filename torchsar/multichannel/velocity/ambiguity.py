@@ -83,12 +83,9 @@ def warned_of_ambiguity(
 
     Returns:
         The estimate with `pulse_rates` in its info: the number of PRFs to add to the Doppler, see
-        `better_pulse_rate`, or zero where the estimate is not ok. `ok` is False where this number
-        is not zero.
+        `better_pulse_rate`. `ok` is False where this number is not zero.
     """
-    off = torch.zeros_like(estimate.quality, dtype=torch.float64)
-    if bool(estimate.ok.any()):
-        off = torch.where(estimate.ok, better_pulse_rate(data, radar, motion, aperture), off)
+    off = better_pulse_rate(data, radar, motion, aperture)
     wrong = (off != 0) & estimate.ok
     if bool(wrong.any()):
         span, count = radar.ambiguous_velocity_m_s, f"{int(wrong.sum())} of {wrong.numel()} trials"
