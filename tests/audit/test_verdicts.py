@@ -83,6 +83,8 @@ CELLS = [
     ("compensate.PhasePolish", "clutter 60 %", 5.0, 0.0),
     ("compensate.PhasePolish", "own", 20.0, 1.0),
     ("compensate.Sca", "few points", 10.0, 0.0),
+    ("compensate.CoarseRotation", "direct", 0.0, 0.8),
+    ("compensate.RotationDescent", "direct", 0.0, 0.8),
     ("compensate.EntropyFixedPoint", "partly lit", 10.0, 0.0),
     ("compensate.Autofocus", "one point", -5.0, 1.0),
     ("compensate.align_running", "direct", 40.0, 0.0),

@@ -23,8 +23,9 @@ from tests.compensate.turning import (
     response,
     target,
 )
+from tests.direct.turntable import Turntable
 from torchsar.compensate.rotation.couplings import Pairs
-from torchsar.compensate.rotation.histories import refined_by_histories, solved
+from torchsar.compensate.rotation.histories import change_by_histories, refined_by_histories, solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of, without_range_term
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.compensate.rotation.range_response import RangeResponse
@@ -128,6 +129,19 @@ def test_phase_histories_correct_an_error_of_the_motion(error: tuple[float, floa
     twice, _ = refined_by_histories(data, SAMPLING, once)
     thrice, _ = refined_by_histories(data, SAMPLING, twice)
     assert ((once.k[0] - K).abs() < 0.5 * offset).all() and ((thrice.k[0] - K).abs() < 0.3 * offset).all()
+
+
+def test_scatterers_beyond_the_pulse_rate_are_left_out() -> None:
+    """The pulses are too sparse at the end, where the target turns faster.
+
+    Its edges return, blurred, at the other end of the band, and were taken for scatterers of other
+    phase histories.
+    """
+    table = Turntable(PRF, PULSES, 24, CELL, 40, 0.45)
+    data, _ = table.noisy(table.echo(*table.satellite(0)), 20.0, 0)
+    _, _, edge_rad, count = change_by_histories(data[None], SAMPLING, truth())
+    turns = 2 * OMEGA * 0.45 / WAVELENGTH * warp(torch.tensor([SAMPLING.duration_s], dtype=F64), K)
+    assert count > 10 and abs(edge_rad / (2 * math.pi) - turns) < 2
 
 
 def test_an_undersampled_range_term_is_impossible() -> None:

@@ -119,8 +119,8 @@ def test_few_scatterers_are_judged_as_well_as_many() -> None:
 
 
 def test_a_target_of_many_weak_scatterers_is_fitted_with_more_of_them() -> None:
-    """The usual number explains 39 % of the energy of 800 scatterers."""
-    clean = echo(*points(9000, 800))
+    """The usual number explains 47 % of the energy of 600 scatterers."""
+    clean = echo(*points(9000, 600))
     data = (clean + noise_std(clean, 10.0) * noise(9000, *clean.shape)).to(torch.complex64)
     found = uneven_rotation(data, **OPTIONS)
     assert found.ok and found.info["scatterers"] > 200 and z_scores(found, K).abs().max() < 4
@@ -140,9 +140,7 @@ def test_each_step_reduces_the_error() -> None:
         name: (estimator(data, **OPTIONS)["warp_k"] / K - 1).abs().median(0).values
         for name, estimator in ESTIMATORS.items()
     }
-    assert (errors["coarse"] < torch.tensor([0.5, 0.1], dtype=F64)).all() and errors["coarse"][0] > errors["phase_fit"][
-        0
-    ]
+    assert (errors["coarse"] < 0.03).all() and errors["coarse"][0] > errors["phase_fit"][0]
     assert (errors["uneven"] < 2e-3).all() and (errors["phase_fit"] > errors["uneven"]).all()
 
 
@@ -160,7 +158,7 @@ def test_a_batch_equals_single_trials(name: str) -> None:
         for key, value in alone.std.items():
             torch.testing.assert_close(together.std[key][i], value, rtol=1e-4, atol=1e-9)
         assert alone.ok == together.ok[i] and torch.allclose(alone.quality, together.quality[i], atol=1e-6)
-    assert not together.ok[2:4].any() and (name == "coarse" or (together.ok[0] and together.ok[4]))
+    assert not together.ok[2:4].any() and together.ok[0] and together.ok[4]
     grid = ESTIMATORS[name](data[:4].view(2, 2, PULSES, 24), **OPTIONS)
     assert grid["warp_k"].shape == (2, 2, 2) and torch.equal(
         grid["warp_k"].flatten(0, 1), ESTIMATORS[name](data[:4], **OPTIONS)["warp_k"]
@@ -352,7 +350,7 @@ def test_phase_and_rotation_are_estimated_in_turn() -> None:
     """
     impaired = target(0) * torch.exp(1j * pulse_phases())[:, None]
     stage = Alternate(
-        3,
+        5,
         phase=Turn(RotationAutofocus(RADAR), CorrectPulsePhase()),
         rotation=Turn(UnevenRotation(RADAR, yc_m=0.0), RangePhase(RADAR)),
     )

@@ -4,7 +4,8 @@ No values to start from are needed. Within a short section the target rotates al
 Doppler spectra of two sections differ by a stretch, the ratio of the two rotation rates; on a
 logarithmic Doppler axis this is a shift. The magnitude spectra of every pair of sections are
 correlated on that axis and summed over range cells. A global search finds the rotation rate as a
-function of time with which the shifts of all pairs agree best.
+function of time with which the shifts of all pairs agree best. The search is repeated on
+compensated data, with longer sections, which resolve scatterers better.
 """
 
 from __future__ import annotations
@@ -15,7 +16,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core.warp import warp_rate
+from torchsar.compensate.rotation.motion import SEARCH_EPS
+from torchsar.core.warp import warp, warp_rate
+from torchsar.focus.image_lines import DopplerLines
+from torchsar.focus.matched_fourier import matched_fourier
+from torchsar.focus.transforms import Gridding
+from torchsar.metrics import entropy
 
 # limits of the number of sections, found by trial: more follow the rate more closely, fewer resolve
 # Doppler better
@@ -26,8 +32,11 @@ _WIDEST = 1.4  # largest logarithm of a ratio of rates that is searched: a facto
 _GRID = 0.07  # step of the search, in logarithms of rates at the middle and the end of the aperture
 _BLUR = 0.03  # blur of the correlations on the grid, about half its step, so that no peak is missed
 _KEPT = 6  # candidates of the grid that are refined, found by trial: reliability against time
-_ROUNDS = 6  # refinements, each of which halves the step: to 0.001 of a rate
+_ROUNDS = 10  # refinements, each of which halves the step: to 0.0001 of a rate
 _ROWS = 16  # range cells of most energy that are used, found by trial: accuracy against time
+# numbers of sections of compensated data, and the largest logarithm of a ratio of rates that is
+# then left, found by trial
+_FEWER_SECTIONS, _LEFT = (6, 4, 4), 0.35
 _LEAST_RATE = 0.1  # least rate over that at the start; slower targets would nearly reverse
 
 
@@ -55,56 +64,100 @@ class _Agreement:
         """
         reach = (self.table.shape[-1] - 1) // 2
         shift = (log_rate[..., self.second] - log_rate[..., self.first]) * _STEPS_PER_UNIT + reach
-        shift = shift.clamp(0, 2 * reach - 1e-3)
+        shift = shift.clamp(1, 2 * reach - 1 - 1e-3)
         whole = shift.floor().long()
-        rest = (shift - whole).to(self.table.dtype)
+        x = (shift - whole).to(self.table.dtype)
         position = (torch.arange(len(self.first), device=shift.device) * self.table.shape[-1] + whole).flatten(1)
         flat = self.table.flatten(1)
-        low, high = (torch.gather(flat, 1, position + step).view(shift.shape) for step in (0, 1))
-        return (low + rest * (high - low)).sum(-1)
+        a, b, c, d = (torch.gather(flat, 1, position + step).view(shift.shape) for step in (-1, 0, 1, 2))
+        # through four points: a maximum between steps is not moved to one of them
+        return (b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a)))).sum(-1)
 
 
-def coarse_warp(data: Tensor, prf_hz: float, sections: int | None = None) -> Tensor:
+def coarse_warp(data: Tensor, prf_hz: float) -> Tensor:
     """Estimate how the rotation rate changes, from the Doppler spectra of short sections.
 
     The ratio of the rotation rate at time t after the first pulse to that at the first pulse is
-    modelled as 1 + k1 t + k2 t^2 / 2 and is found to about a percent. In the middle and at the end
-    of the aperture, ratios from a quarter to four are searched. At least one range cell must hold
-    scatterers off the rotation axis.
+    modelled as 1 + k1 t + k2 t^2 / 2. In the middle and at the end of the aperture, ratios from a
+    quarter to four are searched. At least one range cell must hold scatterers off the rotation
+    axis.
+
+    The first search has half the square root of the number of pulses as half-overlapping sections,
+    within 8..28, so that the Doppler of a scatterer changes within a section by about the Doppler
+    resolution. Compensated data change less: 6 and then twice 4 sections find what is left with a
+    better resolution. Their result is used where it makes the image sharper.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
-        sections: Number of half-overlapping sections; by default half the square root of the number
-            of pulses, within 8..28. The Doppler of a scatterer then changes within a section by
-            about the Doppler resolution. The number is limited to an eighth of the number of
-            pulses, but is at least 4.
 
     Returns:
         k1 in 1/s and k2 in 1/s^2, shape (trial, 2), float64.
     """
-    pulses = data.shape[1]
-    wanted = min(MOST_SECTIONS, max(LEAST_SECTIONS, round(math.sqrt(pulses) / 2))) if sections is None else sections
+    pulses, rows = data.shape[1], _brightest(data, _ROWS)
+    wanted = min(MOST_SECTIONS, max(LEAST_SECTIONS, round(math.sqrt(pulses) / 2)))
     sections = max(4, min(wanted, pulses // 8))
+    k = _change_of_rate(rows, prf_hz, sections, _WIDEST)
+    image = _image(rows, prf_hz, k)
+    for fewer in _FEWER_SECTIONS:
+        if fewer < sections:
+            # pulses at equal steps of the rotation angle: those of a uniform rotation if k is right
+            even = torch.fft.fft(torch.fft.ifftshift(image, dim=1), dim=1, norm="forward")
+            other = _corrected(k, _change_of_rate(even, prf_hz, fewer, _LEFT), pulses / prf_hz)
+            formed = _image(rows, prf_hz, other)
+            # longer sections suffer more from phase errors of the pulses
+            better = entropy(formed) < entropy(image)
+            k = torch.where(better[:, None], other, k)
+            image = torch.where(better[:, None, None], formed, image)
+    return k
+
+
+def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -> Tensor:
+    """k1 and k2 (trial, 2) with which the spectra of sections agree best.
+
+    widest: largest logarithm of a ratio of rates that is searched.
+    """
+    pulses = rows.shape[1]
     length = 2 * (pulses // (sections + 1))
-    spectra = _log_spectra(_brightest(data, _ROWS), length)
+    spectra = _log_spectra(rows, length)
     middles = (
-        torch.arange(spectra.shape[1], dtype=torch.float64, device=data.device) * (length // 2) + (length - 1) / 2
+        torch.arange(spectra.shape[1], dtype=torch.float64, device=rows.device) * (length // 2) + (length - 1) / 2
     ) / prf_hz
-    duration = pulses / prf_hz
-    rates = _ThirdOrderRate(middles, duration)
-    step = torch.arange(-_WIDEST, _WIDEST + 1e-9, _GRID, dtype=torch.float64, device=data.device)
-    best = torch.cartesian_prod(step, step).expand(data.shape[0], -1, -1)
-    products = _products(spectra)
-    best = _best(best, _agreement(products, _BLUR), rates, _KEPT)
-    agreement = _agreement(products, 0.0)
-    nearby = torch.cartesian_prod(*2 * [torch.linspace(-1, 1, 5, dtype=torch.float64, device=data.device)])
+    rates = _ThirdOrderRate(middles, pulses / prf_hz)
+    step = torch.arange(-widest, widest + 1e-9, _GRID, dtype=torch.float64, device=rows.device)
+    best = torch.cartesian_prod(step, step).expand(rows.shape[0], -1, -1)
+    products, *pairs = _products(spectra)
+    best = _best(best, _agreement(products, *pairs, _BLUR), rates, _KEPT)
+    # the maximum is flat: rounding in single precision would move it
+    agreement = _agreement(products.to(torch.complex128), *pairs, 0.0)
+    nearby = torch.cartesian_prod(*2 * [torch.linspace(-1, 1, 5, dtype=torch.float64, device=rows.device)])
     size, kept = _GRID, _KEPT
     for _ in range(_ROUNDS):
         kept = max(1, kept // 2)
         best = _best((best[:, :, None] + size * nearby).flatten(1, 2), agreement, rates, kept)
         size /= 2
     return rates.warp_k(best[:, 0])
+
+
+def _image(rows: Tensor, prf_hz: float, k: Tensor) -> Tensor:
+    """Image (trial, line, range) of a rotation that changes by k."""
+    return matched_fourier(rows, k, prf_hz, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS))
+
+
+def _corrected(k: Tensor, left: Tensor, duration_s: float) -> Tensor:
+    """k1 and k2 (trial, 2) of a rotation whose rate changes by `left` once k is compensated."""
+    times = torch.tensor([duration_s / 2, duration_s], dtype=torch.float64, device=k.device)
+    even = duration_s * warp(times, k) / warp(times[1:], k)
+    return _third_order(warp_rate(times, k) * warp_rate(even, left), duration_s)
+
+
+def _third_order(rates: Tensor, duration_s: float) -> Tensor:
+    """k1 (1/s) and k2 (1/s^2), shape (..., 2), from the rates in the middle and at the end of the
+    aperture over that at the first pulse, shape (..., 2).
+    """
+    middle, end = rates.unbind(-1)
+    k2 = 4 * (end - 2 * middle + 1) / duration_s**2
+    return torch.stack([(end - 1) / duration_s - k2 * duration_s / 2, k2], -1)
 
 
 @dataclass(frozen=True)
@@ -124,9 +177,7 @@ class _ThirdOrderRate:
         The logarithms are those of the rates in the middle and at the end of the aperture, relative
         to the rate at the first pulse, shape (..., 2).
         """
-        middle, end = torch.exp(logs).unbind(-1)
-        k2 = 4 * (end - 2 * middle + 1) / self.duration_s**2
-        return torch.stack([(end - 1) / self.duration_s - k2 * self.duration_s / 2, k2], -1)
+        return _third_order(torch.exp(logs), self.duration_s)
 
     def log_rate(self, logs: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the logarithm of the rotation rate in the middle of every section.
@@ -190,9 +241,8 @@ def _products(spectra: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return (transform @ transform.mH)[..., second, first].mT, first, second
 
 
-def _agreement(products: tuple[Tensor, Tensor, Tensor], blur: float) -> _Agreement:
+def _agreement(transform: Tensor, first: Tensor, second: Tensor, blur: float) -> _Agreement:
     """Correlations of the pairs, blurred by `blur` in the logarithm of Doppler."""
-    transform, first, second = products
     n = 2 * (transform.shape[-1] - 1)
     frequency = torch.arange(transform.shape[-1], device=transform.device) / n
     smooth = torch.exp(-0.5 * (2 * math.pi * frequency * blur * _STEPS_PER_UNIT).square()).to(transform.real.dtype)

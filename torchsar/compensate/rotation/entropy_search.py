@@ -13,9 +13,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation.histories import MOST_PHASE_ERROR_RAD
 from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
 from torchsar.compensate.rotation.unknowns import k_name, uniform_rotation
+from torchsar.compensate.rotation.verdicts import MOST_PHASE_ERROR_RAD
 from torchsar.core import Draws, Estimate, Signal, Stage, settle
 from torchsar.optim import Descent, Searched, differential_evolution, genetic, grid_search, lbfgs, newton
 from torchsar.radar import InverseRadar
@@ -53,7 +53,7 @@ def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int 
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
         the range centre deviation. `genetic_rotation` describes these values and quality in full.
         `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
-        the histories of bright scatterers do not confirm the result (see `genetic_rotation`),
+        bright scatterers do not confirm the result (see `genetic_rotation`),
         or the best point lies on the edge of the grid. info["entropy_grid_nats"], shape (..., m_1,
         m_2, ...), is the entropy on the grid.
 
@@ -91,11 +91,12 @@ def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: 
 
         quality is the relative decrease of exp(entropy), the number of cells that the image fills,
         due to the compensation. `ok` is False where the entropy decreases by less than 0.01 nats,
-        where the minimum lies on the edge of the box, or where the phase histories of at least 3
-        bright scatterers do not confirm k1, k2, ...: info["phase_error_rad"], the phase error that
-        they show for the scatterer farthest from zero Doppler, plus two of its standard deviations,
-        must be below 0.47 rad rms. `ok` does not refer to `omega_rad_s` and `yc_m`: with few image
-        lines they are biased, see `EntropyObjective`.
+        where the minimum lies on the edge of the box, or where at least 3 bright scatterers do not
+        confirm k1, k2, ...: info["phase_error_rad"], the phase error that their phase histories, or
+        else a joint fit of all scatterers, show for the scatterer farthest from zero Doppler, plus
+        two of its standard deviations, must be below 0.47 rad rms. Below third order it includes
+        what a rotation of third order would correct. `ok` does not refer to `omega_rad_s` and
+        `yc_m`: with few image lines they are biased, see `EntropyObjective`.
 
         info holds the number of evaluations; entropy_nats and uncompensated_entropy_nats, the
         entropy with and without compensation; on_edge, shape (..., n), True for unknowns on the
@@ -156,7 +157,7 @@ def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True,
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
         the range centre deviation. `genetic_rotation` describes these values and quality in full.
         `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
-        the histories of bright scatterers do not confirm the result (see `genetic_rotation`),
+        bright scatterers do not confirm the result (see `genetic_rotation`),
         where the search diverges (the result is then its last finite point), or where it has not
         converged after `steps` steps. info["iterations"] is the number of steps.
 
@@ -195,7 +196,7 @@ def descend_rotation(figure: ImageEntropy, start: Tensor, *, steps: int = 60, to
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
         the range centre deviation. `genetic_rotation` describes these values and quality in full.
         `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
-        the histories of bright scatterers do not confirm the result (see `genetic_rotation`),
+        bright scatterers do not confirm the result (see `genetic_rotation`),
         or where a trial has not converged after `steps` steps.
 
     Raises:

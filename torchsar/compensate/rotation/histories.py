@@ -37,9 +37,6 @@ _ROBUST_ROUNDS = 3  # reweighted fits, found by trial: enough to exclude outlier
 # eigenvalue of a normal matrix of unit diagonal below which its direction is not determined: above
 # the rounding of float64, below any real information
 _NO_INFORMATION = 1e-7
-# largest phase error, in rad rms, of a scatterer at the edge of the target: it then still has a
-# Strehl ratio of 0.8, the convention of Marechal
-MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8))
 # power over that of the brightest pixel below which side lobes are to be expected more than 24
 # cells away
 _FAINTEST = 1e-3
@@ -85,44 +82,29 @@ def refined_by_histories(
     return moved.where((found > 0) & moved.possible(sampling), motion), found
 
 
-def warp_phase_error(data: Tensor, sampling: Sampling, motion: Motion, checks: int = 2) -> tuple[Tensor, Tensor]:
-    """Measure how well the relative derivatives of the rotation rate of a rotation fit the data.
+def change_by_histories(data: Tensor, sampling: Sampling, motion: Motion) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Measure how far the phase histories of bright scatterers contradict a rotation.
 
-    The rotation is refined by the histories of bright scatterers. They show by how much the
-    derivatives k1, k2, ... should change, and by how much the histories disagree about it. The
-    change plus two standard deviations are given as the phase error that they cause to the
-    scatterer farthest from zero Doppler among those used. A constant phase and a phase that is
-    linear in the warped time only displace a scatterer and are left out.
+    Peaks that may be speckle of a bright range cell or side lobes are left out.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
         motion: Rotation to be judged.
-        checks: Number of refinements; two are enough for an image that is still blurred, and none
-            are needed for a rotation that is a maximum of the likelihood.
 
     Returns:
-        The phase error in rad, rms over the aperture, shape (trial,); and the number of scatterers,
-        shape (trial,). The error is infinite where there are fewer than 3 scatterers, where all of
-        them lie within a cell of zero Doppler, or where they are not seen in all quarters of the
-        aperture, so that the rotation is extrapolated.
+        The change of the relative derivatives k1, k2, ... that the histories show, shape (trial,
+        order - 1); its covariance, from the differences between scatterers, shape (trial, order -
+        1, order - 1); the largest Doppler of these scatterers, as their phase over the aperture in
+        rad, shape (trial,); and their number, shape (trial,). The Doppler is infinite where there
+        are fewer than 3 scatterers, where all of them lie within a cell of zero Doppler, or where
+        they are not seen in all quarters of the aperture, so that the rotation is extrapolated.
     """
-    refined = motion
-    for _ in range(checks):
-        refined, _ = refined_by_histories(data, sampling, refined)
-    cells, used, change, covariance, lit = _fitted_to_peaks(data, sampling, refined, True, 128, 24, strict=True)
+    cells, used, change, covariance, lit = _fitted_to_peaks(data, sampling, motion, True, 128, 24, strict=True)
     order, count = motion.k.shape[-1], used.sum(-1)
-    warped = Warped.of(motion.k, sampling.times(data.device), sampling.duration_s)
-    line = torch.stack([torch.ones_like(warped.u), warped.u - warped.u.mean(-1, keepdim=True)], 1)
-    line = line / line.square().sum(-1, keepdim=True).sqrt()
-    curves = warped.slopes - (warped.slopes @ line.mT) @ line
-    size = curves @ curves.mT / sampling.pulses
-    k, spread = refined.k - motion.k + change[:, :order], covariance[:, :order, :order]
-    moved, unsure = torch.einsum("bi,bij,bj->b", k, size, k), (size * spread).sum((-2, -1))
     edge = 2 * math.pi * torch.where(used, cells.abs(), 0).amax(-1)
-    error = torch.nan_to_num(edge * (moved.clamp_min(0).sqrt() + 2 * unsure.clamp_min(0).sqrt()), nan=math.inf)
     seen = (count >= LEAST_SCATTERERS) & (lit > _LEAST_LIT) & (edge > 2 * math.pi)
-    return torch.where(seen, error, math.inf), count
+    return change[:, :order], covariance[:, :order, :order], torch.where(seen, edge, math.inf), count
 
 
 def _fitted_to_peaks(
@@ -144,6 +126,7 @@ def _fitted_to_peaks(
     image = image_of(data, sampling, motion, oversampling=_OVERSAMPLING)
     power = image.abs().square()
     noise = noise_power(power)
+    power = torch.where(_unambiguous(motion, sampling, image.shape[1])[..., None], power, 0)
     if strict:
         speckle = power.median(1, keepdim=True).values / math.log(2) * threshold(power[0].numel())
         floor = torch.maximum(speckle, _FAINTEST * power.amax((-2, -1), keepdim=True))
@@ -159,6 +142,18 @@ def _fitted_to_peaks(
     seen = torch.where(used[..., None], seen, 0).sum(1)
     lit = seen.amin(-1) / seen.amax(-1).clamp_min(torch.finfo(torch.float64).tiny)
     return cells, used, *_fitted(history, bases[..., keep], used), lit
+
+
+def _unambiguous(motion: Motion, sampling: Sampling, lines: int) -> Tensor:
+    """Lines (trial, line) whose Doppler the pulse rate resolves at every time of the aperture.
+
+    The fastest rotation limits them. Beyond them scatterers of the other end of the band return.
+    """
+    times = sampling.times(motion.k.device)
+    fastest = warp_rate(times, motion.k).amax(-1) * sampling.duration_s
+    whole = warp(times.new_tensor([sampling.duration_s]), motion.k)[..., 0]
+    line = torch.arange(lines, device=times.device) - lines // 2
+    return line.abs() * (fastest / whole)[:, None] <= lines / 2
 
 
 def _histories(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Tensor]:

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation.histories import warp_phase_error
 from torchsar.compensate.rotation.motion import Motion, Sampling
 from torchsar.compensate.rotation.unknowns import RotationParameters, Unknowns, Variables
+from torchsar.compensate.rotation.verdicts import warp_phase_error
 from torchsar.core import Signal, block_bytes_of, checked_samples, unit_level
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier, range_phase

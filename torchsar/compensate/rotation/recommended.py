@@ -10,32 +10,26 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.coarse import coarse_warp
-from torchsar.compensate.rotation.histories import (
-    LEAST_SCATTERERS,
-    MOST_PHASE_ERROR_RAD,
-    refined_by_histories,
-    warp_phase_error,
-)
+from torchsar.compensate.rotation.histories import refined_by_histories
 from torchsar.compensate.rotation.motion import LEAST_PULSES, Motion, Sampling, image_of
 from torchsar.compensate.rotation.scatterers import MOST, ROUNDS, Fit, fit_scatterers, usual_count
 from torchsar.compensate.rotation.unknowns import k_name
+from torchsar.compensate.rotation.verdicts import (
+    LEAST_EXPLAINED,
+    MOST_PHASE_ERROR_RAD,
+    covariance_of,
+    focus_of,
+    warp_phase_error,
+)
 from torchsar.core import Estimate, block_bytes_of, checked_samples, level_of, over_blocks, refuse_non_finite, settle
 from torchsar.core.warp import k_of_shape, shape_of
 from torchsar.metrics import entropy
 
 # relative standard deviation of the rate beyond which images cannot be scaled, a convention
 MOST_RATE_ERROR = 0.05
-# least share of the energy above the noise that the scatterers explain, found by trial: a lower
-# share accepts wrong focus, a higher one rejects targets of many faint scatterers
-_LEAST_EXPLAINED = 0.4
 _ENTROPY_ROUNDING = 1e-3  # tolerance in nats of a comparison of entropies in float32
 # size of a block of trials over the size that is best for one operation, found by trial
 _BLOCKS = 8
-# last step of a fit that has converged, in standard deviations or as a phase of the scatterers in
-# rad, found by trial
-_REST_STDS, _REST_RAD = 3.0, 0.01
-_TO_GO = 0.25  # distance that is left after the last step over that step, found by trial
-_WRONG_FOCUS = 2.0  # phase error over `MOST_PHASE_ERROR_RAD` of a wrong focus, found by trial
 _HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
 
 Part = Callable[[Tensor, Sampling, Tensor | None], Estimate]
@@ -74,7 +68,7 @@ def uneven_rotation(
             rotation centre), if known a priori, a number or shape (...,); None estimates it.
         scatterers: Largest number of scatterers; more are more accurate and take longer. By default
             one for every 1000 samples of a trial, within 128..800, and twice as many in trials
-            where these explain less than 40 % of the energy.
+            where these explain less than half of the energy.
         rounds: Largest number of maximum-likelihood steps.
 
     Returns:
@@ -87,12 +81,12 @@ def uneven_rotation(
         the share of the energy above the noise that these scatterers explain.
 
         info["focused"] is True where the rotation is good enough to form an image: at least 3
-        scatterers are found, they explain 40 % of the energy or more, their phase histories agree
+        scatterers are found, they explain half of the energy or more, their phase histories agree
         over the whole aperture, the entropy is not higher than without compensation, and the fit
         has converged. `ok` is True where, in addition, the
         standard deviation of the rate is below 5 %, also without the scatterers that may be peaks
         of the noise. Where only `ok` is False, the cross-range scale of the image is unknown. A
-        target of so many scatterers that twice the usual number explain less than 40 % of the
+        target of so many scatterers that twice the usual number explain less than half of the
         energy is not ok either; a larger `scatterers` helps. Further info: scatterers (their
         number), noise_power, steps,
         entropy_nats, uncompensated_entropy_nats.
@@ -129,7 +123,7 @@ def coarse_rotation(
     """Estimate k1 and k2 from the spectra of short sections, the first step of `uneven_rotation`.
 
     The ratio of the rotation rate at time t after the first pulse to that at the first pulse is
-    modelled as 1 + k1 t + k2 t^2 / 2 and is found to about a percent. The rotation rate itself is
+    modelled as 1 + k1 t + k2 t^2 / 2 and is found to a few thousandths. The rotation rate itself is
     not estimated; `omega_rad_s` is 0.
 
     Args:
@@ -146,10 +140,10 @@ def coarse_rotation(
         `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
         standard deviations. quality is the relative decrease of exp(entropy) of the image due to
         the compensation. `ok` is True where the entropy is not higher than without compensation and
-        the phase histories of at least 3 bright scatterers confirm k1, k2, ...: the phase error
-        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler, plus
-        two of its standard deviations, is below 0.47 rad rms, a Strehl ratio of 0.8. `ok` does not
-        refer to `omega_rad_s` and `yc_m`.
+        at least 3 bright scatterers confirm k1, k2, ...: the phase error info["phase_error_rad"]
+        that their phase histories, or else a joint fit of all scatterers, show for the scatterer
+        farthest from zero Doppler, plus two of its standard deviations, is below 0.47 rad rms, a
+        Strehl ratio of 0.8. `ok` does not refer to `omega_rad_s` and `yc_m`.
 
     Raises:
         TypeError: If the data are not complex.
@@ -197,10 +191,10 @@ def phase_fit_rotation(
         `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
         standard deviations. quality is the relative decrease of exp(entropy) of the image due to
         the compensation. `ok` is True where the entropy is not higher than without compensation and
-        the phase histories of at least 3 bright scatterers confirm k1, k2, ...: the phase error
-        info["phase_error_rad"] that they show for the scatterer farthest from zero Doppler, plus
-        two of its standard deviations, is below 0.47 rad rms, a Strehl ratio of 0.8. `ok` does not
-        refer to `omega_rad_s` and `yc_m`.
+        at least 3 bright scatterers confirm k1, k2, ...: the phase error info["phase_error_rad"]
+        that their phase histories, or else a joint fit of all scatterers, show for the scatterer
+        farthest from zero Doppler, plus two of its standard deviations, is below 0.47 rad rms, a
+        Strehl ratio of 0.8. `ok` does not refer to `omega_rad_s` and `yc_m`.
 
     Raises:
         TypeError: If the data are not complex.
@@ -312,26 +306,13 @@ def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_
 
 def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> Estimate:
     """Estimate from a fit, with standard deviations and reliability."""
-    found = _assessed(rows, sampling, fit.motion)
-    used = fit.scatterers.amplitude != 0
-    count = used.sum(-1)
-    present = (rows != 0).any(-1).sum(-1)
-    energy = fit.scatterers.amplitude.abs().square().sum(-1) * present
-    explained = energy / _energy(rows, fit.noise, present)
-    tiny = torch.finfo(torch.float64).tiny
-    predicted = fit.covariance.diagonal(dim1=-2, dim2=-1) * fit.noise[:, None]
-    step = (fit.change.abs() / predicted.clamp_min(tiny).sqrt()).amax(-1)
-    converged = (step <= _REST_STDS) | (step * (fit.noise / (2 * energy.clamp_min(tiny))).sqrt() <= _REST_RAD)
-    quality = settle(explained.clamp(0, 1), 0.0)[0]
-    std = _standard_deviations(fit, free_centre)
-    # histories are less accurate than the fit: they only exclude a wrong focus
-    error, _ = warp_phase_error(rows, sampling, fit.motion, checks=0)
-    confirmed = (count >= LEAST_SCATTERERS) & (error < _WRONG_FOCUS * MOST_PHASE_ERROR_RAD)
-    focused = found.ok & confirmed & (quality >= _LEAST_EXPLAINED) & converged
-    certain = fit.certain[:, fit.motion.k.shape[-1]].clamp_min(tiny).sqrt()
+    found, focus = _assessed(rows, sampling, fit.motion), focus_of(rows, sampling, fit)
+    focused, std = found.ok & focus.right, _standard_deviations(fit, free_centre)
+    count = (fit.scatterers.amplitude != 0).sum(-1)
+    certain = fit.certain[:, fit.motion.k.shape[-1]].clamp_min(torch.finfo(torch.float64).tiny).sqrt()
     scaled = (std["omega_rad_s"] < MOST_RATE_ERROR * fit.motion.omega_rad_s * certain) & (fit.motion.w > 0)
     info = {**found.info, "focused": focused, "scatterers": count, "noise_power": fit.noise, "steps": fit.steps}
-    return Estimate(found.value, quality, focused & scaled, std, info)
+    return Estimate(found.value, focus.explained, focused & scaled, std, info)
 
 
 def _with_more_scatterers(
@@ -341,7 +322,7 @@ def _with_more_scatterers(
     usual number.
     """
     count = usual_count(sampling)
-    at = ((found.quality < _LEAST_EXPLAINED) & (2 * found.info["scatterers"] > count)).nonzero()[:, 0]
+    at = ((found.quality < LEAST_EXPLAINED) & (2 * found.info["scatterers"] > count)).nonzero()[:, 0]
     if not len(at):
         return found
     fit = fit_scatterers(
@@ -361,27 +342,12 @@ def _with_more_scatterers(
     )
 
 
-def _energy(rows: Tensor, noise: Tensor, present: Tensor) -> Tensor:
-    """Energy above the noise of the pulses that are present (their number, (trial,)), (trial,)."""
-    power = torch.view_as_real(rows).double().square().sum((-3, -2, -1))
-    return (power - noise * present * rows.shape[-1]).clamp_min(1e-3 * power).clamp_min(torch.finfo(torch.float64).tiny)
-
-
 def _standard_deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
     """Standard deviations of the values, from the covariance of (k, w, v).
 
     They are infinite where the data do not determine a value.
     """
-    motion, order = fit.motion, fit.motion.k.shape[-1]
-    known = (fit.scatterers.amplitude != 0).any(-1)
-    covariance = fit.covariance * fit.noise[:, None, None]
-    seen, predicted = (c.diagonal(dim1=-2, dim2=-1) for c in (fit.disagreement, covariance))
-    # what the scatterers would differ by if the fit did not take up a part of it as well
-    taken_up = (predicted.shape[-1] / fit.scatterers.effective_number().clamp_min(1)).clamp_max(1)[:, None]
-    to_go = (_TO_GO * fit.change).square()
-    wider = taken_up + (seen + to_go) / predicted.clamp_min(torch.finfo(torch.float64).tiny)
-    wider = wider.clamp_min(1).sqrt()
-    covariance = torch.where(known[:, None, None], covariance * wider[:, :, None] * wider[:, None], math.inf)
+    motion, order, covariance = fit.motion, fit.motion.k.shape[-1], covariance_of(fit)
     k = covariance.diagonal(dim1=-2, dim2=-1)[:, :order].clamp_min(0).sqrt()
     w = torch.where(motion.w > 0, motion.w, 0)
     ww = covariance[:, order, order]
@@ -402,7 +368,7 @@ def _standard_deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
 
 
 def _confirmed(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
-    """A motion as an estimate; ok where the histories of bright scatterers confirm its warp."""
+    """A motion as an estimate; ok where its scatterers confirm its warp."""
     found = _assessed(rows, sampling, motion)
     error, count = warp_phase_error(rows, sampling, motion)
     ok = found.ok & (error < MOST_PHASE_ERROR_RAD)
