@@ -350,7 +350,7 @@ def test_phase_and_rotation_are_estimated_in_turn() -> None:
     """
     impaired = target(0) * torch.exp(1j * pulse_phases())[:, None]
     stage = Alternate(
-        5,
+        3,
         phase=Turn(RotationAutofocus(RADAR), CorrectPulsePhase()),
         rotation=Turn(UnevenRotation(RADAR, yc_m=0.0), RangePhase(RADAR)),
     )
