@@ -126,10 +126,10 @@ def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -
     rates = _ThirdOrderRate(middles, pulses / prf_hz)
     step = torch.arange(-widest, widest + 1e-9, _GRID, dtype=torch.float64, device=rows.device)
     best = torch.cartesian_prod(step, step).expand(rows.shape[0], -1, -1)
-    products, *pairs = _products(spectra)
-    best = _best(best, _agreement(products, *pairs, _BLUR), rates, _KEPT)
+    products, first, second = _products(spectra)
+    best = _best(best, _agreement(products, first, second, _BLUR), rates, _KEPT)
     # the maximum is flat: rounding in single precision would move it
-    agreement = _agreement(products.to(torch.complex128), *pairs, 0.0)
+    agreement = _agreement(products.to(torch.complex128), first, second, 0.0)
     nearby = torch.cartesian_prod(*2 * [torch.linspace(-1, 1, 5, dtype=torch.float64, device=rows.device)])
     size, kept = _GRID, _KEPT
     for _ in range(_ROUNDS):

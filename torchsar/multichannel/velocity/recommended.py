@@ -33,6 +33,9 @@ _POINT_SHARE = 0.02
 # Share from which it is a point rather than clutter, and Doppler cells within which it then bends
 # the fit unless it is separated, by choice.
 _CLEAR_SHARE, _OVERLAP = 0.05, 8.0
+# Least energy of such a point over that of the first: the model of the echo of a wide chirp leaves
+# 0.001 of the energy of the point itself.
+_LEAST_HIDDEN = 0.002
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _PASSES = 2  # of their fit: the second has the expected amplitudes at the positions found
 _OTHERS = 3  # points fitted besides the strongest, by choice: each takes a search of its own
@@ -190,7 +193,8 @@ class _Job:
             tried = tried & (share > _POINT_SHARE)
             if not bool(tried.any()):
                 break
-            hidden = hidden | (tried & (share > _CLEAR_SHARE) & self._overlap(found.motion, further.motion))
+            clear = (share > _CLEAR_SHARE) & (further.energy > _LEAST_HIDDEN * found.energy)
+            hidden = hidden | (tried & clear & self._overlap(found.motion, further.motion))
             points = joined(points, further.motion)
             for _ in range(_PASSES):
                 fit = fitted_together(self.data, self.radar, points, aperture, self.unknowns)
