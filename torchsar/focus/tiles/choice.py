@@ -32,9 +32,9 @@ _LEAST_DB, _MOST_DB = -130.0, -20.0
 # an expansion gains at most this from halving a size or doubling the sub-apertures, by its order
 _MOST_GAIN_DB = 24.0
 _FIT_PULSES, _JUDGED_PULSES = 24, 16
-# time of the operations in ns, measured on one core: per sample of a window and of a spectrum, per
-# flop of a product, per element of the expansion
-_NS_WINDOW, _NS_SPECTRUM, _NS_FLOP, _NS_ELEMENT = 2.8, 4.0, 0.027, 0.8
+# time of the operations in ns, fitted to 13 plans on one core within 7 %: per sample of a window or
+# of its spectrum, per flop of a product, per element of the expansion, and per tile
+_NS_SAMPLE, _NS_FLOP, _NS_ELEMENT, _NS_TILE = 4.4, 0.0142, 2.1, 3000.0
 # |eps| of all pulses over the largest that is sampled
 _MARGIN = 1.1
 # pulses of which the extent of s is found, and least pulses of a sub-aperture
@@ -335,6 +335,6 @@ def _costs(scene: Scene, taps: int, wanted: float) -> Iterator[tuple[tuple[int, 
         pairs = parts * tiles
         flops = 4 * tiles * pulses * joined * length
         flops += 8 * pairs * length * width * (MOMENTS * nodes + (order + 1) * depth)
-        time = tiles * pulses * (samples * _NS_WINDOW + length * _NS_SPECTRUM) + flops * _NS_FLOP
-        time += pairs * length * width * MOMENTS * (order + 1) * _NS_ELEMENT
+        time = tiles * pulses * (samples + length) * _NS_SAMPLE + flops * _NS_FLOP
+        time += pairs * (length * width * MOMENTS * (order + 1) * _NS_ELEMENT + _NS_TILE)
         yield (width, depth, parts, order), time
