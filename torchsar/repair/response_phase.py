@@ -358,8 +358,8 @@ def estimate_response_sharpest(
         is False, and the phase is zero, where the standard deviation is 0.125 rad or more: the
         image has too few bright points, or the response has a ripple finer than the degrees; and
         where noise alone would leave more than 0.08 rad, since such fits may be far off. A
-        ripple finer than twice the highest degree cannot be told from targets side by side, and
-        is not noticed.
+        ripple finer than twice the highest degree is not noticed, since it looks like targets side
+        by side.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.

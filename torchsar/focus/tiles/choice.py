@@ -29,8 +29,9 @@ CHUNK = 64
 _SHARE = 0.4
 # errors that are offered: the kernels reach the least
 _LEAST_DB, _MOST_DB = -130.0, -20.0
-# an expansion gains at most this from halving a size or doubling the sub-apertures, by its order
+# most that an expansion gains from halving a size or doubling the sub-apertures, found by trial
 _MOST_GAIN_DB = 24.0
+# pulses of a sub-aperture to which an expansion is fitted, and others on which it is judged
 _FIT_PULSES, _JUDGED_PULSES = 24, 16
 # time of the operations in ns, fitted to 13 plans on one core within 7 %: per sample of a window or
 # of its spectrum, per flop of a product, per element of the expansion, and per tile

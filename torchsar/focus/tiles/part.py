@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import real_dtype, unit_phasor
+from torchsar.core import outer_phasor, phasor_tables, real_dtype, unit_phasor
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import CHUNK, Choice, even_length, profile_length
 from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
@@ -270,7 +270,7 @@ class Part:
             part = part.permute(1, 2, 3, 0).reshape(tiles, -1, self.length)
             image = torch.bmm(part, along[rows]) if image is None else torch.baddbmm(image, part, along[rows])
         assert image is not None
-        return _times(image.view(tiles, -1, len(self.x), len(self.y)), self.matrices(z.dtype).pixels[rows, None])
+        return _times(image.view(tiles, -1, len(self.x), len(self.y)), matrices.pixels[rows, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,11 +306,8 @@ def _times(x: Tensor, factor: Tensor) -> Tensor:
 
 def _ramp(start: Tensor, step: Tensor, n: int, dtype: torch.dtype) -> Tensor:
     """Phasors exp(2j pi (start + i step)), i < n, in a new last dimension."""
-    fine = 8
-    coarse = torch.arange(-(-n // fine), dtype=start.dtype, device=start.device) * fine
-    first = unit_phasor(start[..., None] + step[..., None] * coarse, dtype)
-    rest = unit_phasor(step[..., None] * torch.arange(fine, dtype=start.dtype, device=start.device), dtype)
-    return (first[..., :, None] * rest[..., None, :]).flatten(-2)[..., :n]
+    fine, coarse = phasor_tables(step, 0.0, n, dtype)
+    return outer_phasor(fine, coarse * unit_phasor(start, dtype)[..., None], n)
 
 
 def _spreading(below: Tensor, weights: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
