@@ -219,7 +219,7 @@ def test_a_second_point_of_the_same_doppler_is_no_clutter():
 
 @pytest.mark.parametrize("snr_db", [-3.0, 25.0])
 def test_the_seen_part_of_the_aperture_has_its_own_ends(snr_db):
-    """Noise far from the lit part bent the fit: 28 deviations; its ends were taken for clutter."""
+    """Standard deviations hold where a point is lit in a part of the expected aperture."""
     move = torch.linspace(-3, 3, 20, dtype=F64)
     clean = torch.stack([azimuth_echo(RADAR, N, 5.0, float(u), 7 * float(u), gate_s=1.0) for u in move])
     data = 10 ** (snr_db / 20) * clean + noise(20, 2)
