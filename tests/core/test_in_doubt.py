@@ -121,8 +121,21 @@ def test_reruns_and_given_estimates_remain_in_doubt_and_given_values_do_not() ->
     given = Subtract()(Subtract()(x, value), value).data
     assert torch.equal(chain.rerun(trace, "correct", given={"level.level": value}).data, given)
     assert torch.equal(chain(x, given={"level.level": value, "level.count": OK}).data, given)
+    assert again.neutral.keys() == trace.neutral.keys()
     with pytest.raises(KeyError, match=r"unknown names \['lvel'\]"):
         chain(x, given={"lvel": trace.estimates["level"]})
+
+
+def test_a_given_estimate_of_a_function_has_the_neutral_values_of_the_stage() -> None:
+    """A function returns its Estimate without neutral values."""
+    x, chain = pulses(), Chain(level=Level(), correct=use(Subtract(), level="level"))
+    bare = Level()(x)
+    bare = Estimate(bare.value, bare.quality, bare.ok)
+    assert torch.equal(chain(x, given={"level": bare}).data, chain(x).data)
+    with pytest.raises(ValueError, match=r"'level' of the estimate 'level' must begin with the trial dimensions"):
+        chain(x, given={"level": Estimate(bare.value, bare.quality[:2], bare.ok[:2])})
+    with pytest.raises(TypeError, match="`given` must map names"):
+        chain(x, given=[bare])  # pyright: ignore[reportArgumentType]
 
 
 def test_vmap_agrees_with_the_batch() -> None:
@@ -139,6 +152,28 @@ def test_vmap_agrees_with_the_batch() -> None:
 def test_an_alternation_has_the_neutral_values_of_its_estimators() -> None:
     stage = Alternate(2, level=Turn(Level(), Subtract()), other=Turn(Double()))
     assert stage.neutral == {"level": 0.0, "count": 1, "factor": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("turns", "message"),
+    [
+        (
+            {"a": Turn(Level(), Subtract()), "b": Turn(Subtract(), None)},
+            "estimator 'b' .* return an Estimate, got Signal",
+        ),
+        ({"a": Turn(Level(), Level()), "b": Turn(Level())}, "corrector of 'a' .* return a Signal, got Estimate"),
+        ({"a": Level(), "b": Turn(Level())}, "'a' must be a Turn"),
+        ({"rounds": 1.5, "a": Turn(Level()), "b": Turn(Level())}, "whole number, got 1.5"),
+    ],
+)
+def test_an_alternation_of_other_things_is_refused(turns: dict, message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        Alternate(**turns)(pulses())
+
+
+def test_a_stage_is_connected_once() -> None:
+    with pytest.raises(TypeError, match="connect all its parameters in one call"):
+        use(use(Subtract(), level="level"), in_doubt="apply")
 
 
 def test_only_two_answers_are_accepted() -> None:

@@ -130,6 +130,16 @@ def test_one_inconsistent_trial_does_not_change_others() -> None:
     check_counts(estimate)
 
 
+def test_a_grid_with_a_first_number_keeps_the_lines_of_an_inconsistent_trial() -> None:
+    """Its numbers are not known, so that they say nothing about the grid."""
+    x, number = lines(2), 500 + torch.arange(N).repeat(2, 1)
+    number[1] = torch.randperm(N, generator=torch.Generator().manual_seed(1))
+    out, estimate = LineIntegrity(500, N + 4)(Signal(x, small_radar().raw_axes(N, 3)), number)
+    assert estimate.ok.tolist() == [True, False] and torch.equal(out.data[:, :N], x)
+    with pytest.raises(ValueError, match=rf"numbers, 500 to {499 + N}, lies on the grid of {N} rows"):
+        LineIntegrity(5000, N)(Signal(x[:1], small_radar().raw_axes(N, 3)), number[:1])
+
+
 @pytest.mark.parametrize(
     "number, message",
     [

@@ -49,6 +49,9 @@ class Alternate(Stage):
             they run.
 
     Raises:
+        TypeError: If a turn is not a `Turn`, the number of rounds is not whole, a stage is not a
+            torch.nn.Module, or on a call, an estimator does not return an Estimate or a corrector
+            a Signal.
         ValueError: If there are fewer than two turns or less than one round, if an estimator needs
             a value that no earlier turn provides in the first round, or if a corrector needs a
             value that its own estimator does not provide.
@@ -56,6 +59,13 @@ class Alternate(Stage):
 
     def __init__(self, rounds: int = 3, **turns: Turn) -> None:
         super().__init__()
+        for name, turn in turns.items():
+            if not isinstance(turn, Turn) or not isinstance(turn.estimator, nn.Module):
+                raise TypeError(f"Alternate: {name!r} must be a Turn(estimator) of a stage, got {turn!r}")
+            if not isinstance(turn.corrector, nn.Module | None):
+                raise TypeError(f"Alternate: the corrector of {name!r} must be a stage or None, got {turn.corrector!r}")
+        if not isinstance(rounds, int):
+            raise TypeError(f"Alternate: rounds must be a whole number, got {rounds!r}")
         if len(turns) < 2 or rounds < 1:
             raise ValueError(
                 f"Alternate needs at least two estimators and one round, got {list(turns)} and rounds={rounds}"
@@ -111,7 +121,13 @@ class Alternate(Stage):
         for _ in range(self.rounds):
             for name, estimator in self.estimators.items():
                 values = {key: value for estimate in found.values() for key, value in estimate.value.items()}
-                found[name] = estimator(self._without_others(signal, name, found), **_accepted(estimator, values))
+                result = estimator(self._without_others(signal, name, found), **_accepted(estimator, values))
+                if not isinstance(result, Estimate):
+                    raise TypeError(
+                        f"Alternate: the estimator {name!r} ({type(estimator).__name__}) must return an Estimate, got "
+                        f"{type(result).__name__}"
+                    )
+                found[name] = result
         return _merged(found)
 
     def _without_others(self, signal: Signal, name: str, found: dict[str, Estimate]) -> Signal:
@@ -119,6 +135,11 @@ class Alternate(Stage):
         for other, corrector in self.correctors.items():
             if other != name and other in found:
                 signal = corrector(signal, **_accepted(corrector, found[other].value))
+                if not isinstance(signal, Signal):
+                    raise TypeError(
+                        f"Alternate: the corrector of {other!r} ({type(corrector).__name__}) must return a Signal, got "
+                        f"{type(signal).__name__}"
+                    )
         return signal
 
 

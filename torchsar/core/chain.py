@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
@@ -58,9 +58,12 @@ def use(stage: nn.Module, *, in_doubt: str = "neutral", **names: str) -> Use:
         The stage with its sources, to be given to a `Chain`.
 
     Raises:
-        TypeError: If a source is not a name; a constant belongs in the constructor of the stage.
+        TypeError: If a source is not a name, since a constant belongs in the constructor of the
+            stage, or if the stage already is the result of `use`.
         ValueError: If `in_doubt` is neither "neutral" nor "apply".
     """
+    if isinstance(stage, Use):
+        raise TypeError("the stage has its connections from `use` already; connect all its parameters in one call")
     if in_doubt not in ("neutral", "apply"):
         raise ValueError(
             f"in_doubt must be 'neutral' (neutral values where an estimate is not ok) or 'apply' (the estimated ones), "
@@ -122,13 +125,16 @@ class _Known:
     held: frozenset[str] = frozenset()
     stages: frozenset[str] = frozenset()
 
-    def with_given(self, given: Given) -> _Known:
-        """These values, replaced by those that the caller gives."""
+    def with_given(self, given: Given, stages: Mapping[str, nn.Module]) -> _Known:
+        """These values, replaced by those that the caller gives for the stages of a chain."""
+        if not isinstance(given, Mapping):
+            raise TypeError(f"`given` must map names to values or estimates, got {type(given).__name__}")
         values = {name: value for name, value in given.items() if not isinstance(value, Estimate)}
         estimates = {name: value for name, value in given.items() if isinstance(value, Estimate)}
         known = _Known({**self.values, **values}, dict(self.estimates), frozenset(values), frozenset(estimates))
         for name, estimate in estimates.items():
-            known.add(name, estimate)
+            _check_trials(name, estimate)
+            known.add(name, _with_neutral(estimate, stages.get(name)))
         return known
 
     def add(self, name: str, estimate: Estimate) -> None:
@@ -243,7 +249,8 @@ class Chain(nn.Module):
                 values; "given.NAME" sets a value that a stage takes from the caller. A stage for
                 which `given` holds every value that it provides does not run at all, even if it
                 would change the signal. "STAGE" with an Estimate, such as that of an earlier trace,
-                has the same effect; its values count only where they are ok.
+                has the same effect; its values count only where they are ok, and elsewhere the
+                neutral values of the estimate, or of the stage if the estimate has none.
 
         Returns:
             Signal after the last stage.
@@ -251,8 +258,9 @@ class Chain(nn.Module):
         Raises:
             KeyError: If a given value has an unknown name, or a value that a stage is connected to
                 is missing.
-            TypeError: If x is neither a Recording nor a Signal, or a stage returns anything else
-                than a Signal, an Estimate or a pair of both.
+            TypeError: If x is neither a Recording nor a Signal, `given` is not a mapping, or a
+                stage returns anything else than a Signal, an Estimate or a pair of both.
+            ValueError: If a value of a given Estimate does not begin with the trial dimensions.
         """
         return self._run(list(self.stages), *self._start(x, given))
 
@@ -270,8 +278,9 @@ class Chain(nn.Module):
         Raises:
             KeyError: If a given value has an unknown name, or a value that a stage is connected to
                 is missing.
-            TypeError: If x is neither a Recording nor a Signal, or a stage returns anything else
-                than a Signal, an Estimate or a pair of both.
+            TypeError: If x is neither a Recording nor a Signal, `given` is not a mapping, or a
+                stage returns anything else than a Signal, an Estimate or a pair of both.
+            ValueError: If a value of a given Estimate does not begin with the trial dimensions.
         """
         signal, known = self._start(x, given)
         log = _Log()
@@ -306,7 +315,8 @@ class Chain(nn.Module):
 
         Returns:
             Trace with all results of the repeated stages. Of the stages before `start` it holds
-            the signals, values, estimates and arguments of `trace`, but neither times nor sizes.
+            the signals, values, estimates, arguments and neutral trials of `trace`, but neither
+            times nor sizes.
 
         Raises:
             KeyError: If a stage or a given value has an unknown name.
@@ -315,6 +325,7 @@ class Chain(nn.Module):
         before = [name for name in trace.inputs if name not in part]
         log = _Log({name: trace.inputs[name] for name in before}, {name: trace.outputs[name] for name in before})
         log.arguments |= {name: trace.arguments[name] for name in before}
+        log.neutral |= {key: mask for key, mask in trace.neutral.items() if key.partition(".")[0] in before}
         self._run(part, trace.inputs[start], known, log)
         return log.trace(known)
 
@@ -323,7 +334,7 @@ class Chain(nn.Module):
         if not isinstance(x, Recording | Signal):
             raise TypeError(f"a chain runs on a Recording or a Signal, got {type(x).__name__}")
         aux = {f"aux.{name}": value for name, value in x.aux.items()} if isinstance(x, Recording) else {}
-        known = _Known({**aux}, {}).with_given(given or {})
+        known = _Known({**aux}, {}).with_given({} if given is None else given, dict(self.stages.named_children()))
         available = {f"{name}.{key}" for name, stage in self.stages.items() for key in _provided(stage)} | set(aux)
         available |= {source for names in self.uses.values() for source in names.values()}
         unknown = (known.held - available) | (known.stages - set(self.stages))
@@ -339,7 +350,9 @@ class Chain(nn.Module):
                 raise KeyError(f"the chain has no stage {name!r}; its stages are {names}")
         part = names[names.index(start) : names.index(stop) + 1 if stop else None]
         before = {name: estimate for name, estimate in trace.estimates.items() if name not in part}
-        known = _Known(dict(trace.values), before).with_given(given or {})
+        known = _Known(dict(trace.values), before).with_given(
+            {} if given is None else given, dict(self.stages.named_children())
+        )
         unknown = (known.held - set(trace.values)) | (known.stages - set(names))
         if unknown:
             raise KeyError(
@@ -419,6 +432,23 @@ def _corrected(signal: Signal, out: Signal, estimate: Estimate) -> bool:
 def _provided(stage: nn.Module) -> Collection[str]:
     """Names of the values that a stage estimates."""
     return getattr(stage, "provides", ())
+
+
+def _with_neutral(estimate: Estimate, stage: nn.Module | None) -> Estimate:
+    """An estimate with the neutral values of a stage where it has none, as that of a function."""
+    known = {key: number for key, number in getattr(stage, "neutral", {}).items() if not isinstance(number, str)}
+    missing = {key: known[key] for key in estimate.value if key in known and key not in estimate.neutral}
+    return replace(estimate, neutral={**estimate.neutral, **missing}) if missing else estimate
+
+
+def _check_trials(name: str, estimate: Estimate) -> None:
+    """Raise ValueError unless the values of a given estimate begin with its trial dimensions."""
+    for key, value in estimate.value.items():
+        if value.shape[: estimate.ok.ndim] != estimate.ok.shape:
+            raise ValueError(
+                f"`given`: the value {key!r} of the estimate {name!r} must begin with the trial dimensions "
+                f"{tuple(estimate.ok.shape)} of `ok`, got the shape {tuple(value.shape)}"
+            )
 
 
 def _check_member(name: str, stage: object) -> None:

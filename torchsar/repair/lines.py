@@ -190,8 +190,8 @@ def line_integrity(
     Raises:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples or a sample is not finite, or if the numbers do not fit
-            the lines or are not integers, the longest gap is less than one, or fewer than half of
-            the numbers are accepted in every trial.
+            the lines or are not integers, the longest gap is less than one, fewer than half of the
+            numbers are accepted in every trial, or the grid holds none of the lines.
     """
     lines = checked_samples(lines, "line_integrity", "line, range")
     _check(lines, line_number, longest_gap)
@@ -211,12 +211,13 @@ def line_integrity(
     _check_consistency(ok, trusted, single)
     verified = torch.where(ok[..., None], verified, torch.where(present, row, PADDING))
     # row 0 is the first received line, whether its own number is right or wrong
-    origin = _first(verified) if first_number is None else torch.full_like(verified[..., 0], first_number)
+    origin = _first(verified) if first_number is None else ok * first_number
     outside = ok[..., None] & ~_enclosed(trusted) & _lossy(offset, trusted)
     verified = torch.where(outside, PADDING, verified)
     slot = verified - origin[..., None]
     rows = n_lines if n_lines is not None else _rows(slot, verified, n)
     inside = (verified != PADDING) & (slot >= 0) & (slot < rows)
+    _check_grid(inside, verified, rows)
     source = _sources(slot, inside, rows)
     empty = _empty_lines(lines, present).gather(-1, source.clamp_min(0)) & (source >= 0)
     before_last = (source >= 0).flip(-1).cumsum(-1).flip(-1) > 0
@@ -257,6 +258,20 @@ def _check_consistency(ok: Tensor, trusted: Tensor, single: Tensor) -> None:
     raise ValueError(
         f"line numbers cannot be reconciled: only {accepted} of {total} agree with those of neighbouring "
         "lines, and at least half must; check that the numbers rise from line to line, or raise longest_gap"
+    )
+
+
+def _check_grid(inside: Tensor, verified: Tensor, rows: int) -> None:
+    """Raise ValueError if the grid holds none of the lines."""
+    try:
+        if bool(inside.any()) or not bool((verified != PADDING).any()):
+            return
+        low, high = int(verified[verified != PADDING].min()), int(verified.max())
+    except RuntimeError:  # inside vmap values cannot be read
+        return
+    raise ValueError(
+        f"none of the line numbers, {low} to {high}, lies on the grid of {rows} rows from first_number on; choose "
+        "first_number and n_lines so that the grid holds the recording"
     )
 
 
@@ -356,7 +371,8 @@ class LineIntegrity(Stage):
 
         Raises:
             ValueError: If the numbers do not fit the lines or are not integers, `longest_gap` is
-                less than one, or fewer than half of the numbers are accepted in every trial.
+                less than one, fewer than half of the numbers are accepted in every trial, or the
+                grid holds none of the lines.
         """
         plan = line_integrity(
             signal.data, line_number, first_number=self.first_number, n_lines=self.n_lines, longest_gap=self.longest_gap
