@@ -292,7 +292,7 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
-@pytest.mark.parametrize("word", ["0", "-3", "many"])
+@pytest.mark.parametrize("word", ["0", "-3", "many", "9" * 30])
 def test_threads_are_a_number_above_zero(word: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["--threads", word, "list"])

@@ -7,6 +7,7 @@ import logging
 import os
 import shlex
 import sys
+import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,8 @@ from typing import Any
 
 from torchsar.study.settings.errors import ConfigError
 
+_MOST = 10_000  # threads or processes, far more than machines have
+_LONGEST = 2000  # characters of a message, far more than those without a long path or value
 EXIT_BAD_INPUT = 2  # the status of argparse for a command line that it rejects
 _COMMANDS = {
     "run": "run an experiment and write its images, figures and report",
@@ -59,8 +62,10 @@ def _folder(command: str, config: str) -> Path:
 
 
 def _positive(text: str) -> int:
-    if not (text.isdecimal() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    if not (text.isdecimal() and len(text) <= 9 and 0 < int(text) <= _MOST):
+        raise argparse.ArgumentTypeError(
+            f"{textwrap.shorten(text, 50)!r} is not a whole number above 0, at most {_MOST}"
+        )
     return int(text)
 
 
@@ -182,7 +187,10 @@ def _refuse_device(name: str, torch: Any) -> None:
 
 
 def _fail(sentence: str) -> int:
-    print(f"torchsar: {' '.join(sentence.split())}", file=sys.stderr)
+    text = " ".join(sentence.split())
+    if len(text) > _LONGEST:
+        text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
+    print(f"torchsar: {text}", file=sys.stderr)
     return EXIT_BAD_INPUT
 
 

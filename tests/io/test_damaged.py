@@ -162,11 +162,20 @@ def encrypted(whole: bytes) -> bytes:
     return bytes(marked)
 
 
+def doubled(whole: bytes) -> bytes:
+    """The archive with another sampling rate beside the first."""
+    held = io.BytesIO(whole)
+    with zipfile.ZipFile(held, "a") as archive, warnings.catch_warnings(action="ignore"):
+        archive.writestr("fs_hz.npy", as_npy(np.array(40e6)))
+    return held.getvalue()
+
+
 WHOLE = packed(STRIPMAP)
 MISTAKEN: dict[str, tuple[bytes, str]] = {
     "empty": (b"", "is empty"),
     "cut off": (WHOLE[: len(WHOLE) // 2], "is cut off or damaged"),
     "encrypted": (encrypted(WHOLE), "fs_hz is encrypted; save the archive without a password"),
+    "a key twice": (doubled(WHOLE), "holds the array 'fs_hz' twice"),
     "one array": (as_npy(STRIPMAP["iq"]), "holds a single array"),
     "of another kind": (b"\x89HDF\r\n" + bytes(99), "is a file of another kind"),
     "an empty archive": (packed({}), "lacks the keys"),
@@ -175,6 +184,17 @@ MISTAKEN: dict[str, tuple[bytes, str]] = {
         "converted to torch.complex64: 480 of 480 samples are NaN or Inf",
     ),
     "an infinite cell": (packed({**STRIPMAP, "first_cell": np.array(np.inf)}), "must be one whole number, got inf"),
+    "a rate in GHz": (
+        packed({**STRIPMAP, "fs_hz": np.array(0.05)}),
+        "fs_hz is 0.05 Hz, and should be 1000 to 1e+13 Hz",
+    ),
+    "a carrier in GHz": (packed({**STRIPMAP, "f0_hz": np.array(5.3)}), "f0_hz is 5.3 Hz, and should be"),
+    "a carrier in MHz": (packed({**STRIPMAP, "f0_hz": np.array(2e7), "pulse_s": np.array(1e-4)}), "the bandwidth"),
+    "a pulse in ms": (
+        packed({**STRIPMAP, "pulse_s": np.array(0.01), "chirp_rate_hz_s": np.array(1e9)}),
+        "is longer than the pulse interval",
+    ),
+    "faster than light": (packed({**STRIPMAP, "v_eff_m_s": np.array(4e8)}), "v_eff_m_s is 4e+08 m/s, and should be"),
     "a long text": (packed({**STRIPMAP, "f0_hz": np.array("high" * 99)}), "got <U396 of shape ()"),
 }
 

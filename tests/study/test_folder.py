@@ -84,6 +84,7 @@ CONFLICTS: dict[str, Callable[[Path], object]] = {
     "a file of the user under a name of the result": lambda out: (out / "report.html").write_text("mine"),
     "a result that the user changed": lambda out: (out / "metrics.json").write_text("my own figures"),
     "a file of the user among the pictures": lambda out: (out / "figures" / "my.png").write_text("mine"),
+    "a pipe under a name of the result": lambda out: ((out / "report.html").unlink(), os.mkfifo(out / "report.html")),
     "pictures behind a link": lambda out: linked((out / "figures").rename(out / "kept"), out / "figures"),
 }
 
@@ -274,6 +275,13 @@ def test_a_damaged_manifest_is_a_sentence(name: str, content: str, out: Path) ->
     with pytest.raises(ConfigError, match=rf"{name}.json (cannot be read|is damaged)"), fresh_result(out, "run", NAMES):
         pytest.fail("must not begin")
     assert result(out) == whole("first", 3)
+
+
+def test_a_manifest_that_is_a_pipe_is_not_waited_for(out: Path) -> None:
+    (out / STATE / "manifest.json").unlink()
+    os.mkfifo(out / STATE / "manifest.json")
+    with pytest.raises(ConfigError, match="manifest.json is no file"), opened(out, "run", NAMES):
+        pytest.fail("must not begin")
 
 
 def test_any_flipped_bit_of_a_manifest_is_found(out: Path) -> None:

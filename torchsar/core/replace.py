@@ -157,8 +157,8 @@ def _move(source: Path, target: Path) -> bool:
 
 
 def _files(path: Path) -> list[Path]:
-    """The file itself, or all files below a folder; a symbolic link counts as a file."""
-    if path.is_symlink() or path.is_file():
+    """The file itself, or all files below a folder; a symbolic link or a pipe counts as a file."""
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
         return [path]
     return sorted(p for p in path.rglob("*") if p.is_symlink() or not p.is_dir())
 
@@ -174,6 +174,8 @@ def _is_as_written(path: Path, known: list[Any] | None) -> bool:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is no file; choose another folder, or remove it")
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

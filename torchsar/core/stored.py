@@ -81,8 +81,9 @@ class ArrayFile(Mapping[str, StoredArray]):
         path: Path of the file; its suffix is of no importance.
 
     Raises:
-        ValueError: If the file is empty, damaged, or of another format. A lookup raises it if the
-            array is damaged, encrypted, or does not hold plain numbers or text.
+        ValueError: If the file is empty, damaged, or of another format, or holds an array twice. A
+            lookup raises it if the array is damaged, encrypted, or does not hold plain numbers or
+            text.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -100,14 +101,20 @@ class ArrayFile(Mapping[str, StoredArray]):
         """The members of the archive by name."""
         try:
             with zipfile.ZipFile(self.path) as archive:
-                return {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+                found = [(info.filename.removesuffix(".npy"), info) for info in archive.infolist()]
         except Exception as error:  # the parsers of numpy and zipfile raise errors of many kinds
             if start.startswith(b"PK"):
                 raise ValueError(f"{self.path} is cut off or damaged ({_reason(error)}); {_AGAIN}") from None
-        raise ValueError(
-            f"{self.path} must be a numpy archive (.npz) or array (.npy), but it is a file of another kind; save the "
-            "arrays by numpy.savez"
-        )
+            raise ValueError(
+                f"{self.path} must be a numpy archive (.npz) or array (.npy), but it is a file of another kind; save "
+                "the arrays by numpy.savez"
+            ) from None
+        members: dict[str, zipfile.ZipInfo | None] = {}
+        for name, info in found:
+            if name in members:
+                raise ValueError(f"{self.path} holds the array {name!r} twice; save it again with one of them")
+            members[name] = info
+        return members
 
     def __getitem__(self, name: str) -> StoredArray:
         info, what = self._members[name], f"{self.path}: {name}" if name else str(self.path)

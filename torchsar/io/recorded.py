@@ -18,6 +18,17 @@ from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
 
 # keys of the archive: samples, then numbers
 _REQUIRED = ("iq", "fs_hz", "prf_hz", "f0_hz", "chirp_rate_hz_s", "pulse_s", "slant_range_cell1_m", "v_eff_m_s")
+# least and largest accepted number with its unit, chosen far beyond those of any recording, sonar
+# included: a wrong unit or a damaged number is outside
+_RANGES = {
+    "fs_hz": (1e3, 1e13, "Hz"),
+    "prf_hz": (1e-3, 1e8, "Hz"),
+    "pulse_s": (1e-10, 10.0, "s"),
+    "slant_range_cell1_m": (0.1, 1e9, "m"),
+    "v_eff_m_s": (1e-3, 3e4, "m/s"),
+}
+# chosen likewise
+_WAVELENGTHS_M = (3e-8, 15.0)
 # optional keys that become side data of the recording
 _AUX = ("agc_db", "line_number", "pilot")
 
@@ -46,7 +57,8 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If the file is not such an archive, or a key is missing or invalid.
+        ValueError: If the file is not such an archive, a key is missing or invalid, or a number is
+            far from those of any recording.
     """
     path = Path(path)
     fields = archive(path, "raw stripmap data")
@@ -55,9 +67,30 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
     c = number(fields["c_m_s"]) if "c_m_s" in fields else LIGHT_M_S
     iq = _samples(fields["iq"])
     with naming(path):
+        _refuse_implausible(numbers, c)
         radar = _radar(numbers, c, _first_cell(fields))
         aux: dict[str, Any] = {name: _side(fields[name], iq) for name in _AUX if name in fields}
         return Recording.from_arrays(_complex(iq.load()), radar, dtype=dtype, what=str(path), **aux)
+
+
+def _refuse_implausible(number: dict[str, float], c: float) -> None:
+    """Raise ValueError for numbers that no recording has; c in m/s."""
+    for key, (low, high, unit) in _RANGES.items():
+        if not low <= number[key] <= high:
+            raise ValueError(f"{key} is {number[key]:g} {unit}, and should be {low:g} to {high:g} {unit}; check it")
+    carrier, band = number["f0_hz"], abs(number["chirp_rate_hz_s"]) * number["pulse_s"]
+    low, high = (c / length for length in reversed(_WAVELENGTHS_M))
+    if not low <= carrier <= high:
+        raise ValueError(f"f0_hz is {carrier:g} Hz, and should be {low:g} to {high:g} Hz; check it")
+    if band > 2 * carrier:
+        raise ValueError(
+            f"the bandwidth chirp_rate_hz_s pulse_s is {band:g} Hz, beyond f0_hz of {carrier:g} Hz; check it"
+        )
+    if number["pulse_s"] * number["prf_hz"] > 1:
+        raise ValueError(
+            f"pulse_s of {number['pulse_s']:g} s is longer than the pulse interval, 1 / prf_hz of "
+            f"{1 / number['prf_hz']:g} s; check both"
+        )
 
 
 def _radar(number: dict[str, float], c: float, first_cell: int) -> StripmapRadar:
