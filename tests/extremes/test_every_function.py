@@ -20,7 +20,7 @@ from torch import Tensor
 from tests.contract import test_stages as contract
 from tests.extremes.judge import DTYPES, VIEWS, differences, has_nan, outcome, random_case, trial
 from tests.extremes.table import ENTRIES, NUMBERS, REASONS, Entry, dims, samples
-from torchsar import compensate, metrics, repair
+from torchsar import compensate, core, metrics, repair
 from torchsar.core import Stage
 from torchsar.multichannel.velocity.stages import strongest_line
 
@@ -139,6 +139,18 @@ def test_single_precision_does_not_choose_another_line() -> None:
     data[..., 3] *= 10
     for level in (1e-30, 1.0, 1e30):
         assert int(strongest_line(data * level)[1]) == 3
+
+
+def test_subnormal_samples_have_a_finite_level() -> None:
+    """Division by a subnormal level gave Inf and NaN, and raw errors of linear algebra."""
+    data = torch.randn(2, 16, 24, dtype=torch.complex64, generator=torch.Generator().manual_seed(1)) * 1e-42
+    assert torch.isfinite(torch.view_as_real(data / core.level_of(data))).all()
+    assert not bool(compensate.link_phases(data).ok.any())
+
+
+def test_sparse_samples_are_refused() -> None:
+    with pytest.raises(TypeError, match=r"dense samples .* call to_dense\(\) first"):
+        compensate.autofocus(torch.ones(16, 24, dtype=torch.complex64).to_sparse())
 
 
 def test_contrast_of_nan_is_nan() -> None:

@@ -83,7 +83,7 @@ def checked_samples(
         neither.
 
     Raises:
-        TypeError: If x is not a tensor of these dtypes.
+        TypeError: If x is not a dense tensor of these dtypes.
         ValueError: If x has no samples or, unless `empty`, no trials, or too few dimensions, or a
             sample is not finite.
     """
@@ -96,6 +96,8 @@ def checked_samples(
             f"{what} works on {'' if real else 'complex '}samples (..., {dims}) in a tensor of {names}, got {got}; "
             f"{advice} first"
         )
+    if x.layout != torch.strided:
+        raise TypeError(f"{what} works on dense samples (..., {dims}), got {x.layout}; call to_dense() first")
     least = dims.count(",") + 1
     if x.ndim < least or not (x.shape[-least:] if empty else x.shape).numel():
         raise ValueError(
@@ -121,14 +123,16 @@ def level_of(x: Tensor, trailing: int = 2) -> Tensor:
 
     Returns:
         Level, real, with `trailing` dimensions of length one at the end: the largest real or
-        imaginary part, rounded down to a power of two; 1 for a trial of zeros and for one with
-        samples that are not finite.
+        imaginary part, rounded down to a power of two, and at least the smallest normal number; 1
+        for a trial of zeros and for one with samples that are not finite.
     """
     x = x.detach()
     part = torch.maximum(x.real.abs(), x.imag.abs()) if x.is_complex() else x.abs()
     largest = part.amax(tuple(range(-trailing, 0)), keepdim=True)
     usual = (largest > 0) & torch.isfinite(largest)
-    return torch.where(usual, torch.exp2(torch.floor(torch.log2(torch.where(usual, largest, 1)))), 1)
+    level = torch.exp2(torch.floor(torch.log2(torch.where(usual, largest, 1))))
+    # the reciprocal of a smaller number is infinite
+    return torch.where(usual, level.clamp_min(torch.finfo(level.dtype).tiny), 1)
 
 
 def unit_level(x: Tensor, trailing: int = 2) -> Tensor:
