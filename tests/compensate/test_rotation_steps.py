@@ -144,6 +144,16 @@ def test_scatterers_beyond_the_pulse_rate_are_left_out() -> None:
     assert count > 10 and abs(edge_rad / (2 * math.pi) - turns) < 2
 
 
+def test_incoherent_pulses_have_no_scatterers_in_a_rotation_that_nearly_stops() -> None:
+    """Most of the band is then beyond the pulse rate, and is no measure of the level of a cell."""
+    flicker = noise(0, 8, PULSES, 1) / noise(0, 8, PULSES, 1).abs() * torch.linspace(1, 4, 24, dtype=F64)
+    end = SAMPLING.duration_s
+    stops = truth(torch.tensor([-2.8 / end, 7.2 / end**2], dtype=F64))
+    motion = Motion(*(v.expand(8, *v.shape[1:]) for v in (stops.k, stops.w, stops.v, stops.centre_m)))
+    *_, count = change_by_histories(flicker, SAMPLING, motion)
+    assert (count == 0).sum() >= 6
+
+
 def test_an_undersampled_range_term_is_impossible() -> None:
     still, wild, broken = Motion.of_unknown_rate(K[None]), truth(), truth()
     assert still.possible(SAMPLING) and truth().possible(SAMPLING) and truth(centre_m=-50.0).possible(SAMPLING)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -118,6 +120,25 @@ def test_the_result_has_all_values_and_the_lowest_quality() -> None:
     found = stage(lines(MEAN, SLOPE))
     assert set(found.value) == {"mean", "slope"} and set(found.std) == {"mean"} and set(found.info) == {"mean.steps"}
     assert found.ok.tolist() == [False] * 3 and found.quality.tolist() == [0.2] * 3
+
+
+def test_an_estimate_from_a_distrusted_value_is_not_ok() -> None:
+    class Late(Slope):
+        """Estimator that is ok from a given run on."""
+
+        def __init__(self, first: int) -> None:
+            super().__init__()
+            self.first, self.runs = first, 0
+
+        def forward(self, signal: Signal) -> Estimate:
+            self.runs += 1
+            return replace(super().forward(signal), ok=torch.full(signal.trials, self.runs >= self.first))
+
+    for rounds, first, ok in ((3, 1, True), (3, 2, True), (3, 3, False), (3, 4, False), (1, 1, True)):
+        late = Turn(Late(first), WithoutSlope())
+        assert (
+            Alternate(rounds, mean=Turn(Mean(), WithoutMean()), slope=late)(lines(MEAN, SLOPE)).ok.tolist() == [ok] * 3
+        )
 
 
 def test_a_batch_equals_its_singles() -> None:

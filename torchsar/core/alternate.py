@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 
 from torchsar.core.estimate import Estimate
@@ -39,7 +41,9 @@ class Alternate(Stage):
     as arguments, the latest values (its own included) whose names are parameters of its `forward`.
     A value that no turn has estimated yet is not passed, so that the default of the parameter
     applies. Inside a round the estimated values count whether they are ok or not, since an estimate
-    is often not ok before the other effects are corrected.
+    is often not ok before the other effects are corrected. The result is ok where the estimators
+    are ok and the values of the others that they last used were ok as well: an estimate from data
+    corrected by a wrong value may look right.
 
         Alternate(rounds=3, phase=Turn(autofocus, corrector), rotation=Turn(estimator))
 
@@ -114,13 +118,16 @@ class Alternate(Stage):
         Returns:
             Estimate with the values and standard deviations of all estimators; where several
             provide the same name, the last of them counts. Per trial, `quality` is the lowest of
-            the qualities, and `ok` is False where any of the estimators is unreliable. Keys of
-            `info` are "TURN.KEY", with the name of the turn in front.
+            the qualities, and `ok` is False where any of the estimators, or of the values that it
+            last used, is unreliable. Keys of `info` are "TURN.KEY", with the name of the turn in
+            front.
         """
         found: dict[str, Estimate] = {}
+        used: dict[str, list[Tensor]] = {}  # verdicts of the values of the others
         for _ in range(self.rounds):
             for name, estimator in self.estimators.items():
                 values = {key: value for estimate in found.values() for key, value in estimate.value.items()}
+                used[name] = [estimate.ok for other, estimate in found.items() if other != name]
                 result = estimator(self._without_others(signal, name, found), **_accepted(estimator, values))
                 if not isinstance(result, Estimate):
                     raise TypeError(
@@ -128,7 +135,7 @@ class Alternate(Stage):
                         f"{type(result).__name__}"
                     )
                 found[name] = result
-        return _merged(found)
+        return _merged(found, [ok for verdicts in used.values() for ok in verdicts])
 
     def _without_others(self, signal: Signal, name: str, found: dict[str, Estimate]) -> Signal:
         """Signal after the correctors of all turns but one."""
@@ -153,12 +160,11 @@ def _accepted(stage: nn.Module, values: Mapping[str, Tensor]) -> dict[str, Tenso
     return {p.name: values[p.name] for p in _parameters(stage) if p.name in values}
 
 
-def _merged(found: dict[str, Estimate]) -> Estimate:
-    """Estimate of all values; `ok` is False where any part is unreliable."""
+def _merged(found: dict[str, Estimate], used: Sequence[Tensor]) -> Estimate:
+    """Estimate of all values; `ok` is False where a part is unreliable, or a verdict in `used`."""
     parts = list(found.values())
-    ok, quality = parts[0].ok, parts[0].quality.double()
-    for part in parts[1:]:
-        ok, quality = ok & part.ok, quality.minimum(part.quality.double())
+    quality = functools.reduce(torch.minimum, [part.quality.double() for part in parts])
+    ok = functools.reduce(torch.logical_and, [*(part.ok for part in parts), *used])
     value, std = (
         {key: entry for part in parts for key, entry in getattr(part, table).items()} for table in ("value", "std")
     )

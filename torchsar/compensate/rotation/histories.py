@@ -126,10 +126,12 @@ def _fitted_to_peaks(
     image = image_of(data, sampling, motion, oversampling=_OVERSAMPLING)
     power = image.abs().square()
     noise = noise_power(power)
-    power = torch.where(_unambiguous(motion, sampling, image.shape[1])[..., None], power, 0)
+    resolved = _unambiguous(motion, sampling, image.shape[1])[..., None]
+    speckle = torch.where(resolved, power, math.nan).nanmedian(1, keepdim=True).values / math.log(2)
+    power = torch.where(resolved, power, 0)
     if strict:
-        speckle = power.median(1, keepdim=True).values / math.log(2) * threshold(power[0].numel())
-        floor = torch.maximum(speckle, _FAINTEST * power.amax((-2, -1), keepdim=True))
+        brightest = power.amax((-2, -1), keepdim=True)
+        floor = torch.maximum(speckle * threshold(power[0].numel()), _FAINTEST * brightest)
         power = torch.where(power > floor, power, power * 1e-30)
     peaks = find_peaks(power, noise * threshold(power[0].numel()), count, _ISOLATED, 2 * half_cells, 1)
     cells = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING
