@@ -14,6 +14,7 @@ from torch import Tensor
 from torchsar.core import Estimate
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.velocity.ambiguity import RESOLVED
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell
 from torchsar.multichannel.velocity.bank import Search, bank_search
 from torchsar.multichannel.velocity.illumination import SeenAperture, lit_as_expected, seen_aperture
@@ -39,8 +40,6 @@ _LEAST_HIDDEN = 0.002
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _PASSES = 2  # of their fit: the second has the expected amplitudes at the positions found
 _OTHERS = 3  # points fitted besides the strongest, by choice: each takes a search of its own
-# Log-likelihood by which other ambiguity numbers must be worse, by choice: a chance of e^-10.
-_RESOLVED = 10.0
 
 
 def moving_point_velocity(
@@ -256,7 +255,7 @@ class _Job:
             better = energy > most
             found, noise = _chosen_fit(other, found, better), torch.where(better, other.noise_power, noise)
             most, second = torch.maximum(energy, most), torch.maximum(second, torch.minimum(energy, most))
-        return found, most - second > _RESOLVED * noise
+        return found, most - second > RESOLVED * noise
 
     def inside(self, motion: PointMotion) -> Tensor:
         """Whether a motion lies within the search, bool (...,)."""

@@ -188,8 +188,9 @@ class SignalIntensityRatio(Stage):
             V, the integration time T and the closest range R0.
         rebuild: Reconstruction method, `LeastSquares(3)` by default, since two bands leave little
             outside the processed band.
-        search_m_s: Least and largest velocity of the search in m/s, None for the unambiguous
-            interval +-lambda PRF / 2.
+        search_m_s: Least and largest velocity of the search in m/s, where the velocity is known to
+            lie between them. None for the interval +-lambda PRF / 2; `ok` is then False where the
+            dwell is too short for the cubic phase to exclude velocities beyond it.
         step_m_s: Step of the grid in m/s.
         range_m: Closest range in metres, None for the reference range of the radar.
         least_quality: Least quality (0 to 1) of an estimate that is `ok`, see `forward`. Below 0.6,
@@ -228,6 +229,7 @@ class SignalIntensityRatio(Stage):
             range_m,
         )
         self.search_m_s, self.step_m_s, self.least_quality = search_m_s or (-half, half), step_m_s, least_quality
+        self.bounded = search_m_s is not None
         low, high = self.search_m_s
         if not (low < high and 0 < step_m_s <= (high - low) / 2):
             raise ValueError(
@@ -257,8 +259,8 @@ class SignalIntensityRatio(Stage):
             the number of PRFs to add to the Doppler (-1, 0 or 1), shape (...,). `ok` is False if
             the data are zero (the value is then the middle of the search interval), the maximum
             lies at an end of the interval, the quality is below `least_quality`, `pulse_rates` is
-            not zero, no tone holds 5 % of the energy of the strongest line, as in clutter, or
-            interferometry is not `ok`.
+            not zero, other numbers are not excluded (unless `search_m_s` is given), no tone holds
+            5 % of the energy of the strongest line, as in clutter, or interferometry is not `ok`.
 
         Raises:
             ValueError: If the reconstruction is singular.
@@ -290,9 +292,10 @@ class SignalIntensityRatio(Stage):
         line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
         dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2
         found = replace(found, ok=found.ok & _is_point(line, self.radar, motion))
-        found = warned_of_ambiguity(found, line, self.radar, motion, Dwell(dwell_s))
         # clutter and other targets displace the maximum of the ratio, but not the tone of a point
         tone = interferometry(line, self.radar, motion, Dwell(dwell_s), check_ambiguity=False)
+        there = replace(motion, u_r_m_s=tone["u_r_m_s"], y0_m=tone["y0_m"])
+        found = warned_of_ambiguity(found, line, self.radar, there, Dwell(dwell_s), exclude=not self.bounded)
         apart, std = (found["u_r_m_s"] - tone["u_r_m_s"]).abs(), found.std["u_r_m_s"]
         std = torch.where(apart > _UNLIKELY * std, apart, std)
         return replace(found, ok=found.ok & tone.ok, std={"u_r_m_s": std})
@@ -341,9 +344,7 @@ def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor,
     return torch.hypot(std, torch.full_like(std, rest_m_s))
 
 
-def _slope_and_bend(
-    intensity: Callable[[Tensor], Intensity], value: Tensor, step_m_s: Tensor
-) -> tuple[Tensor, Tensor]:
+def _slope_and_bend(intensity: Callable[[Tensor], Intensity], value: Tensor, step_m_s: Tensor) -> tuple[Tensor, Tensor]:
     """Return the standard deviation of the slope of log Gamma and its downward curvature, (...,).
 
     Each of _GROUPS interleaved groups of alias frequencies, whose noise is independent, is left out
