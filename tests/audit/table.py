@@ -78,9 +78,6 @@ LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
     "range cells shows: `ok` is False where a sparse description is more likely": [
         *(("compensate.LinkPhases", "own", snr_db) for snr_db in (20.0, 60.0)),
     ],
-    "in strong clutter errors are 1.6 times the predicted deviation; the cause is not known": [
-        ("multichannel.MovingPointVelocity:beam", "sea and point", 30.0),
-    ],
     "near the threshold, where a deviation of 5 % of the rate is ok, the deviation is up to 1.6 times too small "
     "and an error of 10 % of the rate counts as wrong": [
         ("compensate.UnevenRotation", "own", 0.0),
@@ -90,9 +87,6 @@ LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
     "the disagreement of the scatterers overestimates errors of 0.05 % of k1": [
         ("compensate.UnevenRotation", "own", 40.0),
         ("compensate.UnevenRotation", "own", 60.0),
-    ],
-    "at the threshold the curvature of the ratio is noisy": [
-        ("multichannel.SignalIntensityRatio", "own", 10.0),
     ],
 }
 

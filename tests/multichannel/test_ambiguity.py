@@ -33,6 +33,22 @@ def test_the_ambiguity_number_is_right_with_a_wrong_along_track_speed(u_r: float
         assert float(Interferometry(RADAR, Dwell(4.5))(signal, u_a_m_s=u_a).info["pulse_rates"]) == off
 
 
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("dwell_s", "snr_db", "known"), [(2.0, 15.0, True), (1.0, 5.0, False)])
+def test_a_short_dwell_is_ok_only_where_it_excludes_other_pulse_rates(dwell_s, snr_db, known) -> None:
+    """Speeds beyond lambda PRF / 2 were wrong and ok in every trial."""
+    u_r = torch.tensor([-34.0, 32.0, 43.0, -10.0, 0.0, 12.0])[:, None]
+    still, y0 = torch.zeros_like(u_r), torch.linspace(-50, 50, 6)[:, None]
+    world = BistaticWorld(MovingPoints(u_r, still, y0, still), BandLimited(dwell_s), snr_db=snr_db)
+    signal = simulate_bistatic(RADAR, world, 600, None, Draws(4, trials=range(6)), dtype=torch.complex128)[0].signal
+    right = torch.tensor([False, False, False, known, known, known])
+    assert torch.equal(Interferometry(RADAR, Dwell(dwell_s))(signal).ok, right)
+    ratio = SignalIntensityRatio(RADAR, 75.0 * dwell_s, step_m_s=1.0)(signal)
+    assert bool((ratio.ok <= right).all()) and bool(ratio.ok.any()) == known
+    near = Interferometry(RADAR, Dwell(dwell_s), check_ambiguity=False)(signal)
+    assert bool(near.ok.all()) and "pulse_rates" not in near.info
+
+
 def test_targets_outside_the_record_are_reported() -> None:
     far = MovingPoints([0.0, 0.0], [0.0, 0.0], [0.0, 9000.0], [0.0, 0.0])
     with pytest.warns(UserWarning, match="1 of 2 targets are received in no pulse"):

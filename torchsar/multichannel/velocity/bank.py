@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import level_of, per_trial, unit_phasor
+from torchsar.core import level_of, per_trial, take, unit_phasor
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
@@ -121,20 +121,22 @@ def bank_search(
     return best, energy * level[..., 0, 0].square()
 
 
-def tone_energy(data: Tensor, radar: BistaticRadar, motions: PointMotion, aperture: Aperture, reach_m: float) -> Tensor:
-    """Return the largest energy that one of several hypotheses of the motion explains.
+def sharpest_tone(
+    data: Tensor, radar: BistaticRadar, motions: PointMotion, aperture: Aperture, reach_m: float
+) -> tuple[PointMotion, Tensor]:
+    """Find the one of several hypotheses of the motion that explains most of the energy per trial.
 
     The along-track position of each hypothesis may change by up to `reach_m`.
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
         radar: Radar parameters.
-        motions: Hypotheses, shape (..., hypothesis).
+        motions: Hypotheses of one slant-range speed, shape (..., hypothesis).
         aperture: Expected amplitude over slow time.
         reach_m: Largest along-track distance in metres from the position of a hypothesis.
 
     Returns:
-        Energy by normalised correlation, float64 (...,).
+        The motion, and the energy that it explains by normalised correlation, float64 (...,).
     """
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     motions, prepared = (
@@ -143,20 +145,16 @@ def tone_energy(data: Tensor, radar: BistaticRadar, motions: PointMotion, apertu
     )
     size = max(1, _BLOCK_BYTES // (32 * data.numel()))
     parts = [slice(at, at + size) for at in range(0, motions.u_a_m_s.shape[-1], size)]
-    return torch.stack(
-        [
-            _best_tone(
-                prepared,
-                radar,
-                motions.each(lambda value, part=part: value[..., part]),
-                aperture,
-                time_s,
-                reach_m,
-                None,
-            )[0]
-            for part in parts
-        ]
-    ).amax(0)
+    found = [
+        _best_tone(
+            prepared, radar, motions.each(lambda value, part=part: value[..., part]), aperture, time_s, reach_m, None
+        )
+        for part in parts
+    ]
+    energy, position, along = (torch.stack(values, -1) for values in zip(*found, strict=True))
+    at = energy.argmax(-1)
+    best = motions.each(lambda value: value[..., 0])
+    return replace(best, u_a_m_s=take(along, at, -1), y0_m=take(position, at, -1)), take(energy, at, -1)
 
 
 def _steps(half: float, step: float, device: torch.device) -> Tensor:

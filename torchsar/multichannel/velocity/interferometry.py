@@ -55,9 +55,10 @@ def interferometry(
 
     The first pass weights all pulses equally. Later passes weight them by the expected amplitude of
     a point at the position found so far. The slant-range speed u_r is measured modulo lambda PRF
-    and returned within lambda PRF / 2 of the start, which must be so near; beyond it, `ok` is False
-    only where the aperture is long enough for the cubic phase to show it. The along-track speed u_a
-    keeps the value of the start.
+    and returned within lambda PRF / 2 of the start. Only the cubic phase shows a speed beyond it,
+    and `ok` is False where the aperture is too short for that at the SNR, whatever the speed: pass
+    `check_ambiguity=False` where the start is known to be so near. The along-track speed u_a keeps
+    the value of the start.
 
     Args:
         data: Channels with the transmit range removed, shape (..., channel, pulse), complex.
@@ -66,16 +67,17 @@ def interferometry(
         aperture: Expected amplitude over slow time.
         passes: Number of passes, each of which starts from the result of the previous one.
         check_ambiguity: Whether to check that the velocity is not wrong by lambda * PRF, in about
-            10 ms per trial. Where it is wrong, a warning is given and `ok` is False.
+            20 ms per trial. Where it is or may be wrong, `ok` is False; where it is, a warning is
+            given.
 
     Returns:
         `u_r_m_s` (closing positive), `u_a_m_s` and `y0_m` of shape (...,). Standard deviations of
         u_r and y0 follow from the residual noise. `info` holds `snr_db` (over all samples) and
         `noise_power` (per sample), and with `check_ambiguity` also `pulse_rates`, the number of
         PRFs to add to the Doppler (-1, 0 or 1). `ok` is False where `snr_db` is below 19,
-        `pulse_rates` is not zero, or the illumination of the point is not understood, see
-        `lit_as_expected`. Where it is lit in a part of the aperture only, this part is used, see
-        `seen_aperture`.
+        `pulse_rates` is not zero, the data do not exclude other numbers, or the
+        illumination of the point is not understood, see `lit_as_expected`. Where it is lit in a
+        part of the aperture only, this part is used, see `seen_aperture`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -98,7 +100,7 @@ def interferometry(
     snr = found.snr_db
     estimate = estimate_of(found, snr >= DETECTED_DB, _quality(snr))
     if check_ambiguity:
-        estimate = warned_of_ambiguity(estimate, data, radar, motion, aperture)
+        estimate = warned_of_ambiguity(estimate, data, radar, motion, aperture, exclude=True)
     return replace(estimate, ok=estimate.ok & lit_as_expected(data, radar, motion, aperture))
 
 

@@ -161,9 +161,9 @@ class PointLikelihood:
         if self.whitening is None:
             return _white(self.data * phasor.conj(), self.weight, slopes)
         model = self.weight * phasor
-        return _coloured(
-            self.data, self.whitening.applied(model), self.whitening.applied(1j * slopes * model[..., None, :, :])
-        )
+        tilted = self.time_s / self.time_s.abs().amax().clamp_min(_TINY) * model
+        applied = self.whitening.applied
+        return _coloured(self.data, applied(model), applied(tilted), applied(1j * slopes * model[..., None, :, :]))
 
     def noise_power(self, fit: PointFit) -> Tensor:
         """Return the residual power per sample in the pulses in which the point is illuminated.
@@ -222,17 +222,24 @@ def _white(deramped: Tensor, weight: Tensor, slopes: Tensor) -> PointFit:
     )
 
 
-def _coloured(data: Tensor, model: Tensor, columns: Tensor) -> PointFit:
-    """Fit on whitened data, model and derivatives (..., unknown, channel, bin)."""
-    x, s, d = data.flatten(-2), model.flatten(-2), columns.flatten(-2)
+def _coloured(data: Tensor, model: Tensor, tilted: Tensor, columns: Tensor) -> PointFit:
+    """Fit on whitened data, model, model times slow time, and derivatives.
+
+    In clutter, a displaced expected amplitude displaces the point. The amplitude may therefore grow
+    linearly over slow time, by a real factor.
+    """
+    x, s, q, d = data.flatten(-2), model.flatten(-2), tilted.flatten(-2), columns.flatten(-2)
     total = s.abs().square().sum(-1).clamp_min(_TINY)
     amplitude = (s.conj() * x).sum(-1) / total
+    q = q - ((q * s.conj()).sum(-1) / total)[..., None] * s
     d = d - ((d * s.conj()[..., None, :]).sum(-1) / total[..., None])[..., None] * s[..., None, :]
+    tilt = q.abs().square().sum(-1).clamp_min(_TINY)
+    d = d - ((d * q.conj()[..., None, :]).sum(-1).real / tilt[..., None])[..., None] * q[..., None, :]
     gradient = (amplitude.conj()[..., None] * (d.conj() * x[..., None, :]).sum(-1)).real
     normal = (d.conj()[..., :, None, :] * d[..., None, :, :]).sum(-1).real
-    return PointFit(
-        amplitude, amplitude.abs().square() * total, gradient, amplitude.abs().square()[..., None, None] * normal
-    )
+    power = amplitude.abs().square()
+    changed = (amplitude.conj() * (q.conj() * x).sum(-1)).real.square() / (power * tilt).clamp_min(_TINY)
+    return PointFit(amplitude, power * total + changed, gradient, power[..., None, None] * normal)
 
 
 def stepped(

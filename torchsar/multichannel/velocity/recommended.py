@@ -14,6 +14,7 @@ from torch import Tensor
 from torchsar.core import Estimate
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.velocity.ambiguity import RESOLVED
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell
 from torchsar.multichannel.velocity.bank import Search, bank_search
 from torchsar.multichannel.velocity.illumination import SeenAperture, lit_as_expected, seen_aperture
@@ -39,11 +40,6 @@ _LEAST_HIDDEN = 0.002
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _PASSES = 2  # of their fit: the second has the expected amplitudes at the positions found
 _OTHERS = 3  # points fitted besides the strongest, by choice: each takes a search of its own
-# Log-likelihood by which other ambiguity numbers must be worse, by choice: a chance of e^-10.
-_RESOLVED = 10.0
-# Refits about the position found, with so many Gauss-Newton steps each: a round reduces the bias of
-# the position to a third, four rounds to about 1 %.
-_CENTRED_ROUNDS, _CENTRED_STEPS = 4, 4
 
 
 def moving_point_velocity(
@@ -109,7 +105,7 @@ def moving_point_velocity(
     job = _Job(data.to(torch.complex128), radar, aperture, coarse, search, u_a, range_m, unknowns)
     if whitening is not None:
         return job.estimate(
-            job.centred(job.found(whitening), whitening),
+            job.found(whitening),
             torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device),
             whitening,
         )
@@ -217,18 +213,6 @@ class _Job:
         data = torch.where(where[..., None, None], self.data - echo, self.data)
         return replace(self, data=data, aperture=aperture)
 
-    def centred(self, found: Found, whitening: Whitening) -> Found:
-        """Repeat the fit four times, with the expected amplitude about the last position found.
-
-        In clutter a displaced expected amplitude biases the position; each round reduces this bias
-        to a third.
-        """
-        for _ in range(_CENTRED_ROUNDS):
-            found = maximum_likelihood(
-                self.data, self.radar, found.motion, self.aperture, self.unknowns, whitening, _CENTRED_STEPS
-            )
-        return found
-
     def refined(self, found: Found) -> _Refined:
         """Repeat the fit up to two times with the covariance of its residual.
 
@@ -271,7 +255,7 @@ class _Job:
             better = energy > most
             found, noise = _chosen_fit(other, found, better), torch.where(better, other.noise_power, noise)
             most, second = torch.maximum(energy, most), torch.maximum(second, torch.minimum(energy, most))
-        return found, most - second > _RESOLVED * noise
+        return found, most - second > RESOLVED * noise
 
     def inside(self, motion: PointMotion) -> Tensor:
         """Whether a motion lies within the search, bool (...,)."""

@@ -12,6 +12,7 @@ Reference:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -30,9 +31,13 @@ from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
 
 _TOLERANCE_M_S = 1e-4  # of the maximum, well below the 0.06 m/s of error without noise
-# Half step of the derivatives for the standard deviation, found by trial: at 17 dB per sample 0.5
-# m/s predicts 0.065 m/s where 0.051 m/s is measured; 0.25 and 1 m/s predict 0.12 and 0.036 m/s.
-_CURVE_M_S = 0.5
+# Half steps of the derivatives for the standard deviation: the first, and the limits of the second.
+# Found by trial: with a fixed half step of 0.5 m/s, errors are 0.6, 0.75 and 1.0 of the prediction
+# at 10, 13 and 17 dB per sample; with 1 m/s they are 1.0, 1.2 and 1.8.
+_FIRST_M_S, _CURVE_M_S = 0.75, (0.4, 1.5)
+# The second half step is that at which the maximum has fallen by this many standard deviations of
+# the noise of ln Gamma. Found by trial: predictions then hold within 10 % from 10 to 25 dB.
+_FALL = 1.8
 # Systematic error without noise, from echoes beyond the reconstructed bands, relative to lambda
 # PRF: 0.035 m/s rms over velocities and positions, up to 0.06 m/s, of 43 m/s.
 _REST = 8e-4
@@ -183,8 +188,9 @@ class SignalIntensityRatio(Stage):
             V, the integration time T and the closest range R0.
         rebuild: Reconstruction method, `LeastSquares(3)` by default, since two bands leave little
             outside the processed band.
-        search_m_s: Least and largest velocity of the search in m/s, None for the unambiguous
-            interval +-lambda PRF / 2.
+        search_m_s: Least and largest velocity of the search in m/s, where the velocity is known to
+            lie between them. None for the interval +-lambda PRF / 2; `ok` is then False where the
+            dwell is too short for the cubic phase to exclude velocities beyond it.
         step_m_s: Step of the grid in m/s.
         range_m: Closest range in metres, None for the reference range of the radar.
         least_quality: Least quality (0 to 1) of an estimate that is `ok`, see `forward`. Below 0.6,
@@ -223,6 +229,7 @@ class SignalIntensityRatio(Stage):
             range_m,
         )
         self.search_m_s, self.step_m_s, self.least_quality = search_m_s or (-half, half), step_m_s, least_quality
+        self.bounded = search_m_s is not None
         low, high = self.search_m_s
         if not (low < high and 0 < step_m_s <= (high - low) / 2):
             raise ValueError(
@@ -252,8 +259,8 @@ class SignalIntensityRatio(Stage):
             the number of PRFs to add to the Doppler (-1, 0 or 1), shape (...,). `ok` is False if
             the data are zero (the value is then the middle of the search interval), the maximum
             lies at an end of the interval, the quality is below `least_quality`, `pulse_rates` is
-            not zero, no tone holds 5 % of the energy of the strongest line, as in clutter, or
-            interferometry is not `ok`.
+            not zero, other numbers are not excluded (unless `search_m_s` is given), no tone holds
+            5 % of the energy of the strongest line, as in clutter, or interferometry is not `ok`.
 
         Raises:
             ValueError: If the reconstruction is singular.
@@ -285,9 +292,10 @@ class SignalIntensityRatio(Stage):
         line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
         dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2
         found = replace(found, ok=found.ok & _is_point(line, self.radar, motion))
-        found = warned_of_ambiguity(found, line, self.radar, motion, Dwell(dwell_s))
         # clutter and other targets displace the maximum of the ratio, but not the tone of a point
         tone = interferometry(line, self.radar, motion, Dwell(dwell_s), check_ambiguity=False)
+        there = replace(motion, u_r_m_s=tone["u_r_m_s"], y0_m=tone["y0_m"])
+        found = warned_of_ambiguity(found, line, self.radar, there, Dwell(dwell_s), exclude=not self.bounded)
         apart, std = (found["u_r_m_s"] - tone["u_r_m_s"]).abs(), found.std["u_r_m_s"]
         std = torch.where(apart > _UNLIKELY * std, apart, std)
         return replace(found, ok=found.ok & tone.ok, std={"u_r_m_s": std})
@@ -323,14 +331,29 @@ def _is_point(line: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor
 def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor, rest_m_s: float) -> Tensor:
     """Return the jackknife standard deviation (...,) of the maximum of log Gamma.
 
-    Each of _GROUPS interleaved groups of alias frequencies, whose noise is independent, is left out
-    in turn. The systematic error `rest_m_s` is included.
+    The noise of log Gamma changes over less than 0.25 m/s, so that its slope depends on the step.
+    Slope and curvature are taken over the interval about the maximum in which noise may displace
+    it. The systematic error `rest_m_s` is included.
     """
-    low, middle, high = (_left_out(intensity(value + shift)) for shift in (-_CURVE_M_S, 0.0, _CURVE_M_S))
-    slope, curvature = (high - low) / (2 * _CURVE_M_S), (low - 2 * middle + high).mean(-1) / _CURVE_M_S**2
+    step = torch.full_like(value, _FIRST_M_S)
+    spread, bend = _slope_and_bend(intensity, value, step)
+    noise = math.sqrt(2) * step * spread  # of log Gamma at one speed
+    step = torch.where(bend > 0, (2 * _FALL * noise / torch.where(bend > 0, bend, 1)).sqrt(), math.inf)
+    spread, bend = _slope_and_bend(intensity, value, step.clamp(*_CURVE_M_S))
+    std = torch.where(bend > 0, spread / torch.where(bend > 0, bend, 1), math.inf)
+    return torch.hypot(std, torch.full_like(std, rest_m_s))
+
+
+def _slope_and_bend(intensity: Callable[[Tensor], Intensity], value: Tensor, step_m_s: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the standard deviation of the slope of log Gamma and its downward curvature, (...,).
+
+    Each of _GROUPS interleaved groups of alias frequencies, whose noise is independent, is left out
+    in turn.
+    """
+    low, middle, high = (_left_out(intensity(value + sign * step_m_s)) for sign in (-1, 0, 1))
+    slope = (high - low) / (2 * step_m_s[..., None])
     spread = (slope - slope.mean(-1, keepdim=True)).square().sum(-1) * (_GROUPS - 1) / _GROUPS
-    noise = torch.where(curvature < 0, spread.sqrt() / torch.where(curvature < 0, -curvature, 1), torch.inf)
-    return torch.hypot(noise, torch.full_like(noise, rest_m_s))
+    return spread.sqrt(), (2 * middle - low - high).mean(-1) / step_m_s.square()
 
 
 def _left_out(bins: Intensity) -> Tensor:

@@ -92,7 +92,8 @@ class Interferometry(_Velocity):
         range_m: Closest range in metres, None for that of the strongest range line, or for the
             reference range of the radar if there is no range axis.
         check_ambiguity: Whether to check that the velocity is not wrong by lambda * PRF, in about
-            10 ms per trial. Where it is wrong, a warning is given and `ok` is False.
+            20 ms per trial. Where it is or may be wrong, `ok` is False; where it is, a warning is
+            given.
     """
 
     def __init__(

@@ -6,6 +6,10 @@ is therefore of low rank. When the known phase ramp over Doppler has been remove
 changes slowly from bin to bin. It can then be averaged over neighbouring bins, and over range lines
 where there are several.
 
+The phase ramp delays one channel against another by a fraction of a pulse interval, circularly. At
+the ends of a record, the clutter of the channels is therefore not related by it. A taper over a few
+pulses at either end removes this part, which in clutter of 30 dB dominates what whitening leaves.
+
 Reference:
     Reed, Mallett and Brennan 1974 (sample covariance).
 """
@@ -31,9 +35,16 @@ _LOADING = 1e-6  # relative to the mean power: keeps the covariance of noise-fre
 _EVIDENCE = 2.0
 
 
+# Pulses of the taper at either end, at most an eighth of the record. Found by trial with 900 pulses
+# and clutter of 30 dB: errors of 0.25 m/s become 0.17 m/s with 9 pulses, 0.16 m/s with 27 to 108.
+_TAPER = 16
+
+
 @dataclass(frozen=True)
 class Whitening:
     """Matrices that whiten the channels in each Doppler bin of the unitary FFT over pulses.
+
+    The ends of the record are tapered before the FFT.
 
     Args:
         factor: Matrices W with W R W^H = I for the covariance R of the channels in each bin,
@@ -62,7 +73,7 @@ class Whitening:
         Returns:
             Whitened spectra, same shape with Doppler bins in place of pulses.
         """
-        spectrum = torch.fft.fft(data, norm="ortho")
+        spectrum = _spectrum(data)
         return _mixed(self.factor if data.ndim == self.factor.ndim - 1 else self.factor[..., None, :, :, :], spectrum)
 
     def backed(self, data: Tensor) -> Tensor:
@@ -76,7 +87,21 @@ class Whitening:
         Returns:
             Data of the same shape.
         """
-        return torch.fft.ifft(_mixed(self.factor.mH, self.applied(data)), norm="ortho")
+        weighted = _mixed(self.factor.mH, self.applied(data))
+        return torch.fft.ifft(weighted, norm="ortho") * _taper(weighted)
+
+
+def _taper(data: Tensor) -> Tensor:
+    """Return weights of pulses (..., pulse) that rise from 0 to 1 at either end, (pulse,)."""
+    n = data.shape[-1]
+    inside = torch.arange(n, dtype=torch.float64, device=data.device) + 0.5
+    inside = torch.minimum(inside, inside.flip(0)) / max(1, min(_TAPER, n // 8))
+    return torch.sin(torch.pi / 2 * inside.clamp_max(1.0)).square().to(data.real.dtype)
+
+
+def _spectrum(data: Tensor) -> Tensor:
+    """Return the unitary FFT over the pulses of tapered channels, same shape."""
+    return torch.fft.fft(data * _taper(data), norm="ortho")
 
 
 def _mixed(factor: Tensor, spectrum: Tensor) -> Tensor:
@@ -143,7 +168,7 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES)
     ramp = torch.roll(
         shared_response(radar, rest, n, 2, torch.complex128), -n, -1
     )  # bin i of an FFT is bin i - n of two bands
-    flat = torch.fft.fft(lines.to(torch.complex128), norm="ortho") * ramp.conj()
+    flat = _spectrum(lines.to(torch.complex128)) * ramp.conj()
     products = flat[..., :, None, :] * flat.conj()[..., None, :, :]
     total = products.new_zeros(*products.shape[:-1], int(group[-1]) + 1).index_add(-1, group, products).sum(-4)
     size = torch.bincount(group).to(torch.float64) * count
