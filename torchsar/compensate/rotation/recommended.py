@@ -80,7 +80,8 @@ def uneven_rotation(
         mirrored in cross range. Standard deviations are averages of what the noise explains (the
         Fisher information of the scatterers found) and of what the differences between these
         scatterers show, which counts the more, the more of them contribute; they are larger where
-        energy is left that neither the scatterers nor the noise explain. quality is the share of
+        energy is left that neither the scatterers nor the noise explain. From 40 dB they may be 1.7
+        times the errors, since residuals of the model then count as noise. quality is the share of
         the energy above the noise that the scatterers explain.
 
         info["focused"] is True where the rotation is good enough to form an image: at least 3
