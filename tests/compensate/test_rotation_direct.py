@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.compensate.turning import BINS, F64, OPTIONS, PRF, PULSES, K, noise
+from tests.compensate.turning import BINS, F64, OPTIONS, PRF, PULSES, K, noise, points
 from tests.direct.turntable import SMALL, Turntable
 from torchsar.compensate import (
     EntropyObjective,
@@ -23,6 +23,7 @@ from torchsar.compensate import (
 from torchsar.core import Draws, Estimate
 from torchsar.metrics import rotation_bounds
 
+NARROW = Turntable(24e3, 480, 16, 0.45, 60, 0.3, 2.6)
 TINY = Turntable(40e3, 800, 24, 0.3, 40, 0.45)
 TRUE = {"omega_rad_s": 0.02, "k1_per_s": 10.0, "k2_per_s2": 1000.0, "yc_m": 0.0}
 
@@ -88,6 +89,17 @@ def test_a_target_lit_for_half_of_the_aperture_is_not_ok() -> None:
     for estimator in (coarse_rotation, phase_fit_rotation):
         found = estimator(data, **TINY.options)
         assert not found.ok and math.isinf(found.info["phase_error_rad"])
+
+
+@pytest.mark.parametrize("seed, snr_db, many", [(50033, 0.0, None), (71402, 10.0, 400)])
+def test_a_rate_that_is_wrong_by_more_than_a_tenth_is_not_ok(seed: int, snr_db: float, many: int | None) -> None:
+    """Noise makes a rate too large, which then looks accurate, or many scatterers are not found."""
+    x, y, amplitude = NARROW.satellite(seed) if many is None else points(seed, many)
+    clean = NARROW.echo(x * (NARROW.half_width_m / x.abs().max()), y, amplitude)
+    found = uneven_rotation(NARROW.noisy(clean, snr_db, 1000 + seed)[0].to(torch.complex64), **NARROW.options)
+    error = abs(float(found["omega_rad_s"]) / TRUE["omega_rad_s"] - 1)
+    assert not found.ok or error < 0.1
+    assert error < 3.5 * found.std["omega_rad_s"] / TRUE["omega_rad_s"]
 
 
 def test_the_direct_echo_is_the_integral_over_the_pulse() -> None:

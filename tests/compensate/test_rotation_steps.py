@@ -231,7 +231,7 @@ def fit_of(motion: Motion, found: Scatterers) -> Fit:
     covariance, one = torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64)
     never = torch.zeros(1, dtype=torch.bool)
     response, zero = RangeResponse(one, CELLS), covariance[:, 0]
-    return Fit(motion, found, response, covariance, covariance, zero, one, never.long(), never, zero)
+    return Fit(motion, found, response, covariance, zero, zero, zero, one, never.long(), never, zero)
 
 
 def step_of(data: Tensor, present: Tensor) -> tuple[Tensor, _Step]:

@@ -25,8 +25,9 @@ from torchsar.core import Estimate, block_bytes_of, checked_samples, level_of, o
 from torchsar.core.warp import k_of_shape, shape_of
 from torchsar.metrics import entropy
 
-# relative standard deviation of the rate beyond which images cannot be scaled, a convention
-MOST_RATE_ERROR = 0.05
+# relative error of the rate up to which it scales images, a convention, and the standard deviations
+# that it must exceed: a rate that is found too large also looks too accurate
+_RATE_TOLERANCE, _SURE = 0.1, 2.7
 _ENTROPY_ROUNDING = 1e-3  # tolerance in nats of a comparison of entropies in float32
 # size of a block of trials over the size that is best for one operation, found by trial
 _BLOCKS = 8
@@ -76,20 +77,22 @@ def uneven_rotation(
         derivatives k1, k2, ... in 1/s, 1/s^2, ..., shape (..., order - 1), and each of them as
         `k1_per_s`, `k2_per_s2`, ...; and `yc_m`, the range centre deviation, shape (...,). The data
         do not show the sign of the rotation rate, so `omega_rad_s` is positive and the image may be
-        mirrored in cross range. Standard deviations follow from the Fisher information of the
-        scatterers found, or from the differences between them where these are larger. quality is
-        the share of the energy above the noise that these scatterers explain.
+        mirrored in cross range. Standard deviations are averages of what the noise explains (the
+        Fisher information of the scatterers found) and of what the differences between these
+        scatterers show, which counts the more, the more of them contribute; they are larger where
+        energy is left that neither the scatterers nor the noise explain. From 40 dB they may be 1.7
+        times the errors, since residuals of the model then count as noise. quality is the share of
+        the energy above the noise that the scatterers explain.
 
         info["focused"] is True where the rotation is good enough to form an image: at least 3
         scatterers are found, they explain half of the energy or more, their phase histories agree
         over the whole aperture, the entropy is not higher than without compensation, and the fit
-        has converged. `ok` is True where, in addition, the
-        standard deviation of the rate is below 5 %, also without the scatterers that may be peaks
-        of the noise. Where only `ok` is False, the cross-range scale of the image is unknown. A
-        target of so many scatterers that twice the usual number explain less than half of the
-        energy is not ok either; a larger `scatterers` helps. Further info: scatterers (their
-        number), noise_power, steps,
-        entropy_nats, uncompensated_entropy_nats.
+        has converged. `ok` is True where, in addition, an error of the rate above 10 % is
+        improbable: 10 % of it are 2.7 standard deviations or more, also without the scatterers that
+        may be peaks of the noise. Where only `ok` is False, the cross-range scale of the image is
+        unknown. Targets of several hundred scatterers on few pulses, of which the usual numbers
+        explain a part, are often not ok; a larger `scatterers` helps. Further info:
+        scatterers (their number), noise_power, steps, entropy_nats, uncompensated_entropy_nats.
 
     Raises:
         TypeError: If the data are not complex.
@@ -307,10 +310,10 @@ def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_
 def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> Estimate:
     """Estimate from a fit, with standard deviations and reliability."""
     found, focus = _assessed(rows, sampling, fit.motion), focus_of(rows, sampling, fit)
-    focused, std = found.ok & focus.right, _standard_deviations(fit, free_centre)
+    focused, std = found.ok & focus.right, _standard_deviations(fit, focus.accounted, free_centre)
     count = (fit.scatterers.amplitude != 0).sum(-1)
     certain = fit.certain[:, fit.motion.k.shape[-1]].clamp_min(torch.finfo(torch.float64).tiny).sqrt()
-    scaled = (std["omega_rad_s"] < MOST_RATE_ERROR * fit.motion.omega_rad_s * certain) & (fit.motion.w > 0)
+    scaled = (_SURE * std["omega_rad_s"] < _RATE_TOLERANCE * fit.motion.omega_rad_s * certain) & (fit.motion.w > 0)
     info = {**found.info, "focused": focused, "scatterers": count, "noise_power": fit.noise, "steps": fit.steps}
     return Estimate(found.value, focus.explained, focused & scaled, std, info)
 
@@ -342,12 +345,12 @@ def _with_more_scatterers(
     )
 
 
-def _standard_deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
+def _standard_deviations(fit: Fit, accounted: Tensor, free_centre: bool) -> dict[str, Tensor]:
     """Standard deviations of the values, from the covariance of (k, w, v).
 
     They are infinite where the data do not determine a value.
     """
-    motion, order, covariance = fit.motion, fit.motion.k.shape[-1], covariance_of(fit)
+    motion, order, covariance = fit.motion, fit.motion.k.shape[-1], covariance_of(fit, accounted)
     k = covariance.diagonal(dim1=-2, dim2=-1)[:, :order].clamp_min(0).sqrt()
     w = torch.where(motion.w > 0, motion.w, 0)
     ww = covariance[:, order, order]

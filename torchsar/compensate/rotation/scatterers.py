@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.compensate.rotation.couplings import Pairs
-from torchsar.compensate.rotation.histories import inverted, sandwich, solved
+from torchsar.compensate.rotation.histories import inverted, solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.compensate.rotation.range_response import Envelopes, RangeResponse
@@ -45,8 +45,9 @@ _SAMPLES_EACH = 1000
 _SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
 _BLOCK_BYTES = 1 << 19  # phasors of a block of pulses that fit into the cache
 _GROUP = 16  # pulses over which the phase of an echo changes by a few turns
-# Doppler and range cells over which scatterers share errors of the model, found by trial
-_SHARED_CELLS = 2.0
+# Doppler and range cells over which scatterers share errors of the model, found by trial: those of
+# a few scatterers side by side in Doppler are large, with opposite signs
+_SHARED_LINES, _SHARED_CELLS = 8.0, 2.0
 _APART = 0.5  # Doppler and range cells within which scatterers are not resolved
 _BRIGHT = 0.1  # share of the largest amplitude from which a scatterer limits a step, found by trial
 _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
@@ -63,7 +64,7 @@ _CERTAIN = 2.0
 _SETTLED = 0.2  # steps of the motion below this share of its standard deviation end a trial
 
 
-_Taken: TypeAlias = "tuple[Motion, Scatterers, Tensor, Tensor, Tensor, Tensor]"
+_Taken: TypeAlias = "tuple[Motion, Scatterers, Tensor, Tensor, Tensor, Tensor, Tensor]"
 
 
 @dataclass(frozen=True)
@@ -135,9 +136,10 @@ class Scatterers:
             Weights from 0 (independent) to 1, shape (trial, scatterer, scatterer), float64; 0 where
             there is no scatterer.
         """
-        lines, rows = ((x[:, :, None] - x[:, None]).square() for x in (self.cell, self.row))
+        scaled = ((self.cell, _SHARED_LINES), (self.row, _SHARED_CELLS))
+        lines, rows = (((x[:, :, None] - x[:, None]) / reach).square() for x, reach in scaled)
         used = (self.amplitude != 0).double()
-        return torch.exp(-(lines + rows) / (2 * _SHARED_CELLS**2)) * used[:, :, None] * used[:, None]
+        return torch.exp(-(lines + rows) / 2) * used[:, :, None] * used[:, None]
 
     def effective_number(self) -> Tensor:
         """Count the independent scatterers over which the energy is spread.
@@ -164,10 +166,13 @@ class Fit:
         covariance: Covariance of the estimated parameters of the rotation for a noise power of 1,
             shape (trial, parameter, parameter); infinite variance where the data do not determine
             one.
-        disagreement: Covariance of the same parameters as the differences between scatterers show
-            it, in absolute units, same shape. Errors of the model, such as several scatterers in
-            one resolution cell, add to it. It is too small by the share of the differences that the
-            fit takes up: the number of parameters over the number of scatterers.
+        disagreement: Variance of the same parameters as the differences between scatterers show
+            it, in absolute units, shape (trial, parameter). Errors of the model, such as several
+            scatterers in one resolution cell, add to it. It is too small by the share of the
+            differences that the fit takes up: the number of parameters over the number of
+            scatterers.
+        witnesses: Number of independent scatterers that contribute to each of these variances, by
+            the rule of Welch and Satterthwaite, same shape.
         certain: Share of what the data show about each of these parameters that comes from
             scatterers too bright to be peaks of the noise, shape (trial, parameter).
         noise: Noise power per sample, shape (trial,).
@@ -182,6 +187,7 @@ class Fit:
     response: RangeResponse
     covariance: Tensor
     disagreement: Tensor
+    witnesses: Tensor
     certain: Tensor
     noise: Tensor
     steps: Tensor
@@ -239,7 +245,7 @@ def fit_scatterers(
     response = RangeResponse.of_unknown_share(trials, sampling.cells, device)
     zero = covariance.new_zeros(trials, unknowns.size)
     none = Scatterers.none(data)
-    fit = Fit(start, none, response, covariance, covariance, zero, noise, never.long(), never, zero)
+    fit = Fit(start, none, response, covariance, zero, zero, zero, noise, never.long(), never, zero)
     residual, step = data, None
     for iteration in range(rounds + 1):
         new, noise = None, fit.noise
@@ -433,8 +439,9 @@ class _Step:
 
         Returns:
             The rotation and the scatterers after the step; the change of the parameters of the
-            rotation, shape (trial, unknown); their covariance per unit noise power, and that from
-            the differences between scatterers, shape (trial, unknown, unknown) each; and the share
+            rotation, shape (trial, unknown); their covariance per unit noise power, shape (trial,
+            unknown, unknown); their variance from the differences between scatterers, and the
+            number of scatterers that contribute to it, shape (trial, unknown) each; and the share
             of each scatterer in what the data show about them, shape (trial, scatterer, unknown).
         """
         slopes, factor = self._slopes(), _Factor.of(self._local())
@@ -484,6 +491,10 @@ class _Step:
         change, inverse = solved(normal, pull.sum(1)), inverted(normal)[0]
         informed = torch.einsum("bpij,bin,bjn->bpn", curvature, inverse, inverse)
         rest = pull - torch.einsum("bpij,bj->bpi", curvature, change)
+        # share of each scatterer, with those that it is not independent of, in the variances
+        moved_by, alike = rest @ inverse, found.alike()
+        spread = moved_by * (alike @ moved_by)
+        disagreement = spread.sum(1)
         change = change * self._within_reach((joint[..., :-1] @ change[..., None])[..., 0])[:, None]
         if damped:
             change = change * self._without_reversal(change, normal)[:, None]
@@ -497,7 +508,8 @@ class _Step:
             Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), position),
             change,
             _covariance(normal),
-            sandwich(normal, rest.mT @ found.alike() @ rest),
+            disagreement,
+            disagreement.square() / or_one((spread * (alike @ spread)).sum(1)),
             informed / or_one(informed.sum(1, keepdim=True)),
         )
 
@@ -662,7 +674,7 @@ def _after_step(
     Trials that have ended, and steps to a motion that reverses its direction, leave the fit
     unchanged.
     """
-    motion, found, change, covariance, disagreement, shares = taken
+    motion, found, change, covariance, disagreement, witnesses, shares = taken
     least = _CERTAIN * threshold(_OVERSAMPLING * sampling.pulses * sampling.cells) * noise / sampling.pulses
     certain = (shares * (found.amplitude.abs().square() > least[:, None])[..., None]).sum(1)
     valid = (
@@ -680,7 +692,8 @@ def _after_step(
         scatterers=Scatterers(*(torch.where(pick, new, before) for new, before in pairs)).apart(),
         response=response.where(active & valid, fit.response),
         covariance=torch.where(active[:, None, None], covariance, fit.covariance),
-        disagreement=torch.where(active[:, None, None], disagreement, fit.disagreement),
+        disagreement=torch.where(active[:, None], disagreement, fit.disagreement),
+        witnesses=torch.where(active[:, None], witnesses, fit.witnesses),
         certain=torch.where(active[:, None], certain, fit.certain),
         noise=torch.where(active, noise, fit.noise),
         steps=fit.steps + active,

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.compensate.rotation.histories import LEAST_SCATTERERS, change_by_histories, refined_by_histories
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped
 from torchsar.compensate.rotation.scatterers import Fit, fit_scatterers
@@ -27,6 +28,9 @@ LEAST_EXPLAINED = 0.5
 # rad, found by trial
 _REST_STDS, _REST_RAD = 3.0, 0.01
 _TO_GO = 0.25  # distance that is left after the last step over that step, found by trial
+# scatterers that outweigh the variance that the noise explains: a variance that a few of them show
+# is uncertain by a factor, found by trial
+_FEW = 2.0
 _WRONG_FOCUS = 2.0  # phase error over `MOST_PHASE_ERROR_RAD` of a wrong focus, found by trial
 _LEAST_ORDER = 3  # least order of the rotation with which another is compared, that of the paper
 _CHECKS = 2  # refinements of a rotation to be judged: enough for an image that is still blurred
@@ -40,12 +44,15 @@ class Focus(NamedTuple):
             their histories do not contradict the fit, and it has converged, shape (trial,), bool.
         explained: Share of the energy above the noise that the scatterers explain, 0 to 1, shape
             (trial,).
+        accounted: Share of all energy that the scatterers and the noise explain, 0 to 1, shape
+            (trial,).
         edge_rad: Largest Doppler of bright scatterers as a phase over the aperture in rad, shape
             (trial,); infinite where they do not determine the rotation.
     """
 
     right: Tensor
     explained: Tensor
+    accounted: Tensor
     edge_rad: Tensor
 
 
@@ -63,7 +70,10 @@ def focus_of(rows: Tensor, sampling: Sampling, fit: Fit) -> Focus:
     found = (fit.scatterers.amplitude != 0).sum(-1)
     present = (rows != 0).any(-1).sum(-1)
     energy = fit.scatterers.amplitude.abs().square().sum(-1) * present
-    explained = settle((energy / _energy(rows, fit.noise, present)).clamp(0, 1), 0.0)[0]
+    power = torch.view_as_real(rows).double().square().sum((-3, -2, -1)).clamp_min(torch.finfo(torch.float64).tiny)
+    above = (power - fit.noise * present * rows.shape[-1]).clamp_min(1e-3 * power)
+    explained = settle((energy / above).clamp(0, 1), 0.0)[0]
+    accounted = 1 - (1 - explained) * above / power
     tiny = torch.finfo(torch.float64).tiny
     predicted = fit.covariance.diagonal(dim1=-2, dim2=-1) * fit.noise[:, None]
     step = (fit.change.abs() / predicted.clamp_min(tiny).sqrt()).amax(-1)
@@ -72,17 +82,21 @@ def focus_of(rows: Tensor, sampling: Sampling, fit: Fit) -> Focus:
     change, covariance, edge, _ = change_by_histories(rows, sampling, fit.motion)
     confirmed = _phase_error(sampling, fit.motion, change, covariance, edge) < _WRONG_FOCUS * MOST_PHASE_ERROR_RAD
     right = (found >= LEAST_SCATTERERS) & confirmed & (explained >= LEAST_EXPLAINED) & converged
-    return Focus(right, explained, edge)
+    return Focus(right, explained, accounted, edge)
 
 
-def covariance_of(fit: Fit) -> Tensor:
+def covariance_of(fit: Fit, accounted: Tensor) -> Tensor:
     """Compute the covariance of the parameters of the rotation of a joint fit.
 
-    It follows from the Fisher information, or from the differences between scatterers where these
-    are larger.
+    The variance that the noise explains (Fisher information) and that which the differences between
+    scatterers show are averaged, the second with the weight of the number of scatterers that
+    contribute to it. The step that is left is added. Scatterers that are not found disturb the
+    others: standard deviations are divided by the share of the energy that is accounted for.
 
     Args:
         fit: The fit.
+        accounted: Share of all energy that the scatterers and the noise explain, 0 to 1, shape
+            (trial,).
 
     Returns:
         The covariance in the units and the order of the parameters of `Fit`, shape (trial,
@@ -90,12 +104,12 @@ def covariance_of(fit: Fit) -> Tensor:
     """
     known = (fit.scatterers.amplitude != 0).any(-1)
     covariance = fit.covariance * fit.noise[:, None, None]
-    seen, predicted = (c.diagonal(dim1=-2, dim2=-1) for c in (fit.disagreement, covariance))
+    predicted = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(torch.float64).tiny)
     # what the scatterers would differ by if the fit did not take up a part of it as well
     taken_up = (predicted.shape[-1] / fit.scatterers.effective_number().clamp_min(1)).clamp_max(1)[:, None]
-    to_go = (_TO_GO * fit.change).square()
-    wider = taken_up + (seen + to_go) / predicted.clamp_min(torch.finfo(torch.float64).tiny)
-    wider = wider.sqrt()
+    seen = taken_up + fit.disagreement / predicted
+    wider = (fit.witnesses * seen + _FEW) / (fit.witnesses + _FEW) + (_TO_GO * fit.change).square() / predicted
+    wider = wider.sqrt() / or_one(accounted)[:, None]
     return torch.where(known[:, None, None], covariance * wider[:, :, None] * wider[:, None], math.inf)
 
 
@@ -132,7 +146,7 @@ def warp_phase_error(data: Tensor, sampling: Sampling, motion: Motion) -> tuple[
         rows, judged = data[at], motion.part(at)
         fit = fit_scatterers(rows, sampling, refined.part(at))
         focus, order = focus_of(rows, sampling, fit), motion.k.shape[-1]
-        covariance = covariance_of(fit)[:, :order, :order]
+        covariance = covariance_of(fit, focus.accounted)[:, :order, :order]
         joint = _phase_error(sampling, judged, fit.motion.k - judged.k, covariance, focus.edge_rad)
         error = error.index_copy(0, at, torch.where(focus.right, joint, error[at]))
     return error, count
@@ -150,9 +164,3 @@ def _phase_error(sampling: Sampling, motion: Motion, change: Tensor, covariance:
     size = curves @ curves.mT / sampling.pulses
     moved, unsure = torch.einsum("bi,bij,bj->b", change, size, change), (size * covariance).sum((-2, -1))
     return torch.nan_to_num(edge_rad * (moved.clamp_min(0).sqrt() + 2 * unsure.clamp_min(0).sqrt()), math.inf, math.inf)
-
-
-def _energy(rows: Tensor, noise: Tensor, present: Tensor) -> Tensor:
-    """Energy above the noise of the pulses that are present (their number, (trial,)), (trial,)."""
-    power = torch.view_as_real(rows).double().square().sum((-3, -2, -1))
-    return (power - noise * present * rows.shape[-1]).clamp_min(1e-3 * power).clamp_min(torch.finfo(torch.float64).tiny)
