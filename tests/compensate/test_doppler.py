@@ -340,6 +340,20 @@ def test_the_increment_of_one_whole_target_is_reliable() -> None:
     assert not bool(RangeDependentCentroid(AIRCRAFT)(signal).ok.any())  # one target shows no slope over range
 
 
+def test_the_deviation_over_range_includes_the_few_targets_that_are_cut() -> None:
+    """A chirp fills several blocks, whose residuals agree: errors of 7 deviations."""
+    radar, generator = replace(AIRCRAFT, prf_hz=200.0), torch.Generator().manual_seed(3)
+    middle, row = (x * (torch.rand(240, 3, 1, generator=generator) - 0.5) for x in (2.6, 25.0))
+    t, u = (torch.arange(384) - 192) / radar.prf_hz - middle, torch.arange(96) - 48 - row
+    along = torch.polar((t.abs() < 0.5).float(), math.pi * 77 * t.square())
+    x = torch.einsum("tkp,tkr->tpr", along, torch.polar((u.abs() < 12.5).float(), 0.1 * u.square()))
+    x = x + 0.1 * torch.randn(x.shape, generator=generator, dtype=x.dtype)
+    found = RangeDependentCentroid(radar)(Signal(x, radar.raw_axes(384, 96)))
+    error, std = found["doppler_baseband_hz"][found.ok].abs(), found.std["doppler_baseband_hz"][found.ok]
+    assert len(error) > 120 and bool((error < 4 * std + 0.5).all())
+    assert 0.7 < float((error.square().mean() / std.square().mean()).sqrt()) < 1.43
+
+
 def test_faint_range_cells_do_not_bend_the_centroid_over_range() -> None:
     """Without noise, the sidelobes of the pulses are as coherent as the targets."""
     rms = []

@@ -382,6 +382,18 @@ def test_deviation_of_single_shifts(method, count: int, snr_db: float) -> None:
     assert float(ok.double().mean()) >= 0.6 and 0.7 < ratio < 1.5, ratio
 
 
+@pytest.mark.parametrize("spacing", [6, 12])
+def test_deviation_of_single_shifts_of_rows_at_even_spacing(spacing: int) -> None:
+    """The errors of such rows cancel in pairs: twice as much was predicted."""
+    rows = 8 + spacing * torch.randint(80 // spacing, (20, 24), generator=torch.Generator().manual_seed(4)).double()
+    x, shift = points(rows, 40.0)
+    found = align_mean(x)
+    error = off(found["shift_cells"], shift, 96)
+    ok, error = found.ok, rms(error - error.mean(-1, keepdim=True))
+    ratio = float(rms(error[ok]) / rms(found.std["shift_cells"][ok, 0]))
+    assert int(ok.sum()) >= 8 and 0.7 < ratio < 1.5, ratio
+
+
 @pytest.mark.parametrize("seed", [100, 103])
 def test_a_wrong_maximum_of_rows_at_even_spacing_is_noticed(seed: int) -> None:
     """Their likelihood has maxima at the spacing, and a faded row makes a wrong one the highest."""

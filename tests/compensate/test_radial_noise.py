@@ -175,6 +175,18 @@ def test_the_deviation_of_one_scatterer_does_not_contain_the_others(name) -> Non
     assert bool(found.ok.all()) and 0.67**2 < float(ratio) < 1.43**2
 
 
+def test_the_deviation_of_scatterers_of_equal_phases_is_not_that_of_their_power() -> None:
+    """A line of such scatterers along range: errors of 20 predicted deviations, and ok."""
+    line = Points([0.0] * 24, [0.4 + 0.03 * i for i in range(24)])
+    for name, snr_db in (("segmented", 40.0), ("segmented_sum", 40.0), ("segmented", 10.0)):
+        sweeps, pulse, truth = seen(
+            SLOW, n=96, trials=4, scene=line, snr_db=snr_db, dtype=torch.complex64, fidelity=LINES, seed=5
+        )
+        found = ESTIMATORS[name](sweeps, SLOW, pulse)
+        ratio = velocity_rms(found, truth) / found.std["velocity_m_s"].square().mean(-1).sqrt()
+        assert float(ratio.min()) > 0.67 and float(ratio.max()) < 1.43, name
+
+
 def test_sweeps_of_unequal_power_have_the_same_deviation() -> None:
     """The laser may emit more power in the up sweeps."""
     sweeps, pulse, _ = noisy(10, n=64, trials=4)

@@ -558,15 +558,18 @@ def _fit_covariance(basis: Tensor, weight: Tensor, residual: Tensor) -> Tensor:
     The square of each residual is divided by 1 minus its leverage, the share that the block has in
     its own fit.
     """
+    influence = _influence(basis, weight)
+    leverage = (influence * basis).sum(-1)
+    terms = influence * (residual / (1 - leverage).clamp_min(0.1).sqrt())[..., None]
+    return terms.mT @ terms
+
+
+def _influence(basis: Tensor, weight: Tensor) -> Tensor:
+    """Derivatives (..., b, n) of the coefficients of `_weighted_fit` with respect to the values."""
     normal = (basis * weight[..., None]).mT @ basis
     size = normal.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None] + 1e-30
-    inverse = (
-        torch.linalg.inv(normal / size + 1e-12 * torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device))
-        / size
-    )
-    leverage = weight * ((basis @ inverse) * basis).sum(-1)
-    influence = (basis @ inverse) * (weight * residual / (1 - leverage).clamp_min(0.1).sqrt())[..., None]
-    return influence.mT @ influence
+    eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
+    return basis @ torch.linalg.inv(normal / size + 1e-12 * eye) * weight[..., None] / size
 
 
 def _weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -579,13 +582,36 @@ def _weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Ten
     return coefficients, y - coefficients @ basis.mT
 
 
-def _cut_shift_rad(found: Increments, phase_rad: Tensor) -> Tensor:
-    """Shift (..., b) in rad of the increment of each range block by apertures that the ends cut."""
-    turn = cis(-phase_rad)[..., None]
-    ends = (found.ends * turn[..., None]).real.diff(dim=-2)[..., 0, :]
-    total = (found.products.sum(-2) * turn).real
-    shift = found.lines[..., None] * ends / torch.where(total > 0, total, 1)
+def _cut_shifts_rad(found: Increments, turn: Tensor) -> Tensor:
+    """Shifts (..., 2, b) in rad of each range block by apertures cut at the first and last line.
+
+    turn: Phasor of the negative phase increment, shape (...,).
+    """
+    ends = (found.ends * turn[..., None, None]).real * found.ends.real.new_tensor([-1.0, 1.0])[:, None]
+    total = (found.products.sum(-2) * turn[..., None]).real[..., None, :]
+    shift = found.lines[..., None, None] * ends / torch.where(total > 0, total, 1)
     return torch.where(total > 0, shift.clamp(-1, 1), 0)
+
+
+def _uneven_rad(found: Increments, turn: Tensor, at: Tensor) -> Tensor:
+    """Deviation (...,) in rad of a weighted sum over blocks, by few cut targets of uneven density.
+
+    Targets that are seen at a time and cross a beam of constant gain have independent phase
+    increments of even density. The scatter over time of their mean shows their number, and the
+    shift at each end deviates from that of even density the less, the more targets are cut there.
+    A target may fill several blocks, which then deviate together.
+
+    turn: Phasor of the negative phase increment, shape (...,). at: Weights of the blocks, (..., b).
+    """
+    band = found.half_band_rad
+    total = (found.products.sum(-2) * turn[..., None]).real
+    weight = torch.where(total > 0, at / torch.where(total > 0, total, 1), 0)
+    mean = (found.products * (turn[..., None] * weight)[..., None, :]).sum(-1)
+    level = mean.real.mean(-1).square()
+    alone = (1 - torch.sin(2 * band) / (2 * band)) / 2 * (band / torch.sin(band)).square()  # of one target
+    per_target = mean.imag.square().mean(-1) / torch.where(level > 0, alone * level, 1)
+    by_ends = (_cut_shifts_rad(found, turn) * at[..., None, :]).sum(-1).square().sum(-1)
+    return _UNEVEN * (by_ends * per_target.clamp_max(1)).sqrt()
 
 
 def block_centres(count: int, device: torch.device | None = None) -> Tensor:
@@ -731,9 +757,10 @@ class RangeDependentCentroid(Stage):
         Returns:
             `doppler_range_hz` of every range cell, shape (..., range), and `doppler_baseband_hz` in
             the middle of the swath, shape (...,), in Hz. The latter has a standard deviation, which
-            includes the shift by apertures that the ends of the record cut. `ok` is False under the
-            conditions of `reliable_increment`, and where fewer than order + 2 range blocks hold
-            most of the energy: one target alone shows no slope over range.
+            includes the shift by apertures that the ends of the record cut, and what this shift may
+            differ by where few targets are cut. `ok` is False under the conditions of
+            `reliable_increment`, and where fewer than order + 2 range blocks hold most of the
+            energy: one target alone shows no slope over range.
             `info` holds "block_hz" (centroid of each of the b range blocks), shape
             (..., b), and "coefficients_hz" (of the Legendre polynomials), shape (..., order + 1).
 
@@ -750,14 +777,17 @@ class RangeDependentCentroid(Stage):
         at_middle = legendre(torch.zeros(1, dtype=torch.float64, device=products.device), self.order)[0]
         middle = coefficients @ at_middle
         # cut apertures shift each block; the rest of its residual is scatter
-        cut, rest = _weighted_fit(basis, residual - _cut_shift_rad(found, middle), weight)
+        turn = cis(-middle)
+        cut, rest = _weighted_fit(basis, residual - _cut_shifts_rad(found, turn).sum(-2), weight)
         shift = -cut @ at_middle
+        uneven = _uneven_rad(found, turn, _influence(basis, weight) @ at_middle)
         scatter = ((_fit_covariance(basis, weight, rest) @ at_middle) @ at_middle).clamp_min(0).sqrt()
         energy = products.abs()
         square = energy.square().sum(-1)
         count = energy.sum(-1).square() / torch.where(square > 0, square, 1)
         ok = reliable_increment(found, middle, scatter, shift) & (count >= self.order + 2)
-        middle, std = scale * middle, scale * torch.hypot(scatter, shift)
+        std = scale * (scatter.square() + shift.square() + uneven.square()).sqrt()
+        middle = scale * middle
         curve = scale * coefficients @ legendre(block_centres(signal.data.shape[-1], products.device), self.order).mT
         if doppler_hz is not None:
             curve = curve + (prf_hz * torch.round((doppler_hz - middle) / prf_hz))[..., None]

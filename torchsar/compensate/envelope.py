@@ -190,9 +190,10 @@ def align_envelopes(
         zero; `shift_range(data, -shift_cells)` removes these shifts. A pulse of zeros has the shift
         of the fitted history. The standard deviation of a polynomial follows from the scatter of
         the blocks about it. That of single pulses follows from the scatter, over the pulses, of the
-        terms of the range cells in the slope of their likelihood, and from the distance by which
-        three more iterations of `align_mean` move them; where pulses may be aligned at a wrong
-        maximum of their likelihood, it contains their distance. `quality` is 1 / (1 + (2 std)^2).
+        terms of the range cells in the slope of their likelihood, or from the products of different
+        pulses where this is less, and from the distance by which three more iterations of
+        `align_mean` move them; where pulses may be aligned at a wrong maximum of their likelihood,
+        it contains their distance. `quality` is 1 / (1 + (2 std)^2).
         `ok` is False where the standard deviation reaches half a cell (a quarter of a polynomial),
         fewer than two pulses hold samples, the halves of the band do not confirm the polynomial, or
         single pulses may be aligned at a wrong maximum, as with scatterers in evenly spaced range
@@ -340,7 +341,8 @@ def _judged_shifts(lines: Tensor, find: Callable[[Envelopes], Course]) -> tuple[
     if std is None:  # single pulses, of which some may be aligned at a wrong maximum
         likeliest = refined_shifts(envelopes, single_shifts(envelopes, shift, "likelihood", 3))
         drift = robust_std(about_circular_mean(likeliest - shift, present, n).abs(), present).squeeze(-1)
-        std = (single_std(envelopes, likeliest).square() + drift.square() + _INTERPOLATION_CELLS**2).sqrt()
+        error = single_std(envelopes, shift_range(lines, -likeliest))
+        std = (error.square() + drift.square() + _INTERPOLATION_CELLS**2).sqrt()
         wrong, window = expected_outliers(envelopes, shift), n / math.sqrt(12)
         far = torch.hypot(std, window * (wrong / present.sum(-1).clamp_min(1)).sqrt()).clamp_max(window)
         return shift, torch.where(wrong < _OUTLIERS, std, far), wrong < _OUTLIERS

@@ -27,6 +27,7 @@ _SIDELOBE_CELLS, _SIDELOBES = 1.5, 1.5
 # Range cells over which errors of the shift may depend on each other; least share of the variance
 # that is left after the shift was fitted.
 _NEAR_CELLS, _LEAST_LEFT = 8, 0.2
+_PAIRED = 256  # most pulses whose products with each other are formed
 # cycles in the window of the finest features used for the mean drift, found by trial: finer
 # features agree only close to the right drift, coarser ones measure it less well
 _COARSE = 16
@@ -73,7 +74,7 @@ class Envelopes:
         """
         n = lines.shape[-1]
         present = (lines != 0).any(-1)
-        power = _half_cells(unit_level(lines, 1)).abs().square()
+        power = _interpolated(unit_level(lines, 1), _HALF).abs().square()
         mean = power.mean(-1, keepdim=True)
         return Envelopes(torch.fft.rfft(power / torch.where(mean > 0, mean, 1)), present, n)
 
@@ -174,13 +175,13 @@ class Envelopes:
 Course = tuple[Tensor, Tensor | None]
 
 
-def _half_cells(lines: Tensor) -> Tensor:
-    """Band-limited interpolation to half cells; all n frequencies are kept, from -(n // 2) on."""
+def _interpolated(lines: Tensor, per_cell: int) -> Tensor:
+    """Band-limited interpolation; all n frequencies are kept, from -(n // 2) on."""
     n = lines.shape[-1]
     spectrum = torch.fft.fftshift(torch.fft.fft(lines), dim=-1)
-    before = n - n // 2
-    padded = torch.nn.functional.pad(spectrum, (before, n - before))
-    return torch.fft.ifft(torch.fft.ifftshift(padded, dim=-1)) * _HALF
+    before = per_cell * n // 2 - n // 2
+    padded = torch.nn.functional.pad(spectrum, (before, (per_cell - 1) * n - before))
+    return torch.fft.ifft(torch.fft.ifftshift(padded, dim=-1)) * per_cell
 
 
 def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
@@ -322,36 +323,40 @@ def expected_outliers(pulses: Envelopes, shift: Tensor) -> Tensor:
     return torch.where(pulses.present, wrong, 0).sum(-1)
 
 
-def single_std(pulses: Envelopes, shift: Tensor) -> Tensor:
+def single_std(pulses: Envelopes, aligned: Tensor) -> Tensor:
     """Predict the standard deviation of the shifts of single pulses that `refined_shifts` finds.
 
-    A shift errs by the slope of the log-likelihood at the true shift over its curvature. The
-    variance of the slope is that of the terms of the range cells between the pulses, with the
-    covariances of terms up to 8 cells apart, and half of those 12 cells apart. (The slope itself is
-    zero at the shift found, which takes away the share of its variance that is added again.) The
-    mean envelope is that of the other pulses, whose speckle does not follow the pulse.
+    A shift is the slope of the log-likelihood over its curvature. The terms of a range cell in both
+    change from pulse to pulse; the slope less the curvature times the mean shift is the error. Its
+    variance is estimated in two ways, each of which may be too large, and the smaller is taken:
+
+    - from the scatter of the terms between the pulses, with the covariances of terms up to 8 cells
+      apart, and half of those 12 cells apart. (The slope itself is zero at the shift found, which
+      takes away the share of its variance that is added again.) The errors of distant cells are
+      taken for independent, but those of separate rows at even spacing cancel in pairs.
+    - as the mean square of the same sum over the products of two different pulses in place of the
+      power of one, which is the variance for complex amplitudes of normal distribution. The
+      amplitudes of single scatterers do not change.
+
+    The mean envelope is that of the other pulses, whose speckle does not follow the pulse.
 
     Args:
         pulses: Envelopes.
-        shift: Shifts in cells, shape (trial, pulse).
+        aligned: Pulses with their shifts removed, shape (trial, pulse, range), complex.
 
     Returns:
         The standard deviation in cells, shape (trial,), float64; infinite without curvature.
     """
-    power = pulses.on_grid(pulses.moved(shift), _QUARTER).to(torch.float64)
+    x = _interpolated(unit_level(aligned, 1).to(torch.complex128), _QUARTER)
+    x = x / _positive(x.abs().square().mean(-1, keepdim=True)).sqrt()
+    power = x.abs().square()
     count, total = pulses.count.to(torch.float64), power.sum(-2, keepdim=True)
-    weight = -1 / pulses.floored((total - power) / (count - 1).clamp_min(1))
-    before, after = weight.roll(1, -1), weight.roll(-1, -1)
-    slope, bend = (after - before) * (_QUARTER / 2), (2 * weight - before - after) * _QUARTER**2
-    # The gain of a pulse is that of the cells which fix its shift, not that of the noise.
-    mean, least = total / count, pulses.floored(total / count)
-    telling = (slope.sum(-2, keepdim=True) / count * mean).square() / least
-    gain = (power * telling).sum(-1, keepdim=True) / _positive((mean * telling).sum(-1, keepdim=True))
-    term = torch.where(pulses.present[..., None], power * slope / _positive(gain), 0)
-    term = torch.where(pulses.present[..., None], term - term.sum(-2, keepdim=True) / count, 0)
+    slope, bend = _derivatives(-1 / pulses.floored((total - power) / (count - 1).clamp_min(1)))
     curvature = (power * bend).sum(-2, keepdim=True) / count
     whole = curvature.sum(-1, keepdim=True)
-    share = curvature / torch.where(whole > 0, whole, torch.inf)
+    term = power * (slope - bend * _ratio((power * slope).sum((-2, -1), keepdim=True) / count, whole))
+    term = torch.where(pulses.present[..., None], term - term.sum(-2, keepdim=True) / count, 0)
+    share = _ratio(curvature, whole)
     variance, taken = torch.zeros_like(whole), torch.zeros_like(whole)
     for cells, sign in ((_NEAR_CELLS, -1), (2 * _NEAR_CELLS, 2)):
         of_share = _running_sums(share, cells * _QUARTER)
@@ -360,7 +365,34 @@ def single_std(pulses: Envelopes, shift: Tensor) -> Tensor:
         variance = variance + scale * rest.square().sum((-2, -1), keepdim=True) / count
         taken = taken + scale * of_share.square().sum(-1, keepdim=True)
     variance = variance.clamp_min(0) / (1 - taken).clamp_min(_LEAST_LEFT)
+    variance = torch.minimum(variance, _normal_variance(pulses, x))
     return torch.where(whole > 0, variance.sqrt() / _positive(whole), torch.inf)[:, 0, 0]
+
+
+def _normal_variance(pulses: Envelopes, x: Tensor) -> Tensor:
+    """Variance (trial, 1, 1) of the error of the slope for amplitudes of normal distribution.
+
+    x: Aligned pulses of unit power, four samples per cell, (trial, pulse, sample).
+    """
+    mean = x.abs().square().sum(-2, keepdim=True) / pulses.count
+    slope, bend = _derivatives(-1 / pulses.floored(mean))
+    weight = slope - bend * _ratio((mean * slope).sum(-1, keepdim=True), (mean * bend).sum(-1, keepdim=True))
+    some = x[:, :: -(-x.shape[-2] // _PAIRED)]
+    square = ((some.conj() * weight) @ some.mT).abs().square()
+    pairs = square.sum((-2, -1)) - square.diagonal(dim1=-2, dim2=-1).sum(-1)
+    count = (some != 0).any(-1).sum(-1).to(torch.float64)
+    return torch.where(count > 1, pairs / (count * (count - 1)).clamp_min(1), torch.inf)[:, None, None]
+
+
+def _derivatives(weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Slope and negative curvature, per cell, of samples on a circle, four samples per cell."""
+    before, after = weight.roll(1, -1), weight.roll(-1, -1)
+    return (after - before) * (_QUARTER / 2), (2 * weight - before - after) * _QUARTER**2
+
+
+def _ratio(a: Tensor, b: Tensor) -> Tensor:
+    """a / b, zero where b is not positive."""
+    return a / torch.where(b > 0, b, torch.inf)
 
 
 def _positive(value: Tensor) -> Tensor:

@@ -11,7 +11,9 @@ turns as well. The estimate is made in four steps:
 3. Fraction of a sample: in the middle of the transient, the tones of the strongest scatterer in the
    up and the down sweep have equal phase. The phases are also equal at other instants, the fringes,
    which are 1 / (2 f+) apart. Of the fringes near the result of step 2, the one is chosen at which
-   the samples change from the strongest tones of one sweep to those of the next.
+   the samples change from the strongest tones of one sweep to those of the next. Without Doppler
+   shift the samples are symmetric about a turning point, whatever the scene: fringes about which
+   they are clearly less symmetric than about another instant are excluded.
 4. Order: it is decided which half of the period is the up sweep. With complex detection, the up
    sweep has the higher beat frequency if RD > 0. With real detection, a velocity v and one order of
    the sweeps give the same phases as -v and the other order. The correct order is then the one for
@@ -45,6 +47,13 @@ MAX_WINDOWS = 192
 TONES = 4
 # Fringes tried on either side of the one nearest to the sharpest cuts, by choice.
 _FRINGES = 3
+# Steps per half sample in which the symmetry of the record is computed, enough for a linear
+# interpolation; and the share of the greatest symmetry below which a fringe may be excluded, by
+# trial on scenes of 1 to 40 scatterers.
+_FINE, _SYMMETRIC = 8, 0.9
+# Least symmetry of a reliable result, over the share of the scene in the power. Measured on such
+# scenes: above 0.7 in 97 % of the results that are right, below 0.66 where they are wrong.
+_LEAST_SYMMETRY = 0.7
 # Certainty below which a result is unreliable, in standard deviations, by choice: in a normal
 # distribution the chance is 3e-7 above 5 and 1e-3 above 3.
 ORDER_SIGMAS, FRINGE_SIGMAS = 5.0, 3.0
@@ -116,7 +125,8 @@ def find_trigger(
         estimate without use of phases, in seconds modulo half a period.
 
         `ok` is False where `order_sigmas` is below 5, `fringe_sigmas` below 3 or the drop below
-        0.05, or where no whole period fits its block.
+        0.05, where the record is less symmetric about the turning points than the power of the
+        scene in its spectrum lets expect, or where no whole period fits its block.
 
     Raises:
         TypeError: If the record is not a tensor of real or complex samples.
@@ -269,7 +279,11 @@ def _assess(
         plus = (tones.even_cycles + tones.odd_cycles).flatten(-2).median(-1).values.abs() / 2
         phase_difference = (tones.even_turns + tones.odd_turns) + n / 2 * (tones.even_cycles - tones.odd_cycles)
         sign = torch.ones_like(plus)
-    fine, fringe = _fringe(windows, base, (cycles, value), _meeting(phase_difference, plus * sign, middle - base), plus)
+    doppler = (tones.even_cycles + tones.odd_cycles) / 2 if is_complex else (tones.even_cycles - tones.odd_cycles) / 2
+    doppler = _without_outliers(doppler.flatten(-2)).unflatten(-1, doppler.shape[-2:])
+    meeting = _meeting(phase_difference, plus * sign, middle - base)
+    symmetry = _symmetry(windows, base, doppler, is_complex)
+    fine, fringe, symmetric = _fringe(windows, base, (cycles, value), meeting, plus, symmetry)
     # the tones have equal phase half a transient, f+ / (2 K), after the turning point of the
     # reference; before it if the scene is nearer
     half_transient = (
@@ -278,6 +292,7 @@ def _assess(
     start = base + fine - 0.5 - half_transient + torch.where(even_is_up, 0, n)
     start = torch.remainder(start + 1, 2 * n) - 1
     ok = (order > ORDER_SIGMAS) & (fringe > FRINGE_SIGMAS) & (depth > 0.05) & torch.isfinite(start)
+    ok = ok & (symmetric > _LEAST_SYMMETRY * _scene_share(windows, base, is_complex))
     if not joined:
         ok = ok & (start > -0.5) & (start + 2 * n <= block)
     start = torch.where(torch.isfinite(start), start, 0)
@@ -300,13 +315,20 @@ def _meeting(phase_difference: Tensor, plus_cycles: Tensor, expected: Tensor) ->
 
 
 def _fringe(
-    windows: _Windows, base: Tensor, tones: tuple[Tensor, Tensor], expected: Tensor, plus_cycles: Tensor
-) -> tuple[Tensor, Tensor]:
+    windows: _Windows,
+    base: Tensor,
+    tones: tuple[Tensor, Tensor],
+    expected: Tensor,
+    plus_cycles: Tensor,
+    symmetry: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
     """Fringe around `expected` at which samples change from even to odd tones, and its certainty.
 
     The sum of |x - odd|^2 - |x - even|^2 up to a boundary is largest at the true one; its standard
-    deviation follows from the scatter between pairs of sweeps. Offsets are in samples from base,
-    the certainty in standard deviations.
+    deviation follows from the scatter between pairs of sweeps. Fringes about which the record is
+    clearly less symmetric than about another instant are excluded: with many scatterers, the
+    strongest tones do not describe the samples. Offsets are in samples from base, the certainty in
+    standard deviations. The third result is the symmetry at the fringe. symmetry: see `_symmetry`.
     """
     n, reach = windows.radar.sweep_samples, windows.margin
     around = windows.cut((base - reach)[..., None], every=True).squeeze(-4)[..., 1::2, : 2 * reach]
@@ -319,14 +341,62 @@ def _fringe(
     order = torch.arange(-_FRINGES, _FRINGES + 1, dtype=torch.float64, device=base.device)
     offsets = expected[..., None] + order / (2 * plus_cycles.clamp_min(1e-6))[..., None]
     gain = _interpolated(total, (offsets + reach).clamp(0, 2 * reach))
-    best = gain.mean(-2).argmax(-1)
-    advantage = take(gain.movedim(-1, -2), best, -2)[..., None] - gain
-    sigmas = advantage.mean(-2) / (advantage.std(-2) / math.sqrt(advantage.shape[-2])).clamp_min(1e-9)
+    found = _interpolated(symmetry, ((offsets + reach) * 2 * _FINE).clamp(0, symmetry.shape[-1] - 1))
+    mean = symmetry.mean(-2)
+    most, at = mean.max(-1)
+    short = symmetry.gather(-1, at[..., None, None].expand(*symmetry.shape[:-1], 1)) - found
+    clear = _sigmas(short)
+    excluded = (found.mean(-2) < _SYMMETRIC * most[..., None]) & (clear > ORDER_SIGMAS)
+    best = torch.where(excluded, -torch.inf, gain.mean(-2)).argmax(-1)
+    sigmas = _sigmas(take(gain.movedim(-1, -2), best, -2)[..., None] - gain)
     others = torch.arange(len(order), device=base.device) != best[..., None]
-    certainty = torch.where(others, sigmas, torch.inf).amin(-1)
+    certainty = torch.where(others, torch.where(excluded, clear, sigmas), torch.inf).amin(-1)
     # at an end of the search, further fringes may be better
-    certainty = torch.where((best == 0) | (best == len(order) - 1), 0, certainty)
-    return torch.where(certainty > FRINGE_SIGMAS, take(offsets, best), expected), certainty
+    beyond = (best == 0) | (best == len(order) - 1) | excluded.all(-1)
+    certainty = torch.where(beyond, 0, certainty)
+    sure = certainty > FRINGE_SIGMAS
+    return torch.where(sure, take(offsets, best), expected), certainty, take(found.mean(-2), best)
+
+
+def _sigmas(x: Tensor) -> Tensor:
+    """Mean of x (..., k, m) over k values, divided by its standard deviation, (..., m)."""
+    return x.mean(-2) / (x.std(-2) / math.sqrt(x.shape[-2])).clamp_min(1e-9)
+
+
+def _symmetry(windows: _Windows, base: Tensor, shift_cycles: Tensor, is_complex: bool) -> Tensor:
+    """Symmetry of the samples about instants near the turning points, (..., k, m), k of the pairs.
+
+    The optical frequency is symmetric about a turning point, and so are the samples of any scene,
+    once the Doppler shift is removed: the sum of products of samples that lie symmetrically about
+    an instant is greatest there. The instants run from -margin to margin about base in steps of
+    1 / (2 _FINE) sample. An analytic signal is conjugate-symmetric instead.
+
+    shift_cycles: Doppler shift in cycles per sample, (..., line, pair).
+    """
+    n, reach = windows.radar.sweep_samples, windows.margin
+    half = n // 2 - reach
+    x = windows.cut((base + n - half)[..., None], every=True).squeeze(-4)[..., 0::2, : 2 * half].flatten(-3, -2)
+    step = max(1, x.shape[-2] // MAX_WINDOWS)
+    x, shift_cycles = x[..., ::step, :], shift_cycles.flatten(-2)[..., ::step]
+    position = torch.arange(2 * half, dtype=torch.float64, device=base.device) - (half - 0.5)
+    position = position if is_complex else -position.abs()
+    x = x.to(torch.complex128) * unit_phasor(-shift_cycles[..., None] * position, torch.complex128)
+    x = x / x.abs().square().sum(-1, keepdim=True).clamp_min(1e-300).sqrt()
+    spectrum = torch.fft.fft(x, 4 * half)
+    other = torch.fft.fft(x.conj(), 4 * half) if is_complex else spectrum
+    product = torch.fft.fftshift(spectrum * other, dim=-1)
+    fine = torch.fft.ifft(torch.fft.ifftshift(torch.nn.functional.pad(product, [2 * half * (_FINE - 1)] * 2), dim=-1))
+    middle = (2 * half - 1) * _FINE  # the instant before sample `half` by half a sample
+    return fine.real[..., middle - 2 * reach * _FINE : middle + 2 * reach * _FINE + 1] * _FINE
+
+
+def _scene_share(windows: _Windows, base: Tensor, is_complex: bool) -> Tensor:
+    """Share of the scene in the power (...,), if it fills less than half of the spectrum."""
+    spectra = torch.fft.fft(windows.cut(base[..., None]).squeeze(-4))
+    power = (spectra if is_complex else spectra[..., : spectra.shape[-1] // 2]).abs().square()
+    mean = power.mean((-3, -2, -1), dtype=torch.float64)
+    # the median of an exponential distribution is ln 2 times its mean
+    return 1 - power.flatten(-3).median(-1).values / math.log(2) / mean.clamp_min(1e-300)
 
 
 def _extrapolated(cycles: Tensor, value: Tensor, position: Tensor) -> Tensor:

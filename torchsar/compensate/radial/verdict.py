@@ -202,7 +202,9 @@ def velocity_estimate(
     of a period. Added are the effect of jerk, the error of interpolation in periods that have faded
     or in which no scatterer is illuminated, and, for a method that does not use the product of up
     and mirrored down sweeps, its mean difference from the peaks of that product, because the
-    scatterer that it follows may have another velocity than the scene.
+    scatterer that it follows may have another velocity than the scene. The variance of such a
+    method is also no less than that of these differences less the variance of the peaks: where
+    scatterers have equal phases, their interference changes the power less than the phase.
 
     Args:
         velocity_m_s: Measured velocity at the turning points (ends of the up sweeps) in m/s, shape
@@ -272,7 +274,8 @@ def velocity_estimate(
     square = square + (_mean(jerk * share, clear) * bend).square() + floor_m_s**2
     peaks, shared, echo = _product_peaks(product)
     away = residual - peaks
-    off = echo & (away.abs() > 2 * _CONTRADICTION * bin_m_s) & (shared > _HIGHER * common)
+    far_m_s = 2 * _CONTRADICTION * bin_m_s
+    off = echo & (away.abs() > far_m_s) & (shared > _HIGHER * common)
     best_signal, best_noise, _ = signal_and_noise(product, peaks)
     best = (best_signal / best_noise.clamp_min(tiny)).clamp(1e-6, 1e18)
     judged = 10 * torch.log10(best * product.noise_lines / (1 + 1 / (2 * best))) >= LEAST_SQUARED_DB
@@ -283,6 +286,11 @@ def velocity_estimate(
         constant = (offset.square() - 2 * chance - (_BIAS * bin_m_s) ** 2).clamp_min(0)
         wrong = off & (away.square() > _GROSS**2 * variance(slope, expected) / share)
         square = square + torch.where(judged[..., None], constant + torch.where(wrong, away.square(), 0), 0)
+        # the variance is no less than that of the distance from the peaks, less their own
+        near, own = echo & clear & ~off, variance(slope.clamp(-far_m_s, far_m_s), expected)
+        apart = _mean(away.square() * share - own, near) / _mean(share, near).clamp_min(tiny)
+        apart = apart - (_BIAS * bin_m_s) ** 2
+        square = torch.where(judged[..., None], torch.maximum(square, apart), square)
     std = square.sqrt()
     found = signal > 0
     centre = (product.first + product.lines / 2) * radar.range_step_m
