@@ -157,6 +157,14 @@ def waves(n_pulse: int, n: int) -> FarField:
 
 
 @lru_cache(None)
+def direct_sum(x: Tensor) -> Tensor:
+    """Image of a history of any size by the direct sum."""
+    plan = tile_plan(*x.shape[-2:])
+    place = plan.antennas.transmitter_m
+    pixels = plan.grid.pixels_m()
+    return focus.backproject(x, plan.frequency_hz, place, None, plan.antennas.reference_m, pixels)
+
+
 def tile_plan(n_pulse: int, n: int) -> focus.TilePlan:
     """A plan of a few pixels for pulses from a straight path."""
     x = torch.linspace(-50, 50, n_pulse, dtype=F64)
@@ -597,13 +605,16 @@ FUNCTIONS = [
         on("profiles", lambda s: focus.azimuth_matched_filter(s.data, LADAR, s.axes[-2], s.axes[-1])),
     ),
     _entry(
-        "focus.backproject", "raw", lambda x: focus.backproject(x, RADAR, ramp(5, 1.0), 4020 + ramp(5, 3.0), **DOPPLER)
+        "focus.backproject_strip",
+        "raw",
+        lambda x: focus.backproject_strip(x, RADAR, ramp(5, 1.0), 4020 + ramp(5, 3.0), **DOPPLER),
     ),
     _entry(
         "focus.backproject_spotlight",
         "raw",
         lambda x: focus.backproject_spotlight(x, waves(*x.shape[-2:]), ramp(5, 1.0), ramp(5, 1.0)),
     ),
+    _entry("focus.backproject", "raw", direct_sum),
     _entry("focus.image_tiles", "raw", lambda x: tile_plan(*x.shape[-2:]).image(x)),
     _entry("focus.omega_k", "raw", lambda x: focus.omega_k(x, RADAR, **DOPPLER)),
     _entry("focus.omega_k_stolt", "raw", lambda x: focus.omega_k_stolt(x, RADAR, **DOPPLER)),

@@ -15,7 +15,7 @@ from tests.focus import helpers
 from torchsar.focus import (
     OmegaK,
     StoredOmegaK,
-    backproject,
+    backproject_strip,
     omega_k,
     omega_k_stolt,
     range_doppler,
@@ -81,7 +81,7 @@ def test_backprojection_agrees_with_stolt_in_phase_and_shape(name):
     x = (torch.arange(-4, 5, dtype=torch.float64) + case.line) / case.radar.prf_hz * case.radar.velocity_m_s
     for cell in (case.cells[0], case.cells[-1]):
         cells = torch.arange(-4, 5, dtype=torch.float64) + round(cell)
-        patch = backproject(
+        patch = backproject_strip(
             case.raw,
             case.radar,
             x[:, None],
@@ -127,7 +127,7 @@ def exact_patch(name, lines, cells):
     if name == "airborne":
         x = lines.double() / case.radar.prf_hz * case.radar.velocity_m_s
         r = case.radar.near_range_m + cells.double() * case.radar.range_step_m
-        return backproject(case.raw, case.radar, x[:, None], r, **case.arguments, eps=1e-5)
+        return backproject_strip(case.raw, case.radar, x[:, None], r, **case.arguments, eps=1e-5)
     return image_of(omega_k_stolt, name)[lines][:, cells]
 
 

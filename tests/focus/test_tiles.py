@@ -3,98 +3,16 @@
 from __future__ import annotations
 
 import math
-import random
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from torchsar.focus import ImageGrid, TilePlan
-
-C, F64, C128 = 299792458.0, torch.float64, torch.complex128
-
-
-@dataclass(frozen=True)
-class Case:
-    """A geometry and a history of white noise."""
-
-    frequency_hz: Tensor
-    transmitter_m: Tensor
-    receiver_m: Tensor | None
-    reference_m: Tensor
-    grid: ImageGrid
-    history: Tensor
-
-    def plan(self, error_db: float = -70.0) -> TilePlan:
-        return TilePlan(self.frequency_hz, self.transmitter_m, self.receiver_m, self.reference_m, self.grid, error_db)
-
-    def direct(self, pixels_m: Tensor) -> Tensor:
-        """The sum over all samples at pixels (pixel, 3), by its definition."""
-        receiver = self.transmitter_m if self.receiver_m is None else self.receiver_m
-        path = sum(
-            torch.linalg.vector_norm(pixels_m[:, None] - place, dim=-1) for place in (self.transmitter_m, receiver)
-        )
-        turns = (path - self.reference_m)[..., None] * self.frequency_hz / C
-        return (self.history.to(C128) * torch.exp(2j * math.pi * (turns - turns.detach().round()))).sum((-2, -1))
-
-    def error_db(self, image: Tensor, pixels: int = 60) -> float:
-        """Rms error of an image at random pixels, relative to their rms, in dB."""
-        source = torch.Generator().manual_seed(1)
-        i, j = (torch.randint(0, n, (pixels,), generator=source) for n in self.grid.counts)
-        truth = self.direct(self.grid.pixels_m()[i, j])
-        return 10 * math.log10(float((image[i, j] - truth).abs().square().mean() / truth.abs().square().mean()))
-
-
-def case(seed: int) -> Case:
-    """Draw range, aperture, bandwidth, squint, path, receiver and grid."""
-    draw, source = random.Random(seed), torch.Generator().manual_seed(seed)
-
-    def log(low: float, high: float) -> float:
-        return math.exp(draw.uniform(math.log(low), math.log(high)))
-
-    range_m, aperture, carrier = log(200, 700e3), math.radians(log(1, 20)), log(1e9, 35e9)
-    bandwidth, squint, grazing = carrier * log(0.01, 0.4), math.radians(draw.uniform(0, 45)), draw.uniform(0.26, 1.05)
-    pulses, frequencies = draw.randrange(64, 200), draw.randrange(64, 200)
-    counts = draw.randrange(20, 120), draw.randrange(20, 120)
-    cells = C / 2 / bandwidth / math.cos(grazing), C / carrier / (2 * aperture)
-    step = draw.uniform(0.4, 1.0) * draw.choice([min(cells), max(cells)])
-    step = min(step, 0.5 * range_m / max(counts), 0.45 * C * frequencies / (2 * bandwidth) / max(counts))
-    angle = (torch.arange(pulses, dtype=F64) / pulses - 0.5) * aperture
-    ground = range_m * math.cos(grazing)
-    x, y = ground * torch.sin(angle), -ground * torch.cos(angle)
-    if draw.random() < 0.5:
-        x, y = range_m * torch.tan(angle), torch.full_like(angle, -ground)
-    place = torch.stack([x, y, torch.full_like(x, range_m * math.sin(grazing))], -1)
-    cos, sin = math.cos(squint), math.sin(squint)
-    place = place @ torch.tensor([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]], dtype=F64)
-    kind, scale = draw.choice(["straight", "sway", "rough"]), min(1.0, range_m / 2000)
-    if kind == "sway":
-        turns, start = 4 * torch.rand(3, generator=source, dtype=F64), torch.rand(3, generator=source, dtype=F64)
-        time = torch.linspace(0, 1, pulses, dtype=F64)[:, None]
-        place = place + draw.uniform(0.1, 3) * scale * torch.sin(2 * math.pi * (time * turns + start))
-    if kind == "rough":
-        place = place + log(0.003, 0.3) * scale * torch.randn(pulses, 3, generator=source, dtype=F64)
-    transmitter, receiver = place, None
-    radar = draw.choice(["one antenna", "fixed transmitter", "two in motion"])
-    if radar == "fixed transmitter":
-        fixed = [draw.uniform(-1, 1), -draw.uniform(0.3, 1.5), draw.uniform(0.1, 1)]
-        transmitter, receiver = range_m * torch.tensor(fixed, dtype=F64).expand(pulses, 3), place
-    if radar == "two in motion":
-        offset = [draw.uniform(-0.3, 0.3), -draw.uniform(0, 0.3), draw.uniform(0, 0.3)]
-        receiver = place + range_m * torch.tensor(offset, dtype=F64)
-    ends = (transmitter, place if receiver is None else receiver)
-    centre = torch.tensor([-(counts[0] - 1) / 2 * step, -(counts[1] - 1) / 2 * step, 0.0], dtype=F64)
-    return Case(
-        carrier + (torch.arange(frequencies, dtype=F64) - frequencies // 2) * (bandwidth / frequencies),
-        transmitter,
-        receiver,
-        torch.stack([torch.linalg.vector_norm(end, dim=-1) for end in ends]).sum(0),
-        ImageGrid(centre, torch.eye(3, dtype=F64)[:2], counts, step),
-        torch.randn(pulses, frequencies, generator=source, dtype=C128),
-    )
+from tests.focus.geometries import C128, F64, C, case
+from torchsar.focus import ImageGrid
 
 
 @pytest.mark.parametrize("seed", range(1000, 1016))
@@ -224,6 +142,18 @@ def test_a_plan_moves_with_its_path() -> None:
     assert drawn.error_db(plan.image(drawn.history)) < -67
 
 
+def test_trials_with_and_without_a_path_of_their_own() -> None:
+    drawn, lead = case(1004), {"path": (2, 1, 1), "history": (3, 2, 1, 2)}
+    shift = 0.002 * torch.randn(*lead["path"], len(drawn.reference_m), 3, dtype=F64)
+    history = torch.randn(*lead["history"], *drawn.history.shape, dtype=C128)
+    moved = replace(drawn, transmitter_m=drawn.transmitter_m + shift)
+    image = moved.plan().image(history)
+    assert image.shape == (3, 2, 1, 2, *drawn.grid.counts)
+    for at in ((0, 1, 0, 1), (2, 0, 0, 0)):
+        one = replace(moved, transmitter_m=moved.transmitter_m[at[1], 0, 0], history=history[at])
+        assert one.error_db(image[at]) < -67
+
+
 def test_an_error_that_tiles_do_not_reach_is_refused_with_the_figure() -> None:
     drawn = case(1001)
     near = replace(drawn, grid=replace(drawn.grid, step_m=float(drawn.reference_m.mean())))
@@ -265,7 +195,7 @@ def test_geometries_that_make_no_sense_are_refused(change: dict, error: type, te
 def test_histories_of_another_size_or_type_are_refused() -> None:
     drawn = case(1002)
     plan = drawn.plan(-50.0)
-    with pytest.raises(ValueError, match="the plan was made for histories"):
+    with pytest.raises(ValueError, match="needs a history"):
         plan.image(drawn.history[:, 1:])
     with pytest.raises(TypeError):
         plan.image(drawn.history.real)

@@ -93,11 +93,12 @@ _RANGE = "depends on the range"
 NOT_SHIFTED = {
     "pulse": {
         "Backproject:backproject": _LINES,
-        "focus.backproject": _LINES,
+        "focus.backproject_strip": _LINES,
         "focus.backproject_spotlight": _LINES,
         "focus.image_tiles": "the path of a pulse depends on its number",
         "PaddedLines:padded": "appends zeros",
         "repair.split_record": "a sweep may begin in one block and end in the next",
+        "focus.backproject": "the path of a pulse depends on its number",
         **dict.fromkeys(("ZeroFill:zero_fill", "LinearFill:linear_fill"), "gaps at fixed lines"),
         **dict.fromkeys(("repair.zero_fill", "repair.linear_fill"), "gaps at fixed lines"),
         "repair.place_lines": "moves lines to fixed places",
@@ -146,6 +147,7 @@ NOT_SHIFTED = {
                 "Backproject:backproject",
                 "PaddedLines:padded",
                 "focus.backproject",
+                "focus.backproject_strip",
                 "focus.backproject_spotlight",
                 "focus.image_tiles",
                 "focus.omega_k",
@@ -287,7 +289,7 @@ def _strip(amplitude: Tensor) -> Tensor:
 def _strip_adjoint(raw: Tensor) -> Tensor:
     """Backprojection of correlations with the pulse; it keeps the phase of the range of a point."""
     pulse = RADAR.pulse.spectrum(64, RADAR.sampling_hz).conj()
-    image = focus.backproject(raw, RADAR, ALONG, RANGES, doppler_hz=0.0, reference=pulse)
+    image = focus.backproject_strip(raw, RADAR, ALONG, RANGES, doppler_hz=0.0, reference=pulse)
     return image * torch.exp(4j * math.pi / RADAR.wavelength_m * RANGES)
 
 

@@ -1,6 +1,6 @@
 """Range compression, image formation, and predictions of the errors of simplified processing."""
 
-from torchsar.focus.backprojection import Backproject, DopplerBand, EveryPulse, Integration, backproject
+from torchsar.focus.backprojection import backproject
 from torchsar.focus.chirp_z import chirp_z, keystone
 from torchsar.focus.coordinates import ClosestRange, PaddedLines, closest_range
 from torchsar.focus.dechirped import AzimuthTransform, CompressDechirped, azimuth_transform, compress_dechirped
@@ -26,6 +26,13 @@ from torchsar.focus.requirements import Requirement, recommended_form, requireme
 from torchsar.focus.spotlight import GroundGrid, SpotlightBackprojection, backproject_spotlight
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
 from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
+from torchsar.focus.strip_backprojection import (
+    Backproject,
+    DopplerBand,
+    EveryPulse,
+    Integration,
+    backproject_strip,
+)
 from torchsar.focus.target import TargetImage
 from torchsar.focus.tiles import TilePlan, image_tiles
 from torchsar.focus.transforms import CompiledNufft, ExplicitSum, Gridding, Resampling
@@ -84,6 +91,7 @@ __all__ = [
     "azimuth_transform",
     "backproject",
     "backproject_spotlight",
+    "backproject_strip",
     "chirp_z",
     "closest_range",
     "compress_dechirped",

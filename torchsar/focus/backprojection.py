@@ -1,176 +1,82 @@
-"""Backprojection of stripmap data: slow and exact, the reference for every faster focuser."""
+"""Backprojection: the image of any path as a direct sum, slow and exact.
+
+`direct_sum` is the one sum of the project. Its geometry is a function that gives the path of each
+pulse over each pixel, so that it serves positions in space (`backproject`), the hyperbolas of a
+strip (`backproject_strip`) and plane waves (`backproject_spotlight`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Protocol
+import math
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, checked_samples, per_trial, real_dtype, unit_phasor
+from torchsar.core import checked_samples, real_dtype, unit_phasor
 from torchsar.focus.nufft import Nufft, Points, interpolate
-from torchsar.focus.omega_k import Focuser, FrameGeometry
-from torchsar.radar import StripmapRadar
+from torchsar.radar.antenna_path import AntennaPath, broadcast, refuse_unusable
+from torchsar.radar.spotlight import frequency_step_hz
+from torchsar.radar.stripmap import LIGHT_M_S
+
+# Path in metres less the reference path, and weight (None for 1) of some pulses at some pixels,
+# float64 (..., pulse, pixel).
+PathOf = Callable[[slice, slice], tuple[Tensor, Tensor | None]]
+
+_PIXELS = 4096  # pixels of a block, found by trial
 
 
-class Aperture(Protocol):
-    """Choice of the pulses that contribute to a pixel, as a weight of each pulse."""
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight of each pulse at each pixel, in the shape of the arguments.
-
-        Args:
-            since_s: Slow time in seconds since the line of sight that defines the image
-                coordinates, by default that of the beam centre, crossed the pixel.
-            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class EveryPulse:
-    """Aperture of all recorded pulses."""
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight 1 for each pulse, in the shape of `since_s`.
-
-        Args:
-            since_s: Slow time in seconds since the line of sight that defines the image
-                coordinates, by default that of the beam centre, crossed the pixel.
-            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
-        """
-        return torch.ones_like(since_s)
-
-
-@dataclass(frozen=True)
-class Integration:
-    """Aperture of the pulses within an integration time about the crossing of the pixel.
-
-    At the crossing, the line of sight that defines the image coordinates, by default that of the
-    beam centre, points to the pixel.
-
-    Args:
-        integration_s: Integration time in seconds.
-    """
-
-    integration_s: float
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight of each pulse: 1 within the integration time and 0 elsewhere.
-
-        Args:
-            since_s: Slow time in seconds since the line of sight that defines the image
-                coordinates, by default that of the beam centre, crossed the pixel.
-            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
-        """
-        return (since_s.abs() <= self.integration_s / 2).to(since_s.dtype)
-
-
-@dataclass(frozen=True)
-class DopplerBand:
-    """Aperture of the pulses in which the Doppler of the pixel lies in a band about the centroid.
-
-    With the PRF as width, these are the pulses that a focuser in the Doppler domain uses.
-
-    Args:
-        width_hz: Width of the band in Hz.
-    """
-
-    width_hz: float
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight of each pulse: 1 where the Doppler lies in the band and 0 elsewhere.
-
-        Args:
-            since_s: Slow time in seconds since the line of sight that defines the image
-                coordinates, by default that of the beam centre, crossed the pixel.
-            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
-        """
-        return (doppler_offset_hz.abs() <= self.width_hz / 2).to(since_s.dtype)
-
-
-def backproject(
-    raw: Tensor,
-    radar: StripmapRadar,
-    azimuth_m: Tensor,
-    range_m: Tensor,
+def direct_sum(
+    history: Tensor,
+    frequency_hz: Tensor,
+    path: PathOf,
+    pixels: int,
     *,
-    doppler_hz: Tensor | float,
-    velocity_m_s: Tensor | float | None = None,
-    frame_hz: Tensor | float | None = None,
-    reference: Tensor | None = None,
-    aperture: Aperture | None = None,
-    start_s: float = 0.0,
     eps: float = 1e-10,
+    wave_speed_m_s: float = LIGHT_M_S,
     block_bytes: int = 1 << 23,
 ) -> Tensor:
-    """Sum the compressed echo coherently over the pulses at the range of each pixel.
+    """Sum a phase history coherently over its pulses and frequencies at the paths of pixels.
 
-    The range history is the exact hyperbola, computed as the difference from the range at which the
-    line of sight of `frame_hz` crosses the pixel. Between range samples the echo is interpolated
-    from its range spectrum by a non-uniform FFT. A focused target at slant range R has the phase
-    -4 pi R / lambda; its amplitude is the sum over its pulses. Echoes outside the record count as
-    zero. The sum takes about 50 operations per pulse and pixel, so use it for small patches.
-    Differentiable in the raw data, the velocity, `frame_hz` and the pixel positions.
+        image(x) = sum_p w_p(x) sum_k s[p, k] exp(+2j pi f_k l_p(x) / c)
+
+    The sum over the frequencies is a non-uniform FFT: the range profile, periodic in c / (frequency
+    step), is interpolated at the path. It takes about 40 operations per pulse and pixel.
+    Differentiable in the history and the paths.
 
     Args:
-        raw: Raw or range-compressed data, shape (..., pulse, range), complex.
-        radar: Radar of the recording.
-        azimuth_m: Azimuth of the pixels in metres: nominal velocity x the slow time at which the
-            line of sight of `frame_hz` crosses the pixel; float64, broadcasts against `range_m`.
-        range_m: Slant range of the pixels at that crossing in metres; float64.
-        doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
-        velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
-            radar.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
-            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
-            centroid where the radar has none.
-        reference: Spectrum of the range compression filter, shape (range,); None for
-            range-compressed data.
-        aperture: Pulses that contribute to a pixel, such as `Integration` or `DopplerBand`; None
-            for all.
-        start_s: Slow time of the first pulse in seconds.
-        eps: Relative error of the interpolation in range.
+        history: Phase history s, shape (..., pulse, frequency), complex.
+        frequency_hz: Frequencies f in Hz, rising in equal steps, float64 (frequency,).
+        path: Function of a slice of pulses and one of pixels that returns the path l in metres less
+            the path to which the phases refer, and the weight w or None for 1, float64 (..., pulse,
+            pixel).
+        pixels: Number of pixels.
+        eps: Relative error of the interpolation.
+        wave_speed_m_s: Propagation speed c in m/s.
         block_bytes: Size of a working array in bytes.
 
     Returns:
-        Image, shape (..., *pixels), complex, where `pixels` is the broadcast shape of the
-        coordinates.
-
-    Raises:
-        TypeError: If the samples are not complex64 or complex128.
-        ValueError: If there are no samples, or if `doppler_hz` or `velocity_m_s` is neither a
-            number nor a tensor in the shape of the leading dims of the data, the velocity is not
-            positive, or the magnitude of `doppler_hz` or `frame_hz` is not below 2 velocity /
-            wavelength.
+        Image, shape (..., pixel), complex.
     """
-    raw = checked_samples(raw, "backproject", "pulse, range", finite=False)
-    at = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
-    x, r = torch.broadcast_tensors(
-        *(torch.as_tensor(v, dtype=torch.float64, device=raw.device) for v in (azimuth_m, range_m))
-    )
-    shape, x, r = x.shape, x.reshape(-1), r.reshape(-1)
-    geometry = _PixelGeometry(
-        radar, at.velocity_m_s, at.frame_hz, per_trial(doppler_hz, 2, x), aperture or EveryPulse()
-    )
-    echo = _EchoBetweenSamples(raw, reference, radar, eps)
-    pulse_s = start_s + torch.arange(raw.shape[-2], dtype=torch.float64, device=raw.device) / radar.prf_hz
-    trials = max(1, raw[..., 0, 0].numel())
-    # each of the about 20 working arrays of a block takes 16 bytes per pulse and pixel
-    pixels_at_once = min(max(1, x.numel()), 4096)
-    height = max(1, min(raw.shape[-2], block_bytes // (16 * trials * max(pixels_at_once, 2 * raw.shape[-1]))))
-    sums = [
-        torch.zeros((*raw.shape[:-2], min(pixels_at_once, x.numel() - p.start)), dtype=raw.dtype, device=raw.device)
-        for p in _slices(x.numel(), pixels_at_once)
-    ]
-    for pulses in _slices(raw.shape[-2], height):
-        grid = echo.grid(pulses)
-        for i, pixels in enumerate(_slices(x.numel(), pixels_at_once)):
-            difference, weight = geometry(pulse_s[pulses, None], x[pixels], r[pixels])
-            sums[i] = sums[i] + echo.at(grid, r[pixels], difference, weight).sum(-2)
-    return torch.cat(sums, -1).reshape((*raw.shape[:-2], *shape))
+    trials, (pulses, n) = math.prod(history.shape[:-2]), history.shape[-2:]
+    plan = Nufft(n, eps, history.dtype, history.device)
+    step = frequency_step_hz(frequency_hz) / wave_speed_m_s * plan.length
+    carrier = float(frequency_hz[n // 2]) / wave_speed_m_s
+    blocks = list(_slices(pixels, min(pixels, _PIXELS)))
+    # each of the about 20 working arrays of a block takes up to 16 bytes per pulse and pixel
+    height = max(1, min(pulses, block_bytes // (16 * max(1, trials) * max(blocks[0].stop, 2 * n))))
+    sums: list[Tensor | int] = [0] * len(blocks)
+    for some in _slices(pulses, height):
+        profiles = plan.grid(history[..., some, :])
+        for i, block in enumerate(blocks):
+            path_m, weight = path(some, block)
+            # the exponent is +2j pi k q, so that points have the opposite sign
+            points = Points.of(plan.kernel, -path_m * step, plan.length, real_dtype(history.dtype))
+            echo = interpolate(profiles, points) * unit_phasor(carrier * path_m, history.dtype)
+            if weight is not None:
+                echo = echo * weight.to(real_dtype(history.dtype))
+            sums[i] = sums[i] + echo.sum(-2)
+    return torch.cat([torch.as_tensor(part) for part in sums], -1)
 
 
 def _slices(n: int, step: int) -> Iterator[slice]:
@@ -178,132 +84,87 @@ def _slices(n: int, step: int) -> Iterator[slice]:
     yield from (slice(first, min(first + step, n)) for first in range(0, n, step))
 
 
-@dataclass(frozen=True)
-class _PixelGeometry:
-    """Range of pixels relative to that at the crossing of the line of sight `frame_hz`, and the
-    weights of the pulses.
-    """
+def backproject(
+    history: Tensor,
+    frequency_hz: Tensor,
+    transmitter_m: Tensor,
+    receiver_m: Tensor | None,
+    reference_m: Tensor,
+    pixels_m: Tensor,
+    *,
+    eps: float = 1e-10,
+    block_bytes: int = 1 << 23,
+) -> Tensor:
+    """Form the image of a phase history at any pixels by the direct sum over its pulses.
 
-    radar: StripmapRadar
-    velocity_m_s: Tensor
-    frame_hz: Tensor
-    centroid_hz: Tensor
-    aperture: Aperture
+        image(x) = sum_p sum_k s[p, k] exp(+2j pi f_k (l_p(x) - l_ref,p) / c),
 
-    def __call__(self, pulse_s: Tensor, azimuth_m: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Return r(t) - R in metres and the weight, float64 (..., pulse, pixel), for pulses (pulse,
-        1) and pixels (pixel,).
-        """
-        velocity, frame = (per_trial(v, 2, pulse_s) for v in (self.velocity_m_s, self.frame_hz))
-        sin = self.radar.wavelength_m * frame / (2 * velocity)
-        since = pulse_s - azimuth_m / self.radar.velocity_m_s
-        along = velocity * since
-        excess = along * (along - 2 * range_m * sin)
-        slant = torch.sqrt(range_m.square() + excess)
-        doppler = 2 * velocity * (range_m * sin - along) / (slant * self.radar.wavelength_m)
-        return excess / (slant + range_m), self.aperture.weight(
-            *torch.broadcast_tensors(since, doppler - self.centroid_hz)
-        )
-
-
-class _EchoBetweenSamples:
-    """Range-compressed pulses at any range, demodulated by the carrier phase of the range
-    difference.
-    """
-
-    def __init__(self, raw: Tensor, reference: Tensor | None, radar: StripmapRadar, eps: float) -> None:
-        self.raw, self.reference, self.radar = raw, reference, radar
-        self.n = raw.shape[-1]
-        self.plan = Nufft(self.n, eps, raw.dtype, raw.device)
-
-    def grid(self, pulses: slice) -> Tensor:
-        """Oversampled range spectra of some pulses."""
-        spectrum = torch.fft.fft(self.raw[..., pulses, :])
-        if self.reference is not None:
-            spectrum = spectrum * self.reference.to(spectrum.dtype)
-        return self.plan.grid(torch.fft.fftshift(spectrum, dim=-1)) / self.n
-
-    def at(self, grid: Tensor, range_m: Tensor, difference_m: Tensor, weight: Tensor) -> Tensor:
-        """Weighted echo of each pulse and pixel, (..., pulse, pixel)."""
-        cell = ((range_m - self.radar.near_range_m) + difference_m) / self.radar.range_step_m
-        weight = weight * ((cell >= 0) & (cell <= self.n - 1))
-        # the exponent is +2j pi k q / n, so that points have the opposite sign
-        points = Points.of(
-            self.plan.kernel, -cell * (self.plan.length / self.n), self.plan.length, real_dtype(grid.dtype)
-        )
-        carrier = unit_phasor(2 * self.radar.carrier_hz / self.radar.wave_speed_m_s * difference_m, grid.dtype)
-        return interpolate(grid, points) * carrier * weight.to(real_dtype(grid.dtype))
-
-
-class Backproject(Focuser):
-    """Stage that focuses a patch by backprojection, on the image axes of focusers such as `OmegaK`.
+    where l_p(x) is the path from the transmitter over the pixel to the receiver. A point of unit
+    amplitude has the number of samples as peak and keeps its phase. Profiles are periodic: a
+    scatterer whose path is longer by c / (frequency step) appears at the same pixel. The sum takes
+    about 40 operations per pulse and pixel; `TilePlan` is many times faster. Differentiable in the
+    history, the positions, the reference and the pixels.
 
     Args:
-        radar: Radar of the recording.
-        reference: Filter that compresses the pulses in range: "matched", "flat" or "phase"; None
-            for range-compressed data.
-        velocity_m_s: Effective velocity in m/s; None for that of the radar.
-        doppler_hz: Absolute Doppler centroid in Hz; None for the nominal pointing of the radar, or
-            0 where it has none.
-        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
-            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
-            centroid where the radar has none.
-        lines: First raw line of the patch and the line after its last; None for all lines.
-        cells: First range cell of the patch and the cell after its last; None for all cells.
-        oversampling: Pixels per raw sample along either axis.
-        aperture: Pulses that contribute to a pixel, such as `Integration` or `DopplerBand`; None
-            for all.
+        history: Phase history, shape (..., pulse, frequency), complex.
+        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
+        transmitter_m: Positions of the transmitter in metres, float64 (..., pulse, 3).
+        receiver_m: Positions of the receiver in metres, float64 (..., pulse, 3); None if both share
+            an antenna, so that the path is twice its range.
+        reference_m: Path to which the phases refer in metres (twice the reference range of a
+            monostatic radar), float64 (..., pulse).
+        pixels_m: Positions of the pixels in metres, float64 (*pixels, 3), such as those of
+            `ImageGrid.pixels_m`.
         eps: Relative error of the interpolation in range.
+        block_bytes: Size of a working array in bytes.
+
+    Returns:
+        Image, shape (..., *pixels), complex; leading dims are those of the history and the
+        positions, broadcast.
 
     Raises:
-        ValueError: If `reference` is not known.
+        TypeError: If the history is not complex64 or complex128, or frequencies or positions are
+            not float64.
+        ValueError: If there are no samples or pixels, shapes do not match, values are not finite,
+            or the frequencies do not rise in equal steps.
     """
-
-    form = staticmethod(backproject)
-
-    def __init__(
-        self,
-        radar: StripmapRadar,
-        reference: str | None = "matched",
-        velocity_m_s: Tensor | float | None = None,
-        doppler_hz: Tensor | float | None = None,
-        frame_hz: float | None = None,
-        lines: tuple[int, int] | None = None,
-        cells: tuple[int, int] | None = None,
-        oversampling: int = 1,
-        aperture: Aperture | None = None,
-        eps: float = 1e-10,
-    ) -> None:
-        super().__init__(radar, reference, velocity_m_s, doppler_hz, frame_hz)
-        self.lines, self.cells, self.oversampling, self.aperture, self.eps = lines, cells, oversampling, aperture, eps
-
-    def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
-        """Focus the patch of the stage from a signal with axes (pulse, range).
-
-        Args:
-            signal: Recording.
-            doppler_hz: Doppler centroid in Hz; None for that of the stage.
-            velocity_m_s: Effective velocity in m/s; None for that of the stage.
-
-        Returns:
-            Image of the patch with axes (azimuth, range).
-        """
-        azimuth, range_ = self.radar.image_axes(signal.axes)
-        azimuth, range_ = (
-            axis.part(*(bounds or (0, axis.n))).resampled(self.oversampling)
-            for axis, bounds in ((azimuth, self.lines), (range_, self.cells))
+    history = checked_samples(history, "backproject", "pulse, frequency", finite=False)
+    refuse_unusable(frequency_hz=frequency_hz, pixels_m=pixels_m)
+    antennas = AntennaPath(transmitter_m, receiver_m, reference_m)
+    history = expanded_history(history, antennas, frequency_hz, "backproject")
+    if pixels_m.shape[-1:] != (3,) or not pixels_m.numel():
+        raise ValueError(
+            f"backproject needs at least one pixel, pixels_m of shape (*pixels, 3), got {tuple(pixels_m.shape)}"
         )
-        data = backproject(
-            signal.data,
-            replace(self.radar, near_range_m=signal.axes[-1].start),
-            azimuth.values(signal.data.device)[:, None],
-            range_.values(signal.data.device),
-            doppler_hz=self.doppler_hz if doppler_hz is None else doppler_hz,
-            velocity_m_s=self.velocity_m_s if velocity_m_s is None else velocity_m_s,
-            frame_hz=self.frame_hz,
-            reference=self.spectrum(signal.data.shape[-1], signal.data.device),
-            aperture=self.aperture,
-            start_s=signal.axes[-2].start,
-            eps=self.eps,
+    points = pixels_m.reshape(-1, 3)
+
+    def path(pulses: slice, pixels: slice) -> tuple[Tensor, None]:
+        return antennas.path_m(points[pixels], pulses), None
+
+    image = direct_sum(history, frequency_hz, path, len(points), eps=eps, block_bytes=block_bytes)
+    return image.unflatten(-1, pixels_m.shape[:-1])
+
+
+def expanded_history(history: Tensor, antennas: AntennaPath, frequency_hz: Tensor, what: str) -> Tensor:
+    """Expand a phase history to the trials of its antenna path.
+
+    Args:
+        history: Phase history, shape (..., pulse, frequency).
+        antennas: Path of the antennas.
+        frequency_hz: Frequencies in Hz, shape (frequency,).
+        what: Name of the function for the message.
+
+    Returns:
+        The history, its leading dims broadcast with those of the path.
+
+    Raises:
+        ValueError: If its size is not that of the path and the frequencies.
+    """
+    size = antennas.pulses, len(frequency_hz)
+    trials = broadcast([history.shape[:-2], antennas.trials])
+    if history.shape[-2:] != size or trials is None:
+        raise ValueError(
+            f"{what} needs a history (..., pulse, frequency) that fits {(*antennas.trials, *size)} of the path and the "
+            f"frequencies, got {tuple(history.shape)}"
         )
-        return Signal(data, (azimuth, range_))
+    return history.expand(*trials, *size)

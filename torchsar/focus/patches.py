@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Signal
-from torchsar.focus.backprojection import Backproject
+from torchsar.focus.strip_backprojection import Backproject
 from torchsar.radar import StripmapRadar
 
 # half of the lines and cells of a patch: it holds the main lobe and a dozen side lobes at any usual

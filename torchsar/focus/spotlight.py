@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, checked_samples, real_dtype, unit_phasor
-from torchsar.focus.nufft import Nufft, Points, interpolate
-from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, frequency_step_hz, geometry_of
+from torchsar.core import Axis, Signal, Stage, checked_samples, real_dtype
+from torchsar.focus.backprojection import direct_sum
+from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, geometry_of
 
 
 def window_weights(name: str, n: int, device: torch.device | str | None = None) -> Tensor:
@@ -88,10 +87,9 @@ def backproject_spotlight(
 
     where s_k(f) is the sample of pulse k at frequency f and r_k the range of the pixel in pulse k.
     A point scatterer of unit amplitude has the sum of the window weights as peak (without a window
-    the number of samples) and keeps its phase. Range profiles are interpolated by a non-uniform
-    FFT. They are periodic in range: a scatterer c / (2 frequency step) farther appears at the same
-    position. The sum takes pulses x pixels x 40 operations. Differentiable in profiles, pixel and
-    antenna positions.
+    the number of samples) and keeps its phase. Range profiles are periodic: a scatterer c / (2
+    frequency step) farther appears at the same position. See `direct_sum`, which forms the image.
+    Differentiable in profiles, pixel and antenna positions.
 
     Args:
         profiles: Range profiles, shape (..., pulse, range), complex, as from `read_inverse`; s_k(f)
@@ -121,52 +119,16 @@ def backproject_spotlight(
     if not x.numel():
         raise ValueError(f"backprojection needs at least one pixel, got x_m and y_m of the common shape {tuple(shape)}")
     samples = frequency_samples(profiles) * aperture_weights(window, geometry).to(real_dtype(profiles.dtype))
-    between = _BetweenSamples(geometry, eps, samples)
-    trials = max(1, math.prod(samples.shape[:-2]))
-    # each of the about 20 working arrays of a block takes up to 16 bytes per pulse and pixel
-    pixels_at_once = min(x.numel(), 4096)
-    height = max(1, min(samples.shape[-2], block_bytes // (16 * trials * max(pixels_at_once, 2 * samples.shape[-1]))))
-    sums = [
-        samples.new_zeros((*samples.shape[:-2], pixels.stop - pixels.start))
-        for pixels in _slices(x.numel(), pixels_at_once)
-    ]
-    for pulses in _slices(samples.shape[-2], height):
-        grid = between.grid(samples[..., pulses, :])
-        for i, pixels in enumerate(_slices(x.numel(), pixels_at_once)):
-            sums[i] = sums[i] + between.at(grid, geometry.range_m(pulses, x[pixels], y[pixels])).sum(-2)
-    return torch.cat(sums, -1).reshape((*samples.shape[:-2], *shape))
-
-
-def _slices(n: int, step: int) -> Iterator[slice]:
-    """Slices of at most `step` that cover 0..n."""
-    yield from (slice(first, min(first + step, n)) for first in range(0, n, step))
-
-
-class _BetweenSamples:
-    """Profiles at any range with restored carrier, from their frequency samples."""
-
-    def __init__(self, geometry: FarField | Spotlight, eps: float, like: Tensor) -> None:
-        f, per_metre = geometry.frequency_hz, 2 / geometry.wave_speed_m_s
-        self.plan = Nufft(f.shape[0], eps, like.dtype, like.device)
-        self.step_cycles_m = per_metre * frequency_step_hz(f)
-        self.carrier_cycles_m = per_metre * float(f[f.shape[0] // 2])
-
-    def grid(self, samples: Tensor) -> Tensor:
-        """Oversampled profiles of some pulses."""
-        return self.plan.grid(samples)
-
-    def at(self, grid: Tensor, range_m: Tensor) -> Tensor:
-        """sum_f s(f) exp(+4j pi f r / c), (..., pulse, pixel), for a grid (..., pulse, length) and
-        ranges (pulse, pixel).
-        """
-        # the exponent is +2j pi k q, so that points have the opposite sign
-        points = Points.of(
-            self.plan.kernel,
-            -range_m * (self.step_cycles_m * self.plan.length),
-            self.plan.length,
-            real_dtype(grid.dtype),
-        )
-        return interpolate(grid, points) * unit_phasor(self.carrier_cycles_m * range_m, grid.dtype)
+    image = direct_sum(
+        samples,
+        geometry.frequency_hz,
+        lambda pulses, pixels: (2 * geometry.range_m(pulses, x[pixels], y[pixels]), None),
+        x.numel(),
+        eps=eps,
+        wave_speed_m_s=geometry.wave_speed_m_s,
+        block_bytes=block_bytes,
+    )
+    return image.unflatten(-1, shape) if shape else image[..., 0]
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Descriptions of instruments: radars and ladars, their geometry, timing, orbits and waveforms."""
 
+from torchsar.radar.antenna_path import AntennaPath
 from torchsar.radar.bistatic import BistaticRadar, polynomial_range, receive_range
 from torchsar.radar.ephemeris import Ephemeris
 from torchsar.radar.inverse import InverseRadar
@@ -20,6 +21,7 @@ from torchsar.radar.waveform import LinearFM
 
 __all__ = [
     "LIGHT_M_S",
+    "AntennaPath",
     "BistaticRadar",
     "Ephemeris",
     "FarField",

@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torchsar.core import block_bytes_of, checked_samples, over_blocks, refuse_non_finite_values
+from torchsar.core import block_bytes_of, checked_samples, over_blocks
+from torchsar.focus.backprojection import expanded_history
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import Scene, choose, part_bounds, tile_centres, zones
 from torchsar.focus.tiles.expansion import slopes
 from torchsar.focus.tiles.part import Band, Part, Tables
+from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S
 
@@ -69,7 +71,7 @@ class TilePlan:
         error_db: float = -70.0,
     ) -> None:
         self.frequency_hz, self.grid, self.error_db = frequency_hz, grid, float(error_db)
-        _refuse_other_than_float64(frequency_hz=frequency_hz)
+        refuse_unusable(frequency_hz=frequency_hz)
         frequency_step_hz(frequency_hz)
         self._set_path(transmitter_m, receiver_m, reference_m)
         with torch.no_grad():
@@ -77,23 +79,10 @@ class TilePlan:
 
     def _set_path(self, transmitter_m: Tensor, receiver_m: Tensor | None, reference_m: Tensor) -> None:
         """Bring the positions to the shape (path, pulse, 3)."""
-        given = {"transmitter_m": transmitter_m, "reference_m": reference_m}
-        if receiver_m is not None:
-            given["receiver_m"] = receiver_m
-        _refuse_other_than_float64(**given)
-        refuse_non_finite_values("TilePlan", **given)
-        places = [given[name] for name in ("transmitter_m", "receiver_m") if name in given]
-        pulses = reference_m.shape[-1:]
-        lead = _common([reference_m.shape[:-1], *(place.shape[:-2] for place in places)])
-        if lead is None or 0 in (*lead, *reference_m.shape) or any(v.shape[-2:] != (*pulses, 3) for v in places):
-            raise ValueError(
-                "a tile plan needs positions of shape (..., pulse, 3) and reference_m of shape (..., pulse), with "
-                "leading dimensions that broadcast, got "
-                + ", ".join(f"{name} {tuple(value.shape)}" for name, value in given.items())
-            )
-        self._lead = lead
-        self._places = [place.expand(*lead, *pulses, 3).reshape(-1, *pulses, 3) for place in places]
-        self._reference_m = reference_m.expand(*lead, *pulses).reshape(-1, *pulses)
+        self.antennas = antennas = AntennaPath(transmitter_m, receiver_m, reference_m)
+        size = *antennas.trials, antennas.pulses
+        self._places = [place.expand(*size, 3).reshape(-1, *size[-1:], 3) for place in antennas.places]
+        self._reference_m = reference_m.expand(size).reshape(-1, *size[-1:])
         self._kept: dict[tuple, Tables] = {}
 
     def _plan(self, every: Sequence[Tensor]) -> None:
@@ -179,15 +168,13 @@ class TilePlan:
             ValueError: If its size is not that of the plan.
         """
         history = checked_samples(history, "TilePlan.image", "pulse, frequency", finite=False)
-        size = self._reference_m.shape[-1], len(self.frequency_hz)
-        lead = _common([history.shape[:-2], self._lead])
-        if history.shape[-2:] != size or lead is None:
-            raise ValueError(
-                f"the plan was made for histories (..., pulse, frequency) of shape {(*self._lead, *size)}, got "
-                f"{tuple(history.shape)}"
-            )
+        history = expanded_history(history, self.antennas, self.frequency_hz, "TilePlan.image")
+        lead, size = history.shape[:-2], history.shape[-2:]
+        # trials with paths of their own come first, those that share a path after them
+        own = (*(1,) * (len(lead) - len(self.antennas.trials)), *self.antennas.trials)
+        order = sorted(range(len(lead)), key=lambda d: own[d] != lead[d])
         paths = len(self._reference_m)
-        data = history.expand(*lead, *size).reshape(paths, -1, *size) if paths > 1 else history.reshape(1, -1, *size)
+        data = history.permute(*order, -2, -1).reshape(paths, -1, *size)
         trials = data.shape[1]
         profiles = self._profiles(data.transpose(1, 2))
         step = max(1, _GROUP // (paths * trials))
@@ -210,7 +197,8 @@ class TilePlan:
         if self._swapped:
             image = image.mT
         image = image[:, : self.grid.counts[0], : self.grid.counts[1]]
-        return image.reshape(*lead, *self.grid.counts)
+        image = image.reshape(*(lead[d] for d in order), *self.grid.counts)
+        return image.permute(*(order.index(d) for d in range(len(lead))), -2, -1)
 
     def _profiles(self, data: Tensor) -> list[Tensor]:
         """Range profiles of each sub-aperture, extended by the longest window, for data (path,
@@ -278,21 +266,3 @@ def image_tiles(
             equal steps, or tiles do not reach the error in this geometry.
     """
     return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db).image(history)
-
-
-def _common(shapes: Sequence[torch.Size]) -> torch.Size | None:
-    """Shape to which shapes broadcast, None if they do not."""
-    try:
-        return torch.broadcast_shapes(*shapes)
-    except RuntimeError:
-        return None
-
-
-def _refuse_other_than_float64(**values: Tensor) -> None:
-    """Raise TypeError for positions in less than double precision."""
-    for name, value in values.items():
-        if not isinstance(value, Tensor) or value.dtype != torch.float64:
-            kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
-            raise TypeError(
-                f"{name} must be a float64 tensor, got {kind}; float32 resolves only 0.06 m at a range of 700 km"
-            )
