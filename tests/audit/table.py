@@ -64,13 +64,6 @@ OTHER = {
 
 # Cells of the recorded audit that miss a bar, as (estimator, world, SNR), by the reason.
 LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
-    "three targets that the ends of the record cut do not determine a line over range": [
-        ("compensate.RangeDependentCentroid", "few points", 10.0),
-    ],
-    "errors of separate rows at even spacing cancel in pairs, and 0.01 cell is predicted for 0.005": [
-        ("compensate.align_mean", "even rows", 40.0),
-        ("compensate.align_envelopes:single", "even rows", 40.0),
-    ],
     "the leakage of the taper counts as noise; the errors are 4e-4 rad": [
         ("multichannel.EstimateBalance", "own", 60.0),
     ],
