@@ -15,9 +15,11 @@ class MigratingLines(Stage):
     """Stage that estimates a velocity from range lines whose migration has not been corrected.
 
     The estimator gets a copy of the data in which the migration of a point at rest and the range
-    walk of the strongest point are corrected. The signal itself is not changed, so that a later
-    `CorrectMigration` can use the estimated velocity. Data without a range axis do not migrate and
-    go to the estimator directly.
+    walk of the strongest point are corrected. An along-track speed leaves a curved migration, which
+    weakens the ends of the range line and bends its phase. The estimator therefore runs again, on
+    data in which the migration of the motion found is corrected. The signal itself is not changed,
+    so that a later `CorrectMigration` can use the estimated velocity. Data without a range axis do
+    not migrate and go to the estimator directly.
 
     Args:
         radar: Radar parameters.
@@ -45,13 +47,18 @@ class MigratingLines(Stage):
         if "range" not in signal.names:
             return self.estimator(signal)
         walk = self.walk(signal)
-        corrected = self.correct(signal, ambiguity=walk["ambiguity"])
-        if self.one_line:
-            corrected = Signal(strongest_line(corrected.data)[0], corrected.axes[:2])
-        found = self.estimator(corrected)
+        first = self._estimate(self.correct(signal, ambiguity=walk["ambiguity"]))
+        # values that are not ok count as well: the migration that they correct may be why
+        found = self._estimate(self.correct(signal, **{name: first[name] for name in self.provides}))
         return replace(
             found,
             ok=found.ok & walk.ok,
             quality=found.quality.minimum(walk.quality),
             info={**found.info, "ambiguity": walk["ambiguity"]},
         )
+
+    def _estimate(self, corrected: Signal) -> Estimate:
+        """Run the estimator on corrected data."""
+        if self.one_line:
+            corrected = Signal(strongest_line(corrected.data)[0], corrected.axes[:2])
+        return self.estimator(corrected)
