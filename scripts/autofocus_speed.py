@@ -4,7 +4,7 @@ need.
     python scripts/autofocus_speed.py [--trials 16] [--snr 10] [--pulses 400] [--cells 256]
     [--rounds 5]
 
-A turning aircraft with white phase errors (system 002), complex64, one thread. Times are the best
+A rotating aircraft with white phase errors, complex64, one thread. Times are the best
 of the rounds, in turn; the ratio is that to as many pairs of transforms of the whole batch, forward
 and back, as the method's iterations made (of twice the length where it pads).
 """

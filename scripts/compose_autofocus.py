@@ -1,18 +1,17 @@
-"""Your own autofocus in ten lines: descend on any figure of any chain, and learn a schedule from
-simulated trials.
+"""Your own autofocus in ten lines: minimise a function of the image of a chain, and choose settings
+of an autofocus on simulated trials.
 
     python scripts/compose_autofocus.py [--trials 8] [--candidates 60] [--pulses 200] [--out
     compose_autofocus.png]
 
-Both experiments print the median phase error (rad) over SNR on trials whose truth no estimator
-sees, and share one figure.
+Both experiments print the median phase error (rad) over SNR, and share one figure.
 
-1. The motion of a turning aircraft is a polynomial in time, while three bright points fly through
-the same range window on a path of their own. Few
-   coefficients, found through a whole chain by the entropy of the aircraft's range cells, come
-   nearer to it than a free phase per pulse can.
-2. Phase gradient autofocus with three iterations: which three windows? Random search over simulated
-pairs (data, true phase), then trials of another seed.
+1. The motion of a rotating aircraft is a polynomial in time. Three bright points with another
+motion are in the same range window. The few coefficients of the polynomial are found by the image
+entropy of the range cells of the aircraft. Their error is less than that of one free phase per
+pulse.
+2. Phase gradient autofocus with three iterations and three window widths. The widths are found by
+random search on simulated pairs (data, true phase) and tested on trials of another seed.
 """
 
 from __future__ import annotations
@@ -52,13 +51,13 @@ def motion_through_a_chain(n_pulse: int, trials: int) -> dict[str, Tensor]:
     """Phase errors (SNR, trial) of a polynomial found through a chain, with and without a region,
     and of a free phase.
     """
-    signal, truth = plane_and_strangers(n_pulse, trials)
+    signal, truth = plane_and_points(n_pulse, trials)
 
     # the experiment: a model of the phase, a chain, a figure of its image, a descent that every
     # trial makes by itself
     basis = legendre(torch.linspace(-1, 1, n_pulse, dtype=torch.float64), 3).mT[
         2:
-    ]  # constant and slope only turn and shift an image
+    ]  # a constant and a slope only change the phase and the position of an image
     region = (torch.arange(N_RANGE) - N_RANGE // 2).abs() <= 40  # where the aircraft is
     chain = Chain(phase=Sca(), correct=use(CorrectPulsePhase(), phase_rad="phase"), image=AzimuthTransform(RADAR))
     trace = chain.trace(signal)
@@ -78,7 +77,7 @@ def motion_through_a_chain(n_pulse: int, trials: int) -> dict[str, Tensor]:
     return {name: errors(phase, truth) for name, phase in found.items()}
 
 
-def plane_and_strangers(n_pulse: int, trials: int) -> tuple[Signal, Tensor]:
+def plane_and_points(n_pulse: int, trials: int) -> tuple[Signal, Tensor]:
     """Pulses of both targets, (SNR * trial, pulse, range), and the phase of the aircraft."""
     draws = Draws(1, trials=range(len(SNR_DB) * trials))
     plane, truth = simulate_turntable(
@@ -88,10 +87,10 @@ def plane_and_strangers(n_pulse: int, trials: int) -> tuple[Signal, Tensor]:
     points = Points(
         azimuth_m=[-0.02, 0.0, 0.03], range_m=[0.048, 0.051, 0.056], amplitude=[12.0, 12.0, 12.0], random_phase=True
     )
-    strangers, _ = simulate_turntable(
+    others, _ = simulate_turntable(
         RADAR, TurntableWorld(points, motion=(drift(other, n_pulse),)), n_pulse, N_RANGE, other
     )
-    return plane.signal.with_data(plane.signal.data + strangers.signal.data), truth.values["phase_rad"]
+    return plane.signal.with_data(plane.signal.data + others.signal.data), truth.values["phase_rad"]
 
 
 def drift(draws: Draws, n_pulse: int) -> Polynomial:

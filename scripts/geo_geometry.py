@@ -1,11 +1,11 @@
-"""What orbit, pulse rate and velocities do to a GEO spaceborne-airborne bistatic radar: figures 2
-to 4 and 8 of Remote Sens. 2020, 12, 1703.
+"""Effects of orbit, pulse rate and velocities in a GEO spaceborne-airborne bistatic radar: figures
+2 to 4 and 8 of Remote Sens. 2020, 12, 1703.
 
     python scripts/geo_geometry.py [--out geo_geometry] [--small]
 
-The satellite's pulse rate must leave a swath free of its own pulses; the range to it changes slowly
-over its orbit; and what a moving target does to the channels of the receiver is a delay, which its
-along-track speed sets, and a phase, which its slant-range speed sets.
+The pulse rate of the satellite must leave a swath free of its own pulses, and the range to it
+changes slowly over its orbit. In the channels of the receiver a moving target causes a delay, which
+depends on its along-track speed, and a phase, which depends on its slant-range speed.
 """
 
 from __future__ import annotations

@@ -3,9 +3,10 @@ and Tables 5 and 6 of Remote Sens. 2024, 16, 793.
 
     python scripts/ladar_ground.py [--out ladar_ground] [--seed 1] [--small]
 
-Stands in for the paper's recording, which is not public. One real channel records the triangle with
-its transients, 5.3 us before the up sweep on; air and a swaying target do the rest. Re-segmented
-from the trigger on the motion can be found; turned in a ring, as in figure 15b, it cannot.
+A simulation in place of the paper's recording, which is not public. One real channel records the
+triangle with its transients, from 5.3 us before the up sweep on. The air is turbulent and the
+target vibrates. The motion can be estimated if the record is divided into sweeps from the trigger
+on; it cannot if each period is shifted circularly, as in figure 15b.
 """
 
 from __future__ import annotations
@@ -85,8 +86,8 @@ TABLE_6 = {
 def methods(radar: TriangularLadar) -> dict[str, Chain]:
     """Chains from the record to the image.
 
-    "segmented, in a ring" gets sweeps that the paper's circular shift separated, "ideal" the record
-    without motion.
+    "segmented, circular shift" gets sweeps that the paper's circular shift separated, "ideal" the
+    record without motion.
     """
     split = {
         "split": use(SplitSweeps(radar, "recorded"), trigger_s="aux.trigger_s"),
@@ -118,7 +119,7 @@ def methods(radar: TriangularLadar) -> dict[str, Chain]:
             **split, **compensated(SegmentedInterference(radar, hann=True, window_m=RETRO)), **focus, **image
         ),
         "recommended": Chain(**split, **compensated(RadialMotion(radar, window_m=RETRO)), **focus, **polish),
-        "segmented, in a ring": Chain(
+        "segmented, circular shift": Chain(
             **ring, **compensated(SegmentedInterference(radar, hann=True, window_m=RETRO)), **focus, **image
         ),
         "ideal": Chain(**split, **focus, **image),
@@ -296,7 +297,7 @@ def main(arguments: list[str] | None = None) -> None:
         radar = replace(RADAR, keep_every=24) if options.small else RADAR
         recording, truth = recorded(radar, 3840 // radar.keep_every, options.seed)
         assert truth.clean is not None
-        given = {"segmented, in a ring": one_period(recording), "ideal": truth.clean}
+        given = {"segmented, circular shift": one_period(recording), "ideal": truth.clean}
         chains = methods(radar)
         traces = {name: chain.trace(given.get(name, recording)) for name, chain in chains.items()}
         courses = {

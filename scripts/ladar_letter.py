@@ -3,9 +3,9 @@ Remote Sens. 2024, 16, 793.
 
     python scripts/ladar_letter.py [--out ladar_letter] [--seed 1] [--snr-db 20] [--small]
 
-Two tables: one with random phases of the points, and one with equal phases on their regular grid, a
-trap in which an image that collapses rows has LESS entropy than the truth. So look at the residual,
-the motion that is left: 4 pi / lambda times the rms range error, without constant and slope.
+Two tables: one with random phases of the points, and one with equal phases. With equal phases on a
+regular grid, a wrong image has less entropy than the true one. Compare methods by the residual
+phase: 4 pi / lambda times the rms range error, without constant and slope.
 """
 
 from __future__ import annotations

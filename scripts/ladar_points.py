@@ -4,9 +4,9 @@ Sens. 2024, 16, 793.
     python scripts/ladar_points.py [--out ladar_points] [--seed 1] [--snr-db 20] [--stripmap]
     [--small]
 
-Micrometres of radial motion ruin the focus in azimuth, and decimetres per second move the beats by
-several range cells. The up and the down half of each triangle tell the radial velocity; its
-integral is the range error, which is taken out before the image is focused.
+Micrometres of radial motion defocus an image in azimuth, and decimetres per second shift the beat
+frequencies by several range cells. The radial velocity is estimated from the up and the down half
+of each triangle. Its integral is the range error, which is removed before the image is focused.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 """Estimators of the radial motion of a ladar by time and error, beside the bare Fourier transforms
-that they cannot do without.
+that they need.
 
     python scripts/ladar_speed.py [--trials 64] [--periods 256] [--snr 10] [--window 40] [--rounds
     5] [--threads 1]
 
-One point at RD 1.5 m in the motion of system 000, both precisions. Times are the best of the
-rounds, in turn. The ratio is that to a transform of every sweep to twice its length and one
-transform pair along the periods of the range cells of the window. Velocity: median over trials of
-the rms error, beside the bound with unknown phases of the sweeps (with known ones it is half of
-that). Range: the same of the integrated error, its line removed.
+One point at a relative range of 1.5 m, with the motion of the config `sal_points`, both precisions.
+Times are the best of the rounds, in turn. The ratio is that to a transform of every sweep to twice
+its length and one transform pair along the periods of the range cells of the window. Velocity:
+median over trials of the rms error, beside the bound with unknown phases of the sweeps (with known
+ones it is half of that). Range: the same of the integrated error, its line removed.
 """
 
 from __future__ import annotations

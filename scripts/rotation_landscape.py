@@ -1,11 +1,11 @@
-"""Entropy of the image over the rotation that is taken out of it: where its minimum lies, how wide
-it is and how it leans.
+"""Entropy of the image as a function of the assumed rotation: position, width and orientation of
+its minimum.
 
     python scripts/rotation_landscape.py [--out rotation_landscape] [--seed 1] [--snr-db 20]
     [--small]
 
 Cuts through the truth over k1, k2, the Legendre coefficients q2 and q3 of the warp, and the rate,
-for image lines of 1, 1/2 and 1/4 of a Doppler cell; a map over k1 and k2 with its oblique valley;
+for image lines of 1, 1/2 and 1/4 of a Doppler cell; a map over k1 and k2;
 and the gradient of automatic differentiation beside differences. A satellite of 300 scatterers.
 """
 

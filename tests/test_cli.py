@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import resource
 import signal
 import subprocess
@@ -40,6 +41,7 @@ def test_list_explains_experiments_systems_stages_keys_and_data(capsys: pytest.C
     keys = [line.split() for line in text.splitlines() if line.startswith("      ") and line[6] != " "]
     silent = [words[0] for words in keys if len(words) == 1]
     assert len(keys) > 500 and not silent, silent
+    assert "rad, rad/s, ...\n" in text and not re.search(r"[^.]\.\.\n", text)
 
 
 def child_seconds(*arguments: str) -> tuple[float, subprocess.CompletedProcess[str]]:
@@ -60,6 +62,7 @@ def child_seconds(*arguments: str) -> tuple[float, subprocess.CompletedProcess[s
         (["--version"], 0, "torchsar-lab "),
         ([], 2, "a command is missing: choose one of run, sweep, requires, trade, list"),
         (["walk"], 2, "invalid choice: 'walk'"),
+        (["requires"], 2, "arguments are required: config\n"),
         (["run", "stripmap_damaged", "--speed"], 2, "unrecognized arguments: --speed"),
         (["run", "nowhere"], 2, "there is no config file 'nowhere'"),
     ],

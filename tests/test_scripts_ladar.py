@@ -86,7 +86,7 @@ def test_ground(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         and contrasts == sorted(contrasts)
         and residuals == sorted(residuals, reverse=True)
     )
-    assert table["recommended"][4] < 0.05 and table["segmented, in a ring"][4] > 140
+    assert table["recommended"][4] < 0.05 and table["segmented, circular shift"][4] > 140
     responses = rows(second, 26)
     assert responses["pslr_azimuth_db"][1] == -5.01
     assert responses["pslr_azimuth_db"][4] < -12.5 < -10 < responses["pslr_azimuth_db"][0]

@@ -45,7 +45,9 @@ def parser() -> argparse.ArgumentParser:
     for name, text in _COMMANDS.items():
         one = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         one.add_argument("config", help="a YAML file, or the name of a packaged config (see `torchsar list`)")
-        one.add_argument("overrides", nargs="*", metavar="key=value", help="overrides, such as world.noise.snr_db=10")
+        one.add_argument(
+            "overrides", nargs="*", default=[], metavar="key=value", help="overrides, such as world.noise.snr_db=10"
+        )
         one.add_argument("--out", type=Path, metavar="DIR", help=f"result folder (default: {_folder(name, 'CONFIG')})")
         one.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), cuda, cuda:1, ...")
     sweep = commands.choices["sweep"]

@@ -105,7 +105,7 @@ def _width(count: int) -> float:
 
 
 def _wrapped(title: str, width: float) -> str:
-    return textwrap.fill(title, round(_LETTERS * width))
+    return textwrap.fill(title, round(_LETTERS * (width - 0.5)))
 
 
 def decibel(x: Tensor | np.ndarray, reference: float | None = None) -> np.ndarray:
@@ -316,6 +316,9 @@ def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", perce
 
     Returns:
         The figure.
+
+    Raises:
+        TypeError: If `signal` is not a Signal.
     """
     top = level(signal, percentile, _ALONE)
     return _show(signal, _ALONE, dynamic_range_db, title, top, _below(percentile))
@@ -448,6 +451,8 @@ def _draw_over(
 
 def _first(signal: Signal) -> Signal:
     """First trial of a signal."""
+    if not isinstance(signal, Signal):
+        raise TypeError(f"a picture needs a Signal, got {type(signal).__name__}; wrap a tensor: Signal(data, axes)")
     return signal.with_data(signal.data.flatten(0, -3)[0]) if signal.trials else signal
 
 
@@ -917,6 +922,8 @@ def array(x: Tensor) -> np.ndarray:
 
 # units by the last words of a name, the longest first
 _UNITS = {
+    "_per_s2": "1/s²",
+    "_per_s": "1/s",
     "_rad_s": "rad/s",
     "_m_s2": "m/s²",
     "_m_s": "m/s",

@@ -115,6 +115,10 @@ class TestDraws:
         assert torch.equal(whole, parts)
         assert torch.equal(Draws(7, trials=[5, 0]).normal("noise", (4, 5), torch.complex64), whole[[5, 0]])
 
+    def test_a_number_of_trials_in_place_of_indices_is_refused(self):
+        with pytest.raises(TypeError, match=r"trials=range\(4\)"):
+            Draws(7, trials=4)  # type: ignore[arg-type]
+
     def test_earlier_draws_do_not_change_a_draw(self):
         a, b = Draws(7), Draws(7)
         b.uniform("something else", (1000,))

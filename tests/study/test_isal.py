@@ -162,6 +162,8 @@ def test_an_estimate_in_doubt_is_not_used_unless_the_method_says_so_and_the_repo
     assert methods["recommended"]["neutral"] == {"correct.phase_rad": 2} and methods["applied"]["neutral"] == {}
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "Estimate not ok, neutral value used: correct.phase_rad in 2 of 2 trials" in report
+    assert "<b>Not reliable.</b>" in report and methods["applied"]["in_doubt"] == ["correct"]
+    assert report.count("Uses estimates even if they are not ok, in the stages: correct") == 1
 
 
 def test_noise_near_the_end_of_float32_leaves_figures(tmp_path: Path) -> None:

@@ -41,6 +41,7 @@ from torchsar.study.trials.system import Column
         (3.2e9, "Hz", None, "3.200 GHz"),
         (0.00012, "dB", None, "0.00012 dB"),
         ([1.5e-3, 2.5e-3], "m", [1e-4, 2e-4], "1.50 ± 0.10, 2.50 ± 0.20 mm"),
+        (-1e-12, "m", 4e-6, "0.0 ± 4.0 um"),
         (None, "m", None, "–"),
         (math.nan, "m", 1.0, "–"),
         ("auto", "m", None, "auto"),
@@ -61,6 +62,7 @@ def test_a_row_has_one_prefix() -> None:
 
 def test_estimates_have_the_unit_of_their_name() -> None:
     assert plot.name_and_unit("motion.velocity_m_s") == ("velocity", "m/s")
+    assert plot.name_and_unit("k1_per_s") == ("k1", "1/s") and plot.name_and_unit("k2_per_s2") == ("k2", "1/s²")
     assert plot.name_and_unit("world.noise.snr_db") == ("SNR", "dB") and plot.name_and_unit("ok") == ("ok", "")
 
 
@@ -92,6 +94,11 @@ def test_images_in_metres_have_one_scale_unless_they_are_too_elongated() -> None
     ):
         assert plot.image(signal).axes[0].get_aspect() == aspect
         assert [figure.axes[0].get_aspect() for figure in plot.images({"a": signal, "b": signal})] == [aspect] * 2
+
+
+def test_a_picture_of_a_tensor_is_refused_with_the_way_out() -> None:
+    with pytest.raises(TypeError, match=r"needs a Signal, got Tensor; wrap a tensor: Signal\(data, axes\)"):
+        plot.image(torch.zeros(4, 4))  # type: ignore[arg-type]
 
 
 def test_a_crop_holds_every_position_and_stays_inside() -> None:

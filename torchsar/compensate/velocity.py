@@ -332,7 +332,7 @@ class EffectiveVelocity(Stage):
     Args:
         focuser: Focusing stage of the chain, whose radar and range reference spectrum are used.
         reach_m_s: Largest error of the nominal velocity in m/s.
-        lines: Number of range cells in the group, at least 16.
+        lines: Number of range cells that are used, at least 16.
         refine: `parabola_minimum` or `gradient_minimum` of `torchsar.optim.scalar`.
         tolerance_m_s: Tolerance of the refinement in m/s.
 

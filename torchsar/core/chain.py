@@ -183,7 +183,7 @@ class Chain(nn.Module):
     An estimate is used only in the trials in which it is ok. In the others, later stages get the
     neutral value of the estimator (see `Stage`), and a stage that both estimates and corrects
     leaves the signal unchanged, unless `use` says otherwise. The Trace holds the estimates
-    themselves, and tells in `neutral` where they were not used.
+    themselves, and shows in `neutral` where they were not used.
 
     Args:
         **stages: Stages by name, in the order in which they run; `use` connects their parameters.

@@ -47,6 +47,7 @@ class Draws:
             a single trial without that dimension, with the numbers of trial 0.
 
     Raises:
+        TypeError: If `trials` is a number instead of indices.
         ValueError: If the case is a tuple whose length is not the number of trials.
     """
 
@@ -55,6 +56,11 @@ class Draws:
     trials: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.trials, int):
+            raise TypeError(
+                f"`trials` of Draws are indices of trials, got the number {self.trials}; for so many trials write "
+                f"trials=range({self.trials})"
+            )
         if isinstance(self.case, tuple) and (self.trials is None or len(self.case) != len(self.trials)):
             raise ValueError(
                 f"Draws with a tuple of {len(self.case)} cases need as many trials, got "

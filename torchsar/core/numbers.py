@@ -54,7 +54,7 @@ def number(value: Any, sd: Any = None, factor: float = 1.0) -> str:
         sd = float(f"{sd * factor:.1e}")
         digits = 1 - math.floor(math.log10(sd))
         if digits < 10:
-            return " ± ".join(f"{round(x, digits):,.{max(0, digits)}f}" for x in (value, sd))
+            return " ± ".join(f"{round(x, digits) + 0.0:,.{max(0, digits)}f}" for x in (value, sd))  # + 0.0: no -0
         return f"{value:.4g} ± {sd:.2g}"
     if float(value).is_integer() and abs(value) < 1e6:
         return f"{int(value)}"

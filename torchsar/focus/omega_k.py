@@ -631,7 +631,7 @@ class Focuser(Stage):
 class OmegaK(Focuser):
     """Stage that focuses stripmap data by omega-K without Stolt interpolation, see `omega_k`.
 
-    Arguments as in `Focuser`.
+    Arguments as in its base class `Focuser`.
     """
 
     form = staticmethod(omega_k)

@@ -72,7 +72,7 @@ class Sinusoid:
 
     @classmethod
     def named(cls, name: str, *, unit: Literal["mm", "um"]) -> Sinusoid:
-        """Return the vibration of a name amplitude_frequency_phase as in the Reference: `1_0.1_90`.
+        """Return the sinusoidal vibration of a name amplitude_frequency_phase, such as `1_0.1_90`.
 
         Args:
             name: Amplitude in `unit`, frequency in hertz and phase in degrees.

@@ -55,8 +55,8 @@ def autofocus(
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
         start: Phase to start from in rad, shape (..., pulse); by default that of the spatial
-            correlation algorithm (function `sca`). With this
-            default the size of the phase errors has no effect on the result.
+            correlation algorithm (function `sca`). With this default the size of the phase errors
+            has no effect on the result.
         search: Largest number of iterations of the second step, approximately; only hard cases of
             low SNR need them all.
         polish: Largest number of iterations of the third step.
@@ -80,7 +80,8 @@ def autofocus(
         deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of
         speckle. Phases of `link_phases` have its standard deviations, `quality` and `ok`. `info`
         holds "homogeneous" of shape (...,), bool, True where the homogeneous description is more
-        likely; `ok` is False if linked phases then do not confirm that.
+        likely; `ok` is False if linked phases then do not confirm that. Range profiles that are not
+        aligned are not detected: `ok` may then be True although the phase is wrong.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.

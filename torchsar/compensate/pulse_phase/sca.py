@@ -29,10 +29,10 @@ def sca(data: Tensor) -> Estimate:
         `phase_rad` of shape (..., pulse), to be removed. Its standard deviation is the larger of
         that from two halves of the range cells and the distance by which four iterations of the
         entropy fixed point move the phases, because the scene causes the same error in both halves.
-        At a pulse of zeros the phase stays that of the pulse before; the next
-        pulse is paired with the last one that holds samples. `ok` is False unless the image is 1.5
-        times as sharp as autofocus can make pure noise, more than one range cell or a single point
-        makes the sharpness, and the Strehl ratio predicted from the standard deviation exceeds 0.8.
+        At a pulse of zeros the phase stays that of the pulse before; the next pulse is paired with
+        the last one that holds samples. `ok` is False unless the image is 1.5 times as sharp as
+        autofocus can make pure noise, more than one range cell or a single point makes the
+        sharpness, and the Strehl ratio predicted from the standard deviation exceeds 0.8.
         Sharpness is the amount by which the image entropy lies below that of speckle.
 
     Raises:

@@ -169,8 +169,8 @@ def entropy_fixed_point(
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
         start: Phase to start from in rad, shape (..., pulse); by default that of the spatial
-            correlation algorithm (function `sca`). With this
-            default the size of the phase errors has no effect on the result.
+            correlation algorithm (function `sca`). With this default the size of the phase errors
+            has no effect on the result.
         floors: Pairs (floor, largest number of iterations), used one after another. A floor is a
             multiple of the mean power. A trial proceeds to the next pair once its phase steps are
             below `tolerance_rad`.

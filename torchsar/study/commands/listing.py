@@ -69,7 +69,7 @@ def _arguments(target: Callable[..., Any]) -> dict[str, str]:
     found: dict[str, str] = {}
     docs = [getattr(one, "__doc__", None) or "" for one in reversed(getattr(target, "__mro__", (target,)))]
     for names, text in (match for doc in docs for match in _ARGUMENT.findall(inspect.cleandoc(doc))):
-        sentence = re.split(r"(?<=\.)\s+(?=[A-Z])", _plain(text))[0].removesuffix(".")
+        sentence = re.sub(r"(?<!\.)\.$", "", re.split(r"(?<=\.)\s+(?=[A-Z])", _plain(text))[0])
         found.update(dict.fromkeys(names.split(", "), sentence))
     return found
 

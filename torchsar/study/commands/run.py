@@ -185,6 +185,7 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any
         "deviation; arrays.zarr has all numbers",
         "neutral": "methods.NAME.neutral: number of trials in which an estimate is not ok and was not used, by stage "
         "and parameter: the stage got a neutral value, or left the signal unchanged",
+        "in_doubt": "methods.NAME.in_doubt: stages that use estimates even if they are not ok (in_doubt: apply)",
         "ok": "whether all estimates of the method are reliable; its mean is the share of such trials",
         "seconds": "wall time of the chain of the method per trial; shared estimates count in every method",
         "targets_outside": "named targets outside the image, or never in the beam; a case has their number",
@@ -223,6 +224,11 @@ def _method_tree(title: str, name: str, results: Mapping[str, Result]) -> dict[s
         "seconds_by_stage": dict(first.seconds),
         "failed": "; ".join(key_of(case, o.failed) for case, o in outcomes.items() if o.failed),
         "neutral": {key_of(c, key): n for c, r in results.items() for key, n in r.neutral[name].items() if n},
+        "in_doubt": [
+            stage
+            for stage, doubt in results[next(iter(results))].bench.chains[name].in_doubt.items()
+            if doubt == "apply"
+        ],
     }
 
 

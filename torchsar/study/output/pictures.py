@@ -95,9 +95,9 @@ def comparisons(results: Mapping[str, Any], columns: Mapping[str, Any], without:
         log = len(known) > 0 and known.min() > 0 and (column.drawn == "rms" or known.max() > _DECADES * known.min())
         label = f"{column.label} ({column.unit})" if column.unit else column.label
         statistic = "Root mean square" if column.drawn == "rms" else "Mean"
-        part = {"title": "", "x": x, "series": drawn, "bounds": {}}
-        figures = plot.error_curves([part], "", label, log_y=log)
-        yield key, column.label, f"{statistic} over trials of the {label}, by method.", figures
+        figures = plot.error_curves([{"title": "", "x": x, "series": drawn, "bounds": {}}], "", label, log_y=log)
+        by = f"of the method '{names[0]}'" if len(names) == 1 else "by method"
+        yield key, column.label, f"{statistic} over trials of the {label}, {by}.", figures
 
 
 def first_named(images: Mapping[str, Signal], name: str = "ideal") -> dict[str, Signal]:
