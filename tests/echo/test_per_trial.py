@@ -60,13 +60,16 @@ from torchsar.scene import (
     Bend,
     BistaticWorld,
     CalibrationFibre,
+    CircularPath,
     Dechirped,
     Dwell,
     EverySample,
     Extremes,
     Fleet,
+    Flight,
     GroundMovers,
     ImageReflectivity,
+    Jitter,
     KSea,
     LadarWorld,
     LetterE,
@@ -75,6 +78,8 @@ from torchsar.scene import (
     MeasuredTrack,
     Movers,
     MovingPoints,
+    Navigation,
+    Offset,
     OrbitTransmit,
     PathFluctuation,
     Pattern,
@@ -84,6 +89,7 @@ from torchsar.scene import (
     PolynomialTransmit,
     QuadraticInSweep,
     RandomPoints,
+    RandomWalk,
     RangeHistory,
     RetroAndBrokenLine,
     Satellite,
@@ -93,7 +99,9 @@ from torchsar.scene import (
     Speckle,
     SpreadRows,
     StartPhase,
+    StraightPath,
     StripmapWorld,
+    Sway,
     Tones,
     TurntableWorld,
     VibrationSpectrum,
@@ -256,6 +264,18 @@ def impairment_before_others(tested: Any, draws: Draws) -> Outputs:
 
 def echo_of_movers(movers: Any, draws: Draws) -> Outputs:
     return {"data": bistatic_echo(movers, RECEIVER, 10, 24, gate=Pattern(), dtype=DOUBLE)}
+
+
+PULSES_S = torch.arange(40, dtype=torch.float64) / 100
+STRAIGHT = StraightPath((0.0, -50.0, 30.0), (3.0, 0.0, 0.0))
+
+
+def motion_of_a_flight(motion: Any, draws: Draws) -> Outputs:
+    return {"position_m": Flight(STRAIGHT, Sway(y=(motion,))).position_m(draws, PULSES_S)}
+
+
+def navigation(kind: Any, draws: Draws) -> Outputs:
+    return {"recorded_m": kind.recorded_m(draws, PULSES_S, STRAIGHT.position_m(PULSES_S))}
 
 
 def echo_of_a_bend(bend: Any, draws: Draws) -> Outputs:
@@ -628,6 +648,10 @@ CASES = (
     Case(WhitePhase, {}, {"limit_rad": (0.0, 1.0, 3.0)}, (impairment,)),
     Case(PhaseWalk, {}, {"step_rad": (0.0, 0.1, 3.0)}, (impairment,)),
     Case(PhaseSinusoid, {}, {"amplitude_rad": (0.0, 1.0, 30.0), "cycles": (0.0, 2.5, 7.0)}, (impairment,)),
+    Case(Offset, {}, {"metres": (-0.5, 0.0, 2.0)}, (motion_of_a_flight,)),
+    Case(Jitter, {"step_s": 0.03}, {"rms_m": (0.0, 1e-3, 0.2)}, (motion_of_a_flight,)),
+    Case(RandomWalk, {"step_s": 0.03}, {"m_per_root_s": (0.0, 1e-3, 0.2)}, (motion_of_a_flight,)),
+    Case(Navigation, {}, {"latency_s": (-0.02, 0.0, 0.035), "step_m": (0.0, 0.01, 0.5)}, (navigation,)),
 )
 
 # impairments that a config names by factories
@@ -693,6 +717,13 @@ NOT_PER_TRIAL = {
     (Extremes, "jerk_m_s3"): "the reach of a whole batch",
     (Extremes, "displacement_m"): "the reach of a whole batch",
     (RangeHistory, "start_s"): "start of the slow-time axis, which all trials share",
+    **{(StraightPath, name): "the nominal path, which all trials share" for name in ("start_m", "velocity_m_s")},
+    **{
+        (CircularPath, name): "the nominal path, which all trials share"
+        for name in ("radius_m", "height_m", "start_rad", "rate_rad_s")
+    },
+    (Jitter, "step_s"): "decides how many numbers are drawn",
+    (RandomWalk, "step_s"): "decides how many numbers are drawn",
 }
 
 

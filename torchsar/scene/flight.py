@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchsar.core import Draws, UniformSpline, per_trial
 from torchsar.scene.fluctuation import MeasuredTrack, RandomMotion, drawn_motion
-from torchsar.scene.trials import refuse_unless_finite
+from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite
 from torchsar.scene.vibration import Motion, displacement_m
 
 
@@ -233,7 +233,11 @@ class Sway:
 
         Returns:
             Displacement in metres, shape (*trials, pulse, 3), float64.
+
+        Raises:
+            ValueError: If a motion has another number of trials than the draws.
         """
+        refuse_other_trials(self, draws)
         span_s = float(time_s[-1] - time_s[0])
         axes = [
             displacement_m(drawn_motion(motion, draws.part(axis), span_s), time_s)
@@ -263,6 +267,9 @@ class Flight:
 
         Returns:
             Positions in metres, shape (*trials, pulse, 3), float64.
+
+        Raises:
+            ValueError: If a motion has another number of trials than the draws.
         """
         return self.nominal.position_m(time_s) + self.motion.displacement_m(draws.part("motion"), time_s)
 
@@ -301,7 +308,11 @@ class Navigation:
 
         Returns:
             Recorded positions in metres, shape (*trials, pulse, 3), float64.
+
+        Raises:
+            ValueError: If a number has another number of trials than the draws.
         """
+        refuse_other_trials(self, draws)
         if bool((torch.as_tensor(self.latency_s) != 0).any()):
             position_m = _at(time_s, position_m, time_s - per_trial(self.latency_s, 1, time_s))
         recorded = position_m + self.error.displacement_m(draws.part("navigation"), time_s)
