@@ -64,9 +64,6 @@ OTHER = {
 
 # Cells of the recorded audit that miss a bar, as (estimator, world, SNR), by the reason.
 LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
-    "the leakage of the taper counts as noise; the errors are 4e-4 rad": [
-        ("multichannel.EstimateBalance", "own", 60.0),
-    ],
     "the spectra of sparse scenes adapt to phase errors, which neither the bound nor the scatter of the "
     "range cells shows: `ok` is False where a sparse description is more likely": [
         *(("compensate.LinkPhases", "own", snr_db) for snr_db in (20.0, 60.0)),

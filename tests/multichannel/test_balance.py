@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from tests.multichannel.helpers import published_radar
+from tests.multichannel.helpers import compressed_echo, published_radar
 from torchsar.core import Signal
 from torchsar.multichannel import (
     CorrectBalance,
@@ -110,6 +110,67 @@ def test_spread_equals_the_predicted_std():
         seen / found.std["phase_rad"].mean(0)[[0, 2]], torch.ones(2, dtype=torch.float64), atol=0.5, rtol=0
     )
     assert float(found.info["snr_db"].mean()) == pytest.approx(30 - 3, abs=3.5)
+
+
+@pytest.mark.parametrize(
+    "prf, power, snr_db, largest",
+    [
+        (180.0, flat, 60.0, (1.5e-4, 1.5e-3)),
+        (160.0, flat, 40.0, (5e-4, 5e-3)),
+        (180.0, lambda f: (f.abs() < 30).to(torch.float64), 20.0, (2e-3, 0.02)),
+        (180.0, lambda f: ((f > -150) & (f < 40)).to(torch.float64), 40.0, (2e-3, 0.02)),
+        (180.0, lambda f: torch.sinc(1.6 * f / 300) ** 4, 40.0, (1.5e-3, 0.015)),
+    ],
+    ids=["strong", "edge of the band", "narrow", "one side", "side lobes"],
+)
+def test_deviations_of_clutter_unlike_the_prior(prf, power, snr_db, largest):
+    """Deviations were 1.4 times too large, 3 times too small or infinite.
+
+    Of strong clutter, unequal responses of neighbouring frequencies counted as noise; at the edge
+    of the band, leakage biased the gains; delays of narrow clutter erred by 1 ns, clutter on one
+    side of the band led to a wrong maximum, and side lobes biased the gains by 0.08 dB.
+    """
+    radar = published_radar(prf_hz=prf)
+    data = differed(clutter(radar, power, snr_db, trials=12, n_range=60, seed=8), radar)
+    found = estimate_balance(data, radar, FlatBand(2 * prf), 2)
+    assert bool(found.ok.all())
+    for name, true, most in (
+        ("phase_rad", PHASE, largest[0]),
+        ("gain_db", GAIN, largest[1]),
+        ("delay_s", DELAY, 2e-10),
+    ):
+        seen, std = ((x)[:, ::2].square().mean().sqrt() for x in (found[name] - true, found.std[name]))
+        assert float(seen) < most and 0.6 < float(seen / std) < 1.7, (name, float(seen), float(std))
+
+
+def test_a_moving_point_and_few_points():
+    """A moving point that holds most of the power was balanced away, with a small deviation."""
+    radar = published_radar()
+    n_range = 72
+    moving = compressed_echo(radar, N, n_range, [{"u_r": 8.0, "amplitude": 60.0}]).data
+    data = differed(torch.stack([moving, 0 * moving]) + clutter(radar, flat, 20.0, n_range=n_range), radar)
+    assert estimate_balance(data, radar, FlatBand(360.0), 2).ok.tolist() == [False, True]
+    points = [{"y0": 60.0 * (k % 7) - 180, "r0": 4860.0 + 35 * k, "amplitude": 1.0 + k % 3} for k in range(8)]
+    still = compressed_echo(radar, N, n_range, points).data
+    noise = torch.randn(6, *still.shape, dtype=still.dtype, generator=torch.Generator().manual_seed(4))
+    found = estimate_balance(differed(still + 0.01 * noise, radar), radar, FlatBand(360.0), 2)
+    assert bool(found.ok.all())
+    for name, true in (("phase_rad", PHASE), ("gain_db", GAIN), ("delay_s", DELAY)):
+        error, std = (found[name] - true)[:, ::2], found.std[name][:, ::2]
+        assert 0.5 < float(error.square().mean().sqrt() / std.square().mean().sqrt()) < 1.8, name
+
+
+def test_clutter_in_one_of_two_bands_is_not_ok():
+    """It could as well lie in the other band, with a phase that grows along the array."""
+    radar = published_radar()
+    data = clutter(radar, lambda f: ((f > 20) & (f < 160)).to(torch.float64), 20.0, n_range=60)
+    assert not bool(estimate_balance(data, radar, FlatBand(360.0), 2).ok.any())
+
+
+def test_a_wrong_pattern_is_not_ok():
+    """Its gains were wrong by 0.25 dB in all trials and ok."""
+    radar = published_radar(channel_m=(-0.5, 0.0, 0.5))
+    assert not bool(estimate_balance(clutter(radar, flat, 20.0, trials=6, n_range=96), radar).ok.any())
 
 
 def test_stages_remove_the_differences():

@@ -94,6 +94,15 @@ def test_correction_is_the_inverse_and_differentiable():
     )
 
 
+@pytest.mark.parametrize("lines", [64, 10])
+def test_gradients_of_an_estimate_are_finite(lines):
+    """Those of the standard deviation of channel 0, which has no error, were not a number."""
+    x = unbalanced(scene(lines, 16), (1, 1.2), (0, 60)).requires_grad_()
+    estimate = estimate_imbalance(x)
+    total = sum(v.sum() for v in (*estimate.value.values(), *estimate.std.values()))
+    assert bool(torch.autograd.grad(total, x)[0].isfinite().all())
+
+
 def test_too_few_lines_raise():
     with pytest.raises(ValueError, match="more than twice as many lines as channels, got 2 channels and 4 lines"):
         estimate_imbalance(torch.zeros(4, 8, dtype=torch.complex64))

@@ -236,7 +236,7 @@ def _assess(x: Tensor, lag: Tensor, phase: Tensor, log_power: Tensor, blocks: _S
     noise = (_noise(x, channels) / x.abs().square().mean((-2, -1)).clamp_min(1e-300)[..., None]).clamp_max(0.99)
     # an error of the noise level brings the powers of the channels closer together or farther apart
     bias = torch.where(noise > 0, _LOWEST / math.sqrt(_looks(x, channels)) * noise / (1 - noise), _WEAK_NOISE)
-    gain_std = torch.hypot(gain_std, gain * log_power.abs() / 2 * bias)
+    gain_std = _root(gain_std.square() + (gain * log_power / 2 * bias).square())
     clear = (coherence > 5 / math.sqrt(looks)) & ((noise > 0).all(-1) | (coherence > _LEAST_COHERENCE))
     ok = (
         torch.isfinite(gain).all(-1)
@@ -254,7 +254,12 @@ def _assess(x: Tensor, lag: Tensor, phase: Tensor, log_power: Tensor, blocks: _S
 def _jackknife(values: Tensor) -> Tensor:
     """Standard deviation (..., channel) from values without one block, (..., block, channel)."""
     blocks = values.shape[-2]
-    return ((values - values.mean(-2, keepdim=True)).square().sum(-2) * ((blocks - 1) / blocks)).sqrt()
+    return _root((values - values.mean(-2, keepdim=True)).square().sum(-2) * ((blocks - 1) / blocks))
+
+
+def _root(square: Tensor) -> Tensor:
+    """Square root whose gradient is zero at zero, as for channel 0, which has no error."""
+    return torch.where(square > 0, square.clamp_min(torch.finfo(square.dtype).tiny).sqrt(), 0)
 
 
 def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
