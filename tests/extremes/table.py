@@ -843,6 +843,14 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
     "core.settle": (core.settle, {"value": ONES, "fallback": 0.0}),
     "core.level_of": (core.level_of, {"x": torch.ones(4, 4)}),
     "core.unit_level": (core.unit_level, {"x": torch.ones(4, 4)}),
+    "radar.geocentric": (
+        radar.geocentric,
+        {"latitude_deg": 48.0 * ONES, "longitude_deg": 11.0 * ONES, "height_m": 500.0 * ONES},
+    ),
+    "radar.resample_path": (
+        lambda **given: radar.resample_path(torch.arange(9, dtype=F64), pulse_time_s=0.5 + ramp(4, 2.0), **given),
+        {"position_m": torch.ones(9, 3, dtype=F64), "longest_gap_s": 2.0, "jump_m": 1.0},
+    ),
     "radar.plane_wave_loss": (
         radar.plane_wave_loss,
         {"radius_m": 2.0, "range_m": 900.0, "aperture_rad": 0.1, "wavelength_m": 0.03, "elevation_rad": 0.2},
