@@ -19,6 +19,7 @@ from torchsar.focus.matched_fourier import (
 )
 from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
 from torchsar.focus.omega_k import OmegaK, StoredOmegaK, omega_k
+from torchsar.focus.path_image import DirectImage, PathImage, TileImage
 from torchsar.focus.polar import PolarFormat, PolarOperator
 from torchsar.focus.range_doppler import RangeDoppler, range_doppler
 from torchsar.focus.reference import RangeCompress, flat_reference, matched_reference, phase_reference, range_compress
@@ -57,6 +58,7 @@ __all__ = [
     "CrossRangeLines",
     "DerampAzimuth",
     "Detect",
+    "DirectImage",
     "DopplerBand",
     "DopplerLines",
     "EveryPulse",
@@ -73,6 +75,7 @@ __all__ = [
     "OmegaK",
     "OmegaKStolt",
     "PaddedLines",
+    "PathImage",
     "PolarFormat",
     "PolarOperator",
     "QuickLook",
@@ -85,6 +88,7 @@ __all__ = [
     "StoredOmegaK",
     "StripPlan",
     "TargetImage",
+    "TileImage",
     "TilePlan",
     "amplitude",
     "azimuth_matched_filter",

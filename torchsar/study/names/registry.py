@@ -210,6 +210,8 @@ FOCUS: dict[str, Callable[..., Any]] = {
     "range_doppler": focus.RangeDoppler,
     "backproject": focus.Backproject,
     "closest_range": focus.ClosestRange,
+    "tile_image": focus.TileImage,
+    "direct_image": focus.DirectImage,
     "compress_dechirped": focus.CompressDechirped,
     "azimuth_transform": focus.AzimuthTransform,
     "target_image": focus.TargetImage,
