@@ -745,6 +745,7 @@ REASONS = {
     "scene.start_phase_rad": "draws phases of effects, whose classes check them",
     "echo.apply_impairments": "applies impairments, whose classes check them; tests/echo",
     "echo.bistatic_echo": "the echo of simulate_bistatic, which is in the table",
+    "echo.path_echo": "the echo of simulate_path, which is in the table",
     "echo.calibration_channel": "made of a fibre, whose class checks it; tests/repair/test_triangle_calibrate.py",
     "echo.dechirped_echo": "the echo of simulate_turntable with a pulse length; tests/focus/test_dechirped.py",
     "echo.ladar_echo": "the echo of simulate_ladar, which is in the table",
@@ -828,6 +829,14 @@ def _moving(f: Callable, **more: Any) -> Callable:
     )
 
 
+def any_path(range_m: float, wavelength_m: float) -> Any:
+    """One point seen from a straight path at this range and wavelength."""
+    seen = replace(TURNTABLE, carrier_hz=_carrier_hz(wavelength_m))
+    flight = scene.Flight(scene.StraightPath((-range_m, 0.0, 0.0), (0.0, 50.0, 0.0)))
+    world = scene.PathWorld(scene.Points([1.0], [2.0]), flight)
+    return echo.simulate_path(seen, world, 8, 16, Draws(1))[0].signal
+
+
 MOTION = {"u_r_m_s": 3.0, "u_a_m_s": 2.0, "y0_m": 5.0, "range_m": 5000.0}
 FAR = {"range_m": 4000.0, "wavelength_m": 0.03}
 # functions of numbers: the function, and arguments of which each in turn is made extreme
@@ -868,6 +877,7 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
     "echo.simulate": (stripmap, FAR),
     "echo.simulate_turntable": (turntable, FAR),
     "echo.simulate_bistatic": (bistatic, FAR),
+    "echo.simulate_path": (any_path, FAR),
     "echo.simulate_ladar": (ladar(echo.simulate_ladar), {"range_m": 3000.0, "wavelength_m": 1.55e-6}),
     "echo.simulate_ladar_record": (ladar(echo.simulate_ladar_record), {"range_m": 3000.0, "wavelength_m": 1.55e-6}),
     "echo.smooth_response": (

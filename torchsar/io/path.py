@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +58,8 @@ def read_path(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recordi
     fields = archive(path, "phase history")
     if "fp" in fields:
         recording = read_inverse(path, dtype)
-        aux = recording.aux
-        antennas = AntennaPath(aux["position_m"], None, 2 * aux["reference_m"])
-        return Recording(recording.signal, recording.radar, {**aux, **antennas.side_data()})
+        antennas = AntennaPath(recording.aux["position_m"], None, 2 * recording.aux["reference_m"])
+        return replace(recording, aux={**recording.aux, **antennas.side_data()})
     refuse_missing(fields, _REQUIRED, "an archive with the history of any path")
     samples = fields["history"]
     if samples.dtype.kind != "c" or len(samples.shape) != 2 or min(samples.shape) < 2:
