@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,8 @@ from torchsar.core import Signal, level_of, unit_level
 
 # quantities that sharpness is defined for, with their power of the modulus |I|
 _OF = {"intensity": 2, "amplitude": 1}
+# chosen: Newton steps along both axes that refine a shift between two images
+_REFINED = 6
 # precision in which images of half precision are evaluated
 _WORKING = {torch.float16: torch.float32, torch.bfloat16: torch.float32, torch.complex32: torch.complex64}
 
@@ -233,6 +237,61 @@ def error_after_gain_db(images: Tensor, references: Tensor) -> Tensor:
     energy = (a.real.square() + a.imag.square()).sum(dtype=torch.float64)
     gain = (a.conj() * b).sum(dtype=torch.complex128) / torch.where(energy == 0, 1, energy)
     return error_db(a * gain.to(a.dtype), b)
+
+
+def error_after_shift_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
+    """Compute the relative error of an image after a shift and a complex gain, of each trial.
+
+    What autofocus cannot observe of a path shifts the image and changes its phase. The circular
+    shift, a fraction of a sample included, is that of the largest correlation with the reference.
+
+    Args:
+        image: Image I, shape (..., azimuth, range), complex, or a Signal.
+        reference: Image I0, same size.
+
+    Returns:
+        Error |gain shift(I) - I0|^2 / |I0|^2 in dB, shape (...,), float64; 0 dB where the images
+        have nothing in common.
+
+    Raises:
+        TypeError: If one of them is not a tensor of numbers.
+        ValueError: If they are not complex images of equal size.
+    """
+    a, b = (unit_level(x).to(torch.complex128) for x in _pair(image, reference))
+    spectrum, known = (torch.fft.fft2(x) for x in (a, b))
+    cross = spectrum.conj() * known
+    size = cross.shape[-2:]
+    peak = torch.fft.ifft2(cross).abs().flatten(-2).argmax(-1)
+    shift = [peak // size[1], peak % size[1]]
+    shift = [
+        torch.where(at > n // 2, at - n, at).to(torch.float64)[..., None, None]
+        for at, n in zip(shift, size, strict=True)
+    ]
+    turns = [_turns(known, dim) for dim in (-2, -1)]
+    for _ in range(_REFINED):
+        # Newton's method for the power of the correlation, along one axis after the other
+        for dim, f in enumerate(turns):
+            z = cross * torch.exp(2j * math.pi * (turns[0] * shift[0] + turns[1] * shift[1]))
+            w = 2 * math.pi * f
+            s0, s1, s2 = (x.sum((-2, -1), keepdim=True) for x in (z, 1j * w * z, -w.square() * z))
+            slope = 2 * (s1 * s0.conj()).real
+            bend = 2 * (s1.abs().square() + (s2 * s0.conj()).real)
+            step = torch.where(bend < 0, -slope / torch.where(bend < 0, bend, -1), 0)
+            shift[dim] = shift[dim] + step.clamp(-0.5, 0.5)
+    moved = spectrum * torch.exp(-2j * math.pi * (turns[0] * shift[0] + turns[1] * shift[1]))
+    energy = moved.abs().square().sum((-2, -1), keepdim=True)
+    gain = (moved.conj() * known).sum((-2, -1), keepdim=True) / torch.where(energy == 0, 1, energy)
+    return error_db(gain * moved, known)
+
+
+def _turns(spectrum: Tensor, dim: int) -> Tensor:
+    """Frequencies of a spectrum in turns per sample, within half a turn of its circular middle."""
+    n, other = spectrum.shape[dim], -3 - dim
+    f = torch.fft.fftfreq(n, dtype=torch.float64, device=spectrum.device)
+    power = spectrum.abs().square().sum(other)
+    middle = torch.angle((power * torch.exp(2j * math.pi * f)).sum(-1, keepdim=True)) / (2 * math.pi)
+    off = f - middle
+    return (off - torch.round(off)).unsqueeze(other)
 
 
 def rolled_to(image: Signal, reference: Signal) -> Signal:
