@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchsar.core import Chain, Draws, use
-from torchsar.echo import path_echo, simulate_path
+from torchsar.core import Chain, Draws, Recording, use
+from torchsar.echo import PathError, path_echo, simulate_path
 from torchsar.focus import DirectImage, TileImage
 from torchsar.metrics import error_db
 from torchsar.radar import LIGHT_M_S, AntennaPath, InverseRadar, frequency_samples
@@ -59,10 +59,11 @@ def test_equals_direct_sums(receiver: Flight | None) -> None:
     world = PathWorld(POINTS, transmitter, receiver, off, off, PlaneGround(2.0, 0.1, -0.05))
     recording, truth = simulate_path(RADAR, world, N_PULSE, N_RANGE, Draws(0), dtype=torch.complex128)
     names = ["transmitter_m"] if receiver is None else ["transmitter_m", "receiver_m"]
+    true = [truth.values[f"true_{name}"].numpy() for name in names]
     x, y = truth.values["range_m"], truth.values["azimuth_m"]
     points = torch.stack([x, y, 2 + 0.1 * x - 0.05 * y], -1).numpy()
-    places = ([side[name].numpy() for name in names] for side in (truth.values, recording.aux))
-    known = torch.from_numpy(direct(*places, points, truth.values["amplitude"].numpy()))
+    recorded = [recording.aux[name].numpy() for name in names]
+    known = torch.from_numpy(direct(true, recorded, points, truth.values["amplitude"].numpy()))
     history = frequency_samples(recording.signal.data)
     assert float(error_db(history, known)) < -150
     single = simulate_path(RADAR, world, N_PULSE, N_RANGE, Draws(0))[0].signal.data
@@ -75,7 +76,7 @@ def test_clean_recordings_have_the_true_path_and_focus() -> None:
     world = PathWorld(POINTS, AIRCRAFT, navigation=noisy)
     recording, truth = simulate_path(RADAR, world, N_PULSE, N_RANGE, Draws(1, trials=range(3)))
     assert truth.clean is not None and torch.equal(recording.signal.data, truth.clean.signal.data)
-    true, recorded = truth.values["transmitter_m"], recording.aux["transmitter_m"]
+    true, recorded = truth.values["true_transmitter_m"], recording.aux["transmitter_m"]
     assert torch.equal(truth.clean.aux["transmitter_m"], true) and recorded.shape == (3, N_PULSE, 3)
     off = torch.linalg.vector_norm(recorded, dim=-1) - torch.linalg.vector_norm(true, dim=-1)
     torch.testing.assert_close(truth.values["line_of_sight_m"], off)
@@ -84,6 +85,33 @@ def test_clean_recordings_have_the_true_path_and_focus() -> None:
     for trial in image.data:
         i, j = divmod(int(trial.abs().argmax()), 81)
         assert (float(image.axes[0].values()[i]), float(image.axes[1].values()[j])) == (0.0, -12.0)
+
+
+def test_errors_of_the_path_join_a_recording() -> None:
+    world = PathWorld(POINTS, FIXED, DRONE)
+    error = PathError(Sway(x=[Offset(0.1)]), Sway(y=[RandomWalk(torch.tensor([0.0, 0.1], dtype=F64), 0.01)]))
+    draws = Draws(1, trials=range(2))
+    recording, truth = simulate_path(RADAR, world, N_PULSE, N_RANGE, draws, {"path": error})
+    assert truth.clean is not None
+    off = recording.aux["transmitter_m"] - truth.clean.aux["transmitter_m"]
+    torch.testing.assert_close(off, torch.tensor([0.1, 0.0, 0.0], dtype=F64).expand(N_PULSE, 3))
+    walk = recording.aux["receiver_m"] - truth.clean.aux["receiver_m"]
+    assert float(walk[0].abs().max()) == 0 < float(walk[1, :, 1].abs().max()) and float(walk[..., 0].abs().max()) == 0
+    names = ("transmitter_m", "receiver_m")
+    after, before = (
+        sum(torch.linalg.vector_norm(side.aux[name], dim=-1) for name in names) / 2 for side in (recording, truth.clean)
+    )
+    torch.testing.assert_close(truth.values["path.line_of_sight_m"], after - before, rtol=0, atol=1e-9)
+    # reference and samples change together: the echoes are those of the new reference
+    quiet, _ = simulate_path(RADAR, world, N_PULSE, N_RANGE, draws)
+    antennas = AntennaPath(quiet.aux["transmitter_m"], quiet.aux["receiver_m"], recording.aux["path_reference_m"])
+    drawn = POINTS.scatterers(draws)
+    points = torch.stack([drawn.range_m, drawn.azimuth_m, torch.zeros(3, dtype=F64)], -1)
+    known = path_echo(antennas, points, drawn.amplitude[..., None, :], RADAR, N_RANGE)
+    assert float(error_db(frequency_samples(recording.signal.data), known).max()) < -100
+    bare = Recording(recording.signal, RADAR)
+    with pytest.raises(ValueError, match="need recorded positions"):
+        error(bare, draws)
 
 
 def test_snr_is_that_of_lit_pulses_and_noise_has_its_address() -> None:
@@ -113,6 +141,17 @@ def test_the_beam_lights_targets_for_its_width() -> None:
         assert float(lit.mean()) == pytest.approx(middle, abs=1) and len(lit) == pytest.approx(79, abs=2)
 
 
+def test_a_strip_has_a_constant_window_and_records_what_it_holds() -> None:
+    radar, flight = InverseRadar(9.6e9, 300e6, 10.0), Flight(StraightPath((-400.0, -300.0, 300.0), (0.0, 60.0, 0.0)))
+    world = PathWorld(Points([-200.0, 200.0], [0.0, 0.0]), flight, beam=SideBeam(10.0), window_range_m=500.0)
+    recording, _ = simulate_path(radar, world, 100, N_RANGE, Draws(0))
+    assert bool((recording.aux["path_reference_m"] == 1000.0).all())
+    power = recording.signal.data.abs().square().sum(-1)
+    # beyond 520 m, 143 m along the path, nothing is recorded
+    middle = -300 + 6 * torch.arange(100, dtype=F64)
+    assert bool((power[(middle.abs() < 57)] == 0).all()) and bool((power[(middle.abs() - 200).abs() < 140] > 0).all())
+
+
 def test_heights_of_the_ground() -> None:
     level = torch.tensor([[0.0, 2.0, 4.0], [10.0, 12.0, 14.0]], dtype=F64)
     ground = GridGround(level, 0.0, -5.0, 5.0)
@@ -138,7 +177,10 @@ def test_gradients_in_positions_and_amplitudes() -> None:
 @pytest.mark.parametrize(
     ("world", "match"),
     [
-        (lambda: PathWorld(Points([0.0], [40.0]), AIRCRAFT), "must stay within 19.99 m of range .* reaches 33"),
+        (
+            lambda: PathWorld(Points([0.0], [40.0]), AIRCRAFT),
+            "lit scene must stay within 19.99 m of range .* reaches 33",
+        ),
         (lambda: PathWorld(POINTS, FIXED, beam=SideBeam(5.0)), "an antenna that moves horizontally"),
         (lambda: PathWorld(POINTS, AIRCRAFT, snr_db=math.nan), "snr_db must be a finite number"),
         (lambda: PathWorld(POINTS, AIRCRAFT, snr_db=torch.zeros(2)), "one for each of the 3 trials"),

@@ -33,7 +33,7 @@ def values(**changes: torch.Tensor) -> dict[str, torch.Tensor | None]:
     return {**known, **changes}
 
 
-@pytest.mark.parametrize("window", ["none", "hann"])
+@pytest.mark.parametrize("window", ["none", "hann", "range"])
 def test_tiles_equal_the_direct_sum_on_noise(window: str) -> None:
     numbers = (12.0, 8.0, STEP_M, (3.0, -2.0), 0.3)
     tiles, exact = (

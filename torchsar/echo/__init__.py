@@ -15,7 +15,7 @@ from torchsar.echo.ladar import ladar_echo, range_model_error_db, simulate_ladar
 from torchsar.echo.ladar_record import ladar_record, simulate_ladar_record
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.echo.pairs import SimulatedPairs
-from torchsar.echo.path import path_echo, simulate_path
+from torchsar.echo.path import PathError, path_echo, simulate_path
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
 from torchsar.echo.response import ChannelResponse, smooth_response
 from torchsar.echo.sea import sea_echo
@@ -32,6 +32,7 @@ __all__ = [
     "LostGaps",
     "LostLines",
     "LostPulses",
+    "PathError",
     "PeriodicJitter",
     "PhaseSinusoid",
     "PhaseWalk",

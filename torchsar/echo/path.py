@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Signal, Truth, per_trial
+from torchsar.core import Draws, Recording, Signal, Truth, per_trial, unit_phasor
 from torchsar.echo.pulsed import echo_spectrum
 from torchsar.echo.stripmap import Impairment, apply_impairments
-from torchsar.radar import AntennaPath, InverseRadar, range_profiles
-from torchsar.scene import PathWorld
+from torchsar.radar import AntennaPath, InverseRadar, frequency_samples, range_profiles
+from torchsar.scene import PathWorld, Sway
 from torchsar.scene.trials import refuse_other_trials
 
 # bytes of the tables of a block of pulses, about the cache of a processor
@@ -98,8 +98,8 @@ def simulate_path(
         `frequency_hz` and those of `AntennaPath.side_data`, with the positions that navigation
         records. The values of the truth are:
 
-        - `transmitter_m`, shape (..., pulse, 3), and `receiver_m` unless both share an antenna: the
-          true positions;
+        - `true_transmitter_m`, shape (..., pulse, 3), and `true_receiver_m` unless both share an
+          antenna: the true positions;
         - `line_of_sight_m`, shape (..., pulse): half the path over the point (0, 0, 0), recorded
           minus true;
         - `azimuth_m`, `range_m`, `height_m` and `amplitude` of the scatterers, shape (..., target);
@@ -110,8 +110,9 @@ def simulate_path(
         impairments.
 
     Raises:
-        ValueError: If the scene is empty, a scatterer leaves the range window, there are fewer than
-            two pulses, or a parameter given per trial has another length than the number of trials.
+        ValueError: If the scene is empty, a scatterer leaves the range window while it is lit,
+            there are fewer than two pulses, or a parameter given per trial has another length than
+            the number of trials.
     """
     refuse_other_trials(world, draws)
     if n_pulse < 2 or n_range < 2:
@@ -123,8 +124,8 @@ def simulate_path(
     if not x.shape[-1]:
         raise ValueError("the scene holds no scatterer; give it at least one")
     points = torch.stack(torch.broadcast_tensors(x, y, world.ground.height_m(x, y)), -1)
-    _refuse_outside(flown.true, points, radar, n_range)
     gain = _gain(world, flown.true, points, time_s)
+    gain = gain * _within(flown.true, points, gain, radar, n_range)
     history = path_echo(flown.true, points, amplitude[..., None, :] * gain, radar, n_range, dtype)
     std = torch.zeros((), dtype=torch.float64, device=device)
     if world.snr_db is not None:
@@ -174,16 +175,77 @@ class _Flown:
             path = flight.drawn(draws.part(name), span_s)
             true.append(path.position_m(time_s))
             recorded.append(navigation.recorded_m(draws.part(name), time_s, path))
-        legs = [torch.linalg.vector_norm(place, dim=-1) for place in recorded]
-        reference = 2 * legs[0] if len(legs) == 1 else legs[0] + legs[1]
+        if world.window_range_m is None:
+            legs = [torch.linalg.vector_norm(place, dim=-1) for place in recorded]
+            reference = 2 * legs[0] if len(legs) == 1 else legs[0] + legs[1]
+        else:
+            reference = torch.full_like(time_s, 2 * world.window_range_m)
         return _Flown(*(AntennaPath(p[0], p[1] if len(p) > 1 else None, reference) for p in (true, recorded)))
 
     def truth(self) -> dict[str, Tensor]:
         """True positions and the error of the line of sight."""
-        names = ("transmitter_m", "receiver_m")
-        centre = self.true.transmitter_m.new_zeros(1, 3)
-        off = (self.recorded.path_m(centre) - self.true.path_m(centre))[..., 0] / 2
-        return {**dict(zip(names, self.true.places, strict=False)), "line_of_sight_m": off}
+        names = ("true_transmitter_m", "true_receiver_m")
+        values = dict(zip(names, self.true.places, strict=False))
+        return {**values, "line_of_sight_m": _line_of_sight_m(self.recorded, self.true)}
+
+
+def _line_of_sight_m(recorded: AntennaPath, true: AntennaPath) -> Tensor:
+    """Half the path over the point (0, 0, 0), recorded minus true, (..., pulse)."""
+    centre = true.transmitter_m.new_zeros(1, 3)
+    return (recorded.path_m(centre) - true.path_m(centre))[..., 0] / 2
+
+
+@dataclass(frozen=True)
+class PathError:
+    """Impairment: errors of the positions that navigation records.
+
+    It works on simulated and on recorded data with the side data of `AntennaPath.side_data`. The
+    radar keeps the middle of the scene in its window as navigation says: the reference of the
+    phases changes by the error over the point (0, 0, 0), and the samples with it, so that the
+    error of the line of sight is a phase of the pulses as well.
+
+    Args:
+        transmitter: Errors of the transmitter, or of both antennas if they share one.
+        receiver: Errors of the receiver.
+    """
+
+    transmitter: Sway = field(default_factory=Sway)
+    receiver: Sway = field(default_factory=Sway)
+
+    def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
+        """Add the errors to the recorded positions.
+
+        Args:
+            recording: Recording with the axes (pulse, range); the errors are functions of its slow
+                time since the first pulse.
+            draws: Random draws.
+
+        Returns:
+            The recording with other side data and reference, and `line_of_sight_m`, shape (...,
+            pulse): half the path over the point (0, 0, 0), with the errors minus without.
+
+        Raises:
+            ValueError: If the recording holds no positions of the antennas.
+        """
+        aux = recording.aux
+        if "transmitter_m" not in aux:
+            raise ValueError(f"errors of a path need recorded positions (aux transmitter_m), got {[*aux]}")
+        time_s = recording.signal.axis("pulse").offsets(aux["transmitter_m"].device)
+        span_s = float(time_s[-1])
+        moved = {}
+        for name, error in (("transmitter", self.transmitter), ("receiver", self.receiver)):
+            if f"{name}_m" in aux:
+                moved[name] = aux[f"{name}_m"] + error.drawn(draws.part(name), span_s).displacement_m(time_s)
+        reference = aux["path_reference_m"]
+        before = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), reference)
+        after = AntennaPath(moved["transmitter"], moved.get("receiver"), reference)
+        off = _line_of_sight_m(after, before)
+        after = replace(after, reference_m=reference + 2 * off)
+        turns = 2 * off[..., None] * aux["frequency_hz"] / recording.radar.wave_speed_m_s
+        data = recording.signal.data
+        data = range_profiles(frequency_samples(data) * unit_phasor(turns, data.dtype))
+        changed = replace(recording, signal=recording.signal.with_data(data), aux={**aux, **after.side_data()})
+        return changed, {"line_of_sight_m": off}
 
 
 def _gain(world: PathWorld, antennas: AntennaPath, points: Tensor, time_s: Tensor) -> Tensor:
@@ -210,12 +272,17 @@ def _lit_power(history: Tensor, gain: Tensor) -> Tensor:
     return (power * lit).sum(-1) / lit.sum(-1)
 
 
-def _refuse_outside(antennas: AntennaPath, points: Tensor, radar: InverseRadar, n_range: int) -> None:
-    """Raise ValueError if scatterers leave the range window."""
+def _within(antennas: AntennaPath, points: Tensor, gain: Tensor, radar: InverseRadar, n_range: int) -> Tensor:
+    """Whether the window holds the echo of each scatterer, (..., pulse, point); ValueError if it
+    leaves the window while it is lit.
+    """
     off = antennas.path_m(points[..., None, :, :]).detach() / 2
     half = n_range * radar.range_step_m / 2
-    if not bool((off.abs() <= half).all()):
+    within = off.abs() <= half
+    lost = ~within & (gain.detach() >= _LIT)
+    if bool(lost.any()):
         raise ValueError(
-            f"the scene must stay within {half:.4g} m of range from the middle of the window, but reaches "
-            f"{float(off.abs().max()):.4g} m; choose a smaller scene or more range cells"
+            f"the lit scene must stay within {half:.4g} m of range from the middle of the window, but reaches "
+            f"{float((off.abs() * lost).max()):.4g} m; choose a smaller scene or more range cells"
         )
+    return within

@@ -15,6 +15,9 @@ from torchsar.focus.tiles import TilePlan
 from torchsar.radar.antenna_path import AntennaPath
 from torchsar.radar.spotlight import frequency_samples
 
+# windows over pulses and over frequencies by name, if they differ
+_WINDOWS = {"range": ("none", "hann")}
+
 
 class PathImage(Stage):
     """Base class of the stages that image the ground from range profiles along any path.
@@ -37,7 +40,8 @@ class PathImage(Stage):
         range_axis_rad: Direction of the range axis in rad, from ground coordinate x towards y; the
             azimuth axis is a quarter turn further.
         height_m: Height z of the imaged plane in metres.
-        window: "none" or "hann", over pulses and over frequencies.
+        window: "none"; "hann" over pulses and over frequencies; or "range", Hann over frequencies
+            only, for strips, in which each point is seen by a part of the pulses.
 
     Raises:
         ValueError: If a number is not finite, the spacing is not positive or larger than an extent,
@@ -62,8 +66,9 @@ class PathImage(Stage):
                 f"got azimuth_m={azimuth_m}, range_m={range_m}, step_m={step_m}, centre_m={centre_m}, "
                 f"range_axis_rad={range_axis_rad}, height_m={height_m}"
             )
-        window_weights(window, 1)
-        self.window = window
+        self.windows = _WINDOWS.get(window, (window, window))
+        for name in self.windows:
+            window_weights(name, 1)
         counts = tuple(round(extent / step_m) + 1 for extent in (azimuth_m, range_m))
         starts = [centre - n // 2 * step_m for centre, n in zip(reversed(tuple(centre_m)), counts, strict=True)]
         azimuth, range_ = (
@@ -112,7 +117,7 @@ class PathImage(Stage):
             Image with the axes (azimuth, range) in metres.
         """
         data = signal.data
-        weights = (window_weights(self.window, n, data.device) for n in data.shape[-2:])
+        weights = (window_weights(name, n, data.device) for name, n in zip(self.windows, data.shape[-2:], strict=True))
         rows, columns = (weight.to(real_dtype(data.dtype)) for weight in weights)
         history = frequency_samples(data) * columns * rows[:, None]
         grid = ImageGrid(
@@ -132,7 +137,7 @@ class TileImage(PathImage):
         centre_m: Position of the centre in metres along (range axis, azimuth axis).
         range_axis_rad: Direction of the range axis in rad, from ground coordinate x towards y.
         height_m: Height z of the imaged plane in metres.
-        window: "none" or "hann", over pulses and over frequencies.
+        window: "none", "hann" or "range", see `PathImage`.
         error_db: Largest rms error relative to the image of white noise, in dB.
     """
 

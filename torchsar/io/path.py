@@ -30,12 +30,12 @@ def read_path(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recordi
     - `transmitter_m`: positions (pulse, 3), records of a navigation system (record, 3), or the
       position (3,) of a fixed transmitter.
     - `receiver_m`: likewise; not given if both share an antenna.
-    - `path_reference_m` (pulse,): the path to which phases refer, twice the range if they share an
-      antenna.
+    - `path_reference_m` (pulse,): the path to which phases refer, twice the range if both share an
+      antenna with one position.
     It may also hold these:
     - `pulse_time_s` (pulse,), with `transmitter_time_s` (record,) and `receiver_time_s` (record,)
-      if positions are records: they are interpolated by `resample_path`, which refuses gaps and
-      jumps.
+      if positions are records: `resample_path` interpolates them, and refuses gaps and jumps of
+      the record.
     - `origin_deg_m` (3,): latitude and longitude in degrees and height in metres of the origin of
       local coordinates. Positions are then geocentric (ECEF), and are converted by `LocalFrame`.
     - `prf_hz`; by default that of `pulse_time_s`, or 1, so that slow time counts pulses.

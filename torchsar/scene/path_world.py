@@ -181,8 +181,9 @@ class SideBeam:
 class PathWorld:
     """Scene seen from any path, by one antenna or by a transmitter and a receiver.
 
-    A scatterer lies at x = range, y = azimuth, z = height of the ground. The middle of the recorded
-    window, to which phases refer, is the point (0, 0, 0) as navigation sees it.
+    A scatterer lies at x = range, y = azimuth, z = height of the ground. The middle of the range
+    window, to which phases refer, follows the point (0, 0, 0) as navigation sees it, or has a
+    constant range. Echoes beyond the window are not recorded.
 
     Args:
         scene: Scatterers.
@@ -193,11 +194,13 @@ class PathWorld:
         ground: Height of the ground.
         beam: Beam of the receiver, and of the transmitter if they share an antenna; None if the
             scene is always lit.
+        window_range_m: Constant range of the middle of the window in metres, half the path of a
+            bistatic pair; None to follow the middle of the scene.
         snr_db: Mean power of the samples of lit pulses over the noise variance in decibels, None
             for no noise.
 
     Raises:
-        ValueError: If the SNR is not finite.
+        ValueError: If a number is not finite, or the range is negative.
     """
 
     scene: Scene
@@ -207,7 +210,9 @@ class PathWorld:
     receiver_navigation: Navigation = field(default_factory=Navigation)
     ground: Ground = field(default_factory=PlaneGround)
     beam: SideBeam | None = None
+    window_range_m: float | None = None
     snr_db: Tensor | float | None = None
 
     def __post_init__(self) -> None:
         refuse_unless_finite("snr_db", self.snr_db)
+        refuse_unless_finite("window_range_m", self.window_range_m, 0.0)
