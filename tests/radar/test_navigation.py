@@ -60,9 +60,15 @@ def test_noise_quantisation_and_clean_records_are_accepted(rate_hz: float, n: in
         pulses = time[:-1] + 0.3 / rate_hz * 0.01
         for accepted in (position, torch.round(position * 20) / 20, place(time), torch.round(20 * time[:, None]) / 20):
             resample_path(time, accepted.expand(-1, 3), pulses)
-    made = np.random.default_rng(1)
-    random = torch.tensor(np.sort(made.uniform(0, 50, 500)))
-    resample_path(random, place(random), random[:-1], longest_gap_s=2.0)
+
+
+def test_random_times_and_lost_records_are_no_gaps() -> None:
+    for seed in range(20):
+        made = np.random.default_rng(seed)
+        random = torch.tensor(np.sort(made.uniform(0, 50, 1000)))
+        resample_path(random, place(random), random[:-1])
+        kept = torch.arange(1000, dtype=F64)[torch.tensor(made.random(1000) > 0.3)] / 50
+        resample_path(kept, place(kept), kept[:-1])
 
 
 def spoilt(what: str) -> tuple[Tensor, Tensor]:
