@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.audit import channels, ladars, pulses, repairs, rotations, strips
+from tests.audit import channels, ladars, paths, pulses, repairs, rotations, strips
 from tests.audit.frame import Entry
 
 # Functions that a stage with an entry calls with the same data and settings, and stages whose
@@ -18,6 +18,7 @@ SAME = {
     "compensate.sharpest_phase": "compensate.SharpestPhase",
     "compensate.minimum_entropy": "compensate.SharpestPhase",
     "compensate.autofocus": "compensate.Autofocus",
+    "compensate.path_autofocus": "compensate.PathAutofocus",
     "compensate.phase_polish": "compensate.PhasePolish",
     "compensate.PulseGain": "compensate.pulse_gain",
     "compensate.uneven_rotation": "compensate.UnevenRotation",
@@ -80,7 +81,7 @@ LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
 
 def entries() -> list[Entry]:
     """All entries of the audit."""
-    parts = (strips, pulses, rotations, ladars, channels, repairs)
+    parts = (strips, pulses, paths, rotations, ladars, channels, repairs)
     return [entry for part in parts for entry in part.entries()]
 
 

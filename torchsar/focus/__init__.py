@@ -35,6 +35,7 @@ from torchsar.focus.strip_backprojection import (
     backproject_strip,
 )
 from torchsar.focus.target import TargetImage
+from torchsar.focus.tile_operator import TileOperator
 from torchsar.focus.tiles import TilePlan, image_tiles
 from torchsar.focus.transforms import CompiledNufft, ExplicitSum, Gridding, Resampling
 from torchsar.focus.triangular import (
@@ -89,6 +90,7 @@ __all__ = [
     "StripPlan",
     "TargetImage",
     "TileImage",
+    "TileOperator",
     "TilePlan",
     "amplitude",
     "azimuth_matched_filter",

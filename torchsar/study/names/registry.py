@@ -198,6 +198,7 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "sharpest_phase": compensate.SharpestPhase,
     "link_phases": compensate.LinkPhases,
     "autofocus": compensate.TargetAutofocus,
+    "path_autofocus": compensate.PathAutofocus,
     "pulse_phase_correct": compensate.CorrectPulsePhase,
     "segmented_interference": compensate.SegmentedInterference,
     "mirror_product": compensate.MirrorProduct,
