@@ -49,6 +49,7 @@ from torchsar.echo import (
     simulate_bistatic,
     simulate_ladar,
     simulate_ladar_record,
+    simulate_path,
     simulate_turntable,
     smooth_response,
 )
@@ -60,13 +61,17 @@ from torchsar.scene import (
     Bend,
     BistaticWorld,
     CalibrationFibre,
+    CircularPath,
     Dechirped,
     Dwell,
     EverySample,
     Extremes,
     Fleet,
+    Flight,
+    GridGround,
     GroundMovers,
     ImageReflectivity,
+    Jitter,
     KSea,
     LadarWorld,
     LetterE,
@@ -75,25 +80,33 @@ from torchsar.scene import (
     MeasuredTrack,
     Movers,
     MovingPoints,
+    Navigation,
+    Offset,
     OrbitTransmit,
     PathFluctuation,
+    PathWorld,
     Pattern,
+    PlaneGround,
     Points,
     Polynomial,
     PolynomialRotation,
     PolynomialTransmit,
     QuadraticInSweep,
     RandomPoints,
+    RandomWalk,
     RangeHistory,
     RetroAndBrokenLine,
     Satellite,
     Scatterers,
     Ship,
+    SideBeam,
     Sinusoid,
     Speckle,
     SpreadRows,
     StartPhase,
+    StraightPath,
     StripmapWorld,
+    Sway,
     Tones,
     TurntableWorld,
     VibrationSpectrum,
@@ -256,6 +269,36 @@ def impairment_before_others(tested: Any, draws: Draws) -> Outputs:
 
 def echo_of_movers(movers: Any, draws: Draws) -> Outputs:
     return {"data": bistatic_echo(movers, RECEIVER, 10, 24, gate=Pattern(), dtype=DOUBLE)}
+
+
+PULSES_S = torch.arange(40, dtype=torch.float64) / 100
+STRAIGHT = StraightPath((0.0, -50.0, 30.0), (3.0, 0.0, 0.0))
+
+
+def motion_of_a_flight(motion: Any, draws: Draws) -> Outputs:
+    return {"position_m": Flight(STRAIGHT, Sway(y=(motion,))).drawn(draws, 0.39).position_m(PULSES_S)}
+
+
+def navigation(kind: Any, draws: Draws) -> Outputs:
+    return {"recorded_m": kind.recorded_m(draws, PULSES_S, STRAIGHT)}
+
+
+def echo_along_a_path(draws: Draws, **world: Any) -> Outputs:
+    radar = InverseRadar(9.6e9, 50e6, 100.0)
+    known = {"scene": RandomPoints(4, 10.0, 6.0), "transmitter": Flight(STRAIGHT)}
+    return outputs(simulate_path(radar, PathWorld(**{**known, **world}), 12, 64, draws, dtype=DOUBLE))
+
+
+def ground_of_a_path(ground: Any, draws: Draws) -> Outputs:
+    return echo_along_a_path(draws, ground=ground)
+
+
+def beam_of_a_path(beam: Any, draws: Draws) -> Outputs:
+    return echo_along_a_path(draws, beam=beam)
+
+
+def path_world(world: Any, draws: Draws) -> Outputs:
+    return outputs(simulate_path(InverseRadar(9.6e9, 50e6, 100.0), world, 12, 64, draws, dtype=DOUBLE))
 
 
 def echo_of_a_bend(bend: Any, draws: Draws) -> Outputs:
@@ -628,6 +671,34 @@ CASES = (
     Case(WhitePhase, {}, {"limit_rad": (0.0, 1.0, 3.0)}, (impairment,)),
     Case(PhaseWalk, {}, {"step_rad": (0.0, 0.1, 3.0)}, (impairment,)),
     Case(PhaseSinusoid, {}, {"amplitude_rad": (0.0, 1.0, 30.0), "cycles": (0.0, 2.5, 7.0)}, (impairment,)),
+    Case(Offset, {}, {"metres": (-0.5, 0.0, 2.0)}, (motion_of_a_flight,)),
+    Case(Jitter, {"step_s": 0.03}, {"rms_m": (0.0, 1e-3, 0.2)}, (motion_of_a_flight,)),
+    Case(RandomWalk, {"step_s": 0.03}, {"m_per_root_s": (0.0, 1e-3, 0.2)}, (motion_of_a_flight,)),
+    Case(
+        PlaneGround,
+        {},
+        {"level_m": (-1.0, 0.0, 2.0), "slope_x": (0.0, 0.1, -0.2), "slope_y": (0.0, 0.1, -0.2)},
+        (ground_of_a_path,),
+    ),
+    Case(
+        SideBeam,
+        {"width_deg": 20.0, "sway_deg": 1.0, "sway_hz": 3.0},
+        {
+            "width_deg": (5.0, 20.0, 40.0),
+            "squint_deg": (0.0, 2.0, -3.0),
+            "yaw_deg": (0.0, 2.0, -3.0),
+            "sway_deg": (0.0, 2.0, -3.0),
+            "sway_hz": (0.5, 2.0, 5.0),
+        },
+        (beam_of_a_path,),
+    ),
+    Case(
+        PathWorld,
+        {"scene": RandomPoints(4, 10.0, 6.0), "transmitter": Flight(STRAIGHT)},
+        {"snr_db": LEVELS},
+        (path_world,),
+    ),
+    Case(Navigation, {}, {"latency_s": (-0.02, 0.0, 0.035), "step_m": (0.0, 0.01, 0.5)}, (navigation,)),
 )
 
 # impairments that a config names by factories
@@ -677,6 +748,10 @@ FACTORIES = (
 # parameters annotated with Tensor that have no case, and plain numbers, each with the reason
 NOT_PER_TRIAL = {
     (MeasuredTrack, "time_s"): "times of measurement, which all trials share",
+    (GridGround, "level_m"): "heights of one ground, which all trials share",
+    **{(GridGround, n): "place of one ground, which all trials share" for n in ("x0_m", "y0_m", "step_m")},
+    (Navigation, "rate_hz"): "decides how many records there are",
+    (PathWorld, "window_range_m"): "a setting of the receiver, which all trials share",
     (LitPoints, "processed_hz"): "Doppler band of a receiver, which all trials share",
     (Aircraft, "spacing_m"): "decides how many scatterers there are",
     (Aircraft, "length_m"): "decides how many scatterers there are",
@@ -693,6 +768,13 @@ NOT_PER_TRIAL = {
     (Extremes, "jerk_m_s3"): "the reach of a whole batch",
     (Extremes, "displacement_m"): "the reach of a whole batch",
     (RangeHistory, "start_s"): "start of the slow-time axis, which all trials share",
+    **{(StraightPath, name): "the nominal path, which all trials share" for name in ("start_m", "velocity_m_s")},
+    **{
+        (CircularPath, name): "the nominal path, which all trials share"
+        for name in ("radius_m", "height_m", "start_rad", "rate_rad_s")
+    },
+    (Jitter, "step_s"): "decides how many numbers are drawn",
+    (RandomWalk, "step_s"): "decides how many numbers are drawn",
 }
 
 

@@ -72,7 +72,7 @@ def test_levels_and_zeros_in_one_batch(entry: Entry) -> None:
 def test_views_and_nan(entry: Entry) -> None:
     """Lazily conjugated and strided samples of two trials, the second with a NaN."""
     x = samples(entry.kind, 2, torch.complex64).clone()
-    x[1].view(-1)[0] = complex(math.nan, math.nan)
+    x[1].view(-1)[0] = torch.tensor(complex(math.nan, math.nan))
     for view in ("conj", "transposed"):
         found = outcome(lambda view=view: entry.call(VIEWS[view](x)))
         if isinstance(found, str):

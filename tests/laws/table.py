@@ -206,7 +206,7 @@ RANGE_FREE = (
     *("compensate.autofocus", "compensate.sca", "compensate.pga", "compensate.pga_sca", "compensate.link_phases"),
     *("compensate.entropy_fixed_point", "compensate.maximum_contrast", "compensate.minimum_entropy"),
     *("compensate.sharpest_phase", "compensate.phase_polish", "compensate.line_doppler", "metrics.entropy"),
-    *("metrics.contrast", "metrics.correlation", "metrics.error_db", "multichannel.sample_whitening"),
+    *("metrics.contrast", "metrics.correlation", "metrics.error_db"),
 )
 
 # linear entries that keep the energy of any samples, and the factor by which it grows

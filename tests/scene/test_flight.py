@@ -100,7 +100,7 @@ def test_navigation_records_errors_latency_and_whole_steps() -> None:
 def test_late_records_of_rough_motion_are_those_of_earlier_times(motion) -> None:
     """Polynomials continued before the first pulse would grow with the third power."""
     flight = Flight(FLIGHT.nominal, Sway(z=[motion])).drawn(DRAWS.for_trials(range(3)), SPAN_S)
-    late = Navigation(latency_s=torch.tensor([0.2, 0.0, -0.3], dtype=F64)).recorded_m(DRAWS, TIME, flight)
+    late = Navigation(latency_s=torch.tensor([0.2, 0.0, -0.3], dtype=F64)).recorded_m(Draws(0), TIME, flight)
     place = flight.position_m(TIME)
     torch.testing.assert_close(late[0, 20:, 2], place[0, :-20, 2], rtol=0, atol=1e-9)
     torch.testing.assert_close(late[2, :-30, 2], place[2, 30:, 2], rtol=0, atol=1e-9)

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchsar.core import Draws, UnevenSpline, per_trial
 from torchsar.radar.navigation import resample_path
 from torchsar.scene.fluctuation import MeasuredTrack, RandomMotion, drawn_motion
-from torchsar.scene.trials import refuse_unless, refuse_unless_finite
+from torchsar.scene.trials import refuse_other_trials, refuse_unless, refuse_unless_finite
 from torchsar.scene.vibration import Motion, displacement_m
 
 # time before the first and after the last pulse for which motions are drawn, in s, by choice:
@@ -249,8 +249,10 @@ class Sway:
             second after the last.
 
         Raises:
-            ValueError: If the time is not positive and finite.
+            ValueError: If the time is not positive and finite, or a motion has another number of
+                trials than the draws.
         """
+        refuse_other_trials(self, draws)
         if not 0 < span_s < math.inf:
             raise ValueError(f"a flight needs pulses at two times or more, got a span of {span_s:g} s")
         return Sway(*(drawn_motion(getattr(self, axis), draws.part(axis), span_s) for axis in "xyz"))
@@ -357,8 +359,10 @@ class Navigation:
             float64.
 
         Raises:
-            ValueError: If there are fewer than five records.
+            ValueError: If there are fewer than five records, or a number has another number of
+                trials than the draws.
         """
+        refuse_other_trials(self, draws)
         span_s = float(time_s[-1] - time_s[0])
         error = self.error.drawn(draws.part("navigation"), span_s)
         if self.rate_hz is None:

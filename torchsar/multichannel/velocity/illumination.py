@@ -10,6 +10,7 @@ from torch import Tensor
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.model import point_phasor
+from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
 _PARTS = 8  # chosen: each has 10 dB at the SNR of 19 dB from which on a point counts as detected
@@ -41,7 +42,13 @@ class SeenAperture:
 
 
 @torch.no_grad()
-def lit_as_expected(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
+def lit_as_expected(
+    data: Tensor,
+    radar: BistaticRadar,
+    motion: PointMotion,
+    aperture: Aperture,
+    whitening: Whitening | None = None,
+) -> Tensor:
     """Tell whether the echo of a point has the expected amplitude over the whole aperture.
 
     The aperture is divided into eight parts of equal expected energy, and the amplitude a_s of the
@@ -57,18 +64,23 @@ def lit_as_expected(data: Tensor, radar: BistaticRadar, motion: PointMotion, ape
         radar: Radar parameters.
         motion: Fitted motion, shape (...,).
         aperture: Expected amplitude over slow time.
+        whitening: Clutter covariance, None for white noise.
 
     Returns:
         True where this share is at least 0.8, bool (...,).
     """
-    amplitude = _Pulses.of(data, radar, motion, aperture, _PARTS).amplitudes(_PARTS)
+    amplitude = _Pulses.of(data, radar, motion, aperture, _PARTS, whitening).amplitudes(_PARTS)
     squares = _PARTS * amplitude.square().sum(-1)
     return (amplitude.sum(-1).square() >= _LEAST_SHARE * squares) | (squares == 0)
 
 
 @torch.no_grad()
 def seen_aperture(
-    data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture
+    data: Tensor,
+    radar: BistaticRadar,
+    motion: PointMotion,
+    aperture: Aperture,
+    whitening: Whitening | None = None,
 ) -> tuple[Aperture, Tensor]:
     """Adapt the expected amplitude where the point is not lit over the whole aperture.
 
@@ -77,16 +89,17 @@ def seen_aperture(
         radar: Radar parameters.
         motion: Motion whose residual Doppler lies within half a Doppler cell, shape (...,).
         aperture: Expected amplitude over slow time.
+        whitening: Clutter covariance, None for white noise.
 
     Returns:
         The aperture, in these trials times the amplitudes of 32 parts relative to the strongest,
         and zero beyond the nearest parts below 0.35 on either side of it; and where this is so,
         bool (...,). The ends are those pulses between which the point explains most energy.
     """
-    uneven = ~lit_as_expected(data, radar, motion, aperture)
+    uneven = ~lit_as_expected(data, radar, motion, aperture, whitening)
     if not bool(uneven.any()):
         return aperture, uneven
-    pulses = _Pulses.of(data, radar, motion, aperture, _FINE)
+    pulses = _Pulses.of(data, radar, motion, aperture, _FINE, whitening)
     amplitude = pulses.amplitudes(_FINE)
     level = amplitude / amplitude.amax(-1, keepdim=True).clamp_min(_TINY)
     # beyond a dark part there is noise, whose phase far from the point would bend the fit
@@ -97,9 +110,10 @@ def seen_aperture(
 
 @dataclass(frozen=True)
 class _Pulses:
-    """Deramped pulses summed over channels times the expected amplitude, its square, and parts.
+    """What each pulse adds to the correlation of the data with the echo, and to its energy.
 
-    The parts have equal expected energy. Each tensor has the shape (..., pulse).
+    In clutter, both are those of the matched filter in clutter. The parts have equal expected
+    energy. Each tensor has the shape (..., pulse).
     """
 
     value: Tensor
@@ -107,15 +121,26 @@ class _Pulses:
     part: Tensor
 
     @staticmethod
-    def of(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture, parts: int) -> _Pulses:
-        """Deramp the data with a motion, and divide the aperture."""
+    def of(
+        data: Tensor,
+        radar: BistaticRadar,
+        motion: PointMotion,
+        aperture: Aperture,
+        parts: int,
+        whitening: Whitening | None,
+    ) -> _Pulses:
+        """Correlate the data with the echo of a motion, and divide the aperture."""
         time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
         weight = aperture.weight(radar, motion, time_s).expand(*data.shape[:-2], -1)
-        energy = weight.square()
+        echo = weight[..., None, :] * point_phasor(radar, motion, time_s, torch.complex128)
+        filtered = data.to(torch.complex128), echo
+        if whitening is not None:
+            filtered = tuple(whitening.backed(x) for x in filtered)
+        value, energy = ((echo.conj() * x).sum(-2) for x in filtered)
+        energy = energy.real.clamp_min(0)
         before = energy.cumsum(-1) - energy / 2
         part = (parts * before / energy.sum(-1, keepdim=True).clamp_min(_TINY)).floor().clamp(0, parts - 1).long()
-        deramped = data.to(torch.complex128) * point_phasor(radar, motion, time_s, torch.complex128).conj()
-        return _Pulses(deramped.sum(-2) * weight, energy, part)
+        return _Pulses(value, energy, part)
 
     def amplitudes(self, parts: int) -> Tensor:
         """Modulus of the amplitude in each part, (..., part)."""

@@ -104,21 +104,22 @@ def moving_point_velocity(
     coarse, u_a = aperture if isinstance(aperture, Dwell) else Dwell(_COARSE_S), 0.0 if u_a_m_s is None else u_a_m_s
     job = _Job(data.to(torch.complex128), radar, aperture, coarse, search, u_a, range_m, unknowns)
     if whitening is not None:
-        return job.estimate(
-            job.found(whitening),
-            torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device),
-            whitening,
-        )
-    plain = job.found(None)
-    job, plain = job.as_seen(plain)
-    job, plain, hidden = job.separated(plain, aperture)
-    plain = job.refined(plain)
+        job, found = job.as_seen(job.found(whitening), whitening)
+        return job.estimate(found, torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device), whitening)
+    seen, plain = job.as_seen(job.found(None), None)
+    white, plain, hidden = seen.separated(plain, aperture)
+    plain = white.refined(plain)
     if not bool(plain.coloured.any()):
-        return job.estimate(plain.found, plain.coloured, hidden=hidden)
-    other = job.refined(job.found(sample_whitening(job.data, radar)))
+        return white.estimate(plain.found, plain.coloured, hidden=hidden)
+    # what the fit in white noise shows of the aperture and of other points may be clutter
+    clutter = sample_whitening(job.data, radar)
+    job, found = job.as_seen(job.found(clutter), clutter)
+    other = job.refined(found)
     first = ~plain.coloured | (plain.log_det <= other.log_det)  # independent of the other trials
-    return job.estimate(
-        _chosen_fit(plain.found, other.found, first), torch.where(first, plain.coloured, other.coloured), hidden=hidden
+    return white.or_other(job, first).estimate(
+        _chosen_fit(plain.found, other.found, first),
+        torch.where(first, plain.coloured, other.coloured),
+        hidden=hidden & (first | job._overlap(plain.found.motion, other.found.motion)),
     )
 
 
@@ -158,14 +159,26 @@ class _Job:
             near = _chosen_fit(other, near, other.energy > near.energy)
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
 
-    def as_seen(self, found: Found) -> tuple[_Job, Found]:
+    def as_seen(self, found: Found, whitening: Whitening | None) -> tuple[_Job, Found]:
         """Refit points that are lit in a part of the aperture only, and keep that part."""
-        aperture, uneven = seen_aperture(self.data, self.radar, found.motion, self.aperture)
+        aperture, uneven = seen_aperture(self.data, self.radar, found.motion, self.aperture, whitening)
         if not bool(uneven.any()):
             return self, found
         job = replace(self, aperture=aperture)
-        again = maximum_likelihood(self.data, self.radar, found.motion, aperture, self.unknowns)
+        again = maximum_likelihood(self.data, self.radar, found.motion, aperture, self.unknowns, whitening)
         return job, _chosen_fit(again, found, uneven)
+
+    def or_other(self, other: _Job, first: Tensor) -> _Job:
+        """Take the data and the seen aperture of another job where `first` is False."""
+        data = torch.where(first[..., None, None], self.data, other.data)
+        if not any(isinstance(job.aperture, SeenAperture) for job in (self, other)):
+            return replace(self, data=data)
+        one = data.real.new_ones(())
+        (expected, mine), (_, others) = (
+            (x.aperture, x.profile) if isinstance(x, SeenAperture) else (x, one)
+            for x in (self.aperture, other.aperture)
+        )
+        return replace(self, data=data, aperture=SeenAperture(expected, torch.where(first[..., None], mine, others)))
 
     def separated(self, found: Found, aperture: Aperture) -> tuple[_Job, Found, Tensor]:
         """Fit up to three further points together with the first, where these leave white noise.
@@ -269,12 +282,13 @@ class _Job:
         self, found: Found, coloured: Tensor, whitening: Whitening | None = None, hidden: Tensor | None = None
     ) -> Estimate:
         """Form the estimate and judge it; it is not ok where another point is hidden in it."""
+        whitening = sample_whitening(self.left(found), self.radar) if whitening is None else whitening
         found, resolved = self.resolved(found, whitening)
         snr = found.snr_db
         determined = (
             found.covariance[..., 0, 0].sqrt() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         )  # False for one channel, which cannot separate velocity and position
-        lit = lit_as_expected(self.data, self.radar, found.motion, self.aperture)
+        lit = lit_as_expected(self.data, self.radar, found.motion, self.aperture, whitening)
         lit = lit if hidden is None else lit & ~hidden
         return estimate_of(
             found,
