@@ -31,6 +31,7 @@ CONFIGS = {
     "sal": "sal_points",
     "geo": "geo_point_targets",
     "geo_ocean": "geo_ocean",
+    "path": "airborne_spotlight",
 }
 # what is kept of each alternative
 KEPT = ("name", "cpu_s", "wall_s", "peak_bytes", "loss", "within_tolerance", "recommended", "failed")

@@ -184,6 +184,32 @@ def geo_ocean(p: Mapping[str, float]) -> dict[str, Any]:
     }
 
 
+def path(p: Mapping[str, float]) -> dict[str, Any]:
+    """A swaying aircraft, squinted by up to about 27 degrees, that images 30 m of ground."""
+    ground = p["range_m"] / math.sqrt(2)
+    length = p["aperture_rad"] * p["range_m"]
+    flight = {
+        "nominal": {
+            "kind": "straight",
+            "start_m": [-ground, -length / 2 - p["squint"] * ground, ground],
+            "velocity_m_s": [0.0, length, 0.0],
+        },
+        "x": {"sway": {"kind": "sinusoid", "amplitude_m": p["sway_m"], "frequency_hz": 1.5}},
+        "z": {},
+    }
+    return {
+        "radar.bandwidth_hz": p["bandwidth_hz"],
+        "world.pulses": 200,
+        "world.samples": max(128, 32 * math.ceil(p["bandwidth_hz"] * 45 / 1.5e8 / 32)),
+        "world.scene": {"corner": {"kind": "points", "azimuth_m": [0.0], "range_m": [0.0]}},
+        "world.transmitter": flight,
+        "world.navigation": None,
+        "world.noise.snr_db": None,
+        **{f"processor.recommended.stages.image.{side}_m": 30.0 for side in ("azimuth", "range")},
+        "processor.recommended.stages.image.step_m": 0.25,
+    }
+
+
 # losses of every choice lie on both sides of their tolerance in these
 FAMILIES: dict[str, Family] = {
     "stripmap": Family(
@@ -257,6 +283,17 @@ FAMILIES: dict[str, Family] = {
             "off_nadir_deg": (1.0, 8.0),
         },
         geo_ocean,
+    ),
+    "path": Family(
+        "airborne_spotlight",
+        {
+            "range_m": (500.0, 1e4),
+            "aperture_rad": (0.02, 0.15),
+            "bandwidth_hz": (1e8, 1e9),
+            "squint": (-0.5, 0.5),
+            "sway_m": (0.01, 2.0),
+        },
+        path,
     ),
 }
 

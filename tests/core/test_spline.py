@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.interpolate import CubicSpline
 
-from torchsar.core import UniformSpline
+from torchsar.core import UnevenSpline, UniformSpline
 
 START, STEP = 0.3, 0.7
 
@@ -72,3 +72,34 @@ def test_invalid_input_raises() -> None:
         UniformSpline(torch.zeros(3, 1, dtype=torch.float64), 0.0, 1.0)
     with pytest.raises(ValueError, match="positive step"):
         UniformSpline(torch.zeros(4, dtype=torch.float64), 0.0, 0.0)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 6, 40])
+def test_uneven_knots_equal_scipy(n: int) -> None:
+    made = np.random.default_rng(n)
+    for rows in (made.uniform(0.1, 1.9, (3, n)), 10.0 ** made.uniform(-3, 3, (3, n))):
+        at, values = rows.cumsum(-1), made.standard_normal((2, 3, n))
+        t = np.stack([np.linspace(k[0] - 0.5, k[-1] + 0.5, 57) for k in at])
+        found = UnevenSpline(torch.tensor(at), torch.tensor(values)).at(torch.tensor(t))
+        for i in range(3):
+            known = torch.tensor(CubicSpline(at[i], values[:, i], axis=-1)(t[i]))
+            assert float((found[:, i] - known).abs().max()) < 1e-10 * max(1.0, float(known.abs().max()))
+    assert UnevenSpline(torch.tensor(at[0]), torch.tensor(values)).at(torch.tensor(t[0])).shape == (2, 3, 57)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 7])
+def test_gradients_of_uneven_splines(n: int) -> None:
+    at = (torch.rand(2, n, dtype=torch.float64) + 0.3).cumsum(-1).requires_grad_()
+    values = torch.randn(2, n, dtype=torch.float64, requires_grad=True)
+    t = (torch.rand(2, 4, dtype=torch.float64) * n).requires_grad_()
+    assert torch.autograd.gradcheck(lambda k, v, x: UnevenSpline(k, v).at(x), (at, values, t))
+
+
+def test_invalid_uneven_knots_raise() -> None:
+    good = torch.arange(4, dtype=torch.float64)
+    with pytest.raises(TypeError, match="float64 knots, got torch.float32"):
+        UnevenSpline(good.float(), good)
+    with pytest.raises(ValueError, match=r"at least two, got \(\(4,\), \(3,\)\)"):
+        UnevenSpline(good, good[:3])
+    with pytest.raises(ValueError, match="must rise"):
+        UnevenSpline(good.flip(0), good)

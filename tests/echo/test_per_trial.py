@@ -49,6 +49,7 @@ from torchsar.echo import (
     simulate_bistatic,
     simulate_ladar,
     simulate_ladar_record,
+    simulate_path,
     simulate_turntable,
     smooth_response,
 )
@@ -67,6 +68,7 @@ from torchsar.scene import (
     Extremes,
     Fleet,
     Flight,
+    GridGround,
     GroundMovers,
     ImageReflectivity,
     Jitter,
@@ -82,7 +84,9 @@ from torchsar.scene import (
     Offset,
     OrbitTransmit,
     PathFluctuation,
+    PathWorld,
     Pattern,
+    PlaneGround,
     Points,
     Polynomial,
     PolynomialRotation,
@@ -95,6 +99,7 @@ from torchsar.scene import (
     Satellite,
     Scatterers,
     Ship,
+    SideBeam,
     Sinusoid,
     Speckle,
     SpreadRows,
@@ -271,11 +276,29 @@ STRAIGHT = StraightPath((0.0, -50.0, 30.0), (3.0, 0.0, 0.0))
 
 
 def motion_of_a_flight(motion: Any, draws: Draws) -> Outputs:
-    return {"position_m": Flight(STRAIGHT, Sway(y=(motion,))).position_m(draws, PULSES_S)}
+    return {"position_m": Flight(STRAIGHT, Sway(y=(motion,))).drawn(draws, 0.39).position_m(PULSES_S)}
 
 
 def navigation(kind: Any, draws: Draws) -> Outputs:
-    return {"recorded_m": kind.recorded_m(draws, PULSES_S, STRAIGHT.position_m(PULSES_S))}
+    return {"recorded_m": kind.recorded_m(draws, PULSES_S, STRAIGHT)}
+
+
+def echo_along_a_path(draws: Draws, **world: Any) -> Outputs:
+    radar = InverseRadar(9.6e9, 50e6, 100.0)
+    known = {"scene": RandomPoints(4, 10.0, 6.0), "transmitter": Flight(STRAIGHT)}
+    return outputs(simulate_path(radar, PathWorld(**{**known, **world}), 12, 64, draws, dtype=DOUBLE))
+
+
+def ground_of_a_path(ground: Any, draws: Draws) -> Outputs:
+    return echo_along_a_path(draws, ground=ground)
+
+
+def beam_of_a_path(beam: Any, draws: Draws) -> Outputs:
+    return echo_along_a_path(draws, beam=beam)
+
+
+def path_world(world: Any, draws: Draws) -> Outputs:
+    return outputs(simulate_path(InverseRadar(9.6e9, 50e6, 100.0), world, 12, 64, draws, dtype=DOUBLE))
 
 
 def echo_of_a_bend(bend: Any, draws: Draws) -> Outputs:
@@ -651,6 +674,30 @@ CASES = (
     Case(Offset, {}, {"metres": (-0.5, 0.0, 2.0)}, (motion_of_a_flight,)),
     Case(Jitter, {"step_s": 0.03}, {"rms_m": (0.0, 1e-3, 0.2)}, (motion_of_a_flight,)),
     Case(RandomWalk, {"step_s": 0.03}, {"m_per_root_s": (0.0, 1e-3, 0.2)}, (motion_of_a_flight,)),
+    Case(
+        PlaneGround,
+        {},
+        {"level_m": (-1.0, 0.0, 2.0), "slope_x": (0.0, 0.1, -0.2), "slope_y": (0.0, 0.1, -0.2)},
+        (ground_of_a_path,),
+    ),
+    Case(
+        SideBeam,
+        {"width_deg": 20.0, "sway_deg": 1.0, "sway_hz": 3.0},
+        {
+            "width_deg": (5.0, 20.0, 40.0),
+            "squint_deg": (0.0, 2.0, -3.0),
+            "yaw_deg": (0.0, 2.0, -3.0),
+            "sway_deg": (0.0, 2.0, -3.0),
+            "sway_hz": (0.5, 2.0, 5.0),
+        },
+        (beam_of_a_path,),
+    ),
+    Case(
+        PathWorld,
+        {"scene": RandomPoints(4, 10.0, 6.0), "transmitter": Flight(STRAIGHT)},
+        {"snr_db": LEVELS},
+        (path_world,),
+    ),
     Case(Navigation, {}, {"latency_s": (-0.02, 0.0, 0.035), "step_m": (0.0, 0.01, 0.5)}, (navigation,)),
 )
 
@@ -701,6 +748,10 @@ FACTORIES = (
 # parameters annotated with Tensor that have no case, and plain numbers, each with the reason
 NOT_PER_TRIAL = {
     (MeasuredTrack, "time_s"): "times of measurement, which all trials share",
+    (GridGround, "level_m"): "heights of one ground, which all trials share",
+    **{(GridGround, n): "place of one ground, which all trials share" for n in ("x0_m", "y0_m", "step_m")},
+    (Navigation, "rate_hz"): "decides how many records there are",
+    (PathWorld, "window_range_m"): "a setting of the receiver, which all trials share",
     (LitPoints, "processed_hz"): "Doppler band of a receiver, which all trials share",
     (Aircraft, "spacing_m"): "decides how many scatterers there are",
     (Aircraft, "length_m"): "decides how many scatterers there are",

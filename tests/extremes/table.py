@@ -629,6 +629,7 @@ FUNCTIONS = [
     _entry(
         "metrics.error_after_gain_db", "image", lambda x: metrics.error_after_gain_db(x, x.roll(1, -1)), 0, joint=True
     ),
+    _entry("metrics.registered_error_db", "image", lambda x: metrics.registered_error_db(x, x.roll(1, -1).conj()), 0),
     _entry("metrics.azimuth_response", "row", lambda x: metrics.azimuth_response(x, 1.0), {"peak": 1}),
     _entry(
         "metrics.replica_level",
@@ -720,6 +721,7 @@ REASONS = {
     "core.real_dtype": "takes a dtype only",
     "radar.geometry_of": "builds a geometry, whose classes check their fields; tests/focus/test_spotlight.py",
     "io.read_inverse": "reads a file; tests/io/test_damaged.py",
+    "io.read_path": "reads a file; tests/io/test_damaged.py",
     "io.read_stripmap": "reads a file; tests/io/test_damaged.py",
     "multichannel.ImageMovers": "needs seconds for one scene; tests/multichannel/test_scene_image.py",
     "multichannel.MoversImage": "needs seconds for one scene; tests/multichannel/test_scene_image.py",
@@ -727,6 +729,9 @@ REASONS = {
     "multichannel.body_echo": "works on the Body that find_body, which is in the table, has made",
     "focus.PolarFormat": "resamples frequencies of a geometry; tests/focus/test_polar.py",
     "focus.SpotlightBackprojection": "the stage of backproject_spotlight, which is in the table",
+    "focus.PathImage": "the base class of TileImage and DirectImage",
+    "focus.TileImage": "the stage of image_tiles, which is in the table; tests/focus/test_path_image.py",
+    "focus.DirectImage": "the stage of backproject, which is in the table; tests/focus/test_path_image.py",
     "focus.focus_strip": "runs a stage over blocks of lines; tests/focus/test_strip.py",
     "focus.write_strip": "writes a file; tests/focus/test_strip.py",
     "focus.plan_strip": "counts lines and bytes; tests/focus/test_strip.py",
@@ -741,6 +746,7 @@ REASONS = {
     "scene.start_phase_rad": "draws phases of effects, whose classes check them",
     "echo.apply_impairments": "applies impairments, whose classes check them; tests/echo",
     "echo.bistatic_echo": "the echo of simulate_bistatic, which is in the table",
+    "echo.path_echo": "the echo of simulate_path, which is in the table",
     "echo.calibration_channel": "made of a fibre, whose class checks it; tests/repair/test_triangle_calibrate.py",
     "echo.dechirped_echo": "the echo of simulate_turntable with a pulse length; tests/focus/test_dechirped.py",
     "echo.ladar_echo": "the echo of simulate_ladar, which is in the table",
@@ -750,6 +756,9 @@ REASONS = {
     "echo.stripmap_echo": "the echo of simulate, which is in the table",
     "echo.target_energy": "works on the truth of a simulation",
     "echo.turntable_echo": "the echo of simulate_turntable, which is in the table",
+    "compensate.path_autofocus": "compensate.autofocus, which is in the table, through tiles; tests/compensate/"
+    "test_path_autofocus.py",
+    "compensate.PathAutofocus": "the stage of compensate.path_autofocus",
     "compensate.range_error": "integrates an estimate by integrated_range, which is in the table",
     "compensate.turning_points": "reads an axis that the radar has made",
     "multichannel.multichannel_limits": "checks its use of the radar; tests/multichannel/test_requirements.py",
@@ -824,6 +833,14 @@ def _moving(f: Callable, **more: Any) -> Callable:
     )
 
 
+def any_path(range_m: float, wavelength_m: float) -> Any:
+    """One point seen from a straight path at this range and wavelength."""
+    seen = replace(TURNTABLE, carrier_hz=_carrier_hz(wavelength_m))
+    flight = scene.Flight(scene.StraightPath((-range_m, 0.0, 0.0), (0.0, 50.0, 0.0)))
+    world = scene.PathWorld(scene.Points([1.0], [2.0]), flight)
+    return echo.simulate_path(seen, world, 8, 16, Draws(1))[0].signal
+
+
 MOTION = {"u_r_m_s": 3.0, "u_a_m_s": 2.0, "y0_m": 5.0, "range_m": 5000.0}
 FAR = {"range_m": 4000.0, "wavelength_m": 0.03}
 # functions of numbers: the function, and arguments of which each in turn is made extreme
@@ -843,6 +860,14 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
     "core.settle": (core.settle, {"value": ONES, "fallback": 0.0}),
     "core.level_of": (core.level_of, {"x": torch.ones(4, 4)}),
     "core.unit_level": (core.unit_level, {"x": torch.ones(4, 4)}),
+    "radar.geocentric": (
+        radar.geocentric,
+        {"latitude_deg": 48.0 * ONES, "longitude_deg": 11.0 * ONES, "height_m": 500.0 * ONES},
+    ),
+    "radar.resample_path": (
+        lambda **given: radar.resample_path(torch.arange(9, dtype=F64), pulse_time_s=0.5 + ramp(4, 2.0), **given),
+        {"position_m": torch.ones(9, 3, dtype=F64), "longest_gap_s": 2.0, "jump_m": 1.0},
+    ),
     "radar.plane_wave_loss": (
         radar.plane_wave_loss,
         {"radius_m": 2.0, "range_m": 900.0, "aperture_rad": 0.1, "wavelength_m": 0.03, "elevation_rad": 0.2},
@@ -856,6 +881,7 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
     "echo.simulate": (stripmap, FAR),
     "echo.simulate_turntable": (turntable, FAR),
     "echo.simulate_bistatic": (bistatic, FAR),
+    "echo.simulate_path": (any_path, FAR),
     "echo.simulate_ladar": (ladar(echo.simulate_ladar), {"range_m": 3000.0, "wavelength_m": 1.55e-6}),
     "echo.simulate_ladar_record": (ladar(echo.simulate_ladar_record), {"range_m": 3000.0, "wavelength_m": 1.55e-6}),
     "echo.smooth_response": (

@@ -15,7 +15,7 @@ import torch
 
 from torchsar.cli import main
 from torchsar.core import Recording, stored
-from torchsar.io import read_inverse, read_stripmap
+from torchsar.io import read_inverse, read_path, read_stripmap
 
 Members = dict[str, np.ndarray]
 Reader = Callable[[Path], Recording]
@@ -56,11 +56,21 @@ SPOTLIGHT: Members = {
     "freq_hz": 9e9 + 2e6 * np.arange(8),
     **{name: np.linspace(7000.0, 7010.0, 6) for name in ("x_m", "y_m", "z_m", "r0_m")},
 }
+PATH: Members = {
+    "history": _RNG.normal(size=(8, 6)) * (1 + 2j),
+    "freq_hz": 9e9 + 2e6 * np.arange(8),
+    "path_reference_m": np.linspace(7000.0, 7010.0, 6),
+    "pulse_time_s": np.arange(6) / 10.0,
+    "transmitter_time_s": np.arange(7) / 10.0,
+    "transmitter_m": np.linspace(0.0, 70.0, 7)[:, None] * np.ones(3),
+    "receiver_m": np.array([1.0, 2.0, 3.0]),
+}
 ARCHIVES: list[tuple[Reader, Members]] = [
     (read_stripmap, STRIPMAP),
     (read_inverse, PROFILES),
     (read_inverse, TURNTABLE),
     (read_inverse, SPOTLIGHT),
+    (read_path, PATH),
 ]
 TYPES = [bool, "U3", "S0", object, "M8[s]", np.clongdouble, np.longdouble, np.float16, ">f8", ">c8", ">i4", np.uint64]
 NUMBERS = [np.nan, np.inf, -np.inf, 1e300, -1e300, 1e308, 5e-324, 0.0, -1.0, 1e25]

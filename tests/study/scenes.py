@@ -1,4 +1,4 @@
-"""Small configs of the six systems, and ways to write, load and run them."""
+"""Small configs of all systems, and ways to write, load and run them."""
 
 from __future__ import annotations
 
@@ -229,7 +229,37 @@ GEO_OCEAN: dict = {
     "metrics": {"published_targets": {"displacement_vt_m": {"one": {"conventional": 133.0}}}},
 }
 
-SCENES = {tree["system"]: tree for tree in (STRIPMAP, ISAL, ISAL_ROTATION, SAL, GEO, GEO_OCEAN)}
+_AUX = {name: f"aux.{name}" for name in ("frequency_hz", "transmitter_m", "path_reference_m")}
+TILES = {"stage": "tile_image", "azimuth_m": 20.0, "range_m": 20.0, "step_m": 0.25, "uses": _AUX}
+_WALK = {"walk": {"kind": "random_walk", "m_per_root_s": 0.02, "step_s": 0.01}}
+PATH: dict = {
+    "system": "path",
+    "title": "tiny flight",
+    "seed": 3,
+    "radar": {"carrier_hz": 9.6e9, "bandwidth_hz": 300e6, "prf_hz": 100.0},
+    "world": {
+        "pulses": 96,
+        "samples": 64,
+        "scene": {
+            "corners": {"kind": "points", "azimuth_m": [0.0, 6.0], "range_m": [-3.0, 5.0], "amplitude": [9.0, 9.0]},
+            "field": {"kind": "random_points", "count": 30, "azimuth_extent_m": 14.0, "range_extent_m": 14.0},
+        },
+        "transmitter": {
+            "nominal": {"kind": "straight", "start_m": [-1500.0, -48.0, 1500.0], "velocity_m_s": [0.0, 100.0, 0.0]},
+            "x": {"sway": {"kind": "sinusoid", "amplitude_m": 0.3, "frequency_hz": 1.0}},
+        },
+        "navigation": {"x": _WALK, "latency_s": 0.0},
+        "noise": {"snr_db": 15.0},
+    },
+    "processor": {
+        "ideal": {"input": "clean", "stages": {"image": TILES}},
+        "none": {"stages": {"image": TILES}},
+        "recommended": {"stages": {"phase": {"stage": "autofocus"}, "correct": CORRECT, "image": TILES}},
+    },
+    "metrics": {"reference": "ideal", "published": {"entropy_above_ideal_nats": {"one": {"none": 1.0}}}},
+}
+
+SCENES = {tree["system"]: tree for tree in (STRIPMAP, ISAL, ISAL_ROTATION, SAL, GEO, GEO_OCEAN, PATH)}
 
 
 def world(system: str, **changes: object) -> dict:

@@ -27,6 +27,8 @@ from torchsar.study.trials.batch import Batch, summary
 from torchsar.study.trials.bench import Bench
 
 EVERY = pytest.mark.parametrize("system", SCENES)
+# absolute differences between batches, see test_numbers_follow_seed_and_trial_and_not_their_batch
+LEEWAY = {"geo_ocean": 1e-3, "path": 1e-3}
 CASES = {"one": {"seed": 5}, "other/two": {"seed": 6}}
 
 
@@ -150,12 +152,13 @@ def _check_report(tree: dict, loaded, out: Path) -> None:
 @EVERY
 def test_numbers_follow_seed_and_trial_and_not_their_batch(system: str, tmp_path: Path) -> None:
     """In double precision. The search of a ship, whose speed along the track is known to some
-    tenths of a metre per second, stops within a thousandth of that.
+    tenths of a metre per second, stops within a thousandth of that. Tiles are expanded about the
+    mean path of a batch, which changes images by less than their error.
     """
     bench = bench_of(tmp_path, system, precision="complex128")
     both, alone = (figures_of(batch_of(bench, of, methods=["recommended"]))["recommended"] for of in ([0, 1], [1]))
     for key, value in alone.items():
-        close = {"rtol": 1e-6, "atol": 1e-3 if system == "geo_ocean" else 1e-9, "equal_nan": True}
+        close = {"rtol": 1e-6, "atol": LEEWAY.get(system, 1e-9), "equal_nan": True}
         torch.testing.assert_close(both[key][1:], value, **close, msg=lambda said, key=key: f"{key}: {said}")
     assert any(float(value[0]) != float(value[1]) for value in both.values())
     first, other = (bench.trials(Draws(seed, bench.system.address, [0])) for seed in (1, 2))

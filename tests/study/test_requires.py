@@ -38,6 +38,7 @@ PLACES: dict[tuple[str, str], tuple[str, str, list[str]]] = {
         ["world.pulses=900"],
     ),
     ("geo", "migration_correct.kind"): ("geo_point_targets", "processor.recommended.stages.migration.kind", []),
+    ("path", "stage"): ("airborne_spotlight", "processor.recommended.stages.image.stage", []),
     ("geo_ocean", "stationary_image.form"): ("geo_ocean", "processor.conventional.stages.image.form", []),
 }
 

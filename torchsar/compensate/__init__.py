@@ -23,6 +23,7 @@ from torchsar.compensate.envelope import (
     refine_alignment,
     shift_range,
 )
+from torchsar.compensate.path_autofocus import PathAutofocus, path_autofocus
 from torchsar.compensate.point import PointDoppler, doppler_at, peak_time_s
 from torchsar.compensate.pulse_phase import (
     Autofocus,
@@ -124,6 +125,7 @@ __all__ = [
     "Measured",
     "MirrorProduct",
     "MlPeak",
+    "PathAutofocus",
     "Pga",
     "PgaSca",
     "PhaseFitRotation",
@@ -178,6 +180,7 @@ __all__ = [
     "mirror_product",
     "ml_peak",
     "newton_rotation",
+    "path_autofocus",
     "peak_time_s",
     "pga",
     "pga_sca",

@@ -29,6 +29,7 @@ from torchsar.core.spline import UniformSpline
 from torchsar.core.stage import Stage
 from torchsar.core.stored import ArrayFile, StoredArray
 from torchsar.core.stores import array_metadata, document, fault_of_name, group_attributes
+from torchsar.core.uneven_spline import UnevenSpline
 
 __all__ = [
     "SEAL",
@@ -48,6 +49,7 @@ __all__ = [
     "Trace",
     "Truth",
     "Turn",
+    "UnevenSpline",
     "UniformSpline",
     "Use",
     "address",

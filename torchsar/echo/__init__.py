@@ -15,6 +15,7 @@ from torchsar.echo.ladar import ladar_echo, range_model_error_db, simulate_ladar
 from torchsar.echo.ladar_record import ladar_record, simulate_ladar_record
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.echo.pairs import SimulatedPairs
+from torchsar.echo.path import PathError, path_echo, simulate_path
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
 from torchsar.echo.response import ChannelResponse, smooth_response
 from torchsar.echo.sea import sea_echo
@@ -31,6 +32,7 @@ __all__ = [
     "LostGaps",
     "LostLines",
     "LostPulses",
+    "PathError",
     "PeriodicJitter",
     "PhaseSinusoid",
     "PhaseWalk",
@@ -52,12 +54,14 @@ __all__ = [
     "dechirped_echo",
     "ladar_echo",
     "ladar_record",
+    "path_echo",
     "range_model_error_db",
     "sea_echo",
     "simulate",
     "simulate_bistatic",
     "simulate_ladar",
     "simulate_ladar_record",
+    "simulate_path",
     "simulate_turntable",
     "smooth_response",
     "stripmap_echo",

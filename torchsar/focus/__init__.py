@@ -19,6 +19,7 @@ from torchsar.focus.matched_fourier import (
 )
 from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
 from torchsar.focus.omega_k import OmegaK, StoredOmegaK, omega_k
+from torchsar.focus.path_image import DirectImage, PathImage, TileImage
 from torchsar.focus.polar import PolarFormat, PolarOperator
 from torchsar.focus.range_doppler import RangeDoppler, range_doppler
 from torchsar.focus.reference import RangeCompress, flat_reference, matched_reference, phase_reference, range_compress
@@ -34,6 +35,7 @@ from torchsar.focus.strip_backprojection import (
     backproject_strip,
 )
 from torchsar.focus.target import TargetImage
+from torchsar.focus.tile_operator import TileOperator
 from torchsar.focus.tiles import TilePlan, image_tiles
 from torchsar.focus.transforms import CompiledNufft, ExplicitSum, Gridding, Resampling
 from torchsar.focus.triangular import (
@@ -57,6 +59,7 @@ __all__ = [
     "CrossRangeLines",
     "DerampAzimuth",
     "Detect",
+    "DirectImage",
     "DopplerBand",
     "DopplerLines",
     "EveryPulse",
@@ -73,6 +76,7 @@ __all__ = [
     "OmegaK",
     "OmegaKStolt",
     "PaddedLines",
+    "PathImage",
     "PolarFormat",
     "PolarOperator",
     "QuickLook",
@@ -85,6 +89,8 @@ __all__ = [
     "StoredOmegaK",
     "StripPlan",
     "TargetImage",
+    "TileImage",
+    "TileOperator",
     "TilePlan",
     "amplitude",
     "azimuth_matched_filter",

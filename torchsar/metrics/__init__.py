@@ -9,7 +9,7 @@ from torchsar.metrics.bounds import (
     tone_frequency_bound_hz,
     velocity_bound_m_s,
 )
-from torchsar.metrics.image import contrast, correlation, entropy, error_after_gain_db, error_db
+from torchsar.metrics.image import contrast, correlation, entropy, error_after_gain_db, error_db, registered_error_db
 from torchsar.metrics.impulse import impulse_response
 from torchsar.metrics.intervals import finite_rms, half_width_ratio, share_interval, trial_statistics
 from torchsar.metrics.ladar_bounds import (
@@ -42,6 +42,7 @@ __all__ = [
     "radial_velocity_bound_m_s",
     "range_per_sweep_bound_m",
     "reference_doppler_std_hz",
+    "registered_error_db",
     "replica_level",
     "replica_zones",
     "residual_phase",

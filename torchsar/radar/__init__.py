@@ -5,6 +5,8 @@ from torchsar.radar.bistatic import BistaticRadar, polynomial_range, receive_ran
 from torchsar.radar.ephemeris import Ephemeris
 from torchsar.radar.inverse import InverseRadar
 from torchsar.radar.ladar import TriangularLadar, sweep_middles
+from torchsar.radar.local_frame import LocalFrame, geocentric
+from torchsar.radar.navigation import resample_path
 from torchsar.radar.orbit import Orbit, orbit_range, range_coefficients, seen_point
 from torchsar.radar.spotlight import (
     FarField,
@@ -27,6 +29,7 @@ __all__ = [
     "FarField",
     "InverseRadar",
     "LinearFM",
+    "LocalFrame",
     "Orbit",
     "PlaneWaveLoss",
     "Spotlight",
@@ -34,6 +37,7 @@ __all__ = [
     "TimingDiagram",
     "TriangularLadar",
     "frequency_samples",
+    "geocentric",
     "geometry_of",
     "orbit_range",
     "plane_wave_loss",
@@ -41,6 +45,7 @@ __all__ = [
     "range_coefficients",
     "range_profiles",
     "receive_range",
+    "resample_path",
     "seen_point",
     "sweep_middles",
     "timing_diagram",

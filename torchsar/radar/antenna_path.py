@@ -69,6 +69,20 @@ class AntennaPath:
         """Number of pulses."""
         return self.reference_m.shape[-1]
 
+    def side_data(self) -> dict[str, Tensor]:
+        """Return the side data of a recording (`Recording.aux`) that describe the path.
+
+        Returns:
+            `transmitter_m`, `receiver_m` unless both share an antenna, and `path_reference_m`, the
+            three fields of the path, for the stages `TileImage` and `DirectImage`. If they share an
+            antenna also `position_m` and `reference_m`, half the reference path, for `PolarFormat`
+            and `SpotlightBackprojection`.
+        """
+        shared = {"transmitter_m": self.transmitter_m, "path_reference_m": self.reference_m}
+        if self.receiver_m is not None:
+            return {**shared, "receiver_m": self.receiver_m}
+        return {**shared, "position_m": self.transmitter_m, "reference_m": self.reference_m / 2}
+
     def path_m(self, points_m: Tensor, pulses: slice = slice(None)) -> Tensor:
         """Return the path over points less the reference path, float64 (..., pulse, point).
 

@@ -67,6 +67,7 @@ from torchsar.scene.moving import (
     TaylorRange,
 )
 from torchsar.scene.path import AlwaysLit, Antenna, Beam, Dwell, Hyperbola, Parabola, Path
+from torchsar.scene.path_world import GridGround, Ground, PathWorld, PlaneGround, SideBeam
 from torchsar.scene.rotation import PolynomialRotation
 from torchsar.scene.satellite import Satellite
 from torchsar.scene.sea import ImageReflectivity, KSea, Sea, gamma_from_normal
@@ -104,6 +105,8 @@ __all__ = [
     "Fleet",
     "Flight",
     "Gate",
+    "GridGround",
+    "Ground",
     "GroundMovers",
     "Hyperbola",
     "ImageReflectivity",
@@ -128,8 +131,10 @@ __all__ = [
     "Parabola",
     "Path",
     "PathFluctuation",
+    "PathWorld",
     "Pattern",
     "PhaseOnly",
+    "PlaneGround",
     "Points",
     "Polynomial",
     "PolynomialRotation",
@@ -147,6 +152,7 @@ __all__ = [
     "Scene",
     "Sea",
     "Ship",
+    "SideBeam",
     "Sinusoid",
     "Speckle",
     "SpreadRows",

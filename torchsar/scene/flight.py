@@ -1,24 +1,37 @@
 """True flights of antennas, their deviations from the nominal path, and what navigation records.
 
-A flight is a nominal path plus motions in three axes; each motion is one of those that targets have
-(`Sinusoid`, `Polynomial`, `VibrationSpectrum`, `MeasuredTrack`), or one of this module. Navigation
-records the flight with errors of its own, which are what autofocus has to find.
+A flight is a nominal path plus motions in three axes. Each motion is one of those that targets have
+or one of this module: `Polynomial`, `Sinusoid`, `VibrationSpectrum` (band-limited sway, or
+vibration), `Jitter`, `RandomWalk`, `Offset`, `MeasuredTrack`. Navigation records the flight with
+errors of its own, which are what autofocus has to find: a bias is an `Offset`, a drift a
+`Polynomial`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, UniformSpline, per_trial
+from torchsar.core import Draws, UnevenSpline, per_trial
+from torchsar.radar.navigation import resample_path
 from torchsar.scene.fluctuation import MeasuredTrack, RandomMotion, drawn_motion
-from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite
+from torchsar.scene.trials import refuse_other_trials, refuse_unless, refuse_unless_finite
 from torchsar.scene.vibration import Motion, displacement_m
+
+# time before the first and after the last pulse for which motions are drawn, in s, by choice:
+# what navigation records late, and between pulses, lies within
+_LEAD_S = 1.0
+# largest latency, and longest interval of records, in s; both fit into the time above
+_LONGEST_S = 0.5
+# least number of records from which positions are interpolated
+_RECORDS = 5
+# relative error of the product of a time and a rate, below which it is a whole number
+_ROUNDING = 1e-9
 
 
 class NominalPath(Protocol):
@@ -175,8 +188,8 @@ class Jitter:
 class RandomWalk:
     """Sum of independent normally distributed steps, zero at the first pulse.
 
-    Its standard deviation after the time t is `m_per_root_s` sqrt(t). About the mean of a recording
-    of length T, its rms value is `m_per_root_s` sqrt(T / 6).
+    Its standard deviation at the time t is `m_per_root_s` sqrt(t). About the mean of a recording of
+    length T, its rms value is `m_per_root_s` sqrt(T / 6).
 
     Args:
         m_per_root_s: Standard deviation after one second in metres.
@@ -205,8 +218,8 @@ class RandomWalk:
             The displacement in each trial.
         """
         time_s = _steps(span_s, self.step_s)
-        unit = draws.normal("scene.flight.walk", (len(time_s) - 1,)).cumsum(-1) * math.sqrt(self.step_s)
-        unit = torch.nn.functional.pad(unit, (1, 0))
+        unit = draws.normal("scene.flight.walk", (len(time_s),)).cumsum(-1) * math.sqrt(self.step_s)
+        unit = unit - unit[..., int(time_s.abs().argmin()), None]
         return MeasuredTrack(time_s, per_trial(self.m_per_root_s, 1, unit) * unit)
 
 
@@ -224,25 +237,42 @@ class Sway:
     y: Sequence[Motion | RandomMotion] = ()
     z: Sequence[Motion | RandomMotion] = ()
 
-    def displacement_m(self, draws: Draws, time_s: Tensor) -> Tensor:
-        """Draw the displacement.
+    def drawn(self, draws: Draws, span_s: float) -> Sway:
+        """Draw the random motions.
 
         Args:
             draws: Source of random numbers; each axis has its own.
+            span_s: Time from the first to the last pulse in seconds.
+
+        Returns:
+            The displacement in each trial, known from one second before the first pulse to one
+            second after the last.
+
+        Raises:
+            ValueError: If the time is not positive and finite, or a motion has another number of
+                trials than the draws.
+        """
+        refuse_other_trials(self, draws)
+        if not 0 < span_s < math.inf:
+            raise ValueError(f"a flight needs pulses at two times or more, got a span of {span_s:g} s")
+        return Sway(*(drawn_motion(getattr(self, axis), draws.part(axis), span_s) for axis in "xyz"))
+
+    def displacement_m(self, time_s: Tensor) -> Tensor:
+        """Return the displacement; random motions must have been drawn.
+
+        Args:
             time_s: Times since the first pulse in seconds, shape (pulse,), float64.
 
         Returns:
             Displacement in metres, shape (*trials, pulse, 3), float64.
 
         Raises:
-            ValueError: If a motion has another number of trials than the draws.
+            ValueError: If a random motion has not been drawn.
         """
-        refuse_other_trials(self, draws)
-        span_s = float(time_s[-1] - time_s[0])
-        axes = [
-            displacement_m(drawn_motion(motion, draws.part(axis), span_s), time_s)
-            for axis, motion in (("x", self.x), ("y", self.y), ("z", self.z))
-        ]
+        for part in (*self.x, *self.y, *self.z):
+            if isinstance(part, RandomMotion):
+                raise ValueError(f"a {type(part).__name__} is random; call drawn(draws, span_s) first")
+        axes = [displacement_m(motion, time_s) for motion in (self.x, self.y, self.z)]  # type: ignore[arg-type]
         return torch.stack(torch.broadcast_tensors(*axes), -1)
 
 
@@ -258,20 +288,31 @@ class Flight:
     nominal: NominalPath
     motion: Sway = field(default_factory=Sway)
 
-    def position_m(self, draws: Draws, time_s: Tensor) -> Tensor:
-        """Draw the true positions.
+    def drawn(self, draws: Draws, span_s: float) -> Flight:
+        """Draw the random motions.
 
         Args:
             draws: Source of random numbers.
+            span_s: Time from the first to the last pulse in seconds.
+
+        Returns:
+            The path in each trial.
+        """
+        return replace(self, motion=self.motion.drawn(draws.part("motion"), span_s))
+
+    def position_m(self, time_s: Tensor) -> Tensor:
+        """Return the true positions; random motions must have been drawn.
+
+        Args:
             time_s: Times since the first pulse in seconds, shape (pulse,), float64.
 
         Returns:
             Positions in metres, shape (*trials, pulse, 3), float64.
 
         Raises:
-            ValueError: If a motion has another number of trials than the draws.
+            ValueError: If a random motion has not been drawn.
         """
-        return self.nominal.position_m(time_s) + self.motion.displacement_m(draws.part("motion"), time_s)
+        return self.nominal.position_m(time_s) + self.motion.displacement_m(time_s)
 
 
 @dataclass(frozen=True)
@@ -281,62 +322,84 @@ class Navigation:
     Args:
         error: Errors that are added, such as `Offset` (bias), `Polynomial` (drift), `RandomWalk`.
         latency_s: Age of a recorded position in seconds: at the time t the position at t - latency
-            is recorded.
+            is recorded; at most 0.5 s in magnitude.
         step_m: Step in metres to which positions are rounded; 0 for none.
+        rate_hz: Rate of the records in hertz, at least 2 Hz, from which positions at the pulses are
+            interpolated by splines; None for a record at every pulse.
 
     Raises:
-        ValueError: If a number is not finite or the step is negative.
+        ValueError: If a number is not finite, the latency is too long, the step is negative, or
+            the rate is too low.
     """
 
     error: Sway = field(default_factory=Sway)
     latency_s: Tensor | float = 0.0
     step_m: Tensor | float = 0.0
+    rate_hz: float | None = None
 
     def __post_init__(self) -> None:
-        refuse_unless_finite("latency_s of a navigation", self.latency_s)
+        within = (
+            f"latency_s of a navigation must be a number of at most {_LONGEST_S:g} s in magnitude, or one per trial"
+        )
+        refuse_unless(within, self.latency_s, lambda x: abs(x) <= _LONGEST_S)
         refuse_unless_finite("step_m of a navigation", self.step_m, 0.0)
+        refuse_unless_finite("rate_hz of a navigation", self.rate_hz, 1 / _LONGEST_S)
 
-    def recorded_m(self, draws: Draws, time_s: Tensor, position_m: Tensor) -> Tensor:
-        """Record positions.
-
-        Between pulses, and before the first, the true path is continued by a cubic spline.
+    def recorded_m(self, draws: Draws, time_s: Tensor, path: NominalPath) -> Tensor:
+        """Return the positions that are known at the pulses.
 
         Args:
             draws: Source of random numbers.
-            time_s: Times of the pulses in seconds, equally spaced, shape (pulse,), float64.
-            position_m: True positions in metres, shape (..., pulse, 3), float64.
+            time_s: Times of the pulses since the first one in seconds, rising, shape (pulse,),
+                float64.
+            path: True path, such as a `Flight` that has been drawn.
 
         Returns:
-            Recorded positions in metres, shape (*trials, pulse, 3), float64.
+            Recorded positions in metres, interpolated at the pulses, shape (*trials, pulse, 3),
+            float64.
 
         Raises:
-            ValueError: If a number has another number of trials than the draws.
+            ValueError: If there are fewer than five records, or a number has another number of
+                trials than the draws.
         """
         refuse_other_trials(self, draws)
-        if bool((torch.as_tensor(self.latency_s) != 0).any()):
-            position_m = _at(time_s, position_m, time_s - per_trial(self.latency_s, 1, time_s))
-        recorded = position_m + self.error.displacement_m(draws.part("navigation"), time_s)
+        span_s = float(time_s[-1] - time_s[0])
+        error = self.error.drawn(draws.part("navigation"), span_s)
+        if self.rate_hz is None:
+            return self._records_m(error, time_s, path)
+        n = math.ceil(span_s * self.rate_hz - _ROUNDING) + 1
+        if n < _RECORDS:
+            raise ValueError(
+                f"navigation needs at least {_RECORDS} records, got {n} at rate_hz={self.rate_hz:g} in {span_s:g} s"
+            )
+        at = time_s[0] + torch.arange(n, dtype=torch.float64, device=time_s.device) / self.rate_hz
+        return resample_path(at, self._records_m(error, at, path), time_s, jump_m=math.inf)
+
+    def _records_m(self, error: Sway, time_s: Tensor, path: NominalPath) -> Tensor:
+        """Records at times (record,), shape (*trials, record, 3)."""
+        recorded = self._late_m(time_s, path) + error.displacement_m(time_s)
         quantum = per_trial(self.step_m, 2, time_s)
         whole = torch.round(recorded / torch.where(quantum > 0, quantum, 1)) * quantum
         return torch.where(quantum > 0, whole, recorded)
 
-
-def _at(time_s: Tensor, position_m: Tensor, asked_s: Tensor) -> Tensor:
-    """Positions (..., pulse, 3) at equally spaced times, interpolated at times (..., pulse)."""
-    step_s = float(time_s[-1] - time_s[0]) / (len(time_s) - 1)
-    pieces = UniformSpline(position_m.mT.contiguous(), float(time_s[0]), step_s).pieces()  # (..., 3, piece, power)
-    asked = (asked_s - time_s[0])[..., None, :]
-    asked = asked.expand(*torch.broadcast_shapes(pieces.shape[:-2], asked.shape[:-1]), -1)
-    piece = (asked / step_s).floor().clamp(0, len(time_s) - 2)
-    at = piece.long()[..., None].expand(*piece.shape, 4)
-    powers = pieces.expand(*asked.shape[:-1], *pieces.shape[-2:]).gather(-2, at)
-    since = asked - piece * step_s
-    return (((powers[..., 3] * since + powers[..., 2]) * since + powers[..., 1]) * since + powers[..., 0]).mT
+    def _late_m(self, time_s: Tensor, path: NominalPath) -> Tensor:
+        """True positions at the times less the latency, shape (*trials, record, 3)."""
+        latency = torch.as_tensor(self.latency_s, dtype=torch.float64, device=time_s.device)
+        if not latency.ndim:
+            return path.position_m(time_s - latency)
+        # motions take times that all trials share: interpolate between such times, which are those
+        # of jitter from pulse to pulse, and do not depend on the latencies of other trials
+        step_s = float(time_s.diff().min())
+        before, after = (math.ceil(s / step_s) for s in (_LONGEST_S, float(time_s[-1] - time_s[0]) + _LONGEST_S))
+        at = time_s[0] + step_s * torch.arange(-before, after + 1, dtype=torch.float64, device=time_s.device)
+        asked = time_s - latency[..., None]
+        return UnevenSpline(at, path.position_m(at).mT).at(asked[..., None, :]).mT
 
 
 def _steps(span_s: float, step_s: float) -> Tensor:
-    """Times that cover a recording in equal steps, at least two of them."""
-    return step_s * torch.arange(max(2, math.ceil(span_s / step_s - 1e-9) + 1), dtype=torch.float64)
+    """Times in equal steps that cover a recording and some time around it; one of them is zero."""
+    before, after = (math.ceil(time_s / step_s - _ROUNDING) for time_s in (_LEAD_S, span_s + _LEAD_S))
+    return step_s * torch.arange(-before, after + 1, dtype=torch.float64)
 
 
 def _refuse_unless_three(what: str, value: Sequence[float]) -> None:

@@ -19,7 +19,7 @@ from torchsar.study.trials.system import System
 
 # modules with the class `SYSTEM` of each system, by name; other packages add systems by the entry
 # point group `torchsar.systems` (name = "package.module")
-_NAMES = ("stripmap", "isal", "isal_rotation", "sal", "geo", "geo_ocean")
+_NAMES = ("stripmap", "isal", "isal_rotation", "sal", "geo", "geo_ocean", "path")
 SYSTEMS = {name: f"torchsar.study.systems.{name}" for name in _NAMES}
 
 

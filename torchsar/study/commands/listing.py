@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from torchsar.io import inverse, recorded
+from torchsar.io import read_inverse, read_path, read_stripmap
 from torchsar.study.names.registry import GROUPS, WORLD, group_of, stages
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.trials.system import System
@@ -36,7 +36,7 @@ def listing(systems: Mapping[str, System]) -> str:
     for title, catalogue in WORLD.items():
         lines += ["", title, *_entries(catalogue, catalogue.entries)]
     lines += ["", "DATA (data.file=PATH, a numpy archive)"]
-    for name, reader in (("stripmap", recorded.read_stripmap), ("isal", inverse.read_inverse)):
+    for name, reader in (("stripmap", read_stripmap), ("isal", read_inverse), ("path", read_path)):
         schema = inspect.cleandoc(reader.__doc__ or "").split("\n\n")[1]
         lines += [f"  system {name}", textwrap.indent(schema, "    ")]
     return "\n".join(lines)

@@ -6,10 +6,10 @@ A package of the user adds a stage by an entry point of the group `torchsar.stag
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any
+from typing import Annotated, Any
 
 from torchsar import compensate, echo, focus, multichannel, repair, scene
 from torchsar.study.names import channels, factories
@@ -46,6 +46,13 @@ RADIAL_MOTIONS = Catalogue(
         "measured_track": scene.MeasuredTrack.from_file,
     },
 )
+FLIGHT_MOTIONS = Catalogue(
+    "motion of an antenna",
+    "kind",
+    {**RADIAL_MOTIONS.entries, "offset": scene.Offset, "jitter": scene.Jitter, "random_walk": scene.RandomWalk},
+)
+NOMINAL_PATHS = Catalogue("nominal path", "kind", {"straight": scene.StraightPath, "circular": scene.CircularPath})
+GROUNDS = Catalogue("ground", "kind", {"plane": scene.PlaneGround})
 START_PHASES = Catalogue("start phase", "kind", {"normal": scene.StartPhase, "uniform": scene.UniformStartPhase})
 FIDELITIES = Catalogue("fidelity", "kind", {"phase_only": scene.PhaseOnly, "dechirped": factories.dechirped})
 SWEEP_FIDELITIES = Catalogue(
@@ -101,6 +108,23 @@ TARGET_IMPAIRMENTS = Catalogue(
         for name in ("lost_pulses", "white_phase", "phase_walk", "phase_sinusoid", "quantiser")
     },
 )
+AntennaMotions = Sequence[Annotated[scene.Motion | scene.RandomMotion, FLIGHT_MOTIONS]]
+
+
+def path_error(x: AntennaMotions = (), y: AntennaMotions = (), z: AntennaMotions = ()) -> echo.PathError:
+    """Errors of the recorded positions of the antenna, of the transmitter if there are two.
+
+    Args:
+        x: Errors along axis x by name, which add up.
+        y: Errors along axis y.
+        z: Errors along axis z.
+    """
+    return echo.PathError(scene.Sway(x, y, z))
+
+
+PATH_IMPAIRMENTS = Catalogue(
+    "impairment of a recording along any path", "kind", {**TARGET_IMPAIRMENTS.entries, "path_error": path_error}
+)
 LADAR_IMPAIRMENTS = Catalogue(
     "impairment of a ladar recording", "kind", {"quantiser": IMPAIRMENTS.entries["quantiser"]}
 )
@@ -113,6 +137,9 @@ WORLD = {
     "START PHASES (isal, isal_rotation: world.start_phase)": START_PHASES,
     "FIDELITIES (isal, isal_rotation: world.fidelity)": FIDELITIES,
     "MOTIONS (sal: world.motion)": RADIAL_MOTIONS,
+    "MOTIONS (path: world.transmitter, world.receiver, world.navigation)": FLIGHT_MOTIONS,
+    "NOMINAL PATHS (path: world.transmitter, world.receiver)": NOMINAL_PATHS,
+    "GROUNDS (path: world.ground)": GROUNDS,
     "LOG-AMPLITUDES (sal: world.log_amplitude)": LOG_AMPLITUDES,
     "FIDELITIES (sal: world.fidelity)": SWEEP_FIDELITIES,
     "SWEEP ERRORS (sal: world.sweep_error)": SWEEP_ERRORS,
@@ -122,6 +149,7 @@ WORLD = {
     "RECEIVE RANGES (geo: world.receive)": RECEIVE_RANGES,
     "IMPAIRMENTS (stripmap)": IMPAIRMENTS,
     "IMPAIRMENTS (isal, isal_rotation)": TARGET_IMPAIRMENTS,
+    "IMPAIRMENTS (path)": PATH_IMPAIRMENTS,
     "IMPAIRMENTS (sal)": LADAR_IMPAIRMENTS,
     "IMPAIRMENTS (geo)": MULTICHANNEL_IMPAIRMENTS,
 }
@@ -170,6 +198,7 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "sharpest_phase": compensate.SharpestPhase,
     "link_phases": compensate.LinkPhases,
     "autofocus": compensate.TargetAutofocus,
+    "path_autofocus": compensate.PathAutofocus,
     "pulse_phase_correct": compensate.CorrectPulsePhase,
     "segmented_interference": compensate.SegmentedInterference,
     "mirror_product": compensate.MirrorProduct,
@@ -210,6 +239,8 @@ FOCUS: dict[str, Callable[..., Any]] = {
     "range_doppler": focus.RangeDoppler,
     "backproject": focus.Backproject,
     "closest_range": focus.ClosestRange,
+    "tile_image": focus.TileImage,
+    "direct_image": focus.DirectImage,
     "compress_dechirped": focus.CompressDechirped,
     "azimuth_transform": focus.AzimuthTransform,
     "target_image": focus.TargetImage,

@@ -31,7 +31,7 @@ _UNITS = {
 _PREFIXES = {1e3: "k", 1e-3: "m", 1e6: "M", 1e-6: "u", 1e9: "G", 1e-9: "n", 1e12: "T", 1e-12: "p"}
 # pattern of SYSTEM.KEY, least and largest magnitude of numbers other than zero, and the reason; the
 # systems whose numbers are checked; those of other packages have ranges of their own
-_SYSTEMS = ("stripmap", "isal", "isal_rotation", "sal", "geo", "geo_ocean")
+_SYSTEMS = ("stripmap", "isal", "isal_rotation", "sal", "geo", "geo_ocean", "path")
 # first pattern that matches is used
 _RANGES: Sequence[tuple[str, float, float, str]] = (
     ("*.radar.wave_speed_m_s", 1e8, 3.1e8, "the speed of light in glass, air or space"),

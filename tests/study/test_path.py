@@ -1,0 +1,131 @@
+"""Antennas on any path: what is theirs alone in the frame of all systems, and recordings."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.study.scenes import PATH, TILES, bench_of, loaded_as, run, world
+from torchsar.core import Draws
+from torchsar.radar import LIGHT_M_S
+from torchsar.study.commands.sweep import SweepTrial
+from torchsar.study.montecarlo import sweep
+from torchsar.study.settings.cases import cases_of
+from torchsar.study.settings.errors import ConfigError
+from torchsar.study.table import load
+from torchsar.study.trials.bench import Bench
+
+
+def metrics_of(bench: Bench, trials: int = 2, seed: int = 3) -> dict[str, dict[str, torch.Tensor]]:
+    outcomes = bench.batch(Draws(seed, "run", range(trials)), detail=True).outcomes
+    return {name: {key: value.double() for key, value in one.metrics.items()} for name, one in outcomes.items()}
+
+
+def test_autofocus_corrects_what_navigation_leaves(tmp_path: Path) -> None:
+    found = metrics_of(bench_of(tmp_path, "path"), 4)
+    ideal, none, best = (found[name] for name in ("ideal", "none", "recommended"))
+    assert bool((ideal["position_error_rms_m"] < 0.01).all()) and bool((ideal["path_residual_rms_m"] == 0).all())
+    assert bool((none["path_residual_rms_m"] > 1e-3).all()) and bool((none["image_error_db"] > -12).all())
+    assert bool(best["ok"].all()) and bool((best["path_residual_rms_m"] < 3e-4).all())
+    assert bool((best["image_error_db"] < -16).all()) and bool((best["position_error_rms_m"] < 0.05).all())
+
+
+def test_the_residual_of_a_path_has_no_shift_and_is_that_of_the_truth(tmp_path: Path) -> None:
+    """Offset and drift shift the image; of a sinusoid of 1 mm along x, 0.71 mm along the line of
+    sight, three cycles are left, less their slope: a share of 6 / (3 pi)^2 of their power.
+    """
+    bias = {"bias": {"kind": "offset", "metres": 0.05}, "drift": {"kind": "polynomial", "coefficients_m": [0.01]}}
+    sway = {"sway": {"kind": "sinusoid", "amplitude_m": 1e-3 * math.sqrt(2), "frequency_hz": 100 / 96 * 3}}
+    bench = bench_of(tmp_path, "path", world=world("path", navigation={"x": {**bias, **sway}}))
+    found = metrics_of(bench)["none"]
+    torch.testing.assert_close(found["path_residual_rms_m"], torch.full((2,), 6.83e-4).double(), rtol=0.01, atol=0)
+    assert bool((found["image_shift_m"] > 0.02).all()) and bool((found["position_error_rms_m"] < 0.03).all())
+
+
+def test_a_sweep_of_navigation_errors_and_noise_runs_in_one_batch(tmp_path: Path) -> None:
+    methods = {name: PATH["processor"][name] for name in ("ideal", "none", "recommended")}
+    trial = SweepTrial(loaded_as(tmp_path, "path", processor=methods))
+    walk, snr = "world.navigation.x.walk.m_per_root_s", "world.noise.snr_db"
+    record = sweep(trial, {walk: [0.0, 0.02], snr: [0.0, 20.0]}, batched=[walk, snr], trials=2, seed=1)
+    names = list(record.algorithms)
+    residual = np.asarray(record.metrics["path_residual_rms_m"])
+    none, best = residual[names.index("none")], residual[names.index("recommended")]
+    assert (none[0] < 1e-9).all() and (none[1] > 1e-3).all()
+    assert (best[:, 1] < 2e-4).all() and (best[1] < none[1]).all()
+
+
+@pytest.mark.parametrize("config", ["airborne_spotlight", "bistatic_fixed", "drone_stripmap"])
+def test_packaged_configs_work_at_reduced_size(config: str) -> None:
+    small = [
+        f"processor.{name}.stages.image.{side}_m=6.0"
+        for name in ("ideal", "recommended")
+        for side in ("azimuth", "range")
+    ]
+    if config == "airborne_spotlight":
+        small += ["processor.recorded.stages.image.azimuth_m=6.0", "processor.recorded.stages.image.range_m=6.0"]
+    small += ["world.scene.field.count=20", "world.trials=1", "world.scene.corners.amplitude=null"]
+    bench = Bench(next(iter(cases_of(load(config, small)).values())))
+    if config == "drone_stripmap":
+        assert bench.world().beam is not None and bench.world().window_range_m == 500.0
+        return
+    found = metrics_of(bench, 1)
+    assert float(found["ideal"]["position_error_rms_m"]) < 0.02
+    if config == "bistatic_fixed":
+        assert float(found["recommended"]["image_error_db"]) < -75
+
+
+def archive(folder: Path) -> Path:
+    """Recorded phase history of some points from a circle."""
+    made, frequency = np.random.default_rng(2), 9.4e9 + 4e6 * np.arange(64)
+    angle = np.linspace(-0.04, 0.04, 80)
+    place = 2000 * np.stack([-np.cos(angle), np.sin(angle), np.ones(80)], -1)
+    history = np.zeros((64, 80), complex)
+    for _ in range(25):
+        point = np.append(made.uniform(-8, 8, 2), 0.0)
+        path = 2 * (np.linalg.norm(place - point, axis=-1) - np.linalg.norm(place, axis=-1))
+        history += made.normal() * np.exp(-2j * np.pi / LIGHT_M_S * frequency[:, None] * path)
+    path = folder / "recorded.npz"
+    reference = 2 * np.linalg.norm(place, axis=-1)
+    np.savez(path, history=history, freq_hz=frequency, transmitter_m=place, path_reference_m=reference, prf_hz=100.0)
+    return path
+
+
+def test_errors_are_added_to_a_recorded_path_and_corrected(tmp_path: Path) -> None:
+    error = {"kind": "path_error", "x": {"sway": {"kind": "sinusoid", "amplitude_m": 0.01, "frequency_hz": 4.0}}}
+    config = loaded_as(
+        tmp_path,
+        "path",
+        radar=None,
+        world=None,
+        metrics={"reference": "ideal"},
+        data={"file": str(archive(tmp_path)), "impairments": {"path": error}},
+    )
+    tree = run(config.file, tmp_path / "out")
+    none, best = (tree["methods"][name]["metrics"] for name in ("none", "recommended"))
+    assert none["path_residual_rms_m"] == pytest.approx(0.005, rel=0.1) and none["image_error_db"] > -3
+    assert best["path_residual_rms_m"] < 4e-4 and best["image_error_db"] < -12 and best["ok"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"transmitter": {"nominal": {"kind": "straigt"}}}, "world.transmitter.nominal.kind.*did you mean 'straight'"),
+        ({"transmitter": {**PATH["world"]["transmitter"], "x": {"a": {"kind": "jiter"}}}}, "did you mean 'jitter'"),
+        ({"navigation": {"latency_s": 0.7}}, "world.navigation.latency_s|latency_s of a navigation"),
+        ({"beam": {"width_deg": 200.0}}, "between 0 and 180 degrees"),
+        ({"pulses": 1}, "two pulses"),
+    ],
+)
+def test_mistakes_are_named(tmp_path: Path, changes: dict, match: str) -> None:
+    with pytest.raises(ConfigError, match=match):
+        metrics_of(bench_of(tmp_path, "path", world=world("path", **changes)))
+
+
+def test_auto_takes_tiles_and_images_of_other_stages_have_no_points(tmp_path: Path) -> None:
+    chosen = {"stages": {"image": {**TILES, "stage": "auto"}}}
+    bench = bench_of(tmp_path, "path", processor={"recommended": chosen}, metrics={})
+    assert "tiles at -40 dB was chosen" in bench.chosen[0]

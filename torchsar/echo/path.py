@@ -1,0 +1,288 @@
+"""Simulation of phase histories along any path."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws, Recording, Signal, Truth, per_trial, unit_phasor
+from torchsar.echo.pulsed import echo_spectrum
+from torchsar.echo.stripmap import Impairment, apply_impairments
+from torchsar.radar import AntennaPath, InverseRadar, frequency_samples, range_profiles
+from torchsar.scene import PathWorld, Sway
+from torchsar.scene.trials import refuse_other_trials
+
+# bytes of the tables of a block of pulses, about the cache of a processor
+_BLOCK_BYTES = 1 << 22
+# amplitude gain from which a target is lit: half power of each of two ways
+_LIT = 0.5
+
+
+def path_echo(
+    antennas: AntennaPath,
+    points_m: Tensor,
+    weight: Tensor,
+    radar: InverseRadar,
+    n_frequency: int,
+    dtype: torch.dtype = torch.complex64,
+) -> Tensor:
+    """Compute the phase history of points along any path.
+
+    The sample of pulse p at the frequency f is the sum over the points of weight exp(-2j pi f (l -
+    reference) / c) with the path l = |transmitter - x| + |x - receiver|. Antennas are at rest
+    during a pulse. The sum is a matrix product over blocks of frequencies (`echo_spectrum`).
+    Differentiable in positions and weights.
+
+    Args:
+        antennas: Positions of the antennas at every pulse.
+        points_m: Positions of the points in metres, shape (..., point, 3), float64.
+        weight: Amplitude of the points, times the gain of the beam, complex or real,
+            broadcastable to (..., pulse, point).
+        radar: Band of the radar; its `carrier_hz` is that of sample n // 2.
+        n_frequency: Number n of frequencies, which share the bandwidth of the radar.
+        dtype: Complex dtype of the result.
+
+    Returns:
+        Phase history, shape (..., pulse, frequency).
+
+    Raises:
+        ValueError: If there is no point or frequency.
+    """
+    if n_frequency < 1 or not points_m.shape[-2]:
+        raise ValueError(f"path_echo needs points and frequencies, got {points_m.shape[-2]} and {n_frequency}")
+    lead = np.broadcast_shapes(antennas.trials, points_m.shape[:-2])
+    size = points_m.shape[-2] * max(1, round(2 * n_frequency**0.5)) * int(np.prod(lead)) * dtype.itemsize
+    step = max(1, _BLOCK_BYTES // size)
+    out = []
+    for first in range(0, antennas.pulses, step):
+        pulses = slice(first, min(first + step, antennas.pulses))
+        delay = antennas.path_m(points_m[..., None, :, :], pulses) / radar.wave_speed_m_s
+        some = weight if weight.shape[-2] == 1 else weight[..., pulses, :]
+        out.append(
+            echo_spectrum(delay, radar.carrier_hz * delay, some, n_frequency, radar.bandwidth_hz / n_frequency, dtype)
+        )
+    return torch.cat(out, -2)
+
+
+def simulate_path(
+    radar: InverseRadar,
+    world: PathWorld,
+    n_pulse: int,
+    n_range: int,
+    draws: Draws,
+    impairments: Mapping[str, Impairment] | None = None,
+    dtype: torch.dtype = torch.complex64,
+    device: torch.device | str | None = None,
+) -> tuple[Recording, Truth]:
+    """Simulate range profiles along any path, one recording per trial of `draws`.
+
+    Profiles are those of pulses after range compression, or of dechirped sweeps without their video
+    phase.
+
+    Args:
+        radar: Carrier, bandwidth and pulse repetition frequency.
+        world: Scene, true paths, navigation, ground, beam and signal-to-noise ratio.
+        n_pulse: Number of pulses.
+        n_range: Number of range cells, and of frequencies.
+        draws: Random draws.
+        impairments: Impairments by name, applied in order.
+        dtype: Complex dtype of the recording.
+        device: Device of the recording.
+
+    Returns:
+        The recording, shape (..., pulse, range), and the truth. Side data of the recording are
+        `frequency_hz` and those of `AntennaPath.side_data`, with the positions that navigation
+        records. The values of the truth are:
+
+        - `true_transmitter_m`, shape (..., pulse, 3), and `true_receiver_m` unless both share an
+          antenna: the true positions;
+        - `line_of_sight_m`, shape (..., pulse): half the path over the point (0, 0, 0), recorded
+          minus true;
+        - `azimuth_m`, `range_m`, `height_m` and `amplitude` of the scatterers, shape (..., target);
+        - `noise_std`, shape (...,) or (): the standard deviation of the complex noise of a sample;
+        - the true values of each impairment, as "<impairment>.<name>".
+
+        The recording `clean` of the truth has the same noise and the true positions, but no
+        impairments.
+
+    Raises:
+        ValueError: If the scene is empty, a scatterer leaves the range window while it is lit,
+            there are fewer than two pulses, or a parameter given per trial has another length than
+            the number of trials.
+    """
+    refuse_other_trials(world, draws)
+    if n_pulse < 2 or n_range < 2:
+        raise ValueError(f"a recording needs at least two pulses of two samples, got {n_pulse} and {n_range}")
+    time_s = torch.arange(n_pulse, dtype=torch.float64, device=device) / radar.prf_hz
+    flown = _Flown.of(world, draws, time_s)
+    drawn = world.scene.scatterers(draws)
+    x, y, amplitude = (v.to(device) for v in (drawn.range_m, drawn.azimuth_m, drawn.amplitude))
+    if not x.shape[-1]:
+        raise ValueError("the scene holds no scatterer; give it at least one")
+    points = torch.stack(torch.broadcast_tensors(x, y, world.ground.height_m(x, y)), -1)
+    gain = _gain(world, flown.true, points, time_s)
+    gain = gain * _within(flown.true, points, gain, radar, n_range)
+    history = path_echo(flown.true, points, amplitude[..., None, :] * gain, radar, n_range, dtype)
+    std = torch.zeros((), dtype=torch.float64, device=device)
+    if world.snr_db is not None:
+        power = _lit_power(history.detach(), gain.detach())
+        std = torch.sqrt(power / 10 ** (per_trial(world.snr_db, 0, history) / 10))
+        noise = draws.normal("noise", (n_pulse, n_range), dtype, device)
+        history = history + noise * std.to(history.real.dtype)[..., None, None]
+    trials = () if draws.trials is None else (len(draws.trials),)
+    # without random numbers the echo has no trials yet
+    data = range_profiles(history.expand(*np.broadcast_shapes(history.shape[:-2], trials), -1, -1))
+    frequency = radar.carrier_hz + radar.bandwidth_hz / n_range * (
+        torch.arange(n_range, dtype=torch.float64, device=device) - n_range // 2
+    )
+    signal = Signal(data, radar.raw_axes(n_pulse, n_range))
+    recorded, clean = (
+        Recording(signal, radar, {"frequency_hz": frequency, **path.side_data()})
+        for path in (flown.recorded, flown.true)
+    )
+    recording, true_values = apply_impairments(recorded, impairments or {}, draws)
+    values = {
+        **flown.truth(),
+        "azimuth_m": y,
+        "range_m": x,
+        "height_m": points[..., 2],
+        "amplitude": amplitude,
+        "noise_std": std,
+    }
+    return recording, Truth({**values, **true_values}, clean)
+
+
+@dataclass(frozen=True)
+class _Flown:
+    """True and recorded paths, which share the reference."""
+
+    true: AntennaPath
+    recorded: AntennaPath
+
+    @staticmethod
+    def of(world: PathWorld, draws: Draws, time_s: Tensor) -> _Flown:
+        """Draw the flights and what navigation records of them."""
+        span_s = float(time_s[-1] - time_s[0])
+        true, recorded = [], []
+        flights = (("transmitter", world.transmitter, world.navigation),)
+        if world.receiver is not None:
+            flights = (*flights, ("receiver", world.receiver, world.receiver_navigation))
+        for name, flight, navigation in flights:
+            path = flight.drawn(draws.part(name), span_s)
+            true.append(path.position_m(time_s))
+            recorded.append(navigation.recorded_m(draws.part(name), time_s, path))
+        if world.window_range_m is None:
+            legs = [torch.linalg.vector_norm(place, dim=-1) for place in recorded]
+            reference = 2 * legs[0] if len(legs) == 1 else legs[0] + legs[1]
+        else:
+            reference = torch.full_like(time_s, 2 * world.window_range_m)
+        return _Flown(*(AntennaPath(p[0], p[1] if len(p) > 1 else None, reference) for p in (true, recorded)))
+
+    def truth(self) -> dict[str, Tensor]:
+        """True positions and the error of the line of sight."""
+        names = ("true_transmitter_m", "true_receiver_m")
+        values = dict(zip(names, self.true.places, strict=False))
+        return {**values, "line_of_sight_m": _line_of_sight_m(self.recorded, self.true)}
+
+
+def _line_of_sight_m(recorded: AntennaPath, true: AntennaPath) -> Tensor:
+    """Half the path over the point (0, 0, 0), recorded minus true, (..., pulse)."""
+    centre = true.transmitter_m.new_zeros(1, 3)
+    return (recorded.path_m(centre) - true.path_m(centre))[..., 0] / 2
+
+
+@dataclass(frozen=True)
+class PathError:
+    """Impairment: errors of the positions that navigation records.
+
+    It works on simulated and on recorded data with the side data of `AntennaPath.side_data`. The
+    radar keeps the middle of the scene in its window as navigation says: the reference of the
+    phases changes by the error over the point (0, 0, 0), and the samples with it, so that the
+    error of the line of sight is a phase of the pulses as well.
+
+    Args:
+        transmitter: Errors of the transmitter, or of both antennas if they share one.
+        receiver: Errors of the receiver.
+    """
+
+    transmitter: Sway = field(default_factory=Sway)
+    receiver: Sway = field(default_factory=Sway)
+
+    def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
+        """Add the errors to the recorded positions.
+
+        Args:
+            recording: Recording with the axes (pulse, range); the errors are functions of its slow
+                time since the first pulse.
+            draws: Random draws.
+
+        Returns:
+            The recording with other side data and reference, and `line_of_sight_m`, shape (...,
+            pulse): half the path over the point (0, 0, 0), with the errors minus without.
+
+        Raises:
+            ValueError: If the recording holds no positions of the antennas.
+        """
+        aux = recording.aux
+        if "transmitter_m" not in aux:
+            raise ValueError(f"errors of a path need recorded positions (aux transmitter_m), got {[*aux]}")
+        time_s = recording.signal.axis("pulse").offsets(aux["transmitter_m"].device)
+        span_s = float(time_s[-1])
+        moved = {}
+        for name, error in (("transmitter", self.transmitter), ("receiver", self.receiver)):
+            if f"{name}_m" in aux:
+                moved[name] = aux[f"{name}_m"] + error.drawn(draws.part(name), span_s).displacement_m(time_s)
+        reference = aux["path_reference_m"]
+        before = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), reference)
+        after = AntennaPath(moved["transmitter"], moved.get("receiver"), reference)
+        off = _line_of_sight_m(after, before)
+        after = replace(after, reference_m=reference + 2 * off)
+        turns = 2 * off[..., None] * aux["frequency_hz"] / recording.radar.wave_speed_m_s
+        data = recording.signal.data
+        data = range_profiles(frequency_samples(data) * unit_phasor(turns, data.dtype))
+        changed = replace(recording, signal=recording.signal.with_data(data), aux={**aux, **after.side_data()})
+        return changed, {"line_of_sight_m": off}
+
+
+def _gain(world: PathWorld, antennas: AntennaPath, points: Tensor, time_s: Tensor) -> Tensor:
+    """Gain of all ways that have a beam, (..., pulse or 1, point)."""
+    if world.beam is None:
+        return points.new_ones(1, 1)
+    flight = world.transmitter if world.receiver is None else world.receiver
+    nominal = flight.nominal.position_m(time_s)
+    heading = torch.gradient(nominal, dim=0)[0] * nominal.new_tensor([1.0, 1.0, 0.0])
+    speed = torch.linalg.vector_norm(heading, dim=-1, keepdim=True)
+    if not bool((speed > 0).all()):
+        raise ValueError("a beam needs an antenna that moves horizontally; leave it out for a fixed antenna")
+    sight = points[..., None, :, :] - antennas.places[-1][..., None, :]
+    ahead = (sight * (heading / speed)[:, None]).sum(-1) / torch.linalg.vector_norm(sight, dim=-1)
+    one_way = world.beam.gain(time_s, ahead)
+    return one_way.square() if world.receiver is None else one_way
+
+
+def _lit_power(history: Tensor, gain: Tensor) -> Tensor:
+    """Mean power of the samples of pulses in which a target is lit, of all if none is, (...,)."""
+    power = torch.view_as_real(history).double().square().sum(-1).mean(-1)
+    lit = (gain >= _LIT).any(-1).expand(power.shape)
+    lit = lit | ~lit.any(-1, keepdim=True)
+    return (power * lit).sum(-1) / lit.sum(-1)
+
+
+def _within(antennas: AntennaPath, points: Tensor, gain: Tensor, radar: InverseRadar, n_range: int) -> Tensor:
+    """Whether the window holds the echo of each scatterer, (..., pulse, point); ValueError if it
+    leaves the window while it is lit.
+    """
+    off = antennas.path_m(points[..., None, :, :]).detach() / 2
+    half = n_range * radar.range_step_m / 2
+    within = off.abs() <= half
+    lost = ~within & (gain.detach() >= _LIT)
+    if bool(lost.any()):
+        raise ValueError(
+            f"the lit scene must stay within {half:.4g} m of range from the middle of the window, but reaches "
+            f"{float((off.abs() * lost).max()):.4g} m; choose a smaller scene or more range cells"
+        )
+    return within

@@ -1,0 +1,194 @@
+"""Stages that image the ground from range profiles along any path."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Axis, Signal, Stage, real_dtype
+from torchsar.focus.backprojection import backproject
+from torchsar.focus.image_grid import ImageGrid
+from torchsar.focus.spotlight import window_weights
+from torchsar.focus.tiles import TilePlan
+from torchsar.radar.antenna_path import AntennaPath
+from torchsar.radar.spotlight import frequency_samples
+
+# windows over pulses and over frequencies by name, if they differ
+_WINDOWS = {"range": ("none", "hann")}
+
+
+class PathImage(Stage):
+    """Base class of the stages that image the ground from range profiles along any path.
+
+    The image has the axes ("azimuth", "range"), in metres on a horizontal plane. A chain connects
+    the side data of the recording; without `receiver_m` both antennas are at `transmitter_m`:
+
+        use(TileImage(100.0, 100.0, 0.25), frequency_hz="aux.frequency_hz",
+            transmitter_m="aux.transmitter_m", receiver_m="aux.receiver_m",
+            path_reference_m="aux.path_reference_m")
+
+    The image is the sum over pulses and frequencies of the samples times the window, with the phase
+    of a point as in `backproject`. Positions (trial, pulse, 3) are paths of single trials.
+
+    Args:
+        azimuth_m: Extent of the image along its azimuth axis in metres.
+        range_m: Extent along its range axis in metres.
+        step_m: Sample spacing in metres.
+        centre_m: Position of the centre in metres along (range axis, azimuth axis).
+        range_axis_rad: Direction of the range axis in rad, from ground coordinate x towards y; the
+            azimuth axis is a quarter turn further.
+        height_m: Height z of the imaged plane in metres.
+        window: "none"; "hann" over pulses and over frequencies; or "range", Hann over frequencies
+            only, for strips, in which each point is seen by a part of the pulses.
+
+    Raises:
+        ValueError: If a number is not finite, the spacing is not positive or larger than an extent,
+            or the window is not known.
+    """
+
+    def __init__(
+        self,
+        azimuth_m: float,
+        range_m: float,
+        step_m: float,
+        centre_m: tuple[float, float] = (0.0, 0.0),
+        range_axis_rad: float = 0.0,
+        height_m: float = 0.0,
+        window: str = "hann",
+    ) -> None:
+        super().__init__()
+        numbers = (azimuth_m, range_m, step_m, *centre_m, range_axis_rad, height_m)
+        if not (all(map(math.isfinite, numbers)) and len(centre_m) == 2 and 0 < step_m <= min(azimuth_m, range_m)):
+            raise ValueError(
+                "an image needs finite numbers with 0 < step_m <= azimuth_m, range_m and a centre of two coordinates, "
+                f"got azimuth_m={azimuth_m}, range_m={range_m}, step_m={step_m}, centre_m={centre_m}, "
+                f"range_axis_rad={range_axis_rad}, height_m={height_m}"
+            )
+        self.windows = _WINDOWS.get(window, (window, window))
+        for name in self.windows:
+            window_weights(name, 1)
+        counts = tuple(round(extent / step_m) + 1 for extent in (azimuth_m, range_m))
+        starts = [centre - n // 2 * step_m for centre, n in zip(reversed(tuple(centre_m)), counts, strict=True)]
+        azimuth, range_ = (
+            Axis(name, n, start, float(step_m), "m")
+            for name, n, start in zip(("azimuth", "range"), counts, starts, strict=True)
+        )
+        self.axes = azimuth, range_
+        sin, cos = math.sin(range_axis_rad), math.cos(range_axis_rad)
+        axes = torch.tensor([[-sin, cos, 0.0], [cos, sin, 0.0]], dtype=torch.float64)
+        origin = torch.tensor(starts, dtype=torch.float64) @ axes
+        origin[2] = height_m
+        self.grid = ImageGrid(origin, axes, (azimuth.n, range_.n), float(step_m))
+
+    def form(self, history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid) -> Tensor:
+        """Form the image of a phase history; subclasses implement this method.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+            frequency_hz: Frequencies in Hz, shape (frequency,).
+            antennas: Path of the antennas.
+            grid: Pixels.
+
+        Returns:
+            Image, shape (..., azimuth, range).
+        """
+        raise NotImplementedError
+
+    def forward(
+        self,
+        signal: Signal,
+        frequency_hz: Tensor,
+        transmitter_m: Tensor,
+        path_reference_m: Tensor,
+        receiver_m: Tensor | None = None,
+    ) -> Signal:
+        """Form the image of range profiles with the axes (pulse, range).
+
+        Args:
+            signal: Range profiles, the centred unitary inverse FFT of a phase history.
+            frequency_hz: Frequencies in Hz, float64 (range,).
+            transmitter_m: Positions of the transmitter in metres, float64 (..., pulse, 3).
+            path_reference_m: Path to which phases refer in metres, float64 (..., pulse).
+            receiver_m: Positions of the receiver in metres; None if both share an antenna.
+
+        Returns:
+            Image with the axes (azimuth, range) in metres.
+        """
+        data = signal.data
+        weights = (window_weights(name, n, data.device) for name, n in zip(self.windows, data.shape[-2:], strict=True))
+        rows, columns = (weight.to(real_dtype(data.dtype)) for weight in weights)
+        history = frequency_samples(data) * columns * rows[:, None]
+        grid = ImageGrid(
+            self.grid.origin_m.to(data.device), self.grid.axes.to(data.device), self.grid.counts, self.grid.step_m
+        )
+        antennas = AntennaPath(transmitter_m, receiver_m, path_reference_m)
+        return Signal(self.form(history, frequency_hz, antennas, grid), self.axes)
+
+
+class TileImage(PathImage):
+    """Stage that images any path by tiles, see `TilePlan`; arguments as in `PathImage`.
+
+    Args:
+        azimuth_m: Extent of the image along its azimuth axis in metres.
+        range_m: Extent along its range axis in metres.
+        step_m: Sample spacing in metres.
+        centre_m: Position of the centre in metres along (range axis, azimuth axis).
+        range_axis_rad: Direction of the range axis in rad, from ground coordinate x towards y.
+        height_m: Height z of the imaged plane in metres.
+        window: "none", "hann" or "range", see `PathImage`.
+        error_db: Largest rms error relative to the image of white noise, in dB.
+    """
+
+    def __init__(
+        self,
+        azimuth_m: float,
+        range_m: float,
+        step_m: float,
+        centre_m: tuple[float, float] = (0.0, 0.0),
+        range_axis_rad: float = 0.0,
+        height_m: float = 0.0,
+        window: str = "hann",
+        error_db: float = -60.0,
+    ) -> None:
+        super().__init__(azimuth_m, range_m, step_m, centre_m, range_axis_rad, height_m, window)
+        self.error_db = error_db
+
+    def form(self, history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid) -> Tensor:
+        """Form the image by tiles.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+            frequency_hz: Frequencies in Hz, shape (frequency,).
+            antennas: Path of the antennas.
+            grid: Pixels.
+
+        Returns:
+            Image, shape (..., azimuth, range).
+        """
+        places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
+        return TilePlan(frequency_hz, *places, grid, self.error_db).image(history)
+
+
+class DirectImage(PathImage):
+    """Stage that images any path by the direct sum, see `backproject`: slow and exact.
+
+    Arguments as in `PathImage`.
+    """
+
+    def form(self, history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid) -> Tensor:
+        """Form the image by the direct sum.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+            frequency_hz: Frequencies in Hz, shape (frequency,).
+            antennas: Path of the antennas.
+            grid: Pixels.
+
+        Returns:
+            Image, shape (..., azimuth, range).
+        """
+        places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
+        eps = 1e-10 if history.dtype == torch.complex128 else 1e-6
+        return backproject(history, frequency_hz, *places, grid.pixels_m(), eps=eps)

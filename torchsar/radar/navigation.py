@@ -1,0 +1,168 @@
+"""Positions at pulse times from the record of a navigation system."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchsar.core import UnevenSpline
+from torchsar.radar.antenna_path import broadcast, refuse_unusable
+
+# a gap is longer than ten median intervals, and than five times what 95 % of them do not exceed, by
+# choice: the longest of 1000 random intervals is about ten times the median
+_GAP, _USUAL, _SHARE = 10.0, 5.0, 0.95
+# a jump exceeds the median of the residuals by this factor, by choice; normal noise has up to 4
+_ABOVE_MEDIAN = 10.0
+# acceleration that may set in between two records, in m/s^2, by choice: about that of gravity
+_GUST_M_S2 = 10.0
+# normalised fourth difference at equal steps of a jump of 1 in the middle, 3 / sqrt(70), and of an
+# acceleration that sets in, per h^2
+_OF_JUMP = 0.36
+_OF_GUST = 1 / 12
+# share of the median interval by which pulses may lie beyond the record, for rounding errors
+_ROUNDING = 1e-6
+
+
+def resample_path(
+    time_s: Tensor,
+    position_m: Tensor,
+    pulse_time_s: Tensor,
+    *,
+    longest_gap_s: float | None = None,
+    jump_m: float = 0.2,
+) -> Tensor:
+    """Interpolate recorded positions of an antenna at the times of the pulses by cubic splines.
+
+    Times may be uneven. All clocks must agree; to correct a latency, subtract it from `time_s`. The
+    spline passes through the records, so that their noise enters the positions. Differentiable in
+    all tensors.
+
+    A jump shows in the fourth divided differences of the record, in which smooth motion cancels. It
+    is refused if it exceeds ten times their median in the record (more where intervals are long),
+    what an acceleration of 10 m/s^2 that sets in between two records makes, and what a jump of
+    `jump_m` makes. At the ends of a record a jump must be up to three times larger to be found.
+
+    Args:
+        time_s: Times of the records in seconds, rising, float64 (..., record), at least five.
+        position_m: Recorded positions in metres, float64 (..., record, 3).
+        pulse_time_s: Times of the pulses in seconds, within the record, float64 (..., pulse).
+        longest_gap_s: Longest interval between records in seconds from which pulses are
+            interpolated; None for ten times the median interval, or five times the interval that
+            95 % do not exceed if that is longer.
+        jump_m: Smallest jump in metres that is refused in a smooth record, at least four times the
+            step to which its positions are rounded; infinity if jumps are accepted.
+
+    Returns:
+        Positions in metres, float64 (..., pulse, 3); leading dims are those of all three tensors,
+        broadcast.
+
+    Raises:
+        TypeError: If a tensor is not float64.
+        ValueError: If shapes do not match, there are fewer than five records, a value is not
+            finite, times are out of order or doubled, pulses lie beyond the record, or the record
+            has a gap or a jump among the pulses.
+    """
+    refuse_unusable(time_s=time_s, position_m=position_m, pulse_time_s=pulse_time_s)
+    shapes = time_s.shape, position_m.shape, pulse_time_s.shape
+    fits = time_s.ndim and pulse_time_s.numel() and position_m.shape[-2:] == (*time_s.shape[-1:], 3)
+    if not fits or time_s.shape[-1] < 5 or broadcast([shapes[0][:-1], shapes[1][:-2], shapes[2][:-1]]) is None:
+        raise ValueError(
+            "resample_path needs time_s (..., record) of at least five records, position_m (..., record, 3) and "
+            "pulse_time_s (..., pulse) of at least one pulse, with leading dims that broadcast, got "
+            f"{', '.join(str(tuple(shape)) for shape in shapes)}"
+        )
+    if not jump_m > 0 or not (longest_gap_s is None or longest_gap_s > 0):
+        raise ValueError(f"longest_gap_s and jump_m must be positive, got {longest_gap_s} and {jump_m}")
+    time, first, last = (x.detach() for x in (time_s, pulse_time_s.amin(-1), pulse_time_s.amax(-1)))
+    _refuse_order(time)
+    _refuse_outside(time, first, last)
+    _refuse_gaps(time, first, last, longest_gap_s)
+    _refuse_jumps(time, position_m.detach(), first, last, jump_m)
+    return UnevenSpline(time_s[..., None, :], position_m.mT).at(pulse_time_s[..., None, :]).mT
+
+
+def _refuse_order(time: Tensor) -> None:
+    """Raise ValueError unless times rise."""
+    bad = time.diff() <= 0
+    if bool(bad.any()):
+        at, where = _first(bad)
+        before, after = float(time[(*at[:-1], at[-1])]), float(time[(*at[:-1], at[-1] + 1)])
+        if before == after:
+            raise ValueError(
+                f"times of a navigation record must rise, but {after:.9g} s stands twice, at record {at[-1] + 1}"
+                f"{where}; remove doubled records"
+            )
+        raise ValueError(
+            f"times of a navigation record must rise, but {after:.9g} s follows {before:.9g} s at record "
+            f"{at[-1] + 1}{where}; sort the records"
+        )
+
+
+def _refuse_outside(time: Tensor, first: Tensor, last: Tensor) -> None:
+    """Raise ValueError if pulses lie beyond the record."""
+    slack = _ROUNDING * time.diff().median(-1).values
+    for beyond, end, edge in (
+        (time[..., 0] - first, "before the first", 0),
+        (last - time[..., -1], "after the last", -1),
+    ):
+        bad = beyond > slack
+        if bool(bad.any()):
+            at, where = _first(bad[..., None])
+            edges = time[..., edge].expand(bad.shape)
+            raise ValueError(
+                f"pulses must lie within the navigation record, but one is {float(beyond[at[:-1]]):.3g} s {end} record "
+                f"at {float(edges[at[:-1]]):.9g} s{where}; use a longer record or fewer pulses"
+            )
+
+
+def _refuse_gaps(time: Tensor, first: Tensor, last: Tensor, longest_gap_s: float | None) -> None:
+    """Raise ValueError if an interval among the pulses is too long."""
+    step = time.diff()
+    if longest_gap_s is None:
+        usual = step.kthvalue(math.ceil(_SHARE * step.shape[-1]), -1, keepdim=True).values
+        longest = torch.maximum(_GAP * step.median(-1, keepdim=True).values, _USUAL * usual)
+    else:
+        longest = torch.as_tensor(longest_gap_s, dtype=torch.float64)
+    among = (time[..., 1:] > first[..., None]) & (time[..., :-1] < last[..., None])
+    bad = (step > longest) & among
+    if bool(bad.any()):
+        at, where = _first(bad)
+        gap, limit, start = (float(x.expand(bad.shape)[at]) for x in (step, longest, time[..., :-1]))
+        raise ValueError(
+            f"the navigation record has a gap of {gap:.3g} s after {start:.9g} s{where}, longer than {limit:.3g} s; "
+            "image the pulses before or after it, or give longest_gap_s"
+        )
+
+
+def _refuse_jumps(time: Tensor, position: Tensor, first: Tensor, last: Tensor, jump_m: float) -> None:
+    """Raise ValueError if positions jump among the pulses."""
+    t = time.unfold(-1, 5, 1)  # (..., window, 5)
+    mean_step = (t[..., -1] - t[..., 0]) / 4
+    away = (t[..., :, None] - t[..., None, :]) / mean_step[..., None, None]
+    weight = 1 / (away + torch.eye(5, dtype=torch.float64, device=time.device)).prod(-1)
+    weight = weight / torch.linalg.vector_norm(weight, dim=-1, keepdim=True)
+    # the weights have a sum of zero; without the common offset nothing is rounded
+    offset = position.unfold(-2, 5, 1) - position[..., 2:-2, :, None]  # (..., window, 3, 5)
+    residual = torch.linalg.vector_norm((offset * weight[..., None, :]).sum(-1), dim=-1)
+    limit = torch.maximum(_OF_GUST * _GUST_M_S2 * mean_step.square(), mean_step.new_tensor(_OF_JUMP * jump_m))
+    # what is left of smooth motion grows with the fourth power of the interval
+    longer = (mean_step / mean_step.median(-1, keepdim=True).values).clamp_min(1) ** 4
+    limit = torch.maximum(limit, _ABOVE_MEDIAN * longer * residual.median(-1, keepdim=True).values)
+    bad = (residual > limit) & (t[..., -1] > first[..., None]) & (t[..., 0] < last[..., None])
+    if bool(bad.any()):
+        # the middle of the window that it disturbs most
+        at, where = _first(bad & (residual == torch.where(bad, residual, 0).amax(-1, keepdim=True)))
+        size, most, when = (float(x.expand(bad.shape)[at]) for x in (residual, limit, t[..., 2]))
+        raise ValueError(
+            f"the navigation record has a jump of about {size / _OF_JUMP:.3g} m near {when:.9g} s{where}, where up to "
+            f"{most / _OF_JUMP:.3g} m are accepted; correct the record, or give jump_m"
+        )
+
+
+def _first(bad: Tensor) -> tuple[tuple[int, ...], str]:
+    """Index of the first entry that is True, and the trial it belongs to as text."""
+    at = tuple(int(i) for i in bad.nonzero()[0])
+    trial = at[0] if len(at) == 2 else at[:-1]
+    return at, f" in trial {trial}" if len(at) > 1 else ""

@@ -1,0 +1,162 @@
+"""Antennas on any path: aircraft and drones that do not fly straight, bistatic pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws, Recording, Trace
+from torchsar.focus import PathImage, TilePlan, backproject
+from torchsar.io import read_path
+from torchsar.metrics import error_db, registered_error_db
+from torchsar.radar import AntennaPath, InverseRadar
+from torchsar.study.names.registry import PATH_IMPAIRMENTS
+from torchsar.study.output.pictures import Drawn, comparisons
+from torchsar.study.systems.path import figures
+from torchsar.study.systems.path import judge as judging
+from torchsar.study.systems.path.world import Flown, path_radar
+from torchsar.study.trials.batch import Judged, Outcome, Result, Trials
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.system import Column, System
+
+# errors of tiles that are compared, in dB
+_ERRORS_DB = (-20.0, -40.0, -60.0, -80.0)
+# pixels, by choice, at which images are compared with the direct sum
+_PIXELS = 256
+
+
+class AnyPath(System):
+    """Antennas on any path."""
+
+    name = "path"
+    about = "one antenna or two on any path, simulated or recorded range profiles with positions"
+    Radar = staticmethod(path_radar)
+    World = Flown
+    impairments = PATH_IMPAIRMENTS
+    reads = "phase history with positions"
+    ending = "tile_image or direct_image"
+    tolerance = {"image_error_db": -40.0}
+    exact = {"stage": {"stage": "direct_image"}}
+    definitions = {
+        "snr": "mean power of the samples of lit pulses over noise variance, dB",
+        "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
+        "contrast": "standard deviation over mean of the intensity |I|^2",
+        "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB, I0 from the reference method, after the shift, the "
+        "linear phase over the image and the complex gain g that fit best, which autofocus cannot observe; in `trade`: "
+        "of the image of white noise, without registration",
+        "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
+        "corrected minus true, without constant and linear terms; modulo half a wavelength where phases of pulses are "
+        "corrected",
+        "image_shift_m": "mean displacement of the named points, which autofocus cannot observe, m",
+        "position_error_rms_m": "rms over the named points of the distance of the peak from the true position, without "
+        "the common shift of all points, m",
+        "entropy_above_ideal_nats": "entropy minus that of the reference method",
+    }
+    columns = {
+        "image_error_db": Column("image error against the reference", "dB", drawn="mean"),
+        "path_residual_rms_m": Column("error of the line of sight, rms", "m", drawn="rms"),
+        "position_error_rms_m": Column("position error of points, rms", "m"),
+        "image_shift_m": Column("common shift of the points", "m"),
+        "entropy_nats": Column("entropy", "nats", drawn="mean"),
+        "entropy_above_ideal_nats": Column("entropy above the reference", "nats"),
+        "contrast": Column("contrast of the intensity"),
+        "ok": Column("share of trials called reliable"),
+        "seconds": Column("time of a trial", "s"),
+    }
+    target_columns = {
+        "displacement_azimuth_m": Column("displacement in azimuth", "m"),
+        "displacement_range_m": Column("displacement in range", "m"),
+        "irw_azimuth_m": Column("width in azimuth", "m"),
+        "irw_range_m": Column("width in range", "m"),
+        "pslr_azimuth_db": Column("PSLR in azimuth", "dB"),
+        "pslr_range_db": Column("PSLR in range", "dB"),
+    }
+
+    def read(self, path: str, dtype: torch.dtype) -> Recording:
+        return read_path(path, dtype)
+
+    def samples(self, world: Flown, radar: InverseRadar) -> int:
+        return world.pulses * world.samples
+
+    def simulate(self, bench: Bench, world: Flown, draws: Draws) -> Trials:
+        return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
+
+    def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+        return judging.judge(bench, name, trace, trials, detail)
+
+    def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
+        judged = super().compare(bench, outcome, ideal)
+        signals = [one.signal for one in (outcome, ideal) if one is not None and one.signal is not None]
+        if ideal is outcome or len({signal.axes for signal in signals}) != 1 or len(signals) != 2:
+            return judged
+        count = len(judged.metrics["path_residual_rms_m"])
+        error = registered_error_db(*(signal.data for signal in signals)).expand(count)
+        return replace(judged, metrics={**judged.metrics, "image_error_db": error})
+
+    def choices(self, bench: Bench) -> Sequence[Choice]:
+        stages = bench.chains["recommended"].stages.values()
+        stage = next((one for one in stages if isinstance(one, PathImage)), None)
+        if stage is None:
+            return []
+        if bench.recording is None:
+            draws = Draws(bench.config.seed)
+            clean = replace(bench.world(), impairments={}).trials_of(bench.radar, draws, bench.dtype, "cpu").clean
+        else:
+            clean = bench.recording
+        aux, grid = clean.aux, stage.grid
+        antennas = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
+        geometry = (aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
+        plans: dict[float, TilePlan] = {}
+        for error in _ERRORS_DB:
+            try:
+                plans[error] = TilePlan(*geometry, grid, error)
+            except ValueError:  # the geometry does not allow it
+                break
+        alternatives = [
+            Alternative(
+                f"tiles at {error:g} dB",
+                {"stage": "tile_image", "error_db": error},
+                {"image_error_db": plan.choice.error_db},
+                "higher terms of the path within tiles",
+            )
+            for error, plan in plans.items()
+        ]
+        exact = Alternative("direct sum", {"stage": "direct_image"}, {})
+        return [Choice("image", "stage", [*alternatives, exact], partial(_measured, bench, geometry, plans, stage))]
+
+    def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
+        yield partial(comparisons, results, self.columns)
+        for case, result in results.items():
+            yield partial(figures.images, case, result)
+            yield partial(figures.paths, case, result)
+
+
+def _measured(bench: Bench, geometry: tuple, plans: Mapping[float, TilePlan], stage: PathImage) -> Measured:
+    """Images of white noise by tiles, at random pixels beside the direct sum."""
+    frequency, place, receiver, reference = geometry
+    size = (place.shape[-2], len(frequency))
+    noise = Draws(bench.config.seed).normal("trade.noise", size, torch.complex128)
+    counts = stage.grid.counts
+    some = Draws(bench.config.seed).subset("trade.pixels", counts[0] * counts[1], min(_PIXELS, counts[0] * counts[1]))
+    pixels = stage.grid.pixels_m().reshape(-1, 3)[some]
+    exact = backproject(noise, frequency, place, receiver, reference, pixels)
+    history = noise.to(bench.dtype)
+
+    def run(one: Alternative) -> Tensor:
+        if "error_db" in one.keys:
+            return plans[one.keys["error_db"]].image(history)
+        return backproject(history, frequency, place, receiver, reference, pixels, eps=1e-6)
+
+    def loss(one: Alternative, image: Tensor) -> dict[str, float]:
+        made = image.flatten(-2)[..., some] if "error_db" in one.keys else image
+        return {"image_error_db": float(error_db(made[..., None, :].to(exact.dtype), exact[..., None, :]).max())}
+
+    return Measured(run, loss, lambda one: 1.0 if "error_db" in one.keys else len(some) / (counts[0] * counts[1]))
+
+
+SYSTEM = AnyPath

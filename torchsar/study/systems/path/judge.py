@@ -1,0 +1,100 @@
+"""Metrics of one method on recordings along any path."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Chain, Signal, Trace, per_trial
+from torchsar.focus import PathImage
+from torchsar.metrics import contrast, entropy, impulse_response, residual_phase
+from torchsar.study.systems.isal.judge import estimated_phase, received
+from torchsar.study.trials.batch import IMAGE, Judged, Metrics, Trials
+from torchsar.study.trials.bench import Bench
+
+# metrics of a point that are reported
+_OF_POINT = (
+    *("displacement_azimuth_m", "displacement_range_m", "irw_azimuth_m", "irw_range_m"),
+    *("pslr_azimuth_db", "pslr_range_db"),
+)
+# half width of the search for a point, by choice; less if another point is near
+_SEARCH_M = 5.0
+
+
+def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+    """Return the metrics of the image and of the path by one method.
+
+    The field `view` of the result is the error of the line of sight in metres that is left, (trial,
+    pulse).
+    """
+    chain, clean = bench.chains[name], bench.config.processor[name].input == "clean"
+    left = residual_m(chain, trace, trials, bench.radar.wavelength_m, clean)
+    metrics = {"path_residual_rms_m": left.square().mean(-1).sqrt()}
+    targets: dict[str, Metrics] = {}
+    outside: list[str] = []
+    if trace.signal.names == IMAGE:
+        metrics |= {"entropy_nats": entropy(trace.signal), "contrast": contrast(trace.signal)}
+        if bench.recording is None:
+            targets, outside = _points(bench, chain, trace.signal, trials)
+        if targets:
+            metrics |= _positions(targets)
+    metrics = {key: value.double().expand(trials.count) for key, value in metrics.items()}
+    return Judged(metrics, targets if detail else {}, outside if detail else (), view=left)
+
+
+def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, clean: bool) -> Tensor:
+    """Return the error of the line of sight (m) that a chain leaves, (trial, pulse).
+
+    It has no constant and linear terms, which only shift the image. Where the chain corrects phases
+    of pulses it is known modulo half a wavelength.
+    """
+    data = trials.recording.signal.data
+    pulses = (trials.count, data.shape[-2])
+    parts = [x for key, x in trials.truth.items() if key.rpartition(".")[2] == "line_of_sight_m" and not clean]
+    true = sum((x.expand(pulses) for x in parts), torch.zeros(pulses, dtype=torch.float64, device=data.device))
+    phases = [x for key, x in trials.truth.items() if key.endswith(".phase_rad") and not clean]
+    radians = 4 * math.pi / wavelength_m
+    if phases or any("phase_rad" in uses for uses in chain.uses.values()):
+        # a recorded range that is too long leaves a positive phase
+        whole = radians * true + sum((x.reshape(pulses) for x in phases), torch.zeros_like(true))
+        return residual_phase(estimated_phase(chain, trace, whole), whole, received(trials)) / radians
+    time = torch.linspace(-1, 1, pulses[1], dtype=torch.float64, device=data.device)
+    slope = (true * time).sum(-1, keepdim=True) / time.square().sum()
+    return -(true - true.mean(-1, keepdim=True) - slope * time)
+
+
+def _positions(targets: Mapping[str, Metrics]) -> dict[str, Tensor]:
+    """The common shift of all points in m, and the rms distance that is left of them in m."""
+    off = torch.stack([torch.stack([one[f"displacement_{axis}_m"] for axis in IMAGE]) for one in targets.values()])
+    shift = off.mean(0)
+    left = (off - shift).square().sum(1).mean(0).sqrt()
+    return {"image_shift_m": shift.square().sum(0).sqrt(), "position_error_rms_m": left}
+
+
+def _points(bench: Bench, chain: Chain, image: Signal, trials: Trials) -> tuple[dict[str, Metrics], list[str]]:
+    """Metrics of the named points in the image, and the names of those outside it."""
+    stage = next((one for one in reversed(list(chain.stages.values())) if isinstance(one, PathImage)), None)
+    if stage is None:
+        return {}, []
+    (_, cos, _), (_, sin, _) = stage.grid.axes.tolist()  # azimuth and range axes of the image
+    places, outside = {}, []
+    image = image.with_data(image.data.expand(trials.count, *image.data.shape[-2:]))
+    for name, place in bench.world().named_points.items():
+        y, x = (per_trial(v, 0, image.data).expand(trials.count) for v in place)
+        at = torch.stack([cos * y - sin * x, cos * x + sin * y], -1)
+        edges = [(axis.index_of(at[:, i]), axis.n - 1) for i, axis in enumerate(image.axes)]
+        if all(bool(((i >= 0) & (i <= last)).all()) for i, last in edges):
+            places[name] = at
+        else:
+            outside.append(name)
+    if not places:
+        return {}, outside
+    at = torch.stack([*places.values()], 1)  # (trial, point, 2)
+    apart = torch.cdist(at, at) + 2 * _SEARCH_M * torch.eye(len(places), dtype=torch.float64)
+    search_m = max(image.axes[0].step, min(_SEARCH_M, float(apart.min()) / 2))
+    found = impulse_response(image, (at[..., 0], at[..., 1]), search_m=search_m)
+    found |= {f"displacement_{axis}_m": found[f"position_{axis}_m"] - at[..., i] for i, axis in enumerate(IMAGE)}
+    return {name: {key: found[key][:, i] for key in _OF_POINT} for i, name in enumerate(places)}, outside
