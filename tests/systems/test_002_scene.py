@@ -1,4 +1,4 @@
-"""Scenes in which methods fail, as the recorded sweep over scenes shows (20 trials a point)."""
+"""Scenes in which methods fail, as the recorded sweep over scenes shows (40 trials a point)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,11 @@ def test_pga_sca_fails_where_rows_are_dense_or_few() -> None:
         point("pga_sca", "128 a row")["success_share"] <= 0.75
         and point("pga_sca", "128 a row")["median"] > 5 * point("recommended", "128 a row")["median"]
     )
-    assert point("pga_sca", "16 rows of 4")["success_share"] >= 0.9
+
+    # The error shrinks with the number of rows; the verdict trusts it only where many agree.
+    errors = [point("pga_sca", f"{rows} rows of 4")["median"] for rows in (2, 4, 16, 128)]
+    assert errors == sorted(errors, reverse=True) and errors[2] < 0.3
+    assert point("pga_sca", "128 rows of 4")["success_share"] >= 0.9
 
 
 def test_one_row_is_nobodys() -> None:
