@@ -1,0 +1,324 @@
+"""Autofocus of a path: one line-of-sight range per pulse, which moves phases and envelopes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.path.envelopes import drift_m, matched_m, moved
+from torchsar.compensate.path.fringes import roughness, smooth_near, smoothest
+from torchsar.compensate.path.ground import STEP, for_each, ground_image, sights, trials_of
+from torchsar.compensate.pulse_phase.data import without_line
+from torchsar.compensate.pulse_phase.imaging import Imaging, Through
+from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.sharpen import Run, Weights, Wiener, fixed_point, weighted
+from torchsar.compensate.pulse_phase.verdict import (
+    LEAST_ROWS,
+    LEAST_STREHL,
+    sharpness_beyond_speckle,
+    sharpness_of_noise,
+)
+from torchsar.core import Estimate, checked_samples, cis, real_dtype
+from torchsar.focus.spotlight import window_weights
+from torchsar.metrics import entropy
+from torchsar.metrics.phase import residual_phase
+from torchsar.radar import LIGHT_M_S, AntennaPath
+from torchsar.radar.antenna_path import refuse_unusable
+from torchsar.radar.spotlight import frequency_samples, range_profiles
+
+# share of the band of the first phases: envelopes that err by some range cells then matter little
+_FIRST_BAND = 0.25
+# largest errors of the envelopes that the rounds of the search correct, in range cells, by trial
+_REACH_CELLS = (4.0, 2.0, 0.5)
+# share of the band in the rounds of the search
+_BANDS = (0.5, 1.0, 1.0)
+# roughness below which fringes are those of a smooth line of sight, and standard deviation in
+# fringes of a measurement by envelopes: 0.3 to 0.6 for smooth errors, 1.0 for random walks
+_ROUGH, _NEAR_FRINGES = 0.75, 2.0
+# least weight of the window over pulses
+_LEAST_WEIGHT = 0.1
+# iterations of the fixed points, by trial, and phase step at which they end
+_COARSE, _FINE, _TOLERANCE_RAD = 30, 12, 0.03
+# fewest pulses
+_LEAST_PULSES = 8
+# side of the blocks that make halves of the image, in pixels
+_BLOCK = 8
+# iterations by which the halves settle
+_SETTLE = 6
+# factor by which the sharpness must exceed that of noise, as for the phases of pulses
+_MARGIN = 1.5
+
+
+def path_autofocus(
+    profiles: Tensor,
+    frequency_hz: Tensor,
+    antennas: AntennaPath,
+    *,
+    extent_m: float | None = None,
+    height_m: float = 0.0,
+    polish: int = 20,
+) -> Estimate:
+    """Estimate the error of the recorded line of sight of each pulse, with whole fringes.
+
+    The recommended autofocus of antennas on any path, for spotlight scenes. Its steps:
+
+    1. Phases of the pulses, from the phases between adjacent pulses (`sca`), sharpen images of a
+       quarter of the band by iterations through the adjoint of the image formation.
+    2. Phases become ranges. If their second differences show a smooth motion, its fringes follow
+       from the phases, otherwise each pulse takes the range at which its envelope and its phase
+       match the sharpened image best. In three rounds with more of the band, envelopes move too.
+    3. Envelopes may still drift slowly against the phases: polynomials of time that lower the
+       entropy while the phases of the carrier are kept; the drift is added in whole fringes.
+    4. The phase of each pulse is compared with a Wiener estimate of the scene, without windows.
+
+    A scatterer anywhere in the scene gets the correction of the middle: errors across the line of
+    sight, which act differently over the scene, are not found. Not observable are a constant and
+    a linear term, which move the image; they are zero in the result. The fringes of rough errors
+    are known as well as envelopes are, that is in part, so that the result is to be judged modulo
+    half a wavelength. Trials have plans of their own and are processed one after another.
+
+    Args:
+        profiles: Range profiles, the unitary centred inverse FFT of a phase history, shape (...,
+            pulse, range), complex. Pulses that hold only zeros are left out; their line of sight
+            is that of the pulses beside them.
+        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (range,).
+        antennas: Recorded path of the antennas, of all trials or of each of them. The scene is
+            about the origin.
+        extent_m: Side of the imaged square about the origin in metres, which should hold most of
+            the scatterers; by default that of the whole unambiguous ground, which takes longer.
+        height_m: Height z of the imaged plane in metres.
+        polish: Largest number of iterations of the last step.
+
+    Returns:
+        `line_of_sight_m` of shape (..., pulse), float64: half the path over the middle of the
+        scene, recorded minus true; and `offset_m` of shape (..., pulse, 3): the same as an error
+        of the positions along the line of sight, for `CorrectPath`. The standard deviation is that
+        modulo half a wavelength: half of the rms difference between the results of two halves of
+        the image, which have different scatterers and independent noise. `quality` is the Strehl
+        ratio predicted from it, times the share of the sharpness that noise does not explain. `ok`
+        is False unless the image is 1.5 times as sharp as autofocus can make pure noise, more than
+        one range cell makes the sharpness, and that Strehl ratio exceeds 0.8. `info` holds
+        "roughness" (about 1 if the fringes come from single envelopes, less for smooth motions)
+        and "entropy_nats" of the image, shape (...,).
+
+    Raises:
+        TypeError: If the profiles are not complex, or frequencies are not float64.
+        ValueError: If sizes do not match, values are not finite, or the line of sight does not
+            turn.
+    """
+    profiles = checked_samples(profiles, "path_autofocus", "pulse, range")
+    refuse_unusable(frequency_hz=frequency_hz)
+    trials = trials_of("path_autofocus", profiles, frequency_hz, antennas)
+    if extent_m is not None and not 0 < extent_m < math.inf:
+        raise ValueError(f"extent_m must be positive and finite, got {extent_m}")
+
+    @torch.no_grad()
+    def find(rows: Tensor, one: AntennaPath) -> Estimate:
+        operator = ground_image(frequency_hz, one, height_m, extent_m)
+        found = _nothing(rows)
+        present = (rows.real.square() + rows.imag.square()).sum(-1) > 0
+        if int(present.sum()) >= _LEAST_PULSES:
+            if not bool(present.all()):
+                operator = ground_image(frequency_hz, _only(one, present), height_m, extent_m)
+            some = rows[present]
+            some = some / some.abs().amax()
+            found = _Search(some, frequency_hz, operator, polish).found()
+            found = _spread(found, present)
+        sight = sights(one, height_m)
+        along = sight / sight.square().sum(-1, keepdim=True)
+        value = found.value["line_of_sight_m"][:, None] * along
+        std = found.std["line_of_sight_m"][:, None] * along.abs()
+        return Estimate(
+            {**found.value, "offset_m": value}, found.quality, found.ok, {**found.std, "offset_m": std}, found.info
+        )
+
+    return for_each(find, profiles, antennas, trials)
+
+
+def _only(antennas: AntennaPath, present: Tensor) -> AntennaPath:
+    """The path of the pulses that are present."""
+    receiver = None if antennas.receiver_m is None else antennas.receiver_m[present]
+    return AntennaPath(antennas.transmitter_m[present], receiver, antennas.reference_m[present])
+
+
+def _nothing(rows: Tensor) -> Estimate:
+    """The estimate of a trial with too few pulses."""
+    zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
+    none = zero.new_zeros(())
+    info = {"roughness": none + 1, "entropy_nats": none}
+    return Estimate({"line_of_sight_m": zero}, none, none > 0, {"line_of_sight_m": zero + 1}, info)
+
+
+def _spread(found: Estimate, present: Tensor) -> Estimate:
+    """The estimate of all pulses from that of those which are present."""
+    at = present.nonzero()[:, 0]
+    every = torch.arange(len(present), device=present.device)
+    high = torch.searchsorted(at, every).clamp(1, len(at) - 1)
+    share = ((every - at[high - 1]) / (at[high] - at[high - 1])).clamp(0, 1).double()
+
+    def of(x: Tensor) -> Tensor:
+        return x[high - 1] * (1 - share) + x[high] * share
+
+    value = {name: of(x) for name, x in found.value.items()}
+    return Estimate(value, found.quality, found.ok, {name: of(x) for name, x in found.std.items()}, found.info)
+
+
+def _intensity(power: Tensor, mean: Tensor) -> Tensor:
+    """Weights of image cells that sharpen by the sum of the squared intensity."""
+    return power / mean
+
+
+def _surprise(power: Tensor, mean: Tensor) -> Tensor:
+    """Weights of image cells that sharpen by the entropy, of those that are above its level."""
+    share = power / (mean * (power.shape[-1] * power.shape[-2]))
+    log = torch.log(share.clamp_min(torch.finfo(share.dtype).tiny))
+    return (log - (share * log).sum((-2, -1), keepdim=True)).clamp_min(0)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Wiener weights of a part of the image.
+
+    Args:
+        part: 1 in the part, 0 elsewhere, (i, j).
+    """
+
+    part: Tensor
+
+    def __call__(self, power: Tensor, mean: Tensor) -> Tensor:
+        pairs = power + power.roll(1, -1)
+        local = pairs + pairs.roll(-1, -1)
+        share = local / (local + 4 * Wiener().level * mean)
+        weight = share * share * self.part
+        return weight - weight.mean(-2, keepdim=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search of one trial.
+
+    Args:
+        rows: Range profiles of the pulses that are present, (pulse, range).
+        frequency_hz: Frequencies.
+        imaging: Image formation along their recorded path.
+        polish: Iterations of the last step.
+    """
+
+    rows: Tensor
+    frequency_hz: Tensor
+    imaging: Imaging
+    polish: int
+
+    @property
+    def _fringe_m(self) -> float:
+        return LIGHT_M_S / (2 * float(self.frequency_hz.mean()))
+
+    def found(self) -> Estimate:
+        """Find the line of sight, with its standard deviation and verdict."""
+        range_m, rough = self.search()
+        weights = _Part(torch.ones_like(self.imaging.image(self.rows[None])[0].real))
+        phase, _ = self.sharpened(self.rows, range_m, [(weights, self.polish, 1e-3)])
+        range_m = self.line_free(range_m + self.metres(phase))
+        return self.judged(range_m, rough)
+
+    def metres(self, phase_rad: Tensor) -> Tensor:
+        return phase_rad.double() * (self._fringe_m / (2 * math.pi))
+
+    def line_free(self, range_m: Tensor) -> Tensor:
+        return without_line(range_m, torch.ones_like(range_m, dtype=torch.bool))
+
+    def windowed(self, share: float) -> Tensor:
+        """Profiles with Hann windows over pulses and over a share of the band."""
+        pulses, n = self.rows.shape
+        real = real_dtype(self.rows.dtype)
+        k = torch.linspace(-1, 1, n, dtype=torch.float64, device=self.rows.device) / share
+        over_band = torch.where(k.abs() < 1, (1 + torch.cos(math.pi * k)) / 2, 0).to(real)
+        over_pulses = window_weights("hann", pulses, self.rows.device).to(real).clamp_min(_LEAST_WEIGHT)
+        samples = frequency_samples(self.rows) * (over_pulses[:, None] * over_band)
+        return range_profiles(samples)
+
+    def sharpened(
+        self, rows: Tensor, range_m: Tensor, runs: list[tuple[Weights, int, float]], start: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Phases that sharpen the image of rows at a line of sight, and the corrected rows."""
+        at = moved(rows, self.frequency_hz, range_m)
+        columns = at.mT[None].contiguous()
+        phase = torch.zeros_like(columns[:, 0].real) if start is None else start[None]
+        for weights, count, tolerance in runs:
+            phase = fixed_point(columns, phase, Run(weights, Through(self.imaging), count, 1.0, tolerance))[0]
+        return phase[0], at
+
+    def search(self) -> tuple[Tensor, Tensor]:
+        """Line of sight before the last step, and its roughness."""
+        cell = LIGHT_M_S / (2 * float(self.frequency_hz[-1] - self.frequency_hz[0]))
+        range_m = torch.zeros(len(self.rows), dtype=torch.float64, device=self.rows.device)
+        both: list[tuple[Weights, int, float]] = [
+            (_intensity, _COARSE, _TOLERANCE_RAD),
+            (_surprise, _FINE, _TOLERANCE_RAD),
+        ]
+        rows = self.windowed(_FIRST_BAND)
+        columns = rows.mT[None]
+        start = pair_phase(columns, torch.ones_like(columns[:, 0].real, dtype=torch.bool))[0]
+        phase, _ = self.sharpened(rows, range_m, both, start)
+        carrier = self.metres(phase)
+        rough = roughness(carrier, self._fringe_m)
+        if rough < _ROUGH:
+            range_m, phase = self.line_free(smoothest(carrier, self._fringe_m)), None
+        for share, reach in zip(_BANDS, _REACH_CELLS, strict=True):
+            rows = self.windowed(share)
+            phase, at = self.sharpened(rows, range_m, both, phase)
+            rough = roughness(range_m + self.metres(phase), self._fringe_m)
+            if share < 1 and rough >= _ROUGH:
+                continue
+            range_m, phase = self.with_envelopes(range_m, phase, at, reach * cell, rough), None
+            if share == 1:
+                drift = drift_m(moved(rows, self.frequency_hz, range_m), self.frequency_hz, self.imaging)
+                range_m = range_m + self._fringe_m * torch.round(drift / self._fringe_m)
+            range_m = self.line_free(range_m)
+        return range_m, rough
+
+    def with_envelopes(self, range_m: Tensor, phase: Tensor, at: Tensor, reach_m: float, rough: Tensor) -> Tensor:
+        """Line of sight at which envelopes and phases match the image that phases sharpen."""
+        turned = at * cis(-phase)[:, None]
+        model = self.imaging.adjoint(weighted(self.imaging.image(turned[None]), _surprise))[0]
+        near = range_m + matched_m(at, model, self.frequency_hz, reach_m)
+        if rough >= _ROUGH:
+            return near
+        carrier = range_m + self.metres(phase)
+        bends = rough * (self._fringe_m / math.sqrt(12))
+        near_std = _NEAR_FRINGES * self._fringe_m
+        return smooth_near(carrier[None], near[None], self._fringe_m, near_std, bends[None])[0]
+
+    def judged(self, range_m: Tensor, rough: Tensor) -> Estimate:
+        """The estimate, from the sharpness of the image and the agreement of its halves."""
+        at = moved(self.rows, self.frequency_hz, range_m)
+        image = self.imaging.image(at[None])[0]
+        power = image.real.square() + image.imag.square()
+        one, other = (self.sharpened(self.rows, range_m, [(_Part(half), _SETTLE, 0.0)])[0] for half in _halves(power))
+        apart = residual_phase(one[None], other[None])[0]
+        std_rad = apart.double().square().mean().sqrt() / 2
+        sharp, effective, telling = sharpness_beyond_speckle(image.mT)
+        noise = sharpness_of_noise((effective * STEP).clamp_min(1))
+        strehl = torch.exp(-std_rad.square())
+        quality = strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
+        ok = (sharp > _MARGIN * noise) & (telling > LEAST_ROWS) & (strehl > LEAST_STREHL)
+        std = self.metres(std_rad).expand(len(range_m))
+        info = {"roughness": rough, "entropy_nats": entropy(image).double()}
+        return Estimate({"line_of_sight_m": range_m}, quality, ok, {"line_of_sight_m": std}, info)
+
+
+def _halves(power: Tensor) -> tuple[Tensor, Tensor]:
+    """Two parts of an image of about the same energy: its blocks, sorted by energy, in turn."""
+    rows, columns = (-(-n // _BLOCK) for n in power.shape)
+    padded = power.new_zeros(rows * _BLOCK, columns * _BLOCK)
+    padded[: power.shape[0], : power.shape[1]] = power
+    energy = padded.reshape(rows, _BLOCK, columns, _BLOCK).sum((1, 3)).flatten()
+    order = energy.argsort(descending=True)
+    turn = (torch.arange(len(order), device=power.device) + 1) // 2 % 2  # 0, 1, 1, 0, 0, 1, 1, ...
+    first = torch.empty_like(energy).index_copy(0, order, turn.to(energy.dtype))
+    whole = first.reshape(rows, 1, columns, 1).expand(-1, _BLOCK, -1, _BLOCK).reshape(padded.shape)
+    part = whole[: power.shape[0], : power.shape[1]]
+    return part, 1 - part
