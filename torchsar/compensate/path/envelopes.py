@@ -66,16 +66,17 @@ def matched_m(profiles: Tensor, model: Tensor, frequency_hz: Tensor, reach_m: fl
     return tried[at] + step * part
 
 
-def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging) -> Tensor:
+def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging, slopes: bool) -> Tensor:
     """Find how envelopes drift against the phases, by the entropy of the image.
 
     The drift is a polynomial of time that moves the envelopes and leaves the phase of the carrier
-    as it is. Slopes are tried first.
+    as it is.
 
     Args:
         profiles: Range profiles with the phases that focus them, shape (pulse, range), complex.
         frequency_hz: Frequencies in Hz, float64 (range,).
         imaging: Image formation.
+        slopes: Whether to try slopes of some range cells first, each with one image.
 
     Returns:
         Range by which each envelope is too far in metres, float64 (pulse,).
@@ -96,10 +97,12 @@ def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging) -> Tensor:
         found = [_cost_and_slope(shifted(row[None]), rate, basis, imaging) for row in x]
         return torch.stack([one[0] for one in found]), torch.stack([one[1] for one in found])
 
-    count = math.ceil(_REACH_CELLS / _STEP_CELLS)
-    tried = torch.zeros(2 * count + 1, _DEGREE, dtype=torch.float64, device=samples.device)
-    tried[:, 0] = torch.arange(-count, count + 1) * (_STEP_CELLS / _UNIT_CELLS)
-    start = tried[torch.stack([cost(x[None]) for x in tried]).argmin(), None]
+    start = torch.zeros(1, _DEGREE, dtype=torch.float64, device=samples.device)
+    if slopes:
+        count = math.ceil(_REACH_CELLS / _STEP_CELLS)
+        tried = start.repeat(2 * count + 1, 1)
+        tried[:, 0] = torch.arange(-count, count + 1) * (_STEP_CELLS / _UNIT_CELLS)
+        start = tried[torch.stack([cost(x[None]) for x in tried]).argmin(), None]
     found = lbfgs(slope, start, steps=_STEPS, first_step=0.3, with_gradient=True, value_tolerance=1e-5)
     return (found.x @ basis)[0]
 

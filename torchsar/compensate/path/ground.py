@@ -71,7 +71,7 @@ def for_each(
     found = [find(data[index], path_of(antennas, tuple(trials), index)) for index in every]
 
     def joined(parts: list[Tensor]) -> Tensor:
-        return torch.stack(parts).reshape(*trials, *parts[0].shape)
+        return torch.stack(parts).reshape((*trials, *parts[0].shape))
 
     return Estimate(
         {key: joined([one.value[key] for one in found]) for key in found[0].value},

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsar.compensate.path.axes import Part, three_axes
 from torchsar.compensate.path.envelopes import drift_m, matched_m, moved
 from torchsar.compensate.path.fringes import roughness, smooth_near, smoothest
-from torchsar.compensate.path.ground import STEP, for_each, ground_image, sights, trials_of
+from torchsar.compensate.path.ground import STEP, for_each, ground_image, trials_of
 from torchsar.compensate.pulse_phase.data import without_line
-from torchsar.compensate.pulse_phase.imaging import Imaging, Through
+from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import Run, Weights, Wiener, fixed_point, weighted
+from torchsar.compensate.pulse_phase.sharpen import Run, Weights, fixed_point, weighted
 from torchsar.compensate.pulse_phase.verdict import (
     LEAST_ROWS,
     LEAST_STREHL,
@@ -22,15 +23,17 @@ from torchsar.compensate.pulse_phase.verdict import (
     sharpness_of_noise,
 )
 from torchsar.core import Estimate, checked_samples, cis, real_dtype
+from torchsar.focus import TileOperator
 from torchsar.focus.spotlight import window_weights
 from torchsar.metrics import entropy
-from torchsar.metrics.phase import residual_phase
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
 from torchsar.radar.spotlight import frequency_samples, range_profiles
 
 # share of the band of the first phases: envelopes that err by some range cells then matter little
 _FIRST_BAND = 0.25
+# rounds of the search, which end when the line of sight changes by less, rms, in fringes
+_ROUNDS, _SETTLED_FRINGES = 6, 1.0
 # largest errors of the envelopes that the rounds of the search correct, in range cells, by trial
 _REACH_CELLS = (4.0, 2.0, 0.5)
 # share of the band in the rounds of the search
@@ -44,10 +47,6 @@ _LEAST_WEIGHT = 0.1
 _COARSE, _FINE, _TOLERANCE_RAD = 30, 12, 0.03
 # fewest pulses
 _LEAST_PULSES = 8
-# side of the blocks that make halves of the image, in pixels
-_BLOCK = 8
-# iterations by which the halves settle
-_SETTLE = 6
 # factor by which the sharpness must exceed that of noise, as for the phases of pulses
 _MARGIN = 1.5
 
@@ -69,7 +68,7 @@ def path_autofocus(
        quarter of the band by iterations through the adjoint of the image formation.
     2. Phases become ranges. If their second differences show a smooth motion, its fringes follow
        from the phases, otherwise each pulse takes the range at which its envelope and its phase
-       match the sharpened image best. In three rounds with more of the band, envelopes move too.
+       match the sharpened image best. In three to six rounds with more of the band, envelopes move too.
     3. Envelopes may still drift slowly against the phases: polynomials of time that lower the
        entropy while the phases of the carrier are kept; the drift is added in whole fringes.
     4. The phase of each pulse is compared with a Wiener estimate of the scene, without windows.
@@ -127,13 +126,7 @@ def path_autofocus(
             some = some / some.abs().amax()
             found = _Search(some, frequency_hz, operator, polish).found()
             found = _spread(found, present)
-        sight = sights(one, height_m)
-        along = sight / sight.square().sum(-1, keepdim=True)
-        value = found.value["line_of_sight_m"][:, None] * along
-        std = found.std["line_of_sight_m"][:, None] * along.abs()
-        return Estimate(
-            {**found.value, "offset_m": value}, found.quality, found.ok, {**found.std, "offset_m": std}, found.info
-        )
+        return found
 
     return for_each(find, profiles, antennas, trials)
 
@@ -149,7 +142,8 @@ def _nothing(rows: Tensor) -> Estimate:
     zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
     none = zero.new_zeros(())
     info = {"roughness": none + 1, "entropy_nats": none}
-    return Estimate({"line_of_sight_m": zero}, none, none > 0, {"line_of_sight_m": zero + 1}, info)
+    value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
+    return Estimate(value, none, none > 0, {"line_of_sight_m": zero + 1}, info)
 
 
 def _spread(found: Estimate, present: Tensor) -> Estimate:
@@ -160,7 +154,8 @@ def _spread(found: Estimate, present: Tensor) -> Estimate:
     share = ((every - at[high - 1]) / (at[high] - at[high - 1])).clamp(0, 1).double()
 
     def of(x: Tensor) -> Tensor:
-        return x[high - 1] * (1 - share) + x[high] * share
+        part = share.reshape(-1, *(1,) * (x.ndim - 1))
+        return x[high - 1] * (1 - part) + x[high] * part
 
     value = {name: of(x) for name, x in found.value.items()}
     return Estimate(value, found.quality, found.ok, {name: of(x) for name, x in found.std.items()}, found.info)
@@ -178,24 +173,6 @@ def _surprise(power: Tensor, mean: Tensor) -> Tensor:
     return (log - (share * log).sum((-2, -1), keepdim=True)).clamp_min(0)
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Wiener weights of a part of the image.
-
-    Args:
-        part: 1 in the part, 0 elsewhere, (i, j).
-    """
-
-    part: Tensor
-
-    def __call__(self, power: Tensor, mean: Tensor) -> Tensor:
-        pairs = power + power.roll(1, -1)
-        local = pairs + pairs.roll(-1, -1)
-        share = local / (local + 4 * Wiener().level * mean)
-        weight = share * share * self.part
-        return weight - weight.mean(-2, keepdim=True)
-
-
 @dataclass(frozen=True, eq=False)
 class _Search:
     """The search of one trial.
@@ -209,7 +186,7 @@ class _Search:
 
     rows: Tensor
     frequency_hz: Tensor
-    imaging: Imaging
+    imaging: TileOperator
     polish: int
 
     @property
@@ -219,7 +196,7 @@ class _Search:
     def found(self) -> Estimate:
         """Find the line of sight, with its standard deviation and verdict."""
         range_m, rough = self.search()
-        weights = _Part(torch.ones_like(self.imaging.image(self.rows[None])[0].real))
+        weights = Part(torch.ones(self.imaging.plan.grid.counts, device=self.rows.device))
         phase, _ = self.sharpened(self.rows, range_m, [(weights, self.polish, 1e-3)])
         range_m = self.line_free(range_m + self.metres(phase))
         return self.judged(range_m, rough)
@@ -267,17 +244,21 @@ class _Search:
         rough = roughness(carrier, self._fringe_m)
         if rough < _ROUGH:
             range_m, phase = self.line_free(smoothest(carrier, self._fringe_m)), None
-        for share, reach in zip(_BANDS, _REACH_CELLS, strict=True):
-            rows = self.windowed(share)
+        for turn in range(_ROUNDS):
+            share, reach = _BANDS[min(turn, 2)], _REACH_CELLS[min(turn, 2)]
+            rows, before = self.windowed(share), range_m
             phase, at = self.sharpened(rows, range_m, both, phase)
             rough = roughness(range_m + self.metres(phase), self._fringe_m)
             if share < 1 and rough >= _ROUGH:
                 continue
             range_m, phase = self.with_envelopes(range_m, phase, at, reach * cell, rough), None
             if share == 1:
-                drift = drift_m(moved(rows, self.frequency_hz, range_m), self.frequency_hz, self.imaging)
+                rows = moved(rows, self.frequency_hz, range_m)
+                drift = drift_m(rows, self.frequency_hz, self.imaging, slopes=turn == 1)
                 range_m = range_m + self._fringe_m * torch.round(drift / self._fringe_m)
             range_m = self.line_free(range_m)
+            if turn > 1 and (range_m - before).square().mean().sqrt() < _SETTLED_FRINGES * self._fringe_m:
+                break
         return range_m, rough
 
     def with_envelopes(self, range_m: Tensor, phase: Tensor, at: Tensor, reach_m: float, rough: Tensor) -> Tensor:
@@ -293,32 +274,14 @@ class _Search:
         return smooth_near(carrier[None], near[None], self._fringe_m, near_std, bends[None])[0]
 
     def judged(self, range_m: Tensor, rough: Tensor) -> Estimate:
-        """The estimate, from the sharpness of the image and the agreement of its halves."""
-        at = moved(self.rows, self.frequency_hz, range_m)
-        image = self.imaging.image(at[None])[0]
-        power = image.real.square() + image.imag.square()
-        one, other = (self.sharpened(self.rows, range_m, [(_Part(half), _SETTLE, 0.0)])[0] for half in _halves(power))
-        apart = residual_phase(one[None], other[None])[0]
-        std_rad = apart.double().square().mean().sqrt() / 2
-        sharp, effective, telling = sharpness_beyond_speckle(image.mT)
+        """The estimate with three axes, from the sharpness of the image and the phases that are left."""
+        found = three_axes(self.rows, self.imaging, range_m)
+        std_rad = (found.std_m * (2 * math.pi / self._fringe_m)).square().mean().sqrt()
+        sharp, effective, telling = sharpness_beyond_speckle(found.image.mT)
         noise = sharpness_of_noise((effective * STEP).clamp_min(1))
         strehl = torch.exp(-std_rad.square())
         quality = strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
         ok = (sharp > _MARGIN * noise) & (telling > LEAST_ROWS) & (strehl > LEAST_STREHL)
-        std = self.metres(std_rad).expand(len(range_m))
-        info = {"roughness": rough, "entropy_nats": entropy(image).double()}
-        return Estimate({"line_of_sight_m": range_m}, quality, ok, {"line_of_sight_m": std}, info)
-
-
-def _halves(power: Tensor) -> tuple[Tensor, Tensor]:
-    """Two parts of an image of about the same energy: its blocks, sorted by energy, in turn."""
-    rows, columns = (-(-n // _BLOCK) for n in power.shape)
-    padded = power.new_zeros(rows * _BLOCK, columns * _BLOCK)
-    padded[: power.shape[0], : power.shape[1]] = power
-    energy = padded.reshape(rows, _BLOCK, columns, _BLOCK).sum((1, 3)).flatten()
-    order = energy.argsort(descending=True)
-    turn = (torch.arange(len(order), device=power.device) + 1) // 2 % 2  # 0, 1, 1, 0, 0, 1, 1, ...
-    first = torch.empty_like(energy).index_copy(0, order, turn.to(energy.dtype))
-    whole = first.reshape(rows, 1, columns, 1).expand(-1, _BLOCK, -1, _BLOCK).reshape(padded.shape)
-    part = whole[: power.shape[0], : power.shape[1]]
-    return part, 1 - part
+        value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
+        info = {"roughness": rough, "entropy_nats": entropy(found.image).double()}
+        return Estimate(value, quality, ok, {"line_of_sight_m": found.std_m}, info)

@@ -48,8 +48,8 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -
 def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, clean: bool) -> Tensor:
     """Return the error of the line of sight (m) that a chain leaves, (trial, pulse).
 
-    It has no constant and linear terms, which only shift the image. Where the chain corrects phases
-    of pulses it is known modulo half a wavelength.
+    It has no constant and linear terms, which only shift the image. Where the chain estimates it or
+    phases of pulses it is known modulo half a wavelength.
     """
     data = trials.recording.signal.data
     pulses = (trials.count, data.shape[-2])
@@ -57,10 +57,13 @@ def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, 
     true = sum((x.expand(pulses) for x in parts), torch.zeros(pulses, dtype=torch.float64, device=data.device))
     phases = [x for key, x in trials.truth.items() if key.endswith(".phase_rad") and not clean]
     radians = 4 * math.pi / wavelength_m
-    if phases or any("phase_rad" in uses for uses in chain.uses.values()):
+    of_path = [e.value["line_of_sight_m"] for e in trace.estimates.values() if "line_of_sight_m" in e.value]
+    if phases or of_path or any("phase_rad" in uses for uses in chain.uses.values()):
         # a recorded range that is too long leaves a positive phase
         whole = radians * true + sum((x.reshape(pulses) for x in phases), torch.zeros_like(true))
-        return residual_phase(estimated_phase(chain, trace, whole), whole, received(trials)) / radians
+        found = estimated_phase(chain, trace, whole)
+        found = found + radians * sum((x.reshape(pulses) for x in of_path), torch.zeros_like(true))
+        return residual_phase(found, whole, received(trials)) / radians
     time = torch.linspace(-1, 1, pulses[1], dtype=torch.float64, device=data.device)
     slope = (true * time).sum(-1, keepdim=True) / time.square().sum()
     return -(true - true.mean(-1, keepdim=True) - slope * time)
