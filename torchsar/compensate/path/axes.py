@@ -10,15 +10,15 @@ from torch import Tensor
 
 from torchsar.compensate.path.ground import sights
 from torchsar.compensate.pulse_phase.data import or_one, without_line
-from torchsar.compensate.pulse_phase.sharpen import Wiener, weighted
+from torchsar.compensate.pulse_phase.sharpen import Wiener
 from torchsar.focus import TileOperator
-from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, AntennaPath
 
 # blocks of the image along either axis, by choice: many levers, each with several scatterers
 _BLOCKS = 3
-# rounds of measurement and correction, by trial
-_ROUNDS = 4
+# steps that fit the scene to the samples, by trial
+# steps that fit the scene to the samples, by trial
+_FITS = 4
 # share of the mean power of the blocks that is added, so that empty blocks have no gain
 _RIDGE = 1e-3
 # neighbourhood over which the spectrum of the motion is averaged, relative and in coefficients
@@ -27,23 +27,20 @@ _WIDE, _LEAST_WIDE = 0.25, 2
 _UNSEEN = 2
 
 
-@dataclass(frozen=True)
-class Part:
-    """Wiener weights of a part of an image (azimuth, range), see `Wiener`.
+def wiener(power: Tensor, mean: Tensor) -> Tensor:
+    """Weigh the cells of an image (..., azimuth, range) by a Wiener estimate, see `Wiener`.
 
     Args:
-        part: 1 in the part, 0 elsewhere, (azimuth, range).
+        power: Power of the cells.
+        mean: Its mean over the image.
+
+    Returns:
+        Weights 0..1, without the subtracted mean of `Wiener`.
     """
-
-    part: Tensor
-
-    def __call__(self, power: Tensor, mean: Tensor) -> Tensor:
-        """Return the weights of the cells."""
-        pairs = power + power.roll(1, -1)
-        local = pairs + pairs.roll(-1, -1)
-        share = local / (local + 4 * Wiener().level * mean)
-        weight = share * share * self.part
-        return weight - weight.mean(-2, keepdim=True)
+    pairs = power + power.roll(1, -1)
+    local = pairs + pairs.roll(-1, -1)
+    share = local / (local + 4 * Wiener().level * mean)
+    return share * share
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,15 +60,14 @@ class Found:
     image: Tensor
 
 
-def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, rounds: int = _ROUNDS) -> Found:
-    """Refine the line of sight, and find the errors across it, by the phases of blocks of the image.
+def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, rounds: int = 4) -> Found:
+    """Refine the line of sight, and find the errors across it, by phases of blocks of the image.
 
     An error across the line of sight acts with opposite signs on the two sides of a scene. In each
     round the phase of every pulse is measured in each of nine blocks, against a Wiener estimate of
     the scene; least squares fit three axes to the phases of each pulse, with a ridge for the two
-    across: their expected spectrum is that of the motion along the line of sight. What is left of
-    the phases gives the standard deviation. The axes across stay zero if they do not lower the
-    entropy of the image.
+    across: their expected spectrum is that of the motion along the line of sight. What the Wiener
+    estimate leaves of the samples is taken as noise, from which the standard deviation follows.
 
     Args:
         rows: Range profiles, shape (pulse, range), complex.
@@ -82,27 +78,20 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, rou
     Returns:
         The errors.
     """
-    found = [_refined(rows, imaging, line_of_sight_m, rounds, across) for across in (False, True)]
-    costs = [float(entropy(one.image)) for one in found]
-    return found[1] if costs[1] < costs[0] else found[0]
-
-
-def _refined(rows: Tensor, imaging: TileOperator, range_m: Tensor, rounds: int, across: bool) -> Found:
-    """The errors with or without the axes across the line of sight."""
     plan = imaging.plan
     antennas = plan.antennas
     height = float(plan.grid.origin_m[2])
     axes = _axes(antennas, height)
-    motion = torch.cat([range_m[:, None], range_m.new_zeros(len(range_m), 2)], 1)
+    motion = torch.nn.functional.pad(line_of_sight_m[:, None], (0, 2))
     masks = _masks(plan.grid.counts, rows.device)
     radians = 4 * math.pi * float(plan.frequency_hz.mean()) / LIGHT_M_S
-    std = torch.zeros_like(range_m)
+    std = torch.zeros_like(line_of_sight_m)
     for _ in range(rounds):
         offset = (motion[:, None] @ axes)[:, 0]
         operator = _along(imaging, offset)
         angles, information, places = _measured(rows, operator, masks)
         lever = _levers(operator.plan.antennas, places, axes).movedim(0, 1)
-        step, std = _fitted(angles / radians, information * radians**2, lever, motion, across)
+        step, std = _fitted(angles / radians, information * radians**2, lever, motion)
         motion = motion + step
         motion[:, 0] = without_line(motion[:, 0], torch.ones_like(motion[:, 0], dtype=torch.bool))
     offset = (motion[:, None] @ axes)[:, 0]
@@ -137,26 +126,44 @@ def _masks(counts: tuple[int, int], device: torch.device) -> Tensor:
     return torch.stack([block == i for i in range(_BLOCKS**2)])
 
 
+def _scene(rows: Tensor, operator: TileOperator) -> tuple[Tensor, Tensor]:
+    """Scene (azimuth, range) whose echo fits the samples, where the image exceeds its mean, and the
+    variance of the samples that a Wiener estimate of it leaves.
+
+    Steps of least residual, each through the image of what is left, weighted by that estimate.
+    """
+    left, noise = rows[None], torch.zeros_like(rows.real[0, 0]).double()
+    image = operator.image(left)
+    power = image.real.square() + image.imag.square()
+    weight = wiener(power, or_one(power.mean((-2, -1), keepdim=True)))
+    scene = torch.zeros_like(image)
+    for step in range(_FITS):
+        part = (image if step == 0 else operator.image(left)) * weight
+        echo = operator.adjoint(part)
+        size = (echo.conj() * left).sum().real / or_one(echo.abs().square().sum())
+        scene, left = scene + part * size, left - echo * size
+        if step == 0:
+            noise = left.abs().square().double().mean()
+    return scene[0], noise
+
+
 def _measured(rows: Tensor, operator: TileOperator, masks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Phases of each pulse in the blocks (pulse, block), their information (pulse, block, block),
     and the middles of the blocks.
 
     Blocks at the same range overlap in a pulse; least squares fit all blocks at once, each with a
-    complex gain. What is left of the samples is the noise.
+    complex gain.
     """
-    image = operator.image(rows[None])
-    parts = torch.cat([weighted(image, Part(mask)) for mask in masks])
+    scene, noise = _scene(rows, operator)
+    parts = scene * masks
     power = (parts.real.square() + parts.imag.square()).flatten(1).double()
     pixels = operator.plan.grid.pixels_m().reshape(-1, 3)
     places = (power @ pixels) / or_one(power.sum(-1, keepdim=True))
     model = operator.adjoint(parts).movedim(0, -1)  # (pulse, range, block)
-    model = model * (rows.conj() * model.sum(-1)).sum().abs() / or_one(model.sum(-1).abs().square().sum())
     gram = (model.mH @ model).to(torch.complex128)
     ridge = _RIDGE * or_one(gram.diagonal(dim1=-2, dim2=-1).real.mean())
     inverse = torch.linalg.inv(gram + ridge * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))
     gain = (inverse @ (model.mH @ rows[..., None]).to(inverse.dtype))[..., 0]
-    left = rows - (model @ gain.to(model.dtype)[..., None])[..., 0]
-    noise = left.abs().square().double().sum() / max(1, left.numel() - gain.numel())
     return gain.imag, torch.linalg.inv(inverse.real) * (2 / or_one(noise)), places
 
 
@@ -167,9 +174,7 @@ def _levers(antennas: AntennaPath, places_m: Tensor, axes: Tensor) -> Tensor:
     return (torch.stack(torch.broadcast_tensors(*units)).mean(0)[..., None, :] * axes).sum(-1)
 
 
-def _fitted(
-    range_m: Tensor, information: Tensor, lever: Tensor, motion: Tensor, across: bool
-) -> tuple[Tensor, Tensor]:
+def _fitted(range_m: Tensor, information: Tensor, lever: Tensor, motion: Tensor, across: bool) -> tuple[Tensor, Tensor]:
     """Least-squares step of the motion (pulse, 3), and standard deviation of the line of sight.
 
     range_m: errors of half the path in the blocks, (pulse, block), with their information (pulse,
@@ -180,19 +185,18 @@ def _fitted(
     whole = or_one(normal[:, 0, 0])
     step, variance = torch.zeros_like(motion), 1 / whole
     share = normal[:, 0, 1:] / whole[:, None]
-    if across:
-        basis, prior = _spectrum(motion[:, 0])
-        rest = pull[:, 1:] - share * pull[:, :1]
-        seen = normal[:, 1:, 1:] - normal[:, 1:, :1] * share[:, None]
-        parts = [[basis.mT @ (seen[:, i, k, None] * basis) for k in range(2)] for i in range(2)]
-        ridge = torch.cat([prior, prior]).reciprocal()
-        spread = torch.linalg.inv(torch.cat([torch.cat(row, 1) for row in parts]) + torch.diag(ridge))
-        now = (basis.mT @ motion[:, 1:]).mT.reshape(-1)
-        found = spread @ ((basis.mT @ rest).mT.reshape(-1) - ridge * now)
-        step[:, 1:] = basis @ found.reshape(2, -1).mT
-        blocks = spread.reshape(2, len(prior), 2, len(prior))
-        of_pulse = torch.einsum("pa,iakb,pb->pik", basis, blocks, basis)
-        variance = variance + (share[:, None] @ of_pulse @ share[..., None])[:, 0, 0]
+    basis, prior = _spectrum(motion[:, 0])
+    rest = pull[:, 1:] - share * pull[:, :1]
+    seen = normal[:, 1:, 1:] - normal[:, 1:, :1] * share[:, None]
+    parts = [[basis.mT @ (seen[:, i, k, None] * basis) for k in range(2)] for i in range(2)]
+    ridge = torch.cat([prior, prior]).reciprocal()
+    spread = torch.linalg.inv(torch.cat([torch.cat(row, 1) for row in parts]) + torch.diag(ridge))
+    now = (basis.mT @ motion[:, 1:]).mT.reshape(-1)
+    found = spread @ ((basis.mT @ rest).mT.reshape(-1) - ridge * now)
+    step[:, 1:] = basis @ found.reshape(2, -1).mT
+    blocks = spread.reshape(2, len(prior), 2, len(prior))
+    of_pulse = torch.einsum("pa,iakb,pb->pik", basis, blocks, basis)
+    variance = variance + (share[:, None] @ of_pulse @ share[..., None])[:, 0, 0]
     step[:, 0] = pull[:, 0] / whole - (share * step[:, 1:]).sum(-1)
     return step, variance.clamp_min(0).sqrt()
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.path.axes import Part, three_axes
+from torchsar.compensate.path.axes import three_axes
 from torchsar.compensate.path.envelopes import drift_m, matched_m, moved
 from torchsar.compensate.path.fringes import roughness, smooth_near, smoothest
 from torchsar.compensate.path.ground import STEP, for_each, ground_image, trials_of
@@ -58,7 +58,7 @@ def path_autofocus(
     *,
     extent_m: float | None = None,
     height_m: float = 0.0,
-    polish: int = 20,
+    rounds: int = 4,
 ) -> Estimate:
     """Estimate the error of the recorded line of sight of each pulse, with whole fringes.
 
@@ -68,40 +68,42 @@ def path_autofocus(
        quarter of the band by iterations through the adjoint of the image formation.
     2. Phases become ranges. If their second differences show a smooth motion, its fringes follow
        from the phases, otherwise each pulse takes the range at which its envelope and its phase
-       match the sharpened image best. In three to six rounds with more of the band, envelopes move too.
+       match the sharpened image best. In up to six rounds with more of the band, envelopes move
+       too.
     3. Envelopes may still drift slowly against the phases: polynomials of time that lower the
        entropy while the phases of the carrier are kept; the drift is added in whole fringes.
-    4. The phase of each pulse is compared with a Wiener estimate of the scene, without windows.
+    4. Three axes, without windows: the phases of nine blocks of the image, against an estimate of
+       the scene that fits the samples, refine the line of sight. Errors across it, which act
+       differently over the scene, follow with a ridge: their spectrum is taken to be that of the
+       motion along the line of sight.
 
-    A scatterer anywhere in the scene gets the correction of the middle: errors across the line of
-    sight, which act differently over the scene, are not found. Not observable are a constant and
-    a linear term, which move the image; they are zero in the result. The fringes of rough errors
-    are known as well as envelopes are, that is in part, so that the result is to be judged modulo
-    half a wavelength. Trials have plans of their own and are processed one after another.
+    Not observable are a constant and a linear term, which move the image; they are zero in the
+    result. The fringes of rough errors are known as well as envelopes are, that is in part, so that
+    the result is to be judged modulo half a wavelength. Trials have plans of their own and are
+    processed one after another.
 
     Args:
         profiles: Range profiles, the unitary centred inverse FFT of a phase history, shape (...,
-            pulse, range), complex. Pulses that hold only zeros are left out; their line of sight
-            is that of the pulses beside them.
+            pulse, range), complex. Pulses that hold only zeros are left out; their errors are
+            interpolated.
         frequency_hz: Frequencies in Hz, rising in equal steps, float64 (range,).
         antennas: Recorded path of the antennas, of all trials or of each of them. The scene is
             about the origin.
         extent_m: Side of the imaged square about the origin in metres, which should hold most of
             the scatterers; by default that of the whole unambiguous ground, which takes longer.
         height_m: Height z of the imaged plane in metres.
-        polish: Largest number of iterations of the last step.
+        rounds: Rounds of the last step.
 
     Returns:
         `line_of_sight_m` of shape (..., pulse), float64: half the path over the middle of the
-        scene, recorded minus true; and `offset_m` of shape (..., pulse, 3): the same as an error
-        of the positions along the line of sight, for `CorrectPath`. The standard deviation is that
-        modulo half a wavelength: half of the rms difference between the results of two halves of
-        the image, which have different scatterers and independent noise. `quality` is the Strehl
-        ratio predicted from it, times the share of the sharpness that noise does not explain. `ok`
-        is False unless the image is 1.5 times as sharp as autofocus can make pure noise, more than
-        one range cell makes the sharpness, and that Strehl ratio exceeds 0.8. `info` holds
-        "roughness" (about 1 if the fringes come from single envelopes, less for smooth motions)
-        and "entropy_nats" of the image, shape (...,).
+        scene, recorded minus true; and `offset_m` of shape (..., pulse, 3): the error of the
+        positions, of both antennas alike, for `CorrectPath`. The standard deviation of the line of
+        sight is that modulo half a wavelength, from what a Wiener estimate of the scene leaves of
+        the samples. `quality` is the Strehl ratio predicted from it, times the share of the
+        sharpness that noise does not explain. `ok` is False unless the image is 1.5 times as sharp
+        as autofocus can make pure noise, more than one range cell makes the sharpness, and that
+        Strehl ratio exceeds 0.8. `info` holds "roughness" (about 1 if the fringes come from single
+        envelopes, less for smooth motions) and "entropy_nats" of the image, shape (...,).
 
     Raises:
         TypeError: If the profiles are not complex, or frequencies are not float64.
@@ -124,7 +126,7 @@ def path_autofocus(
                 operator = ground_image(frequency_hz, _only(one, present), height_m, extent_m)
             some = rows[present]
             some = some / some.abs().amax()
-            found = _Search(some, frequency_hz, operator, polish).found()
+            found = _Search(some, frequency_hz, operator, rounds).judged()
             found = _spread(found, present)
         return found
 
@@ -181,25 +183,17 @@ class _Search:
         rows: Range profiles of the pulses that are present, (pulse, range).
         frequency_hz: Frequencies.
         imaging: Image formation along their recorded path.
-        polish: Iterations of the last step.
+        rounds: Rounds of the last step.
     """
 
     rows: Tensor
     frequency_hz: Tensor
     imaging: TileOperator
-    polish: int
+    rounds: int
 
     @property
     def _fringe_m(self) -> float:
         return LIGHT_M_S / (2 * float(self.frequency_hz.mean()))
-
-    def found(self) -> Estimate:
-        """Find the line of sight, with its standard deviation and verdict."""
-        range_m, rough = self.search()
-        weights = Part(torch.ones(self.imaging.plan.grid.counts, device=self.rows.device))
-        phase, _ = self.sharpened(self.rows, range_m, [(weights, self.polish, 1e-3)])
-        range_m = self.line_free(range_m + self.metres(phase))
-        return self.judged(range_m, rough)
 
     def metres(self, phase_rad: Tensor) -> Tensor:
         return phase_rad.double() * (self._fringe_m / (2 * math.pi))
@@ -273,9 +267,10 @@ class _Search:
         near_std = _NEAR_FRINGES * self._fringe_m
         return smooth_near(carrier[None], near[None], self._fringe_m, near_std, bends[None])[0]
 
-    def judged(self, range_m: Tensor, rough: Tensor) -> Estimate:
-        """The estimate with three axes, from the sharpness of the image and the phases that are left."""
-        found = three_axes(self.rows, self.imaging, range_m)
+    def judged(self) -> Estimate:
+        """The estimate with three axes, and its verdict."""
+        range_m, rough = self.search()
+        found = three_axes(self.rows, self.imaging, range_m, self.rounds)
         std_rad = (found.std_m * (2 * math.pi / self._fringe_m)).square().mean().sqrt()
         sharp, effective, telling = sharpness_beyond_speckle(found.image.mT)
         noise = sharpness_of_noise((effective * STEP).clamp_min(1))

@@ -16,15 +16,15 @@ class PathAutofocus(Stage):
         extent_m: Side of the imaged square about the origin in metres; None for the whole
             unambiguous ground.
         height_m: Height z of the imaged plane in metres.
-        polish: Largest number of iterations of the last step.
+        rounds: Rounds of the last step.
     """
 
     provides = ("line_of_sight_m", "offset_m")
     neutral = {"line_of_sight_m": 0.0, "offset_m": 0.0}
 
-    def __init__(self, extent_m: float | None = None, height_m: float = 0.0, polish: int = 20) -> None:
+    def __init__(self, extent_m: float | None = None, height_m: float = 0.0, rounds: int = 4) -> None:
         super().__init__()
-        self.extent_m, self.height_m, self.polish = extent_m, height_m, polish
+        self.extent_m, self.height_m, self.rounds = extent_m, height_m, rounds
 
     def forward(
         self,
@@ -48,7 +48,7 @@ class PathAutofocus(Stage):
             `offset_m` of shape (..., pulse, 3).
         """
         antennas = AntennaPath(transmitter_m, receiver_m, path_reference_m)
-        how = {"extent_m": self.extent_m, "height_m": self.height_m, "polish": self.polish}
+        how = {"extent_m": self.extent_m, "height_m": self.height_m, "rounds": self.rounds}
         return path_autofocus(signal.data, frequency_hz, antennas, **how)
 
 
