@@ -17,8 +17,8 @@ from torchsar.radar import LIGHT_M_S, AntennaPath
 # blocks of the image along either axis, by choice: many levers, each with several scatterers
 _BLOCKS = 3
 # steps that fit the scene to the samples, by trial
-# steps that fit the scene to the samples, by trial
-_FITS = 4
+# steps that fit the scene to the samples, by trial, and share of the rest below which one counts
+_FITS, _WORTH = 6, 0.8
 # share of the mean power of the blocks that is added, so that empty blocks have no gain
 _RIDGE = 1e-3
 # neighbourhood over which the spectrum of the motion is averaged, relative and in coefficients
@@ -138,12 +138,16 @@ def _scene(rows: Tensor, operator: TileOperator) -> tuple[Tensor, Tensor]:
     weight = wiener(power, or_one(power.mean((-2, -1), keepdim=True)))
     scene = torch.zeros_like(image)
     for step in range(_FITS):
-        part = (image if step == 0 else operator.image(left)) * weight
+        # without its mean the first weight leaves out what each pulse adds to its own model
+        part = operator.image(left) * weight if step else image * (weight - weight.mean(-2, keepdim=True))
         echo = operator.adjoint(part)
         size = (echo.conj() * left).sum().real / or_one(echo.abs().square().sum())
-        scene, left = scene + part * size, left - echo * size
+        rest = left - echo * size
         if step == 0:
-            noise = left.abs().square().double().mean()
+            noise = rest.abs().square().double().mean() / (1 - weight.double().mean()) ** 2
+        elif rest.abs().square().sum() > _WORTH * left.abs().square().sum():
+            break  # what is left is noise
+        scene, left = scene + part * size, rest
     return scene[0], noise
 
 
@@ -160,11 +164,13 @@ def _measured(rows: Tensor, operator: TileOperator, masks: Tensor) -> tuple[Tens
     pixels = operator.plan.grid.pixels_m().reshape(-1, 3)
     places = (power @ pixels) / or_one(power.sum(-1, keepdim=True))
     model = operator.adjoint(parts).movedim(0, -1)  # (pulse, range, block)
+    # the model holds some noise too
+    excess = model.sum(-1).abs().square().double().mean() / or_one(rows.abs().square().double().mean() - noise)
     gram = (model.mH @ model).to(torch.complex128)
     ridge = _RIDGE * or_one(gram.diagonal(dim1=-2, dim2=-1).real.mean())
     inverse = torch.linalg.inv(gram + ridge * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))
     gain = (inverse @ (model.mH @ rows[..., None]).to(inverse.dtype))[..., 0]
-    return gain.imag, torch.linalg.inv(inverse.real) * (2 / or_one(noise)), places
+    return gain.imag, torch.linalg.inv(inverse.real) * (2 / or_one(noise * excess.clamp_min(1))), places
 
 
 def _levers(antennas: AntennaPath, places_m: Tensor, axes: Tensor) -> Tensor:
@@ -174,7 +180,7 @@ def _levers(antennas: AntennaPath, places_m: Tensor, axes: Tensor) -> Tensor:
     return (torch.stack(torch.broadcast_tensors(*units)).mean(0)[..., None, :] * axes).sum(-1)
 
 
-def _fitted(range_m: Tensor, information: Tensor, lever: Tensor, motion: Tensor, across: bool) -> tuple[Tensor, Tensor]:
+def _fitted(range_m: Tensor, information: Tensor, lever: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     """Least-squares step of the motion (pulse, 3), and standard deviation of the line of sight.
 
     range_m: errors of half the path in the blocks, (pulse, block), with their information (pulse,

@@ -259,7 +259,8 @@ class _Search:
         """Line of sight at which envelopes and phases match the image that phases sharpen."""
         turned = at * cis(-phase)[:, None]
         model = self.imaging.adjoint(weighted(self.imaging.image(turned[None]), _surprise))[0]
-        near = range_m + matched_m(at, model, self.frequency_hz, reach_m)
+        whole = moved(self.rows, self.frequency_hz, range_m)
+        near = range_m + matched_m(whole, model, self.frequency_hz, reach_m)
         if rough >= _ROUGH:
             return near
         carrier = range_m + self.metres(phase)
