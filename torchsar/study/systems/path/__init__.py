@@ -98,6 +98,8 @@ class AnyPath(System):
         error = registered_error_db(*(signal.data for signal in signals)).expand(count)
         return replace(judged, metrics={**judged.metrics, "image_error_db": error})
 
+    bounds = staticmethod(judging.bounds)  # pyright: ignore[reportAssignmentType]
+
     def choices(self, bench: Bench) -> Sequence[Choice]:
         stages = bench.chains["recommended"].stages.values()
         stage = next((one for one in stages if isinstance(one, PathImage)), None)
