@@ -131,8 +131,10 @@ def test_paths_that_err_by_a_wavelength_give_the_image_of_the_true_path() -> Non
 
 def test_noise_and_too_few_pulses_are_not_ok() -> None:
     recording = recorded(1)
-    antennas, frequency = path_of(recording), recording.aux["frequency_hz"]
-    noise = torch.randn(2, PULSES, CELLS, dtype=torch.complex64, generator=torch.Generator().manual_seed(2))
+    frequency, some = recording.aux["frequency_hz"], slice(0, 24)
+    whole = path_of(recording)
+    antennas = AntennaPath(whole.transmitter_m[..., some, :], None, whole.reference_m[..., some])
+    noise = torch.randn(2, 24, CELLS, dtype=torch.complex64, generator=torch.Generator().manual_seed(2))
     noise[1, 5:] = 0
     found = path_autofocus(noise, frequency, antennas, rounds=1)
     assert found.ok.tolist() == [False, False]

@@ -14,6 +14,9 @@ def fringe_error(x_m: Tensor, fringe_m: float) -> Tensor:
     Args:
         x_m: Lengths in metres, any shape.
         fringe_m: Half a wavelength in metres.
+
+    Returns:
+        Lengths in metres, same shape.
     """
     return x_m - fringe_m * torch.round(x_m / fringe_m)
 

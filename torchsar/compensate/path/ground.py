@@ -29,6 +29,9 @@ def trials_of(name: str, profiles: Tensor, frequency_hz: Tensor, antennas: Anten
         frequency_hz: Frequencies in Hz, shape (range,).
         antennas: Recorded path.
 
+    Returns:
+        The leading dimensions to which they broadcast.
+
     Raises:
         ValueError: If the sizes do not match.
     """
@@ -45,6 +48,9 @@ def path_of(antennas: AntennaPath, trials: tuple[int, ...], index: tuple[int, ..
         antennas: Paths.
         trials: Leading dimensions to which they broadcast; () for those that they have.
         index: Number of the trial in each of them.
+
+    Returns:
+        The path, without leading dimensions.
     """
 
     def of(x: Tensor, behind: int) -> Tensor:
@@ -65,6 +71,9 @@ def for_each(
         profiles: Range profiles, shape (..., pulse, range).
         antennas: Paths.
         trials: Leading dimensions of the result.
+
+    Returns:
+        Estimate of all trials, with the leading dimensions.
     """
     data = profiles.expand(*trials, *profiles.shape[-2:])
     every = itertools.product(*map(range, trials))
@@ -111,6 +120,9 @@ def ground_image(
         antennas: Path of one trial.
         height_m: Height z of the ground in metres.
         extent_m: Side of the imaged square in metres; None for all of the unambiguous ground.
+
+    Returns:
+        Image formation of range profiles, with its adjoint.
 
     Raises:
         ValueError: If the line of sight does not turn over the ground.
