@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.path.ground import sights
-from torchsar.compensate.pulse_phase.data import or_one, without_line
+from torchsar.compensate.pulse_phase.data import or_one, safe_angle, without_line
 from torchsar.compensate.pulse_phase.sharpen import Wiener
+from torchsar.core import cis
 from torchsar.focus import TileOperator
 from torchsar.radar import LIGHT_M_S, AntennaPath
 
@@ -164,13 +165,20 @@ def _measured(rows: Tensor, operator: TileOperator, masks: Tensor) -> tuple[Tens
     pixels = operator.plan.grid.pixels_m().reshape(-1, 3)
     places = (power @ pixels) / or_one(power.sum(-1, keepdim=True))
     model = operator.adjoint(parts).movedim(0, -1)  # (pulse, range, block)
+    # phases that are far off are common to all blocks; what is left of them is small
+    common = safe_angle((rows * model.sum(-1).conj()).sum(-1))
+    rows = rows * cis(-common)[:, None]
     # the model holds some noise too
     excess = model.sum(-1).abs().square().double().mean() / or_one(rows.abs().square().double().mean() - noise)
     gram = (model.mH @ model).to(torch.complex128)
     ridge = _RIDGE * or_one(gram.diagonal(dim1=-2, dim2=-1).real.mean())
     inverse = torch.linalg.inv(gram + ridge * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))
     gain = (inverse @ (model.mH @ rows[..., None]).to(inverse.dtype))[..., 0]
-    return gain.imag, torch.linalg.inv(inverse.real) * (2 / or_one(noise * excess.clamp_min(1))), places
+    return (
+        gain.imag + common[:, None],
+        torch.linalg.inv(inverse.real) * (2 / or_one(noise * excess.clamp_min(1))),
+        places,
+    )
 
 
 def _levers(antennas: AntennaPath, places_m: Tensor, axes: Tensor) -> Tensor:

@@ -47,8 +47,9 @@ _LEAST_WEIGHT = 0.1
 _COARSE, _FINE, _TOLERANCE_RAD = 30, 12, 0.03
 # fewest pulses
 _LEAST_PULSES = 8
-# factor by which the sharpness must exceed that of noise, as for the phases of pulses
-_MARGIN = 1.5
+# factor by which the sharpness must exceed that of noise: more than for the phases of pulses, 1.5,
+# because envelopes and three axes are free too
+_MARGIN = 2.0
 
 
 def path_autofocus(
@@ -100,8 +101,8 @@ def path_autofocus(
         positions, of both antennas alike, for `CorrectPath`. The standard deviation of the line of
         sight is that modulo half a wavelength, from what a Wiener estimate of the scene leaves of
         the samples. `quality` is the Strehl ratio predicted from it, times the share of the
-        sharpness that noise does not explain. `ok` is False unless the image is 1.5 times as sharp
-        as autofocus can make pure noise, more than one range cell makes the sharpness, and that
+        sharpness that noise does not explain. `ok` is False unless the image is twice as sharp as
+        autofocus can make pure noise, more than one range cell makes the sharpness, and that
         Strehl ratio exceeds 0.8. `info` holds "roughness" (about 1 if the fringes come from single
         envelopes, less for smooth motions) and "entropy_nats" of the image, shape (...,).
 
