@@ -717,6 +717,8 @@ REASONS = {
     "core.is_out_of_memory": "takes an exception only",
     "core.take": "index arithmetic that callers inside the package have checked",
     "core.per_trial": "appends dimensions; no arithmetic",
+    "core.host_value": "reads one number",
+    "core.host_largest": "reads one number",
     "core.outer_phasor": "a product of two tables that phasor_tables has made",
     "core.real_dtype": "takes a dtype only",
     "radar.geometry_of": "builds a geometry, whose classes check their fields; tests/focus/test_spotlight.py",
