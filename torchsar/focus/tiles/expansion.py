@@ -20,7 +20,7 @@ tile, and all that multiply y, are expanded to second order (`remainders`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -138,13 +138,18 @@ class Expansion:
         stretch = fit[0, 3] * s + fit[1, 3] * s * s
         return (self.carrier + q) * (x * s + x * x * bend) + q * x * (a + s) * stretch
 
-    def tile_phase(self, q: Tensor, x: Tensor) -> Tensor:
-        """Phase in rad of each tile over q (wave number, 1, 1) and x, (wave number, tile, x)."""
-        return q * (self.a * x + 0.5 * self.curvature[:, :1] * x * x)
+    def rows(self, rows: slice) -> Expansion:
+        """Return the expansion of some of the tiles."""
+        mine = {name: getattr(self, name)[rows] for name in ("centre", "path_m", "a", "b", "curvature", "fit")}
+        return replace(self, **mine)
 
-    def range_phase(self, q: Tensor, y: Tensor) -> Tensor:
-        """Phase in rad of each tile over q (wave number,) and y (y,), (tile, wave number, y)."""
-        return q[:, None] * (self.b[..., None] * y + 0.5 * self.curvature[:, 2, None, None] * y * y)
+    def tile_path(self, x: Tensor) -> Tensor:
+        """Path in m that is due to x (x,) alone, (tile, x)."""
+        return self.a * x + 0.5 * self.curvature[:, :1] * x * x
+
+    def range_path(self, y: Tensor) -> Tensor:
+        """Path in m that is due to y (y,) alone, (tile, y)."""
+        return self.b * y + 0.5 * self.curvature[:, 2:] * y * y
 
     def remainders(self, q: Tensor, x: Tensor, order: int, dims: int = 1) -> list[list[Tensor]]:
         """Complex weights of the moments of s: a list over powers of y of lists over powers of s.
@@ -160,13 +165,13 @@ class Expansion:
             dims: Dimensions of the weights behind that of the tiles, with which q and x broadcast.
 
         Returns:
-            Weights, complex128.
+            Weights, complex, in the precision of q.
         """
         behind = (-1, *(1,) * dims)
         (xx1, xy1, yy1, e1), (xx2, xy2, yy2, e2) = (
-            tuple(v.reshape(behind) for v in part.unbind(-1)) for part in self.fit.unbind(1)
+            tuple(v.to(q.dtype).reshape(behind) for v in part.unbind(-1)) for part in self.fit.unbind(1)
         )
-        a, b, xy0 = (v.reshape(behind) for v in (self.a, self.b, self.curvature[:, 1]))
+        a, b, xy0 = (v.to(q.dtype).reshape(behind) for v in (self.a, self.b, self.curvature[:, 1]))
         mean_a, mean = self.common
         k = self.carrier + q
         # what the terms common to all tiles leave

@@ -52,8 +52,9 @@ class Band:
 
     def profiles(self, history: Tensor) -> Tensor:
         """Range profiles (..., length) of a history (..., frequency), from difference zero on."""
-        padded = pad(history, (0, self.length - self.n))
-        return torch.fft.ifft(torch.roll(padded, -(self.n // 2), -1), dim=-1, norm="forward")
+        low, high = history[..., : self.n // 2], history[..., self.n // 2 :]
+        padded = torch.cat([high, history.new_zeros(*history.shape[:-1], self.length - self.n), low], -1)
+        return torch.fft.ifft(padded, dim=-1, norm="forward")
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,11 +116,9 @@ class Part:
         self.low = extent[0] - taps / 2 * self.node_step
         self.nodes = math.ceil((extent[1] - extent[0]) / self.node_step) + taps + 1
         self.extent = extent
-        flat = 2 * self._reach(every) + 1
-        self.length = even_length(flat + choice.rise)
+        self.length = even_length(2 * self._reach(every) + 1 + choice.rise)
         self.slope = window_slope(choice.rise, choice.guard).to(centre.device)
         self.samples = self.length + choice.rise
-        self._across(extent)
 
     def _extent(self, places: Sequence[Tensor]) -> tuple[float, float]:
         """Least and largest s of the pulses in the tiles."""
@@ -141,44 +140,62 @@ class Part:
         inside = self.extent[0] <= low and high <= self.extent[1]
         return inside and 2 * self._reach(places) + 1 <= self.length - self.choice.rise
 
-    def _across(self, extent: tuple[float, float]) -> None:
-        """Matrices from nodes to pixels across the range, and the weights of the tiles."""
-        m = torch.arange(self.length, dtype=torch.float64, device=self.centre.device) - self.length // 2
+    @property
+    def weight_count(self) -> int:
+        """Number of complex values in `across` and in the weights of all tiles."""
+        wide, deep, powers = len(self.x), len(self.y), self.choice.order + 1
+        of_tile = self.length * powers * (MOMENTS * wide + deep) + wide * deep
+        return MOMENTS * self.length * self.nodes * wide + len(self.centre) * of_tile
+
+    def across(self, dtype: torch.dtype) -> list[Tensor]:
+        """Matrices from nodes to pixels across the range, one for each moment of s.
+
+        Args:
+            dtype: Precision of the history.
+
+        Returns:
+            Matrices (wave number, node, x) that all tiles of the part share.
+        """
+        device = self.centre.device
+        m = torch.arange(self.length, dtype=torch.float64, device=device) - self.length // 2
         q = m * (_TURN / (self.length * self.band.step_m))
-        s = torch.linspace(*extent, 3 * self.nodes, dtype=torch.float64, device=self.centre.device)
+        s = torch.linspace(*self.extent, 3 * self.nodes, dtype=torch.float64, device=device)
         values = node_values((s - self.low) / self.node_step, self.nodes, self.choice.taps) / self.length
         phase = self.expansion.common_phase(s, q[:, None, None], self.x[:, None]) / _TURN
-        phasor = unit_phasor(phase, torch.complex128)
-        moments = torch.cat([phasor * s**power for power in range(MOMENTS)], 1)  # (wave number, moment x, sample)
-        across = torch.complex(moments.real @ values.mT, moments.imag @ values.mT)
-        cut = q[:, None, None]
-        tile = unit_phasor(self.expansion.tile_phase(cut, self.x) / _TURN, torch.complex128)
-        weights = [
-            [weight * tile for weight in weights]
-            for weights in self.expansion.remainders(cut, self.x, self.choice.order)
-        ]
-        along = unit_phasor(self.expansion.range_phase(q, self.y) / _TURN, torch.complex128)
-        self._matrices = {
-            torch.complex128: Matrices(
-                across.mT.contiguous(),
-                [[w.expand(-1, len(self.centre), -1) for w in row] for row in weights],
-                [along * self.y**power for power in range(self.choice.order + 1)],
-                self._pixel_phasors(),
-            )
-        }
+        phasor = torch.view_as_real(unit_phasor(phase, torch.complex128)).movedim(-1, 0)  # (2, wave number, x, sample)
+        found = []
+        for power in range(MOMENTS):
+            real, imag = phasor @ (values * s**power).mT
+            found.append(torch.complex(real, imag).mT.to(dtype).contiguous())
+        return found
 
-    def _pixel_phasors(self) -> Tensor:
-        """Carrier phase of the pixels at the reference place, complex128 (tile, x, y)."""
+    def weights(self, rows: slice, dtype: torch.dtype) -> Weights:
+        """Compute what forms the pixels of some tiles, for any history.
+
+        Args:
+            rows: Tiles of the part.
+            dtype: Precision of the history.
+        """
+        of, step = self.expansion.rows(rows), 1 / (self.length * self.band.step_m)
+        # the phases of tiles are linear in the wave number
+        tile = _ramp(-(self.length // 2) * step * of.tile_path(self.x), step * of.tile_path(self.x), self.length, dtype)
+        along = _ramp(
+            -(self.length // 2) * step * of.range_path(self.y), step * of.range_path(self.y), self.length, dtype
+        )
+        real = real_dtype(dtype)
+        m = torch.arange(self.length, dtype=torch.float64, device=self.centre.device) - self.length // 2
+        q = (m * (_TURN * step)).to(real)[:, None, None]
+        tile, along = tile.movedim(-1, 0).contiguous(), along.mT.contiguous()
+        moments = [[tile * weight for weight in row] for row in of.remainders(q, self.x.to(real), self.choice.order)]
+        powers = [along * self.y.to(real) ** power for power in range(self.choice.order + 1)]
+        return Weights(moments, powers, self._pixel_phasors(rows, dtype))
+
+    def _pixel_phasors(self, rows: slice, dtype: torch.dtype) -> Tensor:
+        """Carrier phase of the pixels of some tiles at the reference place, (tile, x, y)."""
         along = self.x[:, None, None] * self.axes[0] + self.y[:, None] * self.axes[1]
-        pixels = self.centre[:, None, None] + along
+        pixels = self.centre[rows, None, None] + along
         path = slopes(self.reference, pixels.reshape(-1, 3), self.axes)[0].reshape(pixels.shape[:-1])
-        return unit_phasor((path - self.expansion.path_m[..., None]) * (self.band.carrier / _TURN), torch.complex128)
-
-    def matrices(self, dtype: torch.dtype) -> Matrices:
-        """Matrices in the precision of a history."""
-        if dtype not in self._matrices:
-            self._matrices[dtype] = self._matrices[torch.complex128].to(dtype)
-        return self._matrices[dtype]
+        return unit_phasor((path - self.expansion.path_m[rows, None]) * (self.band.carrier / _TURN), dtype)
 
     def tables(self, rows: slice, places: Sequence[Tensor], reference_m: Tensor, dtype: torch.dtype) -> Tables:
         """Compute the tables of some tiles.
@@ -212,24 +229,22 @@ class Part:
         weights = spread_kernel(away.to(real), taps)
         return Tables(first, before, after, *_spreading(below.long(), weights, self.nodes))
 
-    def nodes_of(self, profiles: Tensor, tables: Tables) -> Tensor:
-        """Sum the windows of the pulses at the nodes of some tiles.
+    def add_nodes(self, nodes: Tensor, profiles: Tensor, tables: Tables) -> None:
+        """Add the windows of the pulses to the nodes of some tiles.
 
         Args:
+            nodes: Sums at the nodes, real (tile * path * node, trial * wave number * 2); changed in
+                place.
             profiles: Range profiles, extended circularly, complex (path, pulse, trial, sample).
             tables: Tables of the tiles.
-
-        Returns:
-            Real and imaginary parts, real (tile * path, node, trial * wave number * 2).
         """
         tiles, paths, pulses = tables.first.shape
         trials, stride = profiles.shape[-2:]
         base = torch.arange(paths * pulses * trials, device=profiles.device).reshape(paths, pulses, trials) * stride
         index = (tables.first[..., None] + base).reshape(-1)
-        x = _Cut.apply(profiles.reshape(-1), index, self.samples)
-        x = _times(x.view(tiles, paths, pulses, trials, self.samples), tables.before[..., None, :])
-        rise = self.samples - self.length
-        half = rise // 2
+        x = _Cut.apply(profiles.reshape(-1), index, self.samples).view(tiles, paths, pulses, trials, self.samples)
+        x = _times(x, tables.before[..., None, :])
+        half = (self.samples - self.length) // 2
         # the slopes overlap outside the part that is used
         y = x[..., half : half + self.length].clone()
         y[..., :half] += x[..., half + self.length :]
@@ -243,60 +258,47 @@ class Part:
         z = torch.bmm(tables.spread.reshape(-1, joined, height), y.view(tiles * paths * chunks, height, width))
         block = torch.arange(tiles * paths, device=y.device) * self.nodes
         target = tables.node.reshape(tiles * paths, -1) + block[:, None]
-        out = z.new_zeros(tiles * paths * self.nodes, width).index_add(0, target.reshape(-1), z.reshape(-1, width))
-        return out.view(tiles * paths, self.nodes, width)
+        nodes.index_add_(0, target.reshape(-1), z.reshape(-1, width))
 
-    def pixels_of(self, nodes: Tensor, rows: slice, trials: int) -> Tensor:
+    def pixels_of(self, nodes: Tensor, across: Sequence[Tensor], weights: Weights) -> Tensor:
         """Form the pixels of some tiles.
 
         Args:
-            nodes: Sums at the nodes, real (tile * path, node, trial * wave number * 2).
-            rows: Tiles of the part.
-            trials: Trials of a path.
+            nodes: Sums at the nodes, real (tile * path * node, trial * wave number * 2).
+            across: Matrices of `across`.
+            weights: Weights of the tiles.
 
         Returns:
             Pixels, complex (tile, path * trial, x, y).
         """
-        tiles = len(self.centre[rows])
-        z = torch.view_as_complex(nodes.view(-1, self.nodes, trials, self.length, 2))
+        tiles, width = len(weights.pixels), len(self.x)
+        z = torch.view_as_complex(nodes.view(-1, self.nodes, nodes.shape[-1] // (2 * self.length), self.length, 2))
         z = z.permute(3, 0, 2, 1).reshape(self.length, -1, self.nodes)
-        matrices = self.matrices(z.dtype)
-        moments = torch.bmm(z, matrices.across).view(self.length, tiles, -1, MOMENTS, len(self.x)).unbind(-2)
+        moments = [torch.bmm(z, matrix).view(self.length, tiles, -1, width) for matrix in across]
         image: Tensor | None = None
-        for weights, along in zip(matrices.weights, matrices.along, strict=True):
-            part = moments[0] * weights[0][:, rows, None]
-            for moment, weight in zip(moments[1:], weights[1:], strict=True):
-                part = torch.addcmul(part, moment, weight[:, rows, None])
-            part = part.permute(1, 2, 3, 0).reshape(tiles, -1, self.length)
-            image = torch.bmm(part, along[rows]) if image is None else torch.baddbmm(image, part, along[rows])
+        for row, along in zip(weights.moments, weights.along, strict=True):
+            part = moments[0] * row[0][:, :, None]
+            for moment, weight in zip(moments[1:], row[1:], strict=True):
+                part.addcmul_(moment, weight[:, :, None])
+            part = part.view(self.length, tiles, -1).permute(1, 2, 0)
+            image = torch.bmm(part, along) if image is None else image.baddbmm_(part, along)
         assert image is not None
-        return _times(image.view(tiles, -1, len(self.x), len(self.y)), matrices.pixels[rows, None])
+        return _times(image.view(tiles, -1, width, len(self.y)), weights.pixels[:, None])
 
 
 @dataclass(frozen=True, eq=False)
-class Matrices:
-    """Constant matrices of a part.
+class Weights:
+    """What forms the pixels of some tiles.
 
     Args:
-        across: Nodes to pixels across the range, (wave number, node, moment * x).
-        weights: Weights of the moments, by power of y and moment, (wave number, tile, x).
+        moments: Weights of the moments of s, by power of y and moment, (wave number, tile, x).
         along: Wave numbers to pixels along the range, by power of y, (tile, wave number, y).
         pixels: Carrier phase of the pixels, (tile, x, y).
     """
 
-    across: Tensor
-    weights: list[list[Tensor]]
+    moments: list[list[Tensor]]
     along: list[Tensor]
     pixels: Tensor
-
-    def to(self, dtype: torch.dtype) -> Matrices:
-        """Return the matrices in another precision."""
-        return Matrices(
-            self.across.to(dtype),
-            [[w.to(dtype) for w in row] for row in self.weights],
-            [v.to(dtype) for v in self.along],
-            self.pixels.to(dtype),
-        )
 
 
 def _times(x: Tensor, factor: Tensor) -> Tensor:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,10 +22,12 @@ from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S
 
-# tables of a plan up to this size are kept between images
+# tables of the pulses, and weights of the tiles, up to this size are kept between images
 _KEPT_BYTES = 1 << 28
 # tiles and trials whose pixels are formed at once
-_GROUP = 32
+_GROUP = 16
+# profiles that are formed at once
+_PROFILE_BYTES = 1 << 25
 
 
 class TilePlan:
@@ -83,7 +87,7 @@ class TilePlan:
         size = *antennas.trials, antennas.pulses
         self._places = [place.expand(*size, 3).reshape(-1, *size[-1:], 3) for place in antennas.places]
         self._reference_m = reference_m.expand(size).reshape(-1, *size[-1:])
-        self._kept: dict[tuple, Tables] = {}
+        self._tables: dict[tuple, Tables] = {}
 
     def _plan(self, every: Sequence[Tensor]) -> None:
         """Choose the sizes and compute what does not depend on the history."""
@@ -100,10 +104,11 @@ class TilePlan:
         self._band = Band.of(self.frequency_hz, LIGHT_M_S, choice.oversampling)
         self._bounds = part_bounds(nominal[0].shape[0], choice.parts)
         self._tiles = tuple(-(-n // m) for n, m in zip(grid.counts, size, strict=True))
-        numbers, self._zones = [], []
+        self._numbers: list[Tensor] = []
+        self._zones: list[list[Part]] = []
         for block in zones(grid.counts, *size):
             i, j = (torch.arange(s.start, s.stop, device=grid.origin_m.device) for s in block)
-            numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
+            self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
             self._zones.append(
                 [
                     Part(
@@ -117,9 +122,11 @@ class TilePlan:
                     for first, last in self._bounds
                 ]
             )
-        self._order = torch.argsort(torch.cat(numbers))
-        samples = sum(len(part.centre) * part.pulses * (part.samples + part.length) for z in self._zones for part in z)
-        self._keeps = samples * len(every[0]) * 8 <= _KEPT_BYTES
+        parts = [part for zone in self._zones for part in zone]
+        samples = sum(len(part.centre) * part.pulses * (part.samples + part.length) for part in parts)
+        self._keeps_tables = samples * len(every[0]) * 8 <= _KEPT_BYTES
+        self._keeps_weights = 8 * sum(part.weight_count for part in parts) <= _KEPT_BYTES
+        self._weights: dict[tuple, Any] = {}
 
     def moved(self, transmitter_m: Tensor, receiver_m: Tensor | None, reference_m: Tensor) -> TilePlan:
         """Return the plan of a path that differs little, such as by a change of its motion errors.
@@ -178,21 +185,25 @@ class TilePlan:
         trials = data.shape[1]
         profiles = self._profiles(data.transpose(1, 2))
         step = max(1, _GROUP // (paths * trials))
-        groups = [
-            (zone, slice(first, min(first + step, len(zone[0].centre))))
-            for zone in self._zones
-            for first in range(0, len(zone[0].centre), step)
-        ]
-        if torch.is_grad_enabled() and any(v.requires_grad for v in (history, *self._places, self._reference_m)):
-            found = [checkpoint(self._pixels, *group, profiles, use_reentrant=False) for group in groups]
-        else:
-            found = [history] * len(groups)
+        found: list[Tensor] = []
+        total = math.prod(self._tiles)
+        grad = torch.is_grad_enabled() and any(v.requires_grad for v in (history, *self._places, self._reference_m))
+        tiles = data.new_empty(0 if grad else total, paths * trials, self.choice.width, self.choice.depth)
+        for zone, numbers in zip(self._zones, self._numbers, strict=True):
+            across = [self._keep((part, data.dtype), part.across, data.dtype) for part in zone]
+            rows = [slice(i, min(i + step, len(numbers))) for i in range(0, len(numbers), step)]
+            if grad:
+                found += [checkpoint(self._pixels, zone, some, across, profiles, use_reentrant=False) for some in rows]
+                continue
 
-            def work(at: int) -> None:
-                found[at] = self._pixels(*groups[at], profiles)
+            def work(some: slice) -> None:
+                tiles[numbers[some]] = self._pixels(zone, some, across, profiles)  # noqa: B023
 
-            over_blocks(work, range(len(groups)), history)
-        tiles = torch.cat(found)[self._order].unflatten(0, self._tiles)  # (tile, tile, path * trial, x, y)
+            over_blocks(work, rows, history)
+        profiles.clear()
+        if grad:
+            tiles = torch.cat(found)[torch.argsort(torch.cat(self._numbers))]
+        tiles = tiles.unflatten(0, self._tiles)  # (tile, tile, path * trial, x, y)
         image = tiles.permute(2, 0, 3, 1, 4).flatten(1, 2).flatten(-2)
         if self._swapped:
             image = image.mT
@@ -206,34 +217,57 @@ class TilePlan:
         """
         out = []
         for k, (first, last) in enumerate(self._bounds):
-            x = self._band.profiles(data[:, first:last])
             longest = max(zone[k].samples for zone in self._zones)
-            out.append(x[..., torch.arange(x.shape[-1] + longest, device=x.device) % x.shape[-1]])
+            part, length = data[:, first:last], self._band.length
+            whole = part.new_empty(*part.shape[:-1], length + longest)
+            step = max(1, _PROFILE_BYTES // (whole[:, :1].numel() * whole.element_size()))
+            for i in range(0, part.shape[1], step):
+                whole[:, i : i + step, :, :length] = self._band.profiles(part[:, i : i + step])
+            whole[..., length:] = whole[..., torch.arange(longest, device=part.device) % length]
+            out.append(whole)
         return out
 
-    def _pixels(self, zone: Sequence[Part], rows: slice, profiles: Sequence[Tensor]) -> Tensor:
+    def _pixels(
+        self, zone: Sequence[Part], rows: slice, across: Sequence[list[Tensor]], profiles: Sequence[Tensor]
+    ) -> Tensor:
         """Pixels of some tiles, summed over the sub-apertures, (tile, path * trial, x, y)."""
         total: Tensor | None = None
-        for k, (part, x) in enumerate(zip(zone, profiles, strict=True)):
-            size = part.samples * x[..., 0].numel() * x.element_size()
+        for k, (part, matrices, x) in enumerate(zip(zone, across, profiles, strict=True)):
+            paths, pulses, trials, _ = x.shape
+            size = part.samples * paths * pulses * trials * x.element_size()
             step = max(1, block_bytes_of(x.device) // size)
-            blocks = [slice(i, min(i + step, rows.stop)) for i in range(rows.start, rows.stop, step)]
-            nodes = torch.cat([part.nodes_of(x, self._tables(part, k, block, x.dtype)) for block in blocks])
-            image = part.pixels_of(nodes, rows, x.shape[-2])
+            height = paths * part.nodes
+            nodes = x.real.new_zeros((rows.stop - rows.start) * height, trials * part.length * 2)
+            for i in range(rows.start, rows.stop, step):
+                some = slice(i, min(i + step, rows.stop))
+                where = slice((some.start - rows.start) * height, (some.stop - rows.start) * height)
+                part.add_nodes(nodes[where], x, self._tables_of(part, k, some, x.dtype))
+            weights = self._keep((part, rows.start, rows.stop, x.dtype), part.weights, rows, x.dtype)
+            image = part.pixels_of(nodes, matrices, weights)
             total = image if total is None else total + image
         assert total is not None
         return total
 
-    def _tables(self, part: Part, k: int, rows: slice, dtype: torch.dtype) -> Tables:
+    def _keep(self, key: tuple, make: Callable, *given: Any) -> Any:
+        """What depends on the plan alone, from the last image if it is kept."""
+        if key in self._weights:
+            return self._weights[key]
+        with torch.no_grad():
+            found = make(*given)
+        if self._keeps_weights:
+            self._weights[key] = found
+        return found
+
+    def _tables_of(self, part: Part, k: int, rows: slice, dtype: torch.dtype) -> Tables:
         """Tables of some tiles, from the last image if they are kept."""
-        key = id(part), rows.start, rows.stop, dtype
-        if key in self._kept:
-            return self._kept[key]
+        key = part, rows.start, rows.stop, dtype
+        if key in self._tables:
+            return self._tables[key]
         pulses = slice(*self._bounds[k])
         places = [place[:, pulses] for place in self._places]
         tables = part.tables(rows, places, self._reference_m[:, pulses], dtype)
-        if self._keeps and not tables.before.requires_grad:
-            self._kept[key] = tables
+        if self._keeps_tables and not tables.before.requires_grad:
+            self._tables[key] = tables
         return tables
 
 
