@@ -131,12 +131,15 @@ class Expansion:
         fit = fit / torch.stack([scale, scale * scale], -2)
         return cls(centre, axes, reference, path, a0, b0, h0, fit, (a0.mean(), fit.mean(0)), carrier)
 
-    def common_phase(self, s: Tensor, q: Tensor, x: Tensor) -> Tensor:
-        """Phase in rad that all tiles share, of mutually broadcasting s, q in rad/m and x in m."""
+    def common_phase(self, s: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Phase in rad that all tiles share at the carrier, and its derivative in m with respect to
+        the wave number, of mutually broadcasting s and x in m.
+        """
         a, fit = self.common
         bend = 0.5 * (fit[0, 0] * s + fit[1, 0] * s * s)
         stretch = fit[0, 3] * s + fit[1, 3] * s * s
-        return (self.carrier + q) * (x * s + x * x * bend) + q * x * (a + s) * stretch
+        path = x * s + x * x * bend
+        return self.carrier * path, path + x * (a + s) * stretch
 
     def rows(self, rows: slice) -> Expansion:
         """Return the expansion of some of the tiles."""
@@ -165,13 +168,13 @@ class Expansion:
             dims: Dimensions of the weights behind that of the tiles, with which q and x broadcast.
 
         Returns:
-            Weights, complex, in the precision of q.
+            Weights, complex128.
         """
         behind = (-1, *(1,) * dims)
         (xx1, xy1, yy1, e1), (xx2, xy2, yy2, e2) = (
-            tuple(v.to(q.dtype).reshape(behind) for v in part.unbind(-1)) for part in self.fit.unbind(1)
+            tuple(v.reshape(behind) for v in part.unbind(-1)) for part in self.fit.unbind(1)
         )
-        a, b, xy0 = (v.to(q.dtype).reshape(behind) for v in (self.a, self.b, self.curvature[:, 1]))
+        a, b, xy0 = (v.reshape(behind) for v in (self.a, self.b, self.curvature[:, 1]))
         mean_a, mean = self.common
         k = self.carrier + q
         # what the terms common to all tiles leave
@@ -221,7 +224,8 @@ class Expansion:
         s = (a / stretch - self.a)[..., None, None, None]
         q = wave[:, None, None] - (self.carrier / stretch)[..., None, None, None]
         xx0, _, yy0 = (v.reshape(-1, 1, 1, 1, 1) for v in self.curvature.unbind(-1))
-        phase = self.common_phase(s, q, x) + self.carrier * excess(self.reference, self.path_m)
+        constant, per_wave = self.common_phase(s, x)
+        phase = constant + q * per_wave + self.carrier * excess(self.reference, self.path_m)
         phase = phase + q * (a0 * x + 0.5 * xx0 * x * x + b0 * y + 0.5 * yy0 * y * y)
         phase = phase - wave[:, None, None] * excess(places, path)
         parts = (

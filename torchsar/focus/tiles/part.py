@@ -16,8 +16,10 @@ from torchsar.focus.tiles.choice import CHUNK, Choice, even_length, profile_leng
 from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
 from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, node_values, spread_kernel, window_slope
 
-# pulses to which the polynomials of a part are fitted
-_FIT_PULSES = 64
+# pulses to which the polynomials of a part are fitted, and samples of s for each node
+_FIT_PULSES, _FIT_DENSITY = 64, 2
+# degrees of the remainders in the wave number and in x
+_WAVE_DEGREE, _PIXEL_DEGREE = 2, 4
 # share of the extent of s that is added at either end for changes of the path, and least margin
 _MARGIN, _LEAST_MARGIN = 0.02, 1e-6
 _TURN = 2 * math.pi
@@ -156,18 +158,16 @@ class Part:
         Returns:
             Matrices (wave number, node, x) that all tiles of the part share.
         """
-        device = self.centre.device
-        m = torch.arange(self.length, dtype=torch.float64, device=device) - self.length // 2
-        q = m * (_TURN / (self.length * self.band.step_m))
-        s = torch.linspace(*self.extent, 3 * self.nodes, dtype=torch.float64, device=device)
+        s = torch.linspace(*self.extent, _FIT_DENSITY * self.nodes, dtype=torch.float64, device=self.centre.device)
         values = node_values((s - self.low) / self.node_step, self.nodes, self.choice.taps) / self.length
-        phase = self.expansion.common_phase(s, q[:, None, None], self.x[:, None]) / _TURN
-        phasor = torch.view_as_real(unit_phasor(phase, torch.complex128)).movedim(-1, 0)  # (2, wave number, x, sample)
-        found = []
-        for power in range(MOMENTS):
-            real, imag = phasor @ (values * s**power).mT
-            found.append(torch.complex(real, imag).mT.to(dtype).contiguous())
-        return found
+        constant, path = self.expansion.common_phase(s[:, None], self.x)  # (sample, x)
+        per_wave = path / (self.length * self.band.step_m)
+        # in double precision, since the matrix has large values of either sign
+        phasor = _ramp(constant / _TURN - self.length // 2 * per_wave, per_wave, self.length, torch.complex128)
+        moments = torch.cat([values * s**power for power in range(MOMENTS)])
+        found = moments @ torch.view_as_real(phasor).reshape(len(s), -1)
+        found = torch.view_as_complex(found.view(MOMENTS, self.nodes, len(self.x), self.length, 2))
+        return list(found.to(dtype).permute(0, 3, 1, 2).contiguous())
 
     def weights(self, rows: slice, dtype: torch.dtype) -> Weights:
         """Compute what forms the pixels of some tiles, for any history.
@@ -182,20 +182,31 @@ class Part:
         along = _ramp(
             -(self.length // 2) * step * of.range_path(self.y), step * of.range_path(self.y), self.length, dtype
         )
-        real = real_dtype(dtype)
-        m = torch.arange(self.length, dtype=torch.float64, device=self.centre.device) - self.length // 2
-        q = (m * (_TURN * step)).to(real)[:, None, None]
         tile, along = tile.movedim(-1, 0).contiguous(), along.mT.contiguous()
-        moments = [[tile * weight for weight in row] for row in of.remainders(q, self.x.to(real), self.choice.order)]
-        powers = [along * self.y.to(real) ** power for power in range(self.choice.order + 1)]
+        # the remainders are polynomials of the wave number and of x
+        waves = torch.arange(self.length, dtype=torch.float64, device=self.centre.device) - self.length // 2
+        q, to_waves = _interpolation(waves * (_TURN * step), _WAVE_DEGREE)
+        x, to_pixels = _interpolation(self.x, _PIXEL_DEGREE)
+        some = of.remainders(q[:, None, None], x, self.choice.order)
+        few = torch.stack([w.expand(-1, len(tile[0]), -1) for row in some for w in row])
+        every = to_waves.to(dtype) @ (few.to(dtype) @ to_pixels.mT.to(dtype)).flatten(-2)
+        moments = every.view(len(some), -1, *tile.shape).mul_(tile)
+        powers = [along * self.y.to(along.real.dtype) ** power for power in range(self.choice.order + 1)]
         return Weights(moments, powers, self._pixel_phasors(rows, dtype))
 
     def _pixel_phasors(self, rows: slice, dtype: torch.dtype) -> Tensor:
         """Carrier phase of the pixels of some tiles at the reference place, (tile, x, y)."""
-        along = self.x[:, None, None] * self.axes[0] + self.y[:, None] * self.axes[1]
-        pixels = self.centre[rows, None, None] + along
-        path = slopes(self.reference, pixels.reshape(-1, 3), self.axes)[0].reshape(pixels.shape[:-1])
-        return unit_phasor((path - self.expansion.path_m[rows, None]) * (self.band.carrier / _TURN), dtype)
+        path = self._pixel_path(rows) - self.expansion.path_m[rows, None]
+        return unit_phasor(path * (self.band.carrier / _TURN), dtype)
+
+    def _pixel_path(self, rows: slice) -> Tensor:
+        """Path of the pixels of some tiles at the reference place in m, float64 (tile, x, y)."""
+        frame = torch.cat([self.axes, torch.linalg.cross(*self.axes)[None]])
+        total = torch.zeros((), dtype=torch.float64, device=self.centre.device)
+        for place in self.reference:
+            u, v, w = ((self.centre[rows] - place) @ frame.mT)[..., None, None].unbind(1)
+            total = total + ((u + self.x[:, None]).square() + ((v + self.y).square() + w.square())).sqrt()
+        return (3 - len(self.reference)) * total
 
     def tables(self, rows: slice, places: Sequence[Tensor], reference_m: Tensor, dtype: torch.dtype) -> Tables:
         """Compute the tables of some tiles.
@@ -219,9 +230,9 @@ class Part:
         per_sample = band.carrier * band.step_m / _TURN * (1 - 1 / stretch)
         start = band.carrier / _TURN * path - per_sample * (fraction + self.samples // 2)
         before = _ramp(start + self.samples // 2 * 0.5, per_sample + 0.5, self.samples, dtype)
-        parts, rise = torch.view_as_real(before), self.choice.rise
-        parts[..., :rise, :] *= self.slope.to(real)[:, None]
-        parts[..., -rise:, :] *= self.slope.to(real).flip(0)[:, None]
+        rise, slope = self.choice.rise, self.slope.to(dtype)
+        before[..., :rise] *= slope
+        before[..., -rise:] *= slope.flip(0)
         after = _ramp(-fraction / 2, fraction / self.length + 0.5, self.length, dtype)
         position = (s - self.low) / self.node_step
         below = torch.ceil(position.detach() - taps / 2)
@@ -291,12 +302,12 @@ class Weights:
     """What forms the pixels of some tiles.
 
     Args:
-        moments: Weights of the moments of s, by power of y and moment, (wave number, tile, x).
+        moments: Weights of the moments of s, (power of y, moment, wave number, tile, x).
         along: Wave numbers to pixels along the range, by power of y, (tile, wave number, y).
         pixels: Carrier phase of the pixels, (tile, x, y).
     """
 
-    moments: list[list[Tensor]]
+    moments: Tensor
     along: list[Tensor]
     pixels: Tensor
 
@@ -304,6 +315,19 @@ class Weights:
 def _times(x: Tensor, factor: Tensor) -> Tensor:
     """Product, in the memory of x where no gradient is asked for."""
     return x * factor if x.requires_grad or factor.requires_grad else x.mul_(factor)
+
+
+def _interpolation(wanted: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+    """Positions at which a polynomial is to be known, float64 (known,), and the matrix from its
+    values to those at the positions wanted, (wanted, known).
+    """
+    at = torch.arange(degree + 1, dtype=wanted.dtype, device=wanted.device)
+    at = -torch.cos((at + 0.5) * (math.pi / (degree + 1)))
+    half, middle = (wanted.max() - wanted.min()) / 2, (wanted.max() + wanted.min()) / 2
+    t = (wanted - middle) / half.clamp_min(torch.finfo(half.dtype).tiny)
+    powers = torch.arange(degree + 1, device=wanted.device)
+    matrix = torch.linalg.solve((at[:, None] ** powers).mT, (t[:, None] ** powers).mT).mT
+    return middle + half * at, matrix
 
 
 def _ramp(start: Tensor, step: Tensor, n: int, dtype: torch.dtype) -> Tensor:

@@ -22,8 +22,8 @@ from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S
 
-# tables of the pulses, and weights of the tiles, up to this size are kept between images
-_KEPT_BYTES = 1 << 28
+# tables of the pulses, and weights of the tiles, up to this size each are kept between images
+_KEPT_BYTES = 3 << 27
 # tiles and trials whose pixels are formed at once
 _GROUP = 16
 # profiles that are formed at once
@@ -182,13 +182,23 @@ class TilePlan:
         order = sorted(range(len(lead)), key=lambda d: own[d] != lead[d])
         paths = len(self._reference_m)
         data = history.permute(*order, -2, -1).reshape(paths, -1, *size)
-        trials = data.shape[1]
-        profiles = self._profiles(data.transpose(1, 2))
+        tiles = self._formed(data.transpose(1, 2)).unflatten(0, self._tiles)  # (tile, tile, path * trial, x, y)
+        image = tiles.permute(2, 0, 3, 1, 4).flatten(1, 2).flatten(-2)
+        if self._swapped:
+            image = image.mT
+        image = image[:, : self.grid.counts[0], : self.grid.counts[1]]
+        image = image.reshape(*(lead[d] for d in order), *self.grid.counts)
+        return image.permute(*(order.index(d) for d in range(len(lead))), -2, -1)
+
+    def _formed(self, data: Tensor) -> Tensor:
+        """All tiles, (tile, path * trial, x, y), of data (path, pulse, trial, frequency)."""
+        profiles = self._profiles(data)
+        paths, _, trials, _ = data.shape
         step = max(1, _GROUP // (paths * trials))
         found: list[Tensor] = []
-        total = math.prod(self._tiles)
-        grad = torch.is_grad_enabled() and any(v.requires_grad for v in (history, *self._places, self._reference_m))
-        tiles = data.new_empty(0 if grad else total, paths * trials, self.choice.width, self.choice.depth)
+        grad = torch.is_grad_enabled() and any(v.requires_grad for v in (data, *self._places, self._reference_m))
+        count = 0 if grad else math.prod(self._tiles)
+        tiles = data.new_empty(count, paths * trials, self.choice.width, self.choice.depth)
         for zone, numbers in zip(self._zones, self._numbers, strict=True):
             across = [self._keep((part, data.dtype), part.across, data.dtype) for part in zone]
             rows = [slice(i, min(i + step, len(numbers))) for i in range(0, len(numbers), step)]
@@ -199,17 +209,8 @@ class TilePlan:
             def work(some: slice) -> None:
                 tiles[numbers[some]] = self._pixels(zone, some, across, profiles)  # noqa: B023
 
-            over_blocks(work, rows, history)
-        profiles.clear()
-        if grad:
-            tiles = torch.cat(found)[torch.argsort(torch.cat(self._numbers))]
-        tiles = tiles.unflatten(0, self._tiles)  # (tile, tile, path * trial, x, y)
-        image = tiles.permute(2, 0, 3, 1, 4).flatten(1, 2).flatten(-2)
-        if self._swapped:
-            image = image.mT
-        image = image[:, : self.grid.counts[0], : self.grid.counts[1]]
-        image = image.reshape(*(lead[d] for d in order), *self.grid.counts)
-        return image.permute(*(order.index(d) for d in range(len(lead))), -2, -1)
+            over_blocks(work, rows, data)
+        return torch.cat(found)[torch.argsort(torch.cat(self._numbers))] if grad else tiles
 
     def _profiles(self, data: Tensor) -> list[Tensor]:
         """Range profiles of each sub-aperture, extended by the longest window, for data (path,
