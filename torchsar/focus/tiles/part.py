@@ -84,8 +84,8 @@ class Part:
     Args:
         band: Frequencies and profiles.
         choice: Sizes.
-        places: Nominal positions of one or two antennas over the pulses of the part, float64
-            (pulse, 3).
+        pulses: First pulse of the part and the pulse after the last.
+        places: Nominal positions of one or two antennas, float64 (pulse, 3).
         every: Positions of all paths, float64 (path, pulse, 3), for the extents.
         centre: Centres of the tiles, float64 (tile, 3).
         grid: Pixels, with the second axis nearer to the range direction.
@@ -95,6 +95,7 @@ class Part:
         self,
         band: Band,
         choice: Choice,
+        pulses: tuple[int, int],
         places: Sequence[Tensor],
         every: Sequence[Tensor],
         centre: Tensor,
@@ -102,14 +103,16 @@ class Part:
     ) -> None:
         axes = grid.axes
         self.band, self.choice, self.centre, self.axes = band, choice, centre, axes
-        self.pulses = pulses = len(places[0])
-        fitted = torch.linspace(0, pulses - 1, min(pulses, _FIT_PULSES)).round().long()
-        self.reference = [v[pulses // 2, None] for v in places]
+        first, last = pulses
+        self.pulses, self.count = slice(first, last), last - first
+        fitted = torch.linspace(first, last - 1, min(last - first, _FIT_PULSES)).round().long()
+        self.reference = [v[(first + last) // 2, None] for v in places]
         self.expansion = Expansion.of([v[fitted] for v in places], self.reference, centre, axes, band.carrier)
         self.x, self.y = (
             (torch.arange(n, dtype=torch.float64, device=centre.device) - (n - 1) / 2) * grid.step_m
             for n in (choice.width, choice.depth)
         )
+        every = [v[:, self.pulses] for v in every]
         low, high = self._extent(every)
         margin = _MARGIN * (high - low) + _LEAST_MARGIN
         extent = low - margin, high + margin
@@ -138,6 +141,7 @@ class Part:
 
     def covers(self, places: Sequence[Tensor]) -> bool:
         """Whether other positions, each float64 (path, pulse, 3), stay within nodes and windows."""
+        places = [v[:, self.pulses] for v in places]
         low, high = self._extent(places)
         inside = self.extent[0] <= low and high <= self.extent[1]
         return inside and 2 * self._reach(places) + 1 <= self.length - self.choice.rise
@@ -219,8 +223,8 @@ class Part:
         """
         band, taps, of = self.band, self.choice.taps, self.expansion
         device, real = self.centre.device, real_dtype(dtype)
-        path, a, b = slopes(places, self.centre[rows], self.axes)
-        path, stretch = path - reference_m, b / of.b[rows, :, None]
+        path, a, b = slopes([v[:, self.pulses] for v in places], self.centre[rows], self.axes)
+        path, stretch = path - reference_m[:, self.pulses], b / of.b[rows, :, None]
         s = a / stretch - of.a[rows, :, None]
         at = path / band.step_m
         nearest = torch.round(at.detach())

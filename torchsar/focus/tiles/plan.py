@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from torchsar.core import block_bytes_of, checked_samples, over_blocks
 from torchsar.focus.backprojection import expanded_history
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.tiles.choice import Scene, choose, part_bounds, tile_centres, zones
+from torchsar.focus.tiles.choice import Lit, Scene, choose, part_bounds, tile_centres
 from torchsar.focus.tiles.expansion import slopes
 from torchsar.focus.tiles.part import Band, Part, Tables
 from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
@@ -58,6 +58,11 @@ class TilePlan:
             monostatic radar), float64 (..., pulse).
         grid: Pixels. The plan is fastest if one of its axes is that of the range.
         error_db: Largest rms error relative to the image of a history of white noise, in dB.
+        lit: For a beam that lights a part of the image at a time: function of positions in metres,
+            float64 (point, 3), that returns the first pulse that lights each point and the pulse
+            after the last, int64 (point, 2). It decides which pulses are summed for some tiles at a
+            time; pulses before and after those that light a pixel may be included. None for all
+            pulses.
 
     Raises:
         TypeError: If frequencies or positions are not float64.
@@ -73,8 +78,9 @@ class TilePlan:
         reference_m: Tensor,
         grid: ImageGrid,
         error_db: float = -70.0,
+        lit: Lit | None = None,
     ) -> None:
-        self.frequency_hz, self.grid, self.error_db = frequency_hz, grid, float(error_db)
+        self.frequency_hz, self.grid, self.error_db, self.lit = frequency_hz, grid, float(error_db), lit
         refuse_unusable(frequency_hz=frequency_hz)
         frequency_step_hz(frequency_hz)
         self._set_path(transmitter_m, receiver_m, reference_m)
@@ -99,31 +105,21 @@ class TilePlan:
         self._swapped = float(a.abs().mean()) > float(b.abs().mean())
         if self._swapped:
             grid = replace(grid, axes=grid.axes.flip(0), counts=grid.counts[::-1])
-        self.choice = choice = choose(Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid), self.error_db)
+        scene = Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid, self.lit)
+        self.choice = choice = choose(scene, self.error_db)
         size = choice.width, choice.depth
         self._band = Band.of(self.frequency_hz, LIGHT_M_S, choice.oversampling)
-        self._bounds = part_bounds(nominal[0].shape[0], choice.parts)
         self._tiles = tuple(-(-n // m) for n, m in zip(grid.counts, size, strict=True))
         self._numbers: list[Tensor] = []
         self._zones: list[list[Part]] = []
-        for block in zones(grid.counts, *size):
+        for block in scene.zones(*size):
             i, j = (torch.arange(s.start, s.stop, device=grid.origin_m.device) for s in block)
             self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
-            self._zones.append(
-                [
-                    Part(
-                        self._band,
-                        choice,
-                        [place[first:last] for place in nominal],
-                        [place[:, first:last] for place in every],
-                        tile_centres(grid, *size, i, j),
-                        grid,
-                    )
-                    for first, last in self._bounds
-                ]
-            )
+            centre = tile_centres(grid, *size, i, j)
+            bounds = part_bounds(*scene.pulses_of(block, *size), choice.parts)
+            self._zones.append([Part(self._band, choice, pulses, nominal, every, centre, grid) for pulses in bounds])
         parts = [part for zone in self._zones for part in zone]
-        samples = sum(len(part.centre) * part.pulses * (part.samples + part.length) for part in parts)
+        samples = sum(len(part.centre) * part.count * (part.samples + part.length) for part in parts)
         self._keeps_tables = samples * len(every[0]) * 8 <= _KEPT_BYTES
         self._keeps_weights = 8 * sum(part.weight_count for part in parts) <= _KEPT_BYTES
         self._weights: dict[tuple, Any] = {}
@@ -152,9 +148,7 @@ class TilePlan:
         places = [place.detach() for place in plan._places]
         with torch.no_grad():
             if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places] or not all(
-                part.covers([place[:, first:last] for place in places])
-                for zone in self._zones
-                for part, (first, last) in zip(zone, self._bounds, strict=True)
+                part.covers(places) for zone in self._zones for part in zone
             ):
                 plan._plan(places)
         return plan
@@ -212,38 +206,32 @@ class TilePlan:
             over_blocks(work, rows, data)
         return torch.cat(found)[torch.argsort(torch.cat(self._numbers))] if grad else tiles
 
-    def _profiles(self, data: Tensor) -> list[Tensor]:
-        """Range profiles of each sub-aperture, extended by the longest window, for data (path,
-        pulse, trial, frequency).
-        """
-        out = []
-        for k, (first, last) in enumerate(self._bounds):
-            longest = max(zone[k].samples for zone in self._zones)
-            part, length = data[:, first:last], self._band.length
-            whole = part.new_empty(*part.shape[:-1], length + longest)
-            step = max(1, _PROFILE_BYTES // (whole[:, :1].numel() * whole.element_size()))
-            for i in range(0, part.shape[1], step):
-                whole[:, i : i + step, :, :length] = self._band.profiles(part[:, i : i + step])
-            whole[..., length:] = whole[..., torch.arange(longest, device=part.device) % length]
-            out.append(whole)
-        return out
+    def _profiles(self, data: Tensor) -> Tensor:
+        """Range profiles of data (path, pulse, trial, frequency), with the longest window appended."""
+        longest = max((part.samples for zone in self._zones for part in zone), default=0)
+        length = self._band.length
+        whole = data.new_empty(*data.shape[:-1], length + longest)
+        step = max(1, _PROFILE_BYTES // (whole[:, :1].numel() * whole.element_size()))
+        for i in range(0, data.shape[1], step):
+            whole[:, i : i + step, :, :length] = self._band.profiles(data[:, i : i + step])
+        whole[..., length:] = whole[..., torch.arange(longest, device=data.device) % length]
+        return whole
 
-    def _pixels(
-        self, zone: Sequence[Part], rows: slice, across: Sequence[list[Tensor]], profiles: Sequence[Tensor]
-    ) -> Tensor:
+    def _pixels(self, zone: Sequence[Part], rows: slice, across: Sequence[list[Tensor]], profiles: Tensor) -> Tensor:
         """Pixels of some tiles, summed over the sub-apertures, (tile, path * trial, x, y)."""
-        total: Tensor | None = None
-        for k, (part, matrices, x) in enumerate(zip(zone, across, profiles, strict=True)):
-            paths, pulses, trials, _ = x.shape
-            size = part.samples * paths * pulses * trials * x.element_size()
-            step = max(1, block_bytes_of(x.device) // size)
+        paths, _, trials, _ = profiles.shape
+        dtype, size = profiles.dtype, (self.choice.width, self.choice.depth)
+        total = profiles.new_zeros(rows.stop - rows.start, paths * trials, *size) if not zone else None
+        for part, matrices in zip(zone, across, strict=True):
+            x = profiles[:, part.pulses]
+            step = max(1, block_bytes_of(x.device) // (part.samples * x[..., 0].numel() * x.element_size()))
             height = paths * part.nodes
             nodes = x.real.new_zeros((rows.stop - rows.start) * height, trials * part.length * 2)
             for i in range(rows.start, rows.stop, step):
                 some = slice(i, min(i + step, rows.stop))
                 where = slice((some.start - rows.start) * height, (some.stop - rows.start) * height)
-                part.add_nodes(nodes[where], x, self._tables_of(part, k, some, x.dtype))
-            weights = self._keep((part, rows.start, rows.stop, x.dtype), part.weights, rows, x.dtype)
+                part.add_nodes(nodes[where], x, self._tables_of(part, some, dtype))
+            weights = self._keep((part, rows.start, rows.stop, dtype), part.weights, rows, dtype)
             image = part.pixels_of(nodes, matrices, weights)
             total = image if total is None else total + image
         assert total is not None
@@ -259,14 +247,12 @@ class TilePlan:
             self._weights[key] = found
         return found
 
-    def _tables_of(self, part: Part, k: int, rows: slice, dtype: torch.dtype) -> Tables:
+    def _tables_of(self, part: Part, rows: slice, dtype: torch.dtype) -> Tables:
         """Tables of some tiles, from the last image if they are kept."""
         key = part, rows.start, rows.stop, dtype
         if key in self._tables:
             return self._tables[key]
-        pulses = slice(*self._bounds[k])
-        places = [place[:, pulses] for place in self._places]
-        tables = part.tables(rows, places, self._reference_m[:, pulses], dtype)
+        tables = part.tables(rows, self._places, self._reference_m, dtype)
         if self._keeps_tables and not tables.before.requires_grad:
             self._tables[key] = tables
         return tables
@@ -280,6 +266,7 @@ def image_tiles(
     reference_m: Tensor,
     grid: ImageGrid,
     error_db: float = -70.0,
+    lit: Lit | None = None,
 ) -> Tensor:
     """Form the image of a phase history by tiles; see `TilePlan`, which serves several histories.
 
@@ -291,6 +278,7 @@ def image_tiles(
         reference_m: Path to which the phases refer in metres, float64 (..., pulse).
         grid: Pixels.
         error_db: Largest rms error relative to the image of a history of white noise, in dB.
+        lit: Pulses that light each point, see `TilePlan`; None for all.
 
     Returns:
         Image, shape (..., i, j), complex.
@@ -300,4 +288,4 @@ def image_tiles(
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
             equal steps, or tiles do not reach the error in this geometry.
     """
-    return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db).image(history)
+    return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit).image(history)
