@@ -155,6 +155,39 @@ def test_trials_with_and_without_a_path_of_their_own() -> None:
         assert one.error_db(image[at]) < -67
 
 
+def hilly(drawn: Case, slope: float) -> Case:
+    """The same with heights of about `slope` times the extent of the image."""
+    grid = drawn.grid
+    i, j = (torch.arange(n, dtype=F64) / n for n in grid.counts)
+    height = slope * grid.step_m * max(grid.counts) * torch.sin(3 * i + 1)[:, None] * torch.cos(4 * j)
+    return replace(drawn, grid=replace(grid, height_m=height))
+
+
+@pytest.mark.parametrize("seed", range(1000, 1008))
+def test_the_promised_error_holds_on_hills(seed: int) -> None:
+    drawn = hilly(case(seed), 0.02)
+    plan = drawn.plan(-60.0)
+    assert drawn.error_db(plan.image(drawn.history)) < -57
+    assert drawn.error_db(plan.image(drawn.history.to(torch.complex64))) < -57
+    if seed == 1006:
+        turned = replace(drawn, grid=drawn.grid.transposed())
+        torch.testing.assert_close(turned.grid.pixels_m().transpose(0, 1), drawn.grid.pixels_m())
+        assert drawn.error_db(turned.plan(-60.0).image(drawn.history).mT) < -57
+
+
+def test_gradients_in_heights_are_those_of_the_direct_sum() -> None:
+    drawn = hilly(case(1006), 0.02)
+    grid = replace(drawn.grid, counts=(14, 11), height_m=drawn.grid.height_m[:14, :11])
+    weight, found = torch.randn(14, 11, dtype=C128), []
+    for tiles in (True, False):
+        height = grid.height_m.clone().requires_grad_()
+        tried = replace(drawn, grid=replace(grid, height_m=height))
+        image = tried.plan().image(drawn.history) if tiles else tried.direct(tried.grid.pixels_m().reshape(-1, 3))
+        image = image.view(14, 11)
+        found += torch.autograd.grad((image * weight).real.sum() + image.abs().square().mean(), height)
+    assert float((found[0] - found[1]).norm() / found[1].norm()) < 1e-3
+
+
 def strip(pulses: int = 400, pixels: int = 400) -> tuple[Case, Callable[[Tensor], Tensor]]:
     """A straight path beside a strip of which each pulse lights a sixth."""
     spacing, frequencies = 0.3, 64
@@ -267,10 +300,12 @@ def test_histories_of_another_size_or_type_are_refused() -> None:
         {"counts": (0, 3)},
         {"step_m": 0.0},
         {"step_m": math.nan},
+        {"height_m": torch.zeros(3, 2, dtype=F64)},
+        {"height_m": torch.full((2, 3), math.nan, dtype=F64)},
     ],
 )
 def test_grids_that_make_no_sense_are_refused(change: dict) -> None:
-    with pytest.raises(ValueError, match="image grid|pixel spacing"):
+    with pytest.raises(ValueError, match="image grid|pixel spacing|NaN"):
         replace(ImageGrid(torch.zeros(3), torch.eye(3)[:2], (2, 3), 1.0), **change)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.nufft import smooth_length
@@ -149,7 +150,26 @@ def zones(
     ]
 
 
-def tile_centres(grid: ImageGrid, width: int, depth: int, rows: Tensor, columns: Tensor) -> Tensor:
+def tile_heights(grid: ImageGrid, width: int, depth: int) -> Tensor | None:
+    """Heights of the pixels of all tiles in metres, float64 (tile, tile, x, y); None without.
+
+    Args:
+        grid: Pixels of the image.
+        width: Pixels of a tile along the first axis.
+        depth: Pixels of a tile along the second axis.
+    """
+    if grid.height_m is None:
+        return None
+    missing = (-n % size for n, size in zip(grid.counts, (width, depth), strict=True))
+    down, right = missing
+    # tiles that leave the image repeat its last row and column
+    whole = pad(grid.height_m[None, None], (0, right, 0, down), mode="replicate")[0, 0]
+    return whole.unflatten(1, (-1, depth)).unflatten(0, (-1, width)).transpose(1, 2)
+
+
+def tile_centres(
+    grid: ImageGrid, width: int, depth: int, rows: Tensor, columns: Tensor, height_m: Tensor | None = None
+) -> Tensor:
     """Compute the centres of tiles.
 
     Args:
@@ -158,13 +178,17 @@ def tile_centres(grid: ImageGrid, width: int, depth: int, rows: Tensor, columns:
         depth: Pixels of a tile along the second axis.
         rows: Numbers of the tiles along the first axis, (i,).
         columns: Numbers of the tiles along the second axis, (j,).
+        height_m: Height of the centres of all tiles in metres, float64 (tile, tile); None for 0.
 
     Returns:
         Positions in metres, float64 (i * j, 3).
     """
     x = (rows.to(torch.float64) * width + (width - 1) / 2) * grid.step_m
     y = (columns.to(torch.float64) * depth + (depth - 1) / 2) * grid.step_m
-    return (grid.origin_m + (x[:, None] * grid.axes[0])[:, None] + y[:, None] * grid.axes[1]).reshape(-1, 3)
+    centre = grid.origin_m + (x[:, None] * grid.axes[0])[:, None] + y[:, None] * grid.axes[1]
+    if height_m is not None:
+        centre = centre + height_m[rows][:, columns, None] * grid.normal
+    return centre.reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +249,14 @@ class Scene:
         )
         return rows, columns
 
+    def relief(self, width: int, depth: int) -> tuple[Tensor | None, float]:
+        """Mean height of each tile in metres, (tile, tile), and the largest difference from it."""
+        heights = tile_heights(self.grid, width, depth)
+        if heights is None:
+            return None, 0.0
+        mean = heights.mean((-2, -1))
+        return mean, float((heights - mean[..., None, None]).abs().max())
+
     def zones(self, width: int, depth: int) -> list[tuple[slice, slice]]:
         """Zones of the tiles, see `zones`."""
         return zones(self.grid.counts, width, depth, self.most)
@@ -255,10 +287,11 @@ class Scene:
         low, carrier, high = self.waves
         wave = (low + high) / 2 + (high - low) / 2 * _GAUSS.to(x)
         squares, stretches = [], []
-        sampled = [(zone, part) for zone, pulses in _ends(lit) for part in _ends(part_bounds(*pulses, parts))]
-        for zone, (first, last) in sampled:
+        mean, relief = self.relief(width, depth)
+        ends = [(zone, part) for zone, (first, last) in _ends(lit) for part in _ends(part_bounds(first, last, parts))]
+        for zone, (first, last) in ends:
             rows, columns = (_gauss_numbers(s.start, s.stop).to(x.device) for s in zone)
-            centre = tile_centres(self.grid, width, depth, rows, columns)
+            centre = tile_centres(self.grid, width, depth, rows, columns, mean)
             middle, fitted = (first + last) // 2, _sampled(first, last, _FIT_PULSES)
             expansion = Expansion.of(
                 [v[fitted] for v in self.places],
@@ -269,8 +302,9 @@ class Scene:
             )
             judged = _between(first, last, _JUDGED_PULSES)
             places = [v[:: max(1, len(v) // 2)][:, judged].flatten(0, 1) for v in self.judged]
-            error = expansion.error(places, wave, x, y, order)
-            squares.append(float(error.abs().square().mean()))
+            for height in sorted(set((relief * _GAUSS).tolist())):
+                error = expansion.error(places, wave, x, y, order, height)
+                squares.append(float(error.abs().square().mean()))
             stretches.append(float((slopes(places, centre, self.grid.axes)[2] / expansion.b - 1).abs().max()))
         return math.sqrt(sum(squares) / len(squares)), max(stretches)
 
@@ -408,9 +442,11 @@ def _costs(scene: Scene, wanted: float) -> Iterator[tuple[tuple[int, int, int, i
         [size for size in sizes if size < 2 * n or size == sizes[0]]
         for sizes, n in zip((_WIDTHS, _DEPTHS), grid.counts, strict=True)
     )
+    relief = {size: scene.relief(*size)[1] for size in itertools.product(widths, depths)}
     for width, depth, parts, order in itertools.product(widths, depths, number, (1, 2)):
         half = width * grid.step_m / 2, depth * grid.step_m / 2
         reach = max(float((a * half[0] + b * half[1]).max()) for a, b in steepest) + bend * (half[0] + half[1]) ** 2 / 2
+        reach += 2 * relief[width, depth]
         flat = 2 * reach * per_metre + 1
         if not flat <= _LONGEST:
             continue

@@ -89,6 +89,7 @@ class Part:
         every: Positions of all paths, float64 (path, pulse, 3), for the extents.
         centre: Centres of the tiles, float64 (tile, 3).
         grid: Pixels, with the second axis nearer to the range direction.
+        relief_m: Largest height of a pixel above the plane of its tile in metres.
     """
 
     def __init__(
@@ -100,8 +101,9 @@ class Part:
         every: Sequence[Tensor],
         centre: Tensor,
         grid: ImageGrid,
+        relief_m: float = 0.0,
     ) -> None:
-        axes = grid.axes
+        axes, self.relief_m = grid.axes, relief_m
         self.band, self.choice, self.centre, self.axes = band, choice, centre, axes
         first, last = pulses
         self.pulses, self.count = slice(first, last), last - first
@@ -137,7 +139,7 @@ class Part:
         half = float(self.x[-1]), float(self.y[-1])
         bend = float(curvatures([v[..., ::16, :] for v in places], self.centre, self.axes).abs().max())
         reach = float((a.abs() * half[0] + b.abs() * half[1]).max()) + bend * (half[0] + half[1]) ** 2 / 2
-        return reach / self.band.step_m
+        return (reach + 2 * self.relief_m) / self.band.step_m
 
     def covers(self, places: Sequence[Tensor]) -> bool:
         """Whether other positions, each float64 (path, pulse, 3), stay within nodes and windows."""
@@ -151,6 +153,8 @@ class Part:
         """Number of complex values in `across` and in the weights of all tiles."""
         wide, deep, powers = len(self.x), len(self.y), self.choice.order + 1
         of_tile = self.length * powers * (MOMENTS * wide + deep) + wide * deep
+        if self.relief_m:
+            of_tile += wide * deep * 3 * math.isqrt(self.length)
         return MOMENTS * self.length * self.nodes * wide + len(self.centre) * of_tile
 
     def across(self, dtype: torch.dtype) -> list[Tensor]:
@@ -173,42 +177,46 @@ class Part:
         found = torch.view_as_complex(found.view(MOMENTS, self.nodes, len(self.x), self.length, 2))
         return list(found.to(dtype).permute(0, 3, 1, 2).contiguous())
 
-    def weights(self, rows: slice, dtype: torch.dtype) -> Weights:
+    def weights(self, rows: slice, dtype: torch.dtype, height_m: Tensor | None = None) -> Weights:
         """Compute what forms the pixels of some tiles, for any history.
 
         Args:
             rows: Tiles of the part.
             dtype: Precision of the history.
+            height_m: Heights of the pixels above the centres of their tiles in metres, float64
+                (tile, x, y); None for 0. Differentiable.
         """
         of, step = self.expansion.rows(rows), 1 / (self.length * self.band.step_m)
         # the phases of tiles are linear in the wave number
         tile = _ramp(-(self.length // 2) * step * of.tile_path(self.x), step * of.tile_path(self.x), self.length, dtype)
-        along = _ramp(
-            -(self.length // 2) * step * of.range_path(self.y), step * of.range_path(self.y), self.length, dtype
-        )
-        tile, along = tile.movedim(-1, 0).contiguous(), along.mT.contiguous()
+        tile = tile.movedim(-1, 0).contiguous()
         # the remainders are polynomials of the wave number and of x
         waves = torch.arange(self.length, dtype=torch.float64, device=self.centre.device) - self.length // 2
         q, to_waves = _interpolation(waves * (_TURN * step), _WAVE_DEGREE)
         x, to_pixels = _interpolation(self.x, _PIXEL_DEGREE)
-        some = of.remainders(q[:, None, None], x, self.choice.order)
+        order, raised = self.choice.order, height_m is not None
+        some = of.remainders(q[:, None, None], x, order, heights=raised)
         few = torch.stack([w.expand(-1, len(tile[0]), -1) for row in some for w in row])
         every = to_waves.to(dtype) @ (few.to(dtype) @ to_pixels.mT.to(dtype)).flatten(-2)
         moments = every.view(len(some), -1, *tile.shape).mul_(tile)
-        powers = [along * self.y.to(along.real.dtype) ** power for power in range(self.choice.order + 1)]
-        return Weights(moments, powers, self._pixel_phasors(rows, dtype))
+        path, along = self._pixel_path(rows, height_m), of.range_path(self.y)
+        if height_m is not None:
+            along = along[:, None] + path - self._pixel_path(rows)
+        ramps = phasor_tables(step * along, -(self.length // 2), self.length, dtype)
+        pixels = unit_phasor((path - of.path_m[..., None]) * (self.band.carrier / _TURN), dtype)
+        factors = [factor.to(pixels.real.dtype) for factor in of.factors(self.y, order, height_m)]
+        if raised:
+            return RaisedWeights(moments, ramps, [factor.expand_as(pixels.real)[:, None] for factor in factors], pixels)
+        shared = outer_phasor(*ramps, self.length).mT.contiguous()
+        return FlatWeights(moments, [shared * factor for factor in factors], pixels)
 
-    def _pixel_phasors(self, rows: slice, dtype: torch.dtype) -> Tensor:
-        """Carrier phase of the pixels of some tiles at the reference place, (tile, x, y)."""
-        path = self._pixel_path(rows) - self.expansion.path_m[rows, None]
-        return unit_phasor(path * (self.band.carrier / _TURN), dtype)
-
-    def _pixel_path(self, rows: slice) -> Tensor:
+    def _pixel_path(self, rows: slice, height_m: Tensor | None = None) -> Tensor:
         """Path of the pixels of some tiles at the reference place in m, float64 (tile, x, y)."""
         frame = torch.cat([self.axes, torch.linalg.cross(*self.axes)[None]])
         total = torch.zeros((), dtype=torch.float64, device=self.centre.device)
         for place in self.reference:
             u, v, w = ((self.centre[rows] - place) @ frame.mT)[..., None, None].unbind(1)
+            w = w if height_m is None else w + height_m
             total = total + ((u + self.x[:, None]).square() + ((v + self.y).square() + w.square())).sqrt()
         return (3 - len(self.reference)) * total
 
@@ -290,30 +298,76 @@ class Part:
         z = torch.view_as_complex(nodes.view(-1, self.nodes, nodes.shape[-1] // (2 * self.length), self.length, 2))
         z = z.permute(3, 0, 2, 1).reshape(self.length, -1, self.nodes)
         moments = [torch.bmm(z, matrix).view(self.length, tiles, -1, width) for matrix in across]
-        image: Tensor | None = None
-        for row, along in zip(weights.moments, weights.along, strict=True):
+        parts = []
+        for row in weights.moments:
             part = moments[0] * row[0][:, :, None]
             for moment, weight in zip(moments[1:], row[1:], strict=True):
                 part.addcmul_(moment, weight[:, :, None])
-            part = part.view(self.length, tiles, -1).permute(1, 2, 0)
-            image = torch.bmm(part, along) if image is None else image.baddbmm_(part, along)
-        assert image is not None
-        return _times(image.view(tiles, -1, width, len(self.y)), weights.pixels[:, None])
+            parts.append(part)
+        return _times(weights.sums(parts), weights.pixels[:, None])
 
 
 @dataclass(frozen=True, eq=False)
-class Weights:
-    """What forms the pixels of some tiles.
+class FlatWeights:
+    """What forms the pixels of some tiles in the plane of the image.
 
     Args:
-        moments: Weights of the moments of s, (power of y, moment, wave number, tile, x).
-        along: Wave numbers to pixels along the range, by power of y, (tile, wave number, y).
+        moments: Weights of the moments of s, (factor, moment, wave number, tile, x).
+        along: Wave numbers to pixels along the range, by factor, (tile, wave number, y).
         pixels: Carrier phase of the pixels, (tile, x, y).
     """
 
     moments: Tensor
     along: list[Tensor]
     pixels: Tensor
+
+    def sums(self, parts: Sequence[Tensor]) -> Tensor:
+        """Sums of the parts (wave number, tile, trial, x) over wave numbers and factors, (tile,
+        trial, x, y).
+        """
+        image: Tensor | None = None
+        for part, along in zip(parts, self.along, strict=True):
+            rows = part.flatten(2).permute(1, 2, 0)
+            image = torch.bmm(rows, along) if image is None else image.baddbmm_(rows, along)
+        assert image is not None
+        return image.unflatten(1, parts[0].shape[2:])
+
+
+@dataclass(frozen=True, eq=False)
+class RaisedWeights:
+    """What forms the pixels of some tiles at heights above the plane of the image.
+
+    Args:
+        moments: Weights of the moments of s, (factor, moment, wave number, tile, x).
+        ramps: The two tables (`phasor_tables`) of the phasors of each pixel over the wave numbers,
+            (tile, x, y, entry).
+        factors: Factors of the pixels, (tile, 1, x, y).
+        pixels: Carrier phase of the pixels, (tile, x, y).
+    """
+
+    moments: Tensor
+    ramps: tuple[Tensor, Tensor]
+    factors: list[Tensor]
+    pixels: Tensor
+
+    def sums(self, parts: Sequence[Tensor]) -> Tensor:
+        """Sums of the parts (wave number, tile, trial, x) over wave numbers and factors, (tile,
+        trial, x, y).
+        """
+        fine, coarse = self.ramps
+        inner, outer = fine.shape[-1], coarse.shape[-1]
+        image: Tensor | None = None
+        for part, factor in zip(parts, self.factors, strict=True):
+            rows = pad(part.movedim(0, -1), (0, inner * outer - len(part))).transpose(1, 2)
+            blocks = rows.unflatten(-1, (outer, inner)).flatten(2, 3)  # (tile, x, trial * outer, inner)
+            sums = (blocks @ fine.mT).unflatten(2, (-1, outer))  # (tile, x, trial, outer, y)
+            pixels = factor * (sums * coarse.mT[:, :, None]).sum(-2).transpose(1, 2)
+            image = pixels if image is None else image + pixels
+        assert image is not None
+        return image
+
+
+Weights = FlatWeights | RaisedWeights
 
 
 def _times(x: Tensor, factor: Tensor) -> Tensor:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from torch.utils.checkpoint import checkpoint
 from torchsar.core import block_bytes_of, checked_samples, over_blocks
 from torchsar.focus.backprojection import expanded_history
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.tiles.choice import Lit, Scene, choose, part_bounds, tile_centres
+from torchsar.focus.tiles.choice import Lit, Scene, choose, part_bounds, tile_centres, tile_heights
 from torchsar.focus.tiles.expansion import slopes
 from torchsar.focus.tiles.part import Band, Part, Tables
 from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
@@ -104,20 +103,22 @@ class TilePlan:
         # the second axis of a tile is that of the range
         self._swapped = float(a.abs().mean()) > float(b.abs().mean())
         if self._swapped:
-            grid = replace(grid, axes=grid.axes.flip(0), counts=grid.counts[::-1])
+            grid = grid.transposed()
         scene = Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid, self.lit)
         self.choice = choice = choose(scene, self.error_db)
-        size = choice.width, choice.depth
+        self._size = size = choice.width, choice.depth
         self._band = Band.of(self.frequency_hz, LIGHT_M_S, choice.oversampling)
         self._tiles = tuple(-(-n // m) for n, m in zip(grid.counts, size, strict=True))
         self._numbers: list[Tensor] = []
         self._zones: list[list[Part]] = []
+        mean, relief = scene.relief(*size)
         for block in scene.zones(*size):
             i, j = (torch.arange(s.start, s.stop, device=grid.origin_m.device) for s in block)
             self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
-            centre = tile_centres(grid, *size, i, j)
+            centre = tile_centres(grid, *size, i, j, mean)
             bounds = part_bounds(*scene.pulses_of(block, *size), choice.parts)
-            self._zones.append([Part(self._band, choice, pulses, nominal, every, centre, grid) for pulses in bounds])
+            given = nominal, every, centre, grid, relief
+            self._zones.append([Part(self._band, choice, pulses, *given) for pulses in bounds])
         parts = [part for zone in self._zones for part in zone]
         samples = sum(len(part.centre) * part.count * (part.samples + part.length) for part in parts)
         self._keeps_tables = samples * len(every[0]) * 8 <= _KEPT_BYTES
@@ -189,25 +190,31 @@ class TilePlan:
         profiles = self._profiles(data)
         paths, _, trials, _ = data.shape
         step = max(1, _GROUP // (paths * trials))
+        heights = tile_heights(self.grid.transposed() if self._swapped else self.grid, *self._size)
+        if heights is not None:
+            heights = (heights - heights.detach().mean((-2, -1), keepdim=True)).flatten(0, 1)
         found: list[Tensor] = []
-        grad = torch.is_grad_enabled() and any(v.requires_grad for v in (data, *self._places, self._reference_m))
+        given = [data, *self._places, self._reference_m, *([] if heights is None else [heights])]
+        grad = torch.is_grad_enabled() and any(v.requires_grad for v in given)
         count = 0 if grad else math.prod(self._tiles)
-        tiles = data.new_empty(count, paths * trials, self.choice.width, self.choice.depth)
+        tiles = data.new_empty(count, paths * trials, *self._size)
         for zone, numbers in zip(self._zones, self._numbers, strict=True):
             across = [self._keep((part, data.dtype), part.across, data.dtype) for part in zone]
+            above = None if heights is None else heights[numbers]
             rows = [slice(i, min(i + step, len(numbers))) for i in range(0, len(numbers), step)]
             if grad:
-                found += [checkpoint(self._pixels, zone, some, across, profiles, use_reentrant=False) for some in rows]
+                fixed = across, profiles, above
+                found += [checkpoint(self._pixels, zone, some, *fixed, use_reentrant=False) for some in rows]
                 continue
 
             def work(some: slice) -> None:
-                tiles[numbers[some]] = self._pixels(zone, some, across, profiles)  # noqa: B023
+                tiles[numbers[some]] = self._pixels(zone, some, across, profiles, above)  # noqa: B023
 
             over_blocks(work, rows, data)
         return torch.cat(found)[torch.argsort(torch.cat(self._numbers))] if grad else tiles
 
     def _profiles(self, data: Tensor) -> Tensor:
-        """Range profiles of data (path, pulse, trial, frequency), with the longest window appended."""
+        """Range profiles of data (path, pulse, trial, frequency), their first samples repeated."""
         longest = max((part.samples for zone in self._zones for part in zone), default=0)
         length = self._band.length
         whole = data.new_empty(*data.shape[:-1], length + longest)
@@ -217,11 +224,18 @@ class TilePlan:
         whole[..., length:] = whole[..., torch.arange(longest, device=data.device) % length]
         return whole
 
-    def _pixels(self, zone: Sequence[Part], rows: slice, across: Sequence[list[Tensor]], profiles: Tensor) -> Tensor:
+    def _pixels(
+        self,
+        zone: Sequence[Part],
+        rows: slice,
+        across: Sequence[list[Tensor]],
+        profiles: Tensor,
+        height_m: Tensor | None,
+    ) -> Tensor:
         """Pixels of some tiles, summed over the sub-apertures, (tile, path * trial, x, y)."""
         paths, _, trials, _ = profiles.shape
-        dtype, size = profiles.dtype, (self.choice.width, self.choice.depth)
-        total = profiles.new_zeros(rows.stop - rows.start, paths * trials, *size) if not zone else None
+        dtype, height_m = profiles.dtype, None if height_m is None else height_m[rows]
+        total = profiles.new_zeros(rows.stop - rows.start, paths * trials, *self._size) if not zone else None
         for part, matrices in zip(zone, across, strict=True):
             x = profiles[:, part.pulses]
             step = max(1, block_bytes_of(x.device) // (part.samples * x[..., 0].numel() * x.element_size()))
@@ -231,7 +245,10 @@ class TilePlan:
                 some = slice(i, min(i + step, rows.stop))
                 where = slice((some.start - rows.start) * height, (some.stop - rows.start) * height)
                 part.add_nodes(nodes[where], x, self._tables_of(part, some, dtype))
-            weights = self._keep((part, rows.start, rows.stop, dtype), part.weights, rows, dtype)
+            if height_m is not None and height_m.requires_grad:
+                weights = part.weights(rows, dtype, height_m)
+            else:
+                weights = self._keep((part, rows.start, rows.stop, dtype), part.weights, rows, dtype, height_m)
             image = part.pixels_of(nodes, matrices, weights)
             total = image if total is None else total + image
         assert total is not None
