@@ -45,8 +45,8 @@ class TilePlan:
 
     Leading dimensions of the positions are trials with paths of their own. Their mean is the
     nominal path, from which they may differ as motion errors do. The image is differentiable in
-    the history, the positions and the reference; memory for gradients is limited to that of some
-    tiles at a time.
+    the history, the positions, the reference and the heights of the pixels; memory for gradients is
+    limited to that of some tiles at a time.
 
     Args:
         frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
