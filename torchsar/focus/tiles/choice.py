@@ -151,17 +151,19 @@ def zones(
 
 
 def tile_heights(grid: ImageGrid, width: int, depth: int) -> Tensor | None:
-    """Heights of the pixels of all tiles in metres, float64 (tile, tile, x, y); None without.
+    """Arrange the heights of an image by tiles.
 
     Args:
         grid: Pixels of the image.
         width: Pixels of a tile along the first axis.
         depth: Pixels of a tile along the second axis.
+
+    Returns:
+        Heights of the pixels in metres, float64 (tile, tile, x, y); None if the image is flat.
     """
     if grid.height_m is None:
         return None
-    missing = (-n % size for n, size in zip(grid.counts, (width, depth), strict=True))
-    down, right = missing
+    down, right = (-n % size for n, size in zip(grid.counts, (width, depth), strict=True))
     # tiles that leave the image repeat its last row and column
     whole = pad(grid.height_m[None, None], (0, right, 0, down), mode="replicate")[0, 0]
     return whole.unflatten(1, (-1, depth)).unflatten(0, (-1, width)).transpose(1, 2)
