@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Trace
-from torchsar.focus import PathImage, TilePlan, backproject
+from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
 from torchsar.io import read_path
 from torchsar.metrics import error_db, registered_error_db
 from torchsar.radar import AntennaPath, InverseRadar
@@ -39,7 +40,7 @@ class AnyPath(System):
     World = Flown
     impairments = PATH_IMPAIRMENTS
     reads = "phase history with positions"
-    ending = "tile_image or direct_image"
+    ending = "tile_image, omega_k_image or direct_image"
     tolerance = {"image_error_db": -40.0}
     exact = {"stage": {"stage": "direct_image"}}
     definitions = {
@@ -48,7 +49,7 @@ class AnyPath(System):
         "contrast": "standard deviation over mean of the intensity |I|^2",
         "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB, I0 from the reference method, after the shift, the "
         "linear phase over the image and the complex gain g that fit best, which autofocus cannot observe; in `trade`: "
-        "of the image of white noise, without registration",
+        "of the image of white noise, without registration, relative to the direct sum over the same pulses",
         "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
         "corrected minus true, without constant and linear terms; modulo half a wavelength where phases of pulses are "
         "corrected",
@@ -111,23 +112,34 @@ class AnyPath(System):
         aux, grid = clean.aux, stage.grid
         antennas = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
         geometry = (aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
-        plans: dict[float, TilePlan] = {}
+        tiles: dict[float, float] = {}
         for error in _ERRORS_DB:
             try:
-                plans[error] = TilePlan(*geometry, grid, error)
+                tiles[error] = TilePlan(*geometry, grid, error).choice.error_db
             except ValueError:  # the geometry does not allow it
                 break
         alternatives = [
             Alternative(
                 f"tiles at {error:g} dB",
                 {"stage": "tile_image", "error_db": error},
-                {"image_error_db": plan.choice.error_db},
+                {"image_error_db": predicted},
                 "higher terms of the path within tiles",
             )
-            for error, plan in plans.items()
+            for error, predicted in tiles.items()
+        ]
+        straight = _compensations(bench, geometry)
+        compensated = [
+            Alternative(
+                f"omega-K after motion compensation of order {order}",
+                {"stage": "omega_k_image", "order": order, "beam_deg": one.beam.width_deg},
+                {"image_error_db": one.predicted_db()},
+                "change of motion errors with the angle" + (" and with the range" if order == 1 else ""),
+            )
+            for order, one in straight.items()
         ]
         exact = Alternative("direct sum", {"stage": "direct_image"}, {})
-        return [Choice("image", "stage", [*alternatives, exact], partial(_measured, bench, geometry, plans, stage))]
+        measured = partial(_measured, bench, geometry, straight, stage)
+        return [Choice("image", "stage", [*compensated, *alternatives, exact], measured)]
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         yield partial(comparisons, results, self.columns)
@@ -136,27 +148,48 @@ class AnyPath(System):
             yield partial(figures.paths, case, result)
 
 
-def _measured(bench: Bench, geometry: tuple, plans: Mapping[float, TilePlan], stage: PathImage) -> Measured:
-    """Images of white noise by tiles, at random pixels beside the direct sum."""
+def _compensations(bench: Bench, geometry: tuple) -> dict[int, MotionCompensation]:
+    """Motion compensation of both orders that suit the path, with the beam of the method that uses
+    it; none without such a method.
+    """
+    stages = [stage for chain in bench.chains.values() for stage in chain.stages.values()]
+    stage = next((one for one in stages if isinstance(one, OmegaKImage)), None)
+    found: dict[int, MotionCompensation] = {}
+    for order in (1, 2) if stage is not None else ():
+        assert stage is not None
+        frequency, *places = geometry
+        with suppress(ValueError):  # the path is too far from straight
+            found[order] = MotionCompensation(frequency, AntennaPath(*places), stage.grid, stage.beam, order)
+    return found
+
+
+def _measured(bench: Bench, geometry: tuple, straight: Mapping[int, MotionCompensation], stage: PathImage) -> Measured:
+    """Images of white noise, at random pixels beside the direct sum."""
     frequency, place, receiver, reference = geometry
     size = (place.shape[-2], len(frequency))
     noise = Draws(bench.config.seed).normal("trade.noise", size, torch.complex128)
     counts = stage.grid.counts
     some = Draws(bench.config.seed).subset("trade.pixels", counts[0] * counts[1], min(_PIXELS, counts[0] * counts[1]))
     pixels = stage.grid.pixels_m().reshape(-1, 3)[some]
-    exact = backproject(noise, frequency, place, receiver, reference, pixels)
+    whole = backproject(noise, frequency, place, receiver, reference, pixels)
     history = noise.to(bench.dtype)
 
     def run(one: Alternative) -> Tensor:
         if "error_db" in one.keys:
-            return plans[one.keys["error_db"]].image(history)
+            return TilePlan(*geometry, stage.grid, one.keys["error_db"]).image(history)
+        if "order" in one.keys:
+            return straight[one.keys["order"]].image(history)
         return backproject(history, frequency, place, receiver, reference, pixels, eps=1e-6)
 
     def loss(one: Alternative, image: Tensor) -> dict[str, float]:
-        made = image.flatten(-2)[..., some] if "error_db" in one.keys else image
+        exact = straight[one.keys["order"]].exact(noise, pixels) if "order" in one.keys else whole
+        made = image if one.keys["stage"] == "direct_image" else image.flatten(-2)[..., some]
         return {"image_error_db": float(error_db(made[..., None, :].to(exact.dtype), exact[..., None, :]).max())}
 
-    return Measured(run, loss, lambda one: 1.0 if "error_db" in one.keys else len(some) / (counts[0] * counts[1]))
+    def share(one: Alternative) -> float:
+        return len(some) / (counts[0] * counts[1]) if one.keys["stage"] == "direct_image" else 1.0
+
+    return Measured(run, loss, share)
 
 
 SYSTEM = AnyPath
