@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate import autofocus
-from torchsar.core import Draws, Recording, Trace
+from torchsar.core import Draws, Recording, Signal, Trace
+from torchsar.echo.turntable import rotation_angle
+from torchsar.focus import AzimuthTransform
 from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.io import read_inverse
@@ -29,6 +31,7 @@ from torchsar.study.trials.batch import Judged, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.system import Column, System
+from torchsar.study.trials.yardstick import Imaged, beside_direct_sum, noise_of, turntable
 
 _GEOMETRY = ("frequency_hz", "angle_rad", "position_m", "reference_m")
 # iterations of `autofocus` that are compared: its defaults, 120 and 20, and fewer
@@ -122,6 +125,7 @@ class Isal(System):
         efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
         return [
             *echo_choices(bench),
+            beside_direct_sum(bench, partial(_imaged, bench), "migration while the target turns"),
             Choice("effort of autofocus", "autofocus.search", efforts, partial(_efforts, bench)),
         ]
 
@@ -148,6 +152,17 @@ def _efforts(bench: Bench) -> Measured:
         return {"residual_phase_rms_rad": float((error(phase) - best).max())}
 
     return Measured(lambda one: autofocus(data, **one.keys)["phase_rad"], loss)
+
+
+def _imaged(bench: Bench) -> Imaged:
+    """Image of white noise by the transform along the pulses."""
+    world, radar, size = bench.world(), bench.radar, (bench.world().pulses, bench.world().samples)
+    noise, image = noise_of(bench, *size), AzimuthTransform(radar)
+    signal = Signal(noise, radar.raw_axes(*size)).to(bench.dtype)
+    rate = world.of(radar).rotation_rad_s
+    angle = rotation_angle(radar, world.pulses, radar.rotation_rad_s if rate is None else rate, noise.real)
+    cross = radar.image_axes(signal.axes)[0].values()
+    return turntable(radar, noise, angle, cross, 0.0, lambda: image(signal).data)
 
 
 SYSTEM = Isal
