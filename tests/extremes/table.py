@@ -178,7 +178,7 @@ def compensated(x: Tensor) -> Tensor:
     """Image of a history of any size by motion compensation and omega-K."""
     plan = tile_plan(*x.shape[-2:])
     place, reference = plan.antennas.transmitter_m, plan.antennas.reference_m
-    beam = focus.ProcessedBeam(0.5)
+    beam = focus.ProcessedBeam(0.3)
     return focus.compensated_omega_k(x, plan.frequency_hz, place, reference, plan.grid, beam)
 
 

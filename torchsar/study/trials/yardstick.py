@@ -38,6 +38,7 @@ class Imaged:
         weight: Weights of some pulses (a slice) at positions (pixel, 3) in the sum, float64 (pulse,
             pixel); None for all pulses alike.
         wave_speed_m_s: Propagation speed in m/s.
+        whole: Number of pixels of the whole image, if `pixels_m` holds random ones only.
     """
 
     history: Tensor
@@ -47,6 +48,7 @@ class Imaged:
     image: Callable[[], Tensor]
     weight: Callable[[slice, Tensor], Tensor] | None = None
     wave_speed_m_s: float = LIGHT_M_S
+    whole: int | None = None
 
     def exact(self, some: Tensor) -> Tensor:
         """Return the direct sum at some pixels, given by their numbers in `pixels_m`."""
@@ -135,5 +137,5 @@ def _measured(bench: Bench, imaged: Callable[[], Imaged]) -> Measured:
     return Measured(
         lambda one: of.exact(some) if one.keys["exact"] else of.image(),
         loss,
-        lambda one: len(some) / count if one.keys["exact"] else 1.0,
+        lambda one: len(some) / (of.whole or count) if one.keys["exact"] else 1.0,
     )

@@ -340,8 +340,8 @@ def _imaged(bench: Bench) -> Imaged:
     axes = radar.axes(size["pulses"], _LINES)
     lines, cells = stationary_axis(radar, axes[1], stage.rebuild.bands), axes[2]
     # points that are lit from begin to end, at ranges that hold their migration
-    reach = (size["pulses"] / radar.prf_hz - size["gate"].duration_s) / 2 * radar.speed_m_s
-    rows = [round(float(lines.index_of(y))) for y in (-reach, reach)]
+    reach = max(0.0, size["pulses"] / radar.prf_hz - size["gate"].duration_s) / 2 * radar.speed_m_s
+    rows = [round(float(lines.index_of(y))) + more for y, more in ((-reach, 0), (reach, 1))]
     columns = slice(cells.n // 4, 3 * cells.n // 4)
     along, closest = lines.values()[slice(*rows)], cells.values()[columns]
     pixels = torch.cartesian_prod(along, closest, along.new_zeros(1))[:, [1, 0, 2]]

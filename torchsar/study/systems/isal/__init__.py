@@ -123,9 +123,12 @@ class Isal(System):
                 "use a config that simulates the echoes"
             )
         efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
+        # without a rotation rate the image has no cross range
+        known = bench.radar.rotation_rad_s is not None
+        images = [beside_direct_sum(bench, partial(_imaged, bench), "migration while the target turns")] * known
         return [
             *echo_choices(bench),
-            beside_direct_sum(bench, partial(_imaged, bench), "migration while the target turns"),
+            *images,
             Choice("effort of autofocus", "autofocus.search", efforts, partial(_efforts, bench)),
         ]
 
@@ -159,9 +162,11 @@ def _imaged(bench: Bench) -> Imaged:
     world, radar, size = bench.world(), bench.radar, (bench.world().pulses, bench.world().samples)
     noise, image = noise_of(bench, *size), AzimuthTransform(radar)
     signal = Signal(noise, radar.raw_axes(*size)).to(bench.dtype)
-    rate = world.of(radar).rotation_rad_s
-    angle = rotation_angle(radar, world.pulses, radar.rotation_rad_s if rate is None else rate, noise.real)
-    cross = radar.image_axes(signal.axes)[0].values()
+    rate = radar.rotation_rad_s if world.rotation_rad_s is None else world.rotation_rad_s
+    turning = float(torch.as_tensor(rate).reshape(-1)[0])
+    angle = rotation_angle(radar, world.pulses, turning, noise.real)
+    # the axis has the scale of the assumed rate
+    cross = radar.image_axes(signal.axes)[0].values() * (radar.rotation_rad_s / turning)
     return turntable(radar, noise, angle, cross, 0.0, lambda: image(signal).data)
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Trace
-from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
+from torchsar.focus import ImageGrid, MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
 from torchsar.io import read_path
 from torchsar.metrics import error_db, registered_error_db
 from torchsar.radar import AntennaPath, InverseRadar
@@ -24,11 +24,10 @@ from torchsar.study.trials.batch import Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.system import Column, System
+from torchsar.study.trials.yardstick import noise_of, some_pixels
 
 # errors of tiles that are compared, in dB
 _ERRORS_DB = (-20.0, -40.0, -60.0, -80.0)
-# pixels, by choice, at which images are compared with the direct sum
-_PIXELS = 256
 
 
 class AnyPath(System):
@@ -127,7 +126,7 @@ class AnyPath(System):
             )
             for error, predicted in tiles.items()
         ]
-        straight = _compensations(bench, geometry)
+        straight = _compensations(bench, geometry, grid)
         compensated = [
             Alternative(
                 f"omega-K after motion compensation of order {order}",
@@ -148,7 +147,7 @@ class AnyPath(System):
             yield partial(figures.paths, case, result)
 
 
-def _compensations(bench: Bench, geometry: tuple) -> dict[int, MotionCompensation]:
+def _compensations(bench: Bench, geometry: tuple, grid: ImageGrid) -> dict[int, MotionCompensation]:
     """Motion compensation of both orders that suit the path, with the beam of the method that uses
     it; none without such a method.
     """
@@ -159,17 +158,16 @@ def _compensations(bench: Bench, geometry: tuple) -> dict[int, MotionCompensatio
         assert stage is not None
         frequency, *places = geometry
         with suppress(ValueError):  # the path is too far from straight
-            found[order] = MotionCompensation(frequency, AntennaPath(*places), stage.grid, stage.beam, order)
+            found[order] = MotionCompensation(frequency, AntennaPath(*places), grid, stage.beam, order)
     return found
 
 
 def _measured(bench: Bench, geometry: tuple, straight: Mapping[int, MotionCompensation], stage: PathImage) -> Measured:
     """Images of white noise, at random pixels beside the direct sum."""
     frequency, place, receiver, reference = geometry
-    size = (place.shape[-2], len(frequency))
-    noise = Draws(bench.config.seed).normal("trade.noise", size, torch.complex128)
+    noise = noise_of(bench, place.shape[-2], len(frequency))
     counts = stage.grid.counts
-    some = Draws(bench.config.seed).subset("trade.pixels", counts[0] * counts[1], min(_PIXELS, counts[0] * counts[1]))
+    some = some_pixels(bench, counts[0] * counts[1])
     pixels = stage.grid.pixels_m().reshape(-1, 3)[some]
     whole = backproject(noise, frequency, place, receiver, reference, pixels)
     history = noise.to(bench.dtype)

@@ -114,10 +114,15 @@ def choices(bench: Bench, seen: Moved) -> list[Choice]:
     # a continuous record knows no single range of a sweep
     possible = [entry for entry in _MODELS if bench.world().record is None or not entry[0].startswith("one_per")]
     models = [_model(bench, seen, *entry) for entry in possible]
+    filters = [n for n, s in bench.chains["recommended"].stages.items() if isinstance(s, AzimuthMatchedFilter)]
+    images = [
+        beside_direct_sum(bench, partial(_imaged, bench, name), "migration while a point is seen")
+        for name in filters[-1:]
+    ]
     return [
         Choice("echo model", "world.fidelity", models, partial(_echoes, bench, seen)),
         Choice("estimator of the velocity", "estimator", found, partial(_estimates, bench)),
-        beside_direct_sum(bench, partial(_imaged, bench), "migration while a point is seen"),
+        *images,
     ]
 
 
@@ -177,15 +182,11 @@ def _estimates(bench: Bench) -> Measured:
     return Measured(run, lambda one, estimate: {"velocity_rmse_m_s": error(estimate) - best})
 
 
-def _imaged(bench: Bench) -> Imaged:
-    """Image of white noise on the axes of the recommended method, and a straight path beside it."""
+def _imaged(bench: Bench, name: str) -> Imaged:
+    """Image of white noise by the named filter of the recommended method, on the axes of its data,
+    and a straight path beside it.
+    """
     radar, chain = bench.radar, bench.chains["recommended"]
-    name = next((name for name, stage in chain.stages.items() if isinstance(stage, AzimuthMatchedFilter)), None)
-    if name is None:
-        raise ValueError(
-            "processor.recommended forms no image, which the comparison with the direct sum needs; add "
-            "azimuth_matched_filter"
-        )
     draws = Draws(bench.config.seed, "trade", [0])
     pulse, range_ = chain.trace(bench.trials(draws).recording).inputs[name].axes[-2:]
     beam = chain.stages[name].beam_rad or radar.beam_rad
