@@ -38,6 +38,7 @@ Reference:
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -470,8 +471,8 @@ class MotionCompensation:
         # slow time is the coordinate along the track, at 1 m/s; the aperture is that of the beam
         pulse, aperture = LinearFM(self.sampling_hz, 1.0), near * beam.band / (1 - beam.middle**2)
         radar = StripmapRadar(self.carrier_hz, pulse, sampling, 1 / step, 1.0, near, None, aperture)
-        eps = {"eps": 1e-12} if data.dtype == torch.complex128 else {}
-        return self._on_grid(omega_k_stolt(data, radar, doppler_hz=doppler, **eps))
+        eps = 1e-12 if data.dtype == torch.complex128 else 2e-4
+        return self._on_grid(omega_k_stolt(data, radar, doppler_hz=doppler, eps=eps))
 
     def _on_grid(self, image: Tensor) -> Tensor:
         """Interpolate the image of omega-K at the pixels, with the phase and scale of the sum."""
@@ -516,6 +517,27 @@ class MotionCompensation:
             return self.antennas.path_m(pixels_m[pixels], pulses), weight
 
         return direct_sum(history, self.frequency_hz, path, len(pixels_m), eps=eps)
+
+
+def possible_compensations(
+    frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid, beam: ProcessedBeam
+) -> dict[int, MotionCompensation]:
+    """Prepare motion compensation of both orders, as far as the path suits.
+
+    Args:
+        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
+        antennas: Path of the antennas, without leading dimensions.
+        grid: Pixels.
+        beam: Processed beam.
+
+    Returns:
+        Motion compensation by its order, 1 or 2; empty if the path does not suit.
+    """
+    found: dict[int, MotionCompensation] = {}
+    for order in (1, 2):
+        with suppress(ValueError):
+            found[order] = MotionCompensation(frequency_hz, antennas, grid, beam, order)
+    return found
 
 
 def compensated_omega_k(

@@ -11,11 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Alternate, Chain, Draws, Signal, unit_phasor
+from torchsar.core import Alternate, Chain, Draws, Signal
 from torchsar.echo import bistatic_echo
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_db
+from torchsar.metrics.direct_images import DirectlySummed, points_at_rest
 from torchsar.metrics.moving_point import FocusedPoint, PeakCuts, point_responses, worst_image_error_db
 from torchsar.metrics.replicas import azimuth_response
 from torchsar.multichannel import (
@@ -36,7 +37,6 @@ from torchsar.multichannel import (
     multichannel_requirements,
 )
 from torchsar.multichannel.requirements import Estimator
-from torchsar.multichannel.stationary import stationary_axis
 from torchsar.multichannel.velocity import (
     AlongTrackAutofocus,
     GradientVelocity,
@@ -46,13 +46,11 @@ from torchsar.multichannel.velocity import (
     SignalIntensityRatio,
 )
 from torchsar.multichannel.velocity.migrating import MigratingLines
-from torchsar.radar import AntennaPath, frequency_samples
 from torchsar.scene import BandLimited, ExactRange, LitPoints, MovingPoints, TaylorRange
 from torchsar.study.systems.geo.world import TRUTHS, Level, Points
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
-from torchsar.study.trials.yardstick import Imaged, beside_direct_sum, some_pixels
+from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 
 _ESTIMATORS: dict[type, Estimator] = {
     SignalIntensityRatio: "sir",
@@ -191,7 +189,7 @@ def choices(bench: Bench) -> list[Choice]:
         Choice("range to the receiver", "world.receive", series, partial(_received, bench)),
         Choice("dimensions", "world.samples", dimensions, partial(_dimensions, bench)),
         Choice("precision", "precision", precisions, partial(_precisions, bench)),
-        beside_direct_sum(bench, partial(_imaged, bench), "ambiguities that reconstruction suppresses"),
+        beside_direct_sum(partial(_summed, bench), "ambiguities that reconstruction suppresses"),
     ]
 
 
@@ -329,40 +327,16 @@ def _dimensions(bench: Bench) -> Measured:
     return Measured(run, loss, lambda one: share)
 
 
-def _imaged(bench: Bench) -> Imaged:
-    """Points at rest near the random pixels, by the bands that are reconstructed for known motion.
-
-    Noise does not serve: reconstruction inverts the sampling by the channels, which the direct sum
-    leaves as it is. Receive paths count once, so that frequencies are half those of the radar.
-    """
+def _summed(bench: Bench) -> DirectlySummed:
+    """Image of points at rest by the bands that are reconstructed for known motion."""
     radar, size = bench.radar, _cropped(bench)
-    stage = StationaryImage(radar, LeastSquares(min(2, radar.channels)))
-    axes = radar.axes(size["pulses"], _LINES)
-    lines, cells = stationary_axis(radar, axes[1], stage.rebuild.bands), axes[2]
-    # points that are lit from begin to end, at ranges that hold their migration
-    reach = max(0.0, size["pulses"] / radar.prf_hz - size["gate"].duration_s) / 2 * radar.speed_m_s
-    rows = [round(float(lines.index_of(y))) + more for y, more in ((-reach, 0), (reach, 1))]
-    columns = slice(cells.n // 4, 3 * cells.n // 4)
-    along, closest = lines.values()[slice(*rows)], cells.values()[columns]
-    pixels = torch.cartesian_prod(along, closest, along.new_zeros(1))[:, [1, 0, 2]]
-    some = pixels[some_pixels(bench, len(pixels))]
-    off = Draws(bench.config.seed).part("trade").uniform("offset", (2, len(some))) - 0.5
-    y, r = some[:, 1] + off[0] * lines.step, some[:, 0] + off[1] * cells.step - radar.reference_range_m
-    points = MovingPoints([0.0] * len(some), [0.0] * len(some), y.tolist(), r.tolist())
-    echo = bistatic_echo(
-        points.movers(radar, Draws(0)), radar, size["pulses"], _LINES, gate=size["gate"], dtype=torch.complex128
-    )
-    signal = RemoveTransmitRange(radar)(Signal(echo, axes))
-    used = signal.to(bench.dtype)
-    place = (radar.speed_m_s * axes[1].values() - radar.channels_at()[:, None]).reshape(-1)
-    place = torch.stack([torch.zeros_like(place), place, torch.zeros_like(place)], -1)
-    cell = torch.arange(cells.n, dtype=torch.float64) - cells.n // 2
-    phase = unit_phasor((closest - radar.reference_range_m) / radar.wavelength_m, bench.dtype)
-    return Imaged(
-        frequency_samples(signal.data.flatten(0, 1)),
-        (radar.carrier_hz + cell * (radar.sampling_hz / cells.n)) / 2,
-        AntennaPath(place, None, torch.full_like(place[:, 0], 2 * radar.reference_range_m)),
-        pixels.view(len(along), len(closest), 3),
-        lambda: stage(used).data[slice(*rows), columns] * phase,
-        wave_speed_m_s=radar.wave_speed_m_s,
-    )
+    gate, pulses, samples = size["gate"], size["pulses"], _LINES
+
+    def echo(azimuth_m: Tensor, range_m: Tensor) -> Tensor:
+        still = torch.zeros_like(range_m)
+        movers = MovingPoints(still, still, azimuth_m, range_m).movers(radar, Draws(0))
+        made = bistatic_echo(movers, radar, pulses, samples, gate=gate, dtype=torch.complex128)
+        return RemoveTransmitRange(radar)(Signal(made, radar.axes(pulses, samples))).data
+
+    stage, draws = StationaryImage(radar, LeastSquares(min(2, radar.channels))), Draws(bench.config.seed)
+    return points_at_rest(radar, stage, (pulses, samples), gate.duration_s, draws, bench.dtype, echo)

@@ -18,6 +18,7 @@ from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.io import read_inverse
 from torchsar.metrics import phase_rmse
+from torchsar.metrics.direct_images import DirectlySummed, turning_target
 from torchsar.radar import InverseRadar, geometry_of
 from torchsar.scene import PhaseOnly, Sinusoid, displacement_m
 from torchsar.study.names.factories import with_wavelength
@@ -29,9 +30,8 @@ from torchsar.study.systems.isal.judge import received, whole_phase
 from torchsar.study.systems.isal.world import Target, echo_choices
 from torchsar.study.trials.batch import Judged, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 from torchsar.study.trials.system import Column, System
-from torchsar.study.trials.yardstick import Imaged, beside_direct_sum, noise_of, turntable
 
 _GEOMETRY = ("frequency_hz", "angle_rad", "position_m", "reference_m")
 # iterations of `autofocus` that are compared: its defaults, 120 and 20, and fewer
@@ -125,7 +125,7 @@ class Isal(System):
         efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
         # without a rotation rate the image has no cross range
         known = bench.radar.rotation_rad_s is not None
-        images = [beside_direct_sum(bench, partial(_imaged, bench), "migration while the target turns")] * known
+        images = [beside_direct_sum(partial(_summed, bench), "migration while the target turns")] * known
         return [
             *echo_choices(bench),
             *images,
@@ -157,17 +157,17 @@ def _efforts(bench: Bench) -> Measured:
     return Measured(lambda one: autofocus(data, **one.keys)["phase_rad"], loss)
 
 
-def _imaged(bench: Bench) -> Imaged:
+def _summed(bench: Bench) -> DirectlySummed:
     """Image of white noise by the transform along the pulses."""
-    world, radar, size = bench.world(), bench.radar, (bench.world().pulses, bench.world().samples)
-    noise, image = noise_of(bench, *size), AzimuthTransform(radar)
-    signal = Signal(noise, radar.raw_axes(*size)).to(bench.dtype)
+    world, radar = bench.world(), bench.radar
+    axes = radar.raw_axes(world.pulses, world.samples)
     rate = radar.rotation_rad_s if world.rotation_rad_s is None else world.rotation_rad_s
     turning = float(torch.as_tensor(rate).reshape(-1)[0])
-    angle = rotation_angle(radar, world.pulses, turning, noise.real)
+    angle = rotation_angle(radar, world.pulses, turning, torch.empty(()))
     # the axis has the scale of the assumed rate
-    cross = radar.image_axes(signal.axes)[0].values() * (radar.rotation_rad_s / turning)
-    return turntable(radar, noise, angle, cross, 0.0, lambda: image(signal).data)
+    cross, image = radar.image_axes(axes)[0].values() * (radar.rotation_rad_s / turning), AzimuthTransform(radar)
+    about = (radar, angle, cross, 0.0, world.samples, Draws(bench.config.seed))
+    return turning_target(*about, lambda noise: image(Signal(noise.to(bench.dtype), axes)).data)
 
 
 SYSTEM = Isal

@@ -25,14 +25,14 @@ from torchsar.focus.rotation_requirements import (
     rotation_requirements,
 )
 from torchsar.metrics import error_db, rotation_bounds
+from torchsar.metrics.direct_images import DirectlySummed, turning_target
 from torchsar.scene import PhaseOnly, Points
 from torchsar.study.systems.isal.world import echo_choices
 from torchsar.study.systems.isal_rotation.world import Rotating, first_values, k_of
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 from torchsar.study.trials.system import Noise
-from torchsar.study.trials.yardstick import Imaged, beside_direct_sum, noise_of, turntable
 
 # products of pulses, lines and range cells up to which the sum itself is the yardstick
 _EXPLICIT = 3e8
@@ -92,7 +92,7 @@ def choices(bench: Bench) -> list[Choice]:
         Choice("order of the rotation", "rotation.order", orders, partial(_orders, bench)),
         Choice("range term", "range_phase", range_terms, partial(_range_terms, bench)),
         Choice("transform", "matched_fourier.transform", transforms, partial(_transforms, bench)),
-        beside_direct_sum(bench, partial(_imaged, bench), "migration, range in a cell"),
+        beside_direct_sum(partial(_summed, bench), "migration, range in a cell"),
         Choice("estimator of the rotation", "estimator", found, partial(_estimates, bench)),
         *echo_choices(bench),
     ]
@@ -232,24 +232,20 @@ def _transforms(bench: Bench) -> Measured:
     return Measured(run, lambda one, image: {"image_error_db": float(error_db(image.to(truth), truth).max())})
 
 
-def _imaged(bench: Bench) -> Imaged:
+def _summed(bench: Bench) -> DirectlySummed:
     """Image of white noise by the true rotation of the first trial."""
-    (omega, k, yc), radar, pulses = _rotation(bench.world()), bench.radar, bench.world().pulses
-    noise = noise_of(bench, pulses, bench.world().samples)
-    range_m = radar.raw_axes(*noise.shape)[1].values()
-    data, lines = noise.to(bench.dtype), DopplerLines()
-    angle = omega * warp(torch.arange(pulses, dtype=torch.float64) / radar.prf_hz, k)
+    (omega, k, yc), radar, world, lines = _rotation(bench.world()), bench.radar, bench.world(), DopplerLines()
+    range_m, count = radar.raw_axes(world.pulses, world.samples)[1].values(), lines.number(world.pulses)
+    phi = warp(torch.arange(world.pulses + 1, dtype=torch.float64) / radar.prf_hz, k)
     # lines lie at equal steps of the Doppler at the mean rate
-    line = torch.arange(lines.number(pulses), dtype=torch.float64) - lines.number(pulses) // 2
-    whole = warp(torch.tensor([pulses / radar.prf_hz], dtype=torch.float64), k)
-    doppler = line / (lines.oversampling * whole)
+    doppler = (torch.arange(count, dtype=torch.float64) - count // 2) / (lines.oversampling * phi[-1])
 
-    def image() -> Tensor:
-        still = range_phase(data, range_m, radar.wavelength_m, radar.prf_hz, omega, k, yc)
-        return matched_fourier(still, k, radar.prf_hz, lines=lines)
+    def image(noise: Tensor) -> Tensor:
+        about = (range_m, radar.wavelength_m, radar.prf_hz, omega, k, yc)
+        return matched_fourier(range_phase(noise.to(bench.dtype), *about), k, radar.prf_hz, lines=lines)
 
     cross = radar.wavelength_m * doppler / (2 * omega)
-    return turntable(radar, noise, angle, cross, yc, image)
+    return turning_target(radar, omega * phi[:-1], cross, yc, world.samples, Draws(bench.config.seed), image)
 
 
 def _draws(bench: Bench) -> Draws:

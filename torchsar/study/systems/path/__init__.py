@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -11,9 +10,11 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Trace
-from torchsar.focus import ImageGrid, MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
+from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
+from torchsar.focus.motion_compensation import possible_compensations
 from torchsar.io import read_path
 from torchsar.metrics import error_db, registered_error_db
+from torchsar.metrics.direct_images import some_pixels, white_noise
 from torchsar.radar import AntennaPath, InverseRadar
 from torchsar.study.names.registry import PATH_IMPAIRMENTS
 from torchsar.study.output.pictures import Drawn, comparisons
@@ -24,7 +25,6 @@ from torchsar.study.trials.batch import Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.system import Column, System
-from torchsar.study.trials.yardstick import noise_of, some_pixels
 
 # errors of tiles that are compared, in dB
 _ERRORS_DB = (-20.0, -40.0, -60.0, -80.0)
@@ -126,7 +126,10 @@ class AnyPath(System):
             )
             for error, predicted in tiles.items()
         ]
-        straight = _compensations(bench, geometry, grid)
+        # by the beam of the method that uses omega-K, if there is one
+        stages = [one for chain in bench.chains.values() for one in chain.stages.values()]
+        beams = [one.beam for one in stages if isinstance(one, OmegaKImage)]
+        straight = {} if not beams else possible_compensations(geometry[0], antennas, grid, beams[0])
         compensated = [
             Alternative(
                 f"omega-K after motion compensation of order {order}",
@@ -147,27 +150,18 @@ class AnyPath(System):
             yield partial(figures.paths, case, result)
 
 
-def _compensations(bench: Bench, geometry: tuple, grid: ImageGrid) -> dict[int, MotionCompensation]:
-    """Motion compensation of both orders that suit the path, with the beam of the method that uses
-    it; none without such a method.
-    """
-    stages = [stage for chain in bench.chains.values() for stage in chain.stages.values()]
-    stage = next((one for one in stages if isinstance(one, OmegaKImage)), None)
-    found: dict[int, MotionCompensation] = {}
-    for order in (1, 2) if stage is not None else ():
-        assert stage is not None
-        frequency, *places = geometry
-        with suppress(ValueError):  # the path is too far from straight
-            found[order] = MotionCompensation(frequency, AntennaPath(*places), grid, stage.beam, order)
-    return found
-
-
-def _measured(bench: Bench, geometry: tuple, straight: Mapping[int, MotionCompensation], stage: PathImage) -> Measured:
+def _measured(
+    bench: Bench,
+    geometry: tuple[Tensor, Tensor, Tensor | None, Tensor],
+    straight: Mapping[int, MotionCompensation],
+    stage: PathImage,
+) -> Measured:
     """Images of white noise, at random pixels beside the direct sum."""
     frequency, place, receiver, reference = geometry
-    noise = noise_of(bench, place.shape[-2], len(frequency))
+    draws = Draws(bench.config.seed)
+    noise = white_noise(draws, place.shape[-2], len(frequency))
     counts = stage.grid.counts
-    some = some_pixels(bench, counts[0] * counts[1])
+    some = some_pixels(draws, counts[0] * counts[1])
     pixels = stage.grid.pixels_m().reshape(-1, 3)[some]
     whole = backproject(noise, frequency, place, receiver, reference, pixels)
     history = noise.to(bench.dtype)

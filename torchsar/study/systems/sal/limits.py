@@ -13,22 +13,21 @@ from torch import Tensor
 
 from torchsar.compensate.radial import mirror_product, radial_motion, segmented_interference, spectrum_correlation
 from torchsar.compensate.radial.mirror import Intercept
-from torchsar.core import Draws, Estimate, unit_phasor
+from torchsar.core import Draws, Estimate
 from torchsar.echo import range_model_error_db
-from torchsar.focus import AzimuthMatchedFilter, azimuth_matched_filter, deramp_azimuth
+from torchsar.focus import AzimuthMatchedFilter
 from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_after_gain_db
+from torchsar.metrics.direct_images import DirectlySummed, ladar_strip
 from torchsar.metrics.radial_motion import lit_periods
-from torchsar.radar import AntennaPath, frequency_samples
 from torchsar.scene import drawn_motion
 from torchsar.scene.moved_scene import Moved
 from torchsar.study.names.registry import SWEEP_FIDELITIES
 from torchsar.study.systems.sal.world import Ground
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 from torchsar.study.trials.system import Noise
-from torchsar.study.trials.yardstick import Imaged, beside_direct_sum, noise_of
 
 # limits that stop only methods with such a stage, whose key has that value
 _CONCERNS = {
@@ -115,10 +114,7 @@ def choices(bench: Bench, seen: Moved) -> list[Choice]:
     possible = [entry for entry in _MODELS if bench.world().record is None or not entry[0].startswith("one_per")]
     models = [_model(bench, seen, *entry) for entry in possible]
     filters = [n for n, s in bench.chains["recommended"].stages.items() if isinstance(s, AzimuthMatchedFilter)]
-    images = [
-        beside_direct_sum(bench, partial(_imaged, bench, name), "migration while a point is seen")
-        for name in filters[-1:]
-    ]
+    images = [beside_direct_sum(partial(_summed, bench, n), "migration while a point is seen") for n in filters[-1:]]
     return [
         Choice("echo model", "world.fidelity", models, partial(_echoes, bench, seen)),
         Choice("estimator of the velocity", "estimator", found, partial(_estimates, bench)),
@@ -182,35 +178,9 @@ def _estimates(bench: Bench) -> Measured:
     return Measured(run, lambda one, estimate: {"velocity_rmse_m_s": error(estimate) - best})
 
 
-def _imaged(bench: Bench, name: str) -> Imaged:
-    """Image of white noise by the named filter of the recommended method, on the axes of its data,
-    and a straight path beside it.
-    """
-    radar, chain = bench.radar, bench.chains["recommended"]
-    draws = Draws(bench.config.seed, "trade", [0])
-    pulse, range_ = chain.trace(bench.trials(draws).recording).inputs[name].axes[-2:]
-    beam = chain.stages[name].beam_rad or radar.beam_rad
-    noise, along = noise_of(bench, pulse.n, range_.n), radar.speed_m_s * pulse.values()
-    closest = radar.reference_range_m + range_.values()
-    middle = closest[range_.n // 2]
-    place = torch.stack([torch.zeros_like(along), along, torch.zeros_like(along)], -1)
-    antennas = AntennaPath(place, None, 2 * middle.expand(pulse.n))
-    pixels = torch.cartesian_prod(along, closest, along.new_zeros(1))[:, [1, 0, 2]].view(pulse.n, range_.n, 3)
-    cell = torch.arange(range_.n, dtype=torch.float64) - range_.n // 2
-    band = radar.wave_speed_m_s / (2 * range_.step)
-    data = noise.to(bench.dtype)
-    # dechirped echoes have the conjugate phase; the filter gives the mean over an aperture
-    phase = unit_phasor(2 * (closest - middle) / radar.wavelength_m, bench.dtype)
-    lit = 2 * torch.floor(beam * closest / (2 * radar.speed_m_s * pulse.step)) + 1 if beam else closest * 0 + 1
-
-    def image() -> Tensor:
-        deramped = deramp_azimuth(data, radar, pulse, range_)
-        return azimuth_matched_filter(deramped, radar, pulse, range_, beam).conj() * phase * lit.to(phase.real.dtype)
-
-    def seen(pulses: slice, points: Tensor) -> Tensor:
-        reach = beam * points[:, 0] / 2 if beam else torch.full_like(points[:, 0], math.inf)
-        return ((along[pulses, None] - points[:, 1]).abs() <= reach).to(torch.float64)
-
-    history = frequency_samples(noise.conj().resolve_conj())
-    frequency = radar.carrier_hz + cell * (band / range_.n)
-    return Imaged(history, frequency, antennas, pixels, image, seen, radar.wave_speed_m_s)
+def _summed(bench: Bench, name: str) -> DirectlySummed:
+    """Image of white noise by a filter of the recommended method, on the axes of its data."""
+    draws, chain = Draws(bench.config.seed), bench.chains["recommended"]
+    data = chain.trace(bench.trials(Draws(bench.config.seed, "trade", [0])).recording).inputs[name]
+    beam = getattr(chain.stages[name], "beam_rad", None) or bench.radar.beam_rad
+    return ladar_strip(bench.radar, data.axes[-2], data.axes[-1], beam, draws, bench.dtype)

@@ -11,20 +11,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Signal, Truth, unit_phasor
+from torchsar.core import Draws, Recording, Signal, Truth
 from torchsar.echo import simulate
 from torchsar.echo.jitter import sample_unevenly
 from torchsar.focus.patches import HALF, PointPatches
-from torchsar.focus.reference import REFERENCES
 from torchsar.focus.requirements import Requirement, full_swath_m, requirements
 from torchsar.metrics import error_after_gain_db, error_db
-from torchsar.radar import AntennaPath, StripmapRadar
+from torchsar.metrics.direct_images import PIXELS, DirectlySummed, points_of_a_strip
+from torchsar.radar import StripmapRadar
 from torchsar.repair.jitter import BandLimited, Exact, Lagrange
 from torchsar.scene import Dwell, Hyperbola, Parabola, Points, StripmapWorld
 from torchsar.study.names.registry import FOCUS
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
-from torchsar.study.trials.yardstick import PIXELS, Imaged, beside_direct_sum
+from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 
 # a period of four timing offsets (samples) as in Tsvetkov 2017, and raw lines enough to time them
 _OFFSETS, _LINES = (0.0, 0.18, -0.12, 0.07), 1024
@@ -135,7 +134,7 @@ def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
     found = [
         Choice("focusing form", "stage", forms, partial(_forms, bench), exact),
         Choice("precision", "precision", precisions, partial(_precisions, bench)),
-        beside_direct_sum(bench, partial(_imaged, bench), "change of migration over the swath"),
+        beside_direct_sum(partial(_summed, bench), "change of migration over the swath"),
     ]
     if bench.recording is None:
         probe = probe_of(bench)
@@ -183,48 +182,17 @@ def _form_of(bench: Bench) -> str:
     return next((name for name in names if name in FORMS), "omega_k")
 
 
-def _imaged(bench: Bench) -> Imaged:
-    """Points at random positions of the swath by the recommended form, at the pixels nearest to
-    them: a target has the Doppler of its dwell only, which white noise has not.
-    """
+def _summed(bench: Bench) -> DirectlySummed:
+    """Points at random positions of the swath, by the recommended form."""
     probe, radar = probe_of(bench), bench.radar
-    size, (doppler, velocity), form = probe.size, probe.motion, _form_of(bench)
-    reach = max(0.0, size[0] / radar.prf_hz - probe.dwell_s) / 2 * radar.velocity_m_s
+    reach = max(0.0, probe.size[0] / radar.prf_hz - probe.dwell_s) / 2 * radar.velocity_m_s
     at = Draws(bench.config.seed).uniform("trade.points", (2, PIXELS))
     low, high = min(probe.edges_m), max(probe.edges_m)
     scene = Points(((2 * at[0] - 1) * reach).tolist(), (low + at[1] * (high - low)).tolist())
     recording, truth = replace(probe, world=replace(probe.world, scene=scene)).recorded(torch.complex128)
-    raw, of = recording.signal, truth.values
-    frame = doppler if radar.pointing_doppler_hz is None else radar.pointing_doppler_hz
-    positions = radar.image_position(of["zero_doppler_s"], of["closest_range_m"], frame, velocity)
-    axes = radar.image_axes(raw.axes)
-    index = [axis.index_of(x).round().long().clamp(0, axis.n - 1) for axis, x in zip(axes, positions, strict=True)]
-    along, slant = (axis.values()[i] for axis, i in zip(axes, index, strict=True))
-    sine = radar.sin_squint(frame, velocity)
-    # the crossing of the line of sight is earlier than that of broadside
-    along = velocity * along / radar.velocity_m_s + sine * slant
-    pixels = torch.stack([slant * torch.sqrt(1 - sine.square()), along, torch.zeros_like(along)], -1)
-    place = velocity * raw.axes[0].values()
-    place = torch.stack([torch.zeros_like(place), place, torch.zeros_like(place)], -1)
-    n, known = size[1], (of["doppler_hz"], of["velocity_m_s"])
-    compressed = torch.fft.fft(raw.data) * REFERENCES["matched"](radar.pulse, n, radar.sampling_hz)
-    cell = torch.arange(n, dtype=torch.float64) - n // 2
-    used, near = raw.to(bench.dtype), raw.axes[1].start
-    phase = unit_phasor(2 * (slant - near) / radar.wavelength_m, bench.dtype)
-    return Imaged(
-        torch.fft.fftshift(compressed, dim=-1),
-        radar.carrier_hz + cell * (radar.sampling_hz / n),
-        AntennaPath(place, None, torch.full_like(place[:, 0], 2 * near)),
-        pixels,
-        lambda: _first_lines(_focused(bench, form, used, known), size[0])[index[0], index[1]] * phase,
-        wave_speed_m_s=radar.wave_speed_m_s,
-        whole=size[0] * size[1],
-    )
-
-
-def _first_lines(image: Tensor, lines: int) -> Tensor:
-    """One line per pulse of an image that may have several."""
-    return image[:: image.shape[0] // lines]
+    raw, used, of = recording.signal, recording.signal.to(bench.dtype), truth.values
+    places, known = (of["zero_doppler_s"], of["closest_range_m"]), (of["doppler_hz"], of["velocity_m_s"])
+    return points_of_a_strip(radar, raw, *places, *probe.motion, lambda: _focused(bench, _form_of(bench), used, known))
 
 
 def _precisions(bench: Bench) -> Measured:
