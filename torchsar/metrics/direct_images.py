@@ -136,6 +136,9 @@ def turning_target(
         draws: Random draws.
         image: Function of range profiles (pulse, range) that returns their image (azimuth, range),
             with phases that refer to the angle zero.
+
+    Returns:
+        The image with its direct sum.
     """
     profiles = white_noise(draws, len(angle_rad), samples)
     cell = torch.arange(samples, dtype=torch.float64) - samples // 2
@@ -169,6 +172,9 @@ def ladar_strip(
         beam_rad: Angle of the aperture in rad; None for the whole record.
         draws: Random draws.
         dtype: Dtype of the image.
+
+    Returns:
+        The image with its direct sum.
     """
     noise, along = white_noise(draws, pulse.n, range_.n), radar.speed_m_s * pulse.values()
     closest = radar.reference_range_m + range_.values()
@@ -224,6 +230,9 @@ def points_at_rest(
         echo: Function of azimuth and range beyond the reference range of points in metres, float64
             (point,), that returns their echo without the transmit range, complex128 (channel,
             pulse, range).
+
+    Returns:
+        The image with its direct sum.
     """
     axes = radar.axes(*size)
     lines, cells = stationary_axis(radar, axes[1], stage.rebuild.bands), axes[2]
@@ -273,6 +282,9 @@ def points_of_a_strip(
             nominal pointing.
         velocity_m_s: Effective velocity in m/s.
         image: Function that forms the image, complex (azimuth, range).
+
+    Returns:
+        The image with its direct sum.
     """
     pulses, n = raw.data.shape
     frame = doppler_hz if radar.pointing_doppler_hz is None else radar.pointing_doppler_hz

@@ -45,6 +45,9 @@ def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[s
         image: Image with the axes (azimuth, range).
         radar: Radar parameters.
         margin: Edges that are left out; None for those of the aperture and the pulse.
+
+    Returns:
+        First index and the one after the last, by the name of the axis.
     """
     lines, samples = (axis.n for axis in image.axes)
     if margin is None:
@@ -127,6 +130,9 @@ def focus_name(chain: Chain) -> str:
 
     Args:
         chain: Chain of stages.
+
+    Returns:
+        Name of the stage.
     """
     focusing = [name for name, stage in chain.stages.items() if hasattr(focuser_of(stage), "frame_hz")]
     return focusing[-1] if focusing else list(chain.stages)[-1]
@@ -137,5 +143,8 @@ def focuser_of(stage: nn.Module) -> nn.Module:
 
     Args:
         stage: Stage of a chain.
+
+    Returns:
+        The focusing stage.
     """
     return getattr(stage, "focuser", stage)

@@ -48,7 +48,7 @@ class Isal(System):
     impairments = TARGET_IMPAIRMENTS
     reads = "range profile or phase history"
     ending = "azimuth_transform or target_image"
-    tolerance = {"echo_error_db": -20.0, "residual_phase_rms_rad": 0.1}
+    tolerance = {"echo_error_db": -20.0, "image_error_db": -20.0, "residual_phase_rms_rad": 0.1}
     exact = {"world.fidelity": {"kind": "dechirped"}}
     definitions = {
         "snr": "mean power of all range-compressed samples over noise variance, dB",
