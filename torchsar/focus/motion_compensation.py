@@ -25,8 +25,9 @@ of D with the angle, (cos(theta) - cos(m)) e.d, which is the narrow-beam approxi
 correction of a cell instead of a closest range, since a point migrates over cells while it is seen,
 (R / cos(theta) cos(m) - R) de/dR.d; and the envelope that the second order does not move. For white
 noise each pulse, range, angle and frequency contributes independently to the image, so that the
-relative image error is the mean of |exp(j phi) - 1|^2 over them, which `compensation_error`
-evaluates.
+relative image error is the mean of |exp(j phi) - 1|^2 over them, which
+`MotionCompensation.predicted_db` evaluates. For lit points the mean over angles has the pattern of
+the antenna as weight.
 
 Uneven steps along the track are resampled by a non-uniform Fourier transform, the sum over pulses
 in which backprojection also adds them, with the weight of the processed beam.
@@ -38,6 +39,7 @@ Reference:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -308,8 +310,13 @@ class MotionCompensation:
         excess = self._excess(along, self.beam.mean_cosine * range_m, self._off_m[:, None])
         return excess / (torch.sqrt((range_m.square() + excess).clamp_min(0)) + range_m)
 
-    def predicted_db(self) -> float:
-        """Predict the error of `image` relative to `exact` for a history of white noise.
+    def predicted_db(self, pattern: Callable[[Tensor], Tensor] | None = None) -> float:
+        """Predict the error of `image` relative to `exact`.
+
+        Args:
+            pattern: Power of the echo of a point over the sine of its angle ahead of broadside,
+                such as that of an antenna, which lights the middle of the beam best; None for a
+                history of white noise, which has all angles alike.
 
         Returns:
             Relative square error in dB: the mean of |exp(j phi) - 1|^2 over pulses, angles, closest
@@ -324,12 +331,13 @@ class MotionCompensation:
         # the ripple depends on the product of range and frequency
         spread = self.sampling_hz / self.carrier_hz / math.sqrt(12)
         ripple = torch.stack([self._ripple_error(closest * (1 + sign * spread)) for sign in (-1, 1)]).mean(0)
-        error = float((weight * (self._phase_error(closest) + ripple)).sum())
+        error = float((weight * (self._phase_error(closest, pattern) + ripple)).sum())
         return 10 * math.log10(error + _LEAK / (_MARGIN * len(self.frequency_hz)))
 
-    def _phase_error(self, closest_m: Tensor) -> Tensor:
+    def _phase_error(self, closest_m: Tensor, pattern: Callable[[Tensor], Tensor] | None) -> Tensor:
         """Mean of |exp(j phi) - 1|^2 at closest ranges, float64 (range,)."""
         sine, share = self.beam.quadrature()
+        share = share if pattern is None else share * pattern(sine)
         some = slice(None, None, max(1, len(self._pulse_m) // _PULSES))
         # (pulse, range, angle)
         range_m = closest_m[:, None] / torch.sqrt(1 - sine.square())

@@ -128,13 +128,14 @@ class AnyPath(System):
         ]
         # by the beam of the method that uses omega-K, if there is one
         stages = [one for chain in bench.chains.values() for one in chain.stages.values()]
+        pattern = None if bench.recording is not None else bench.world().lit_power
         beams = [one.beam for one in stages if isinstance(one, OmegaKImage)]
         straight = {} if not beams else possible_compensations(geometry[0], antennas, grid, beams[0])
         compensated = [
             Alternative(
                 f"omega-K after motion compensation of order {order}",
                 {"stage": "omega_k_image", "order": order, "beam_deg": one.beam.width_deg},
-                {"image_error_db": one.predicted_db()},
+                {"image_error_db": one.predicted_db(pattern)},
                 "change of motion errors with the angle" + (" and with the range" if order == 1 else ""),
             )
             for order, one in straight.items()
