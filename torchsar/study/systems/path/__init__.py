@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -141,7 +141,7 @@ class AnyPath(System):
             for order, one in straight.items()
         ]
         exact = Alternative("direct sum", {"stage": "direct_image"}, {})
-        measured = partial(_measured, bench, geometry, straight, stage)
+        measured = partial(_measured, bench, geometry, tiles, straight, stage)
         return [Choice("image", "stage", [*compensated, *alternatives, exact], measured)]
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
@@ -154,6 +154,7 @@ class AnyPath(System):
 def _measured(
     bench: Bench,
     geometry: tuple[Tensor, Tensor, Tensor | None, Tensor],
+    tiles: Iterable[float],
     straight: Mapping[int, MotionCompensation],
     stage: PathImage,
 ) -> Measured:
@@ -165,11 +166,11 @@ def _measured(
     some = some_pixels(draws, counts[0] * counts[1])
     pixels = stage.grid.pixels_m().reshape(-1, 3)[some]
     whole = backproject(noise, frequency, place, receiver, reference, pixels)
-    history = noise.to(bench.dtype)
+    history, plans = noise.to(bench.dtype), {error: TilePlan(*geometry, stage.grid, error) for error in tiles}
 
     def run(one: Alternative) -> Tensor:
         if "error_db" in one.keys:
-            return TilePlan(*geometry, stage.grid, one.keys["error_db"]).image(history)
+            return plans[one.keys["error_db"]].image(history)
         if "order" in one.keys:
             return straight[one.keys["order"]].image(history)
         return backproject(history, frequency, place, receiver, reference, pixels, eps=1e-6)
