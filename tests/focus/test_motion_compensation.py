@@ -109,6 +109,13 @@ def test_the_first_order_loses_what_the_second_corrects() -> None:
     assert measured[0] > measured[1] + 10
 
 
+def test_points_at_the_compensated_angle_lose_least() -> None:
+    plan = STRIPS["drone"].plan()
+    assert plan.predicted_db(torch.ones_like) == pytest.approx(plan.predicted_db())
+    sine = math.sqrt(1 - plan.beam.mean_cosine**2)
+    assert plan.predicted_db(lambda s: torch.exp(-(((s.abs() - sine) / 0.005) ** 2))) < plan.predicted_db() - 6
+
+
 def test_a_straight_track_gives_the_weighted_direct_sum() -> None:
     strip = replace(STRIPS["drone"], sway_m=0.0)
     assert strip.measured_db(strip.plan()) < -45

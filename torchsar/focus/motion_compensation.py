@@ -315,8 +315,8 @@ class MotionCompensation:
 
         Args:
             pattern: Power of the echo of a point over the sine of its angle ahead of broadside,
-                such as that of an antenna, which lights the middle of the beam best; None for a
-                history of white noise, which has all angles alike.
+                such as that of an antenna; None for a history of white noise, which has all angles
+                alike.
 
         Returns:
             Relative square error in dB: the mean of |exp(j phi) - 1|^2 over pulses, angles, closest
