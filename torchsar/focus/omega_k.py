@@ -120,7 +120,21 @@ def band_weight(radar: StripmapRadar, offset_hz: Tensor, band_hz: float) -> Tens
             f"azimuth is cut at the PRF; process at most {radar.prf_hz / (1 + BAND_EDGE):.6g} Hz",
             stacklevel=2,
         )
-    beyond = (offset_hz.abs() - band_hz / 2) / (BAND_EDGE * band_hz)
+    return raised_cosine_band(offset_hz / band_hz)
+
+
+def raised_cosine_band(offset: Tensor) -> Tensor:
+    """Compute the weights of a band of unit width: 1 inside, 1/2 at +-0.5, 0 outside.
+
+    Each edge is a raised cosine, a tenth of the band wide.
+
+    Args:
+        offset: Distance from the middle of the band, relative to its width, any shape.
+
+    Returns:
+        Weights, same shape.
+    """
+    beyond = (offset.abs() - 0.5) / BAND_EDGE
     return 0.5 - 0.5 * torch.sin(math.pi * beyond.clamp(-0.5, 0.5))
 
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Signal, block_bytes_of, over_blocks, real_dtype, spectrum_in_blocks, transform_in_blocks
-from torchsar.focus.omega_k import BAND_EDGE, FrameGeometry, band_weight, through_doppler
+from torchsar.focus.omega_k import BAND_EDGE, FrameGeometry, band_weight, raised_cosine_band, through_doppler
 from torchsar.radar import StripmapRadar
 
 # tolerated excess of the band of an image over its sampling rate, relative to this rate; measured
@@ -246,9 +246,7 @@ class DopplerSkew:
         scale = 1 + (lean if skewed else torch.zeros_like(lean[:1]))
         offset = self.base_hz[part, None] - self.centre_hz[..., None, None] * scale
         offset = offset - prf * torch.round(offset / prf)
-        beyond = (offset.abs() / self.band_hz - 0.5) / BAND_EDGE
-        weight = 0.5 - 0.5 * torch.sin(math.pi * beyond.clamp(-0.5, 0.5))
-        return rows * weight.to(real_dtype(rows.dtype))
+        return rows * raised_cosine_band(offset / self.band_hz).to(real_dtype(rows.dtype))
 
     def planes(self, part: slice, change: int) -> Tensor:
         """Compute which multiple of the PRF the rows occupy in the spectrum of the image.
