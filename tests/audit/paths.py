@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from tests.audit.frame import Batch, Entry, World, nothing
+from tests.audit.frame import Batch, Entry, Quantity, World, nothing
 from tests.audit.pulses import PHASES
 from tests.compensate.scenes import turned, white
-from torchsar.compensate import PathAutofocus
+from torchsar.compensate import PathAutofocus, PathPhase
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_path
+from torchsar.metrics import phase_rmse
 from torchsar.radar import InverseRadar
-from torchsar.scene import Flight, PathWorld, Points, RandomPoints, Scene, Sinusoid, Speckle, StraightPath, Sway
+from torchsar.scene import (
+    Flight,
+    Navigation,
+    PathWorld,
+    Points,
+    RandomPoints,
+    RandomWalk,
+    Scene,
+    Sinusoid,
+    Speckle,
+    StraightPath,
+    Sway,
+)
 
 PULSES, CELLS = 64, 64
+KNOWN = ("frequency_hz", "transmitter_m", "path_reference_m")
 RADAR = InverseRadar(9.6e9, 300e6, 64.0)
 FLIGHT = Flight(StraightPath((-700.0, -20.0, 700.0), (0.0, 40.0, 0.0)), Sway(x=[Sinusoid(0.2, 1.5)]))
 FEW = RandomPoints(20, 20.0, 16.0)
@@ -40,11 +55,41 @@ def signal(x: Tensor) -> Signal:
     return Signal(x.to(torch.complex64), RADAR.raw_axes(*x.shape[-2:]))
 
 
-def autofocus(data: Signal) -> Estimate:
+def phase(data: Signal) -> Estimate:
     """The stage with the recorded path, which is the same in all worlds."""
     aux = simulate_path(RADAR, PathWorld(FEW, FLIGHT), PULSES, CELLS, Draws(0))[0].aux
-    known = {name: aux[name] for name in ("frequency_hz", "transmitter_m", "path_reference_m")}
-    return PathAutofocus()(data, **known)
+    return PathPhase()(data, **{name: aux[name] for name in KNOWN})
+
+
+def flown(scene: Scene, snr_db: float) -> Callable[[int, int], Batch]:
+    """Draw scenes and paths that navigation records with random walks of 1 cm."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        walk = [RandomWalk(0.01 * math.sqrt(6), 1 / PULSES)]
+        world = PathWorld(scene, FLIGHT, navigation=Navigation(Sway(walk, walk, walk)), snr_db=snr_db)
+        recording, truth = simulate_path(
+            RADAR, world, PULSES, CELLS, Draws(seed, trials=range(trials)), dtype=torch.complex64
+        )
+        known = {name: recording.aux[name] for name in KNOWN}
+        return Batch(recording.signal, {"line_of_sight_m": truth.values["line_of_sight_m"]}, known)
+
+    return draw
+
+
+def path_autofocus(data: Signal, **known: Tensor) -> Estimate:
+    """The stage with the recorded paths, or with one path where the data are no recording."""
+    aux = simulate_path(RADAR, PathWorld(FEW, FLIGHT), PULSES, CELLS, Draws(0))[0].aux
+    return PathAutofocus()(data, **(known or {name: aux[name] for name in KNOWN}))
+
+
+def apart(found: Tensor, truth: Tensor) -> Tensor:
+    """Rms of the line of sight modulo half a wavelength, without constant and linear terms."""
+    radians = 4 * math.pi / RADAR.wavelength_m
+    return phase_rmse(found * radians, truth.double() * radians) / radians
+
+
+# a residual of 0.47 rad, as for the phases of pulses
+LINE_OF_SIGHT = (Quantity("line_of_sight_m", 0.47 * RADAR.wavelength_m / (4 * math.pi), apart),)
 
 
 def entries() -> list[Entry]:
@@ -55,4 +100,13 @@ def entries() -> list[Entry]:
         World("clutter", drawn(Speckle(800, 20.0, 16.0), 10.0), 10.0),
         World("one point", drawn(Points([3.0], [-2.0], random_phase=True), -5.0), -5.0),
     )
-    return [Entry("compensate.PathAutofocus", autofocus, worlds, PHASES, share=0.1)]
+    paths = (
+        *nothing((PULSES, CELLS), signal),
+        *(World("own", flown(FEW, snr), snr) for snr in (-20.0, -10.0, 0.0, 10.0, 20.0, 40.0)),
+        World("clutter", flown(Speckle(800, 20.0, 16.0), 10.0), 10.0),
+        World("one point", flown(Points([3.0], [-2.0], random_phase=True), -5.0), -5.0),
+    )
+    return [
+        Entry("compensate.PathPhase", phase, worlds, PHASES, share=0.1),
+        Entry("compensate.PathAutofocus", path_autofocus, paths, LINE_OF_SIGHT, share=0.1),
+    ]

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from torchsar.compensate import PathAutofocus, path_autofocus
+from torchsar.compensate import CorrectPath, PathAutofocus, PathPhase, path_autofocus, path_phase
+from torchsar.compensate.path.envelopes import drift_m, moved
+from torchsar.compensate.path.fringes import roughness, smooth_near, smoothest
+from torchsar.compensate.path.ground import ground_image
 from torchsar.core import Draws, Recording, unit_phasor
 from torchsar.echo import simulate_path
-from torchsar.focus import ImageGrid, TileOperator, TilePlan
-from torchsar.metrics import phase_rmse
+from torchsar.focus import ImageGrid, TileImage, TileOperator, TilePlan
+from torchsar.metrics import phase_rmse, registered_error_db
 from torchsar.radar import AntennaPath, InverseRadar
-from torchsar.scene import Flight, PathWorld, RandomPoints, Sinusoid, StraightPath, Sway
+from torchsar.scene import Flight, Navigation, PathWorld, RandomPoints, RandomWalk, Sinusoid, StraightPath, Sway
 
 F64 = torch.float64
 RADAR = InverseRadar(9.6e9, 300e6, 64.0)
@@ -61,7 +65,7 @@ def test_white_phases_of_migrating_scatterers_are_found_and_noise_is_not() -> No
     frequency, antennas = recording.aux["frequency_hz"], path_of(recording)
     noise = torch.randn(1, PULSES, CELLS, dtype=torch.complex64, generator=torch.Generator().manual_seed(2))
     data = torch.cat([turned(recording.signal.data, phase), noise])
-    found = path_autofocus(data, frequency, antennas, **QUICK)
+    found = path_phase(data, frequency, antennas, **QUICK)
     error = phase_rmse(found["phase_rad"][:2], phase)
     assert found.ok.tolist() == [True, True, False] and bool((error < 0.2).all())
     std = found.std["phase_rad"][:2].square().mean(-1).sqrt()
@@ -74,7 +78,7 @@ def test_trials_with_paths_of_their_own_equal_singles() -> None:
     place = recording.aux["transmitter_m"] + torch.tensor([0.0, 0.05], dtype=F64)[:, None, None]
     signal = recording.signal.with_data(turned(recording.signal.data, phase))
     known = {"frequency_hz": frequency, "path_reference_m": recording.aux["path_reference_m"]}
-    stage = PathAutofocus(search=4, polish=1)
+    stage = PathPhase(search=4, polish=1)
     both = stage(signal, transmitter_m=place, **known)
     one = stage(signal.with_data(signal.data[1]), transmitter_m=place[1], **known)
     assert both["phase_rad"].shape == (2, PULSES) and both.ok.shape == (2,)
@@ -86,6 +90,85 @@ def test_paths_without_a_turn_and_other_sizes_are_refused() -> None:
     frequency, antennas = recording.aux["frequency_hz"], path_of(recording)
     still = AntennaPath(antennas.transmitter_m[:1].expand(PULSES, 3), None, antennas.reference_m)
     with pytest.raises(ValueError, match="a line of sight that turns"):
-        path_autofocus(recording.signal.data, frequency, still)
+        path_phase(recording.signal.data, frequency, still)
     with pytest.raises(ValueError, match=r"profiles \(..., pulse, range\) of \(64, 64\), got \(1, 63, 64\)"):
-        path_autofocus(recording.signal.data[:, 1:], frequency, antennas)
+        path_phase(recording.signal.data[:, 1:], frequency, antennas)
+
+
+def with_navigation(trials: int, error_m: float, snr_db: float = 10.0) -> tuple[Recording, Recording, torch.Tensor]:
+    """Recordings along a path that errs by random walks and along the true one, and the errors."""
+    walk = [RandomWalk(error_m * math.sqrt(6), 1 / PULSES)]
+    world = PathWorld(RandomPoints(20, 20.0, 16.0), FLIGHT, None, Navigation(Sway(walk, walk, walk)), snr_db=snr_db)
+    recording, truth = simulate_path(RADAR, world, PULSES, CELLS, Draws(5, trials=range(trials)), dtype=torch.complex64)
+    assert truth.clean is not None
+    return recording, truth.clean, truth.values["line_of_sight_m"]
+
+
+def test_paths_that_err_by_a_wavelength_give_the_image_of_the_true_path() -> None:
+    recording, clean, true_m = with_navigation(1, 0.03)
+    recording = replace(recording, signal=recording.signal.with_data(recording.signal.data.clone()))
+    present = torch.arange(PULSES) != 20
+    recording.signal.data[:, ~present] = 0
+    known = {name: recording.aux[name] for name in ("frequency_hz", "transmitter_m", "path_reference_m")}
+    found = PathAutofocus(rounds=2)(recording.signal, **known)
+    radians = 4 * math.pi / RADAR.wavelength_m
+    error = phase_rmse(radians * found["line_of_sight_m"], radians * true_m, present[None])
+    assert found.ok.all() and bool((error < 0.15).all()), error
+    assert found["offset_m"].shape == (1, PULSES, 3)
+    image = TileImage(20.0, 20.0, 0.25, window="hann")
+    moved = CorrectPath()(recording.signal, found["offset_m"], known["transmitter_m"])["transmitter_m"]
+    images = [
+        image(signal, **{**known, "transmitter_m": place}).data
+        for signal, place in (
+            (clean.signal.with_data(clean.signal.data * present[:, None]), clean.aux["transmitter_m"]),
+            (recording.signal, moved),
+            (recording.signal, known["transmitter_m"]),
+        )
+    ]
+    after, before = (registered_error_db(x, images[0].expand_as(x)) for x in images[1:])
+    assert bool((after < -10).all()) and bool((before > -3).all()), (before, after)
+
+
+def test_noise_and_too_few_pulses_are_not_ok() -> None:
+    recording = recorded(1)
+    frequency, some = recording.aux["frequency_hz"], slice(0, 24)
+    whole = path_of(recording)
+    antennas = AntennaPath(whole.transmitter_m[..., some, :], None, whole.reference_m[..., some])
+    noise = torch.randn(2, 24, CELLS, dtype=torch.complex64, generator=torch.Generator().manual_seed(2))
+    noise[1, 5:] = 0
+    found = path_autofocus(noise, frequency, antennas, rounds=1)
+    assert found.ok.tolist() == [False, False]
+    assert all(bool(torch.isfinite(x).all()) for x in (*found.value.values(), *found.std.values(), found.quality))
+    with pytest.raises(ValueError, match="extent_m must be positive and finite, got -1"):
+        path_autofocus(noise, frequency, antennas, extent_m=-1.0)
+
+
+def test_fringes_of_a_smooth_line_of_sight_are_found() -> None:
+    fringe, time = 0.0156, torch.arange(200, dtype=F64)
+    true = torch.stack([0.2 * torch.sin(0.05 * time), 0.1 * torch.cos(0.08 * time)])
+    made = torch.Generator().manual_seed(3)
+    carrier = (
+        true
+        + 4e-4 * torch.randn(2, 200, dtype=F64, generator=made)
+        + fringe * torch.randint(-9, 9, (2, 200), generator=made)
+    )
+    rough = roughness(carrier, fringe)
+    assert bool((rough < 0.5).all()) and bool((roughness(100 * carrier, fringe) > 0.8).all())
+    near = true + fringe * torch.randn(2, 200, dtype=F64, generator=made)
+    found = smooth_near(carrier, near, fringe, 2 * fringe, rough * fringe / math.sqrt(12))
+    assert float((found - true).abs().max()) < fringe / 4
+    line = (smoothest(carrier, fringe) - true).diff(n=2, dim=-1)
+    assert float(line.abs().max()) < fringe / 2
+
+
+def test_an_envelope_that_drifts_against_the_phases_is_found() -> None:
+    recording = recorded(1)
+    frequency = recording.aux["frequency_hz"]
+    imaging = ground_image(frequency, path_of(recording), 0.0)
+    drift = 0.3 * torch.linspace(-1, 1, PULSES, dtype=F64)
+    fringe = RADAR.wavelength_m / 2
+    rows = recording.signal.data[0].to(torch.complex64)
+    late = moved(rows, frequency, -drift)
+    back = unit_phasor(-drift[:, None] * 2 * frequency.mean() / 299792458.0, late.dtype)  # keeps the carrier
+    found = drift_m(late * back, frequency, imaging, slopes=True)
+    assert float((found - drift).square().mean().sqrt()) < fringe

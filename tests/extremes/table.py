@@ -768,9 +768,13 @@ REASONS = {
     "echo.stripmap_echo": "the echo of simulate, which is in the table",
     "echo.target_energy": "works on the truth of a simulation",
     "echo.turntable_echo": "the echo of simulate_turntable, which is in the table",
-    "compensate.path_autofocus": "compensate.autofocus, which is in the table, through tiles; tests/compensate/"
+    "compensate.path_autofocus": "needs a path; tests/compensate/test_path_autofocus.py",
+    "compensate.path_phase": "compensate.autofocus, which is in the table, through tiles; tests/compensate/"
     "test_path_autofocus.py",
+    "compensate.CorrectPath": "subtracts positions",
     "compensate.PathAutofocus": "the stage of compensate.path_autofocus",
+    "compensate.PathPhase": "the stage of compensate.path_phase",
+    "metrics.line_of_sight_bound_m": "works on a scene of scatterers; tests/metrics/test_path_bounds.py",
     "compensate.range_error": "integrates an estimate by integrated_range, which is in the table",
     "compensate.turning_points": "reads an axis that the radar has made",
     "multichannel.multichannel_limits": "checks its use of the radar; tests/multichannel/test_requirements.py",

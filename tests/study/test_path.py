@@ -67,6 +67,7 @@ def test_packaged_configs_work_at_reduced_size(config: str) -> None:
     ]
     if config == "airborne_spotlight":
         small += ["processor.recorded.stages.image.azimuth_m=6.0", "processor.recorded.stages.image.range_m=6.0"]
+        small += ["processor.recommended.stages.autofocus.extent_m=12.0", "world.pulses=96"]
     small += ["world.scene.field.count=20", "world.trials=1", "world.scene.corners.amplitude=null"]
     bench = Bench(next(iter(cases_of(load(config, small)).values())))
     if config == "drone_stripmap":

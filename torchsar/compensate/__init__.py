@@ -23,7 +23,7 @@ from torchsar.compensate.envelope import (
     refine_alignment,
     shift_range,
 )
-from torchsar.compensate.path_autofocus import PathAutofocus, path_autofocus
+from torchsar.compensate.path import CorrectPath, PathAutofocus, PathPhase, path_autofocus, path_phase
 from torchsar.compensate.point import PointDoppler, doppler_at, peak_time_s
 from torchsar.compensate.pulse_phase import (
     Autofocus,
@@ -112,6 +112,7 @@ __all__ = [
     "Chirplets",
     "CoarseRotation",
     "CompensateMotion",
+    "CorrectPath",
     "CorrectPulsePhase",
     "DopplerCentroid",
     "EffectiveVelocity",
@@ -126,6 +127,7 @@ __all__ = [
     "MirrorProduct",
     "MlPeak",
     "PathAutofocus",
+    "PathPhase",
     "Pga",
     "PgaSca",
     "PhaseFitRotation",
@@ -181,6 +183,7 @@ __all__ = [
     "ml_peak",
     "newton_rotation",
     "path_autofocus",
+    "path_phase",
     "peak_time_s",
     "pga",
     "pga_sca",

@@ -26,6 +26,7 @@ class TileOperator:
                 f"{tuple(plan.antennas.trials)}; make one operator for each path"
             )
         self.plan = plan
+        self._graph: tuple[Tensor, Tensor] | None = None
 
     def image(self, rows: Tensor) -> Tensor:
         """Form the image of range profiles.
@@ -42,13 +43,18 @@ class TileOperator:
     def adjoint(self, image: Tensor) -> Tensor:
         """Apply the adjoint of `image`, by automatic differentiation.
 
+        The graph of the last number of trials is kept: it does not depend on the image.
+
         Args:
             image: Image, shape (trial, i, j), complex.
 
         Returns:
             Range profiles, shape (trial, pulse, range).
         """
-        size = (self.plan.antennas.pulses, len(self.plan.frequency_hz))
-        with torch.enable_grad():
-            rows = image.detach().new_zeros(image.shape[0], *size).requires_grad_()
-            return torch.autograd.grad(self.image(rows), rows, image.detach())[0]
+        size = (image.shape[0], self.plan.antennas.pulses, len(self.plan.frequency_hz))
+        if self._graph is None or (self._graph[0].shape, self._graph[0].dtype) != (size, image.dtype):
+            with torch.enable_grad():
+                rows = image.detach().new_zeros(size).requires_grad_()
+                self._graph = rows, self.image(rows)
+        rows, of_rows = self._graph
+        return torch.autograd.grad(of_rows, rows, image.detach(), retain_graph=True)[0]

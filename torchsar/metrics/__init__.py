@@ -19,6 +19,7 @@ from torchsar.metrics.ladar_bounds import (
     velocity_known_offset_bound_m_s,
     velocity_segmented_bound_m_s,
 )
+from torchsar.metrics.path_bounds import line_of_sight_bound_m
 from torchsar.metrics.phase import phase_rmse, residual_phase, strehl
 from torchsar.metrics.replicas import azimuth_response, replica_level, replica_zones
 from torchsar.metrics.rotation_bounds import rotation_bounds
@@ -36,6 +37,7 @@ __all__ = [
     "half_width_ratio",
     "impulse_response",
     "integrated_range_detrended_bound_m",
+    "line_of_sight_bound_m",
     "phase_rmse",
     "pulse_phase_bound_of_scene_rad",
     "pulse_phase_bound_rad",

@@ -199,6 +199,8 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "link_phases": compensate.LinkPhases,
     "autofocus": compensate.TargetAutofocus,
     "path_autofocus": compensate.PathAutofocus,
+    "path_phase": compensate.PathPhase,
+    "path_correct": compensate.CorrectPath,
     "pulse_phase_correct": compensate.CorrectPulsePhase,
     "segmented_interference": compensate.SegmentedInterference,
     "mirror_product": compensate.MirrorProduct,

@@ -50,8 +50,8 @@ class AnyPath(System):
         "linear phase over the image and the complex gain g that fit best, which autofocus cannot observe; in `trade`: "
         "of the image of white noise, without registration, relative to the direct sum over the same pulses",
         "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
-        "corrected minus true, without constant and linear terms; modulo half a wavelength where phases of pulses are "
-        "corrected",
+        "corrected minus true, without constant and linear terms; modulo half a wavelength where the path or phases of "
+        "pulses are corrected",
         "image_shift_m": "mean displacement of the named points, which autofocus cannot observe, m",
         "position_error_rms_m": "rms over the named points of the distance of the peak from the true position, without "
         "the common shift of all points, m",
@@ -97,6 +97,8 @@ class AnyPath(System):
         count = len(judged.metrics["path_residual_rms_m"])
         error = registered_error_db(*(signal.data for signal in signals)).expand(count)
         return replace(judged, metrics={**judged.metrics, "image_error_db": error})
+
+    bounds = staticmethod(judging.bounds)  # pyright: ignore[reportAssignmentType]
 
     def choices(self, bench: Bench) -> Sequence[Choice]:
         stages = bench.chains["recommended"].stages.values()

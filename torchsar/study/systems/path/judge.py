@@ -10,9 +10,10 @@ from torch import Tensor
 
 from torchsar.core import Chain, Signal, Trace, per_trial
 from torchsar.focus import PathImage
-from torchsar.metrics import contrast, entropy, impulse_response, residual_phase
+from torchsar.metrics import contrast, entropy, impulse_response, line_of_sight_bound_m, residual_phase
+from torchsar.radar import AntennaPath
 from torchsar.study.systems.isal.judge import estimated_phase, received
-from torchsar.study.trials.batch import IMAGE, Judged, Metrics, Trials
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Metrics, Trials
 from torchsar.study.trials.bench import Bench
 
 # metrics of a point that are reported
@@ -22,6 +23,8 @@ _OF_POINT = (
 )
 # half width of the search for a point, by choice; less if another point is near
 _SEARCH_M = 5.0
+# most pulses * samples * scatterers for which a bound is computed, by choice: some seconds
+_MOST_WORK = 10_000_000
 
 
 def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
@@ -48,8 +51,8 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -
 def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, clean: bool) -> Tensor:
     """Return the error of the line of sight (m) that a chain leaves, (trial, pulse).
 
-    It has no constant and linear terms, which only shift the image. Where the chain corrects phases
-    of pulses it is known modulo half a wavelength.
+    It has no constant and linear terms, which only shift the image. Where the chain estimates it or
+    phases of pulses it is known modulo half a wavelength.
     """
     data = trials.recording.signal.data
     pulses = (trials.count, data.shape[-2])
@@ -57,13 +60,43 @@ def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, 
     true = sum((x.expand(pulses) for x in parts), torch.zeros(pulses, dtype=torch.float64, device=data.device))
     phases = [x for key, x in trials.truth.items() if key.endswith(".phase_rad") and not clean]
     radians = 4 * math.pi / wavelength_m
-    if phases or any("phase_rad" in uses for uses in chain.uses.values()):
+    of_path = [e.value["line_of_sight_m"] for e in trace.estimates.values() if "line_of_sight_m" in e.value]
+    if phases or of_path or any("phase_rad" in uses for uses in chain.uses.values()):
         # a recorded range that is too long leaves a positive phase
         whole = radians * true + sum((x.reshape(pulses) for x in phases), torch.zeros_like(true))
-        return residual_phase(estimated_phase(chain, trace, whole), whole, received(trials)) / radians
+        found = estimated_phase(chain, trace, whole)
+        found = found + radians * sum((x.reshape(pulses) for x in of_path), torch.zeros_like(true))
+        return residual_phase(found, whole, received(trials)) / radians
     time = torch.linspace(-1, 1, pulses[1], dtype=torch.float64, device=data.device)
     slope = (true * time).sum(-1, keepdim=True) / time.square().sum()
     return -(true - true.mean(-1, keepdim=True) - slope * time)
+
+
+def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
+    """Return the Cramer-Rao bound of the line of sight, (trial,); nothing for large or recorded
+    scenes and for data without noise.
+    """
+    truth, count = batch.trials.truth, batch.trials.count
+    std = truth.get("noise_std")
+    if bench.recording is not None or std is None or not bool((std > 0).all()):
+        return {}
+    x, y, z, amplitude = (truth[name] for name in ("range_m", "azimuth_m", "height_m", "amplitude"))
+    aux = batch.trials.clean.aux
+    antennas = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
+    if antennas.pulses * len(aux["frequency_hz"]) * x.shape[-1] > _MOST_WORK or bench.world().beam is not None:
+        return {}
+
+    def of(value: Tensor, i: int, behind: int) -> Tensor:
+        return value.expand(count, *value.shape[value.ndim - behind :])[i]
+
+    found = []
+    for i in range(count):
+        receiver = None if antennas.receiver_m is None else of(antennas.receiver_m, i, 2)
+        one = AntennaPath(of(antennas.transmitter_m, i, 2), receiver, of(antennas.reference_m, i, 1))
+        points = torch.stack([of(v, i, 1) for v in (x, y, z)], -1)
+        noise = float(of(std, i, 0))
+        found.append(line_of_sight_bound_m(aux["frequency_hz"], one, points, of(amplitude, i, 1), noise))
+    return {"path_residual_rms_m": {"Cramer-Rao": torch.stack(found)}}
 
 
 def _positions(targets: Mapping[str, Metrics]) -> dict[str, Tensor]:

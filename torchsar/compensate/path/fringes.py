@@ -1,0 +1,91 @@
+"""Whole half wavelengths of the line of sight: fringes, which the phases of pulses leave open."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def fringe_error(x_m: Tensor, fringe_m: float) -> Tensor:
+    """Reduce lengths to the nearest fringe, to -fringe_m / 2..fringe_m / 2.
+
+    Args:
+        x_m: Lengths in metres, any shape.
+        fringe_m: Half a wavelength in metres.
+
+    Returns:
+        Lengths in metres, same shape.
+    """
+    return x_m - fringe_m * torch.round(x_m / fringe_m)
+
+
+def roughness(carrier_m: Tensor, fringe_m: float) -> Tensor:
+    """Measure the bends of the line of sight from pulse to pulse, as far as phases show them.
+
+    Args:
+        carrier_m: Line of sight in metres, known modulo fringes, shape (..., pulse).
+        fringe_m: Half a wavelength in metres.
+
+    Returns:
+        Rms of the second differences, reduced to the nearest fringe, over that of arbitrary ones,
+        shape (...,): 1 for rough motion, which says nothing about fringes.
+    """
+    bends = fringe_error(carrier_m.diff(n=2, dim=-1), fringe_m)
+    return bends.square().mean(-1).sqrt() * (math.sqrt(12) / fringe_m)
+
+
+def smoothest(carrier_m: Tensor, fringe_m: float) -> Tensor:
+    """Choose fringes so that all second differences are below half a fringe.
+
+    Args:
+        carrier_m: Line of sight in metres, known modulo fringes, shape (..., pulse).
+        fringe_m: Half a wavelength in metres.
+
+    Returns:
+        Line of sight in metres, up to a constant and a linear term, shape (..., pulse).
+    """
+    bends = fringe_error(carrier_m.diff(n=2, dim=-1), fringe_m)
+    first = fringe_error(carrier_m[..., 1:2] - carrier_m[..., :1], fringe_m)
+    steps = torch.cat([first, first + bends.cumsum(-1)], -1)
+    return torch.cat([carrier_m[..., :1], carrier_m[..., :1] + steps.cumsum(-1)], -1)
+
+
+def smooth_near(
+    carrier_m: Tensor, near_m: Tensor, fringe_m: float, near_std_m: float, bend_std_m: Tensor, reach: int = 6
+) -> Tensor:
+    """Choose fringes of a smooth line of sight, given a rough measurement of it.
+
+    The Viterbi algorithm minimises the sum of the squared differences from the measurement and of
+    the squared second differences, each over its variance.
+
+    Args:
+        carrier_m: Line of sight in metres, known modulo fringes, shape (trial, pulse).
+        near_m: Measured line of sight in metres, shape (trial, pulse).
+        fringe_m: Half a wavelength in metres.
+        near_std_m: Standard deviation of the measurement in metres.
+        bend_std_m: Standard deviation of the second differences in metres, shape (trial,).
+        reach: Largest number of fringes from the measurement.
+
+    Returns:
+        Line of sight in metres, shape (trial, pulse).
+    """
+    n = fringe_m * torch.arange(-reach, reach + 1, dtype=carrier_m.dtype, device=carrier_m.device)
+    places = (carrier_m + fringe_m * torch.round((near_m - carrier_m) / fringe_m))[..., None] + n
+    far = ((places - near_m[..., None]) / near_std_m).square()
+    weight = bend_std_m.clamp_min(1e-3 * fringe_m)[:, None, None, None].square().reciprocal()
+    cost, back = far[:, 0, :, None] + far[:, 1, None, :], []  # (trial, last but one, last)
+    for p in range(2, places.shape[1]):
+        here, before, earlier = (places[:, p - i] for i in range(3))
+        bend = here[:, None, None] - 2 * before[:, None, :, None] + earlier[:, :, None, None]
+        total, chosen = (cost[..., None] + weight * bend.square()).min(1)
+        cost = total + far[:, p, None, :]
+        back.append(chosen)
+    size = len(n)
+    best = cost.flatten(1).argmin(-1)
+    path = [best % size, best // size]
+    rows = torch.arange(len(cost), device=cost.device)
+    for chosen in reversed(back):
+        path.append(chosen[rows, path[-1], path[-2]])
+    return places.gather(-1, torch.stack(path[::-1], -1)[..., None])[..., 0]

@@ -1,0 +1,153 @@
+"""The ground that autofocus images along a path, and the paths of single trials."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Estimate
+from torchsar.focus import ImageGrid, TileOperator, TilePlan
+from torchsar.radar import LIGHT_M_S, AntennaPath
+from torchsar.radar.spotlight import frequency_step_hz
+
+# pixel spacing in resolution cells, by choice: images are sampled above their bandwidth
+STEP = 0.7
+# error of the images in dB, by choice: far below what noise and side lobes leave
+_ERROR_DB = -40.0
+
+
+def trials_of(name: str, profiles: Tensor, frequency_hz: Tensor, antennas: AntennaPath) -> torch.Size:
+    """Return the leading dimensions of profiles and paths.
+
+    Args:
+        name: Name of the calling function, for the message.
+        profiles: Range profiles, shape (..., pulse, range).
+        frequency_hz: Frequencies in Hz, shape (range,).
+        antennas: Recorded path.
+
+    Returns:
+        The leading dimensions to which they broadcast.
+
+    Raises:
+        ValueError: If the sizes do not match.
+    """
+    size = antennas.pulses, len(frequency_hz)
+    if profiles.shape[-2:] != size:
+        raise ValueError(f"{name} needs profiles (..., pulse, range) of {size}, got {tuple(profiles.shape)}")
+    return torch.broadcast_shapes(profiles.shape[:-2], antennas.trials)
+
+
+def path_of(antennas: AntennaPath, trials: tuple[int, ...], index: tuple[int, ...]) -> AntennaPath:
+    """Return the path of one trial.
+
+    Args:
+        antennas: Paths.
+        trials: Leading dimensions to which they broadcast; () for those that they have.
+        index: Number of the trial in each of them.
+
+    Returns:
+        The path, without leading dimensions.
+    """
+
+    def of(x: Tensor, behind: int) -> Tensor:
+        lead = trials or tuple(antennas.trials)
+        return x.expand(*lead, *x.shape[x.ndim - behind :])[index]
+
+    receiver = None if antennas.receiver_m is None else of(antennas.receiver_m, 2)
+    return AntennaPath(of(antennas.transmitter_m, 2), receiver, of(antennas.reference_m, 1))
+
+
+def for_each(
+    find: Callable[[Tensor, AntennaPath], Estimate], profiles: Tensor, antennas: AntennaPath, trials: torch.Size
+) -> Estimate:
+    """Join the estimates of single trials; each has a plan of its own, whose image fills the cache.
+
+    Args:
+        find: Estimator of one trial, given its profiles (pulse, range) and its path.
+        profiles: Range profiles, shape (..., pulse, range).
+        antennas: Paths.
+        trials: Leading dimensions of the result.
+
+    Returns:
+        Estimate of all trials, with the leading dimensions.
+    """
+    data = profiles.expand(*trials, *profiles.shape[-2:])
+    every = itertools.product(*map(range, trials))
+    found = [find(data[index], path_of(antennas, tuple(trials), index)) for index in every]
+
+    def joined(parts: list[Tensor]) -> Tensor:
+        return torch.stack(parts).reshape((*trials, *parts[0].shape))
+
+    return Estimate(
+        {key: joined([one.value[key] for one in found]) for key in found[0].value},
+        joined([one.quality for one in found]),
+        joined([one.ok for one in found]),
+        {key: joined([one.std[key] for one in found]) for key in found[0].std},
+        {key: joined([one.info[key] for one in found]) for key in found[0].info},
+    )
+
+
+def sights(antennas: AntennaPath, height_m: float = 0.0) -> Tensor:
+    """Return the direction in which positions lengthen half the path over the middle of the scene.
+
+    Args:
+        antennas: Path.
+        height_m: Height z of the middle in metres.
+
+    Returns:
+        Gradient of half the path by the position of the antennas, which move together, (..., pulse,
+        3); a unit vector if they share one place.
+    """
+    middle = antennas.transmitter_m.new_tensor([0.0, 0.0, height_m])
+    ways = [place - middle for place in antennas.places]
+    units = [way / torch.linalg.vector_norm(way, dim=-1, keepdim=True) for way in ways]
+    return torch.stack(torch.broadcast_tensors(*units)).mean(0)
+
+
+def ground_image(
+    frequency_hz: Tensor, antennas: AntennaPath, height_m: float, extent_m: float | None = None
+) -> TileOperator:
+    """Return the image of the ground about the origin, for one path.
+
+    Its second axis is that of the range. Pixels are 0.7 of a resolution cell apart.
+
+    Args:
+        frequency_hz: Frequencies in Hz, float64 (range,).
+        antennas: Path of one trial.
+        height_m: Height z of the ground in metres.
+        extent_m: Side of the imaged square in metres; None for all of the unambiguous ground.
+
+    Returns:
+        Image formation of range profiles, with its adjoint.
+
+    Raises:
+        ValueError: If the line of sight does not turn over the ground.
+    """
+    middle = torch.zeros(3, dtype=torch.float64, device=frequency_hz.device)
+    middle[2] = height_m
+    with torch.no_grad():
+        slope = -2 * sights(antennas, height_m)[:, :2]  # change of the path per metre, (pulse, 2)
+        away = slope.mean(0)
+        steep = float(torch.linalg.vector_norm(away))
+        across = torch.stack([-away[1], away[0]]) / max(steep, 1e-300)
+        turn = slope @ across
+        span, step = float(turn.max() - turn.min()), float(turn.diff().abs().mean())
+    band = float(frequency_hz[-1] - frequency_hz[0])
+    wavelength = LIGHT_M_S / float(frequency_hz.mean())
+    if not (span > 0 and steep > 0):
+        raise ValueError("autofocus of a path needs a line of sight that turns over the ground; the path has none")
+    extent = wavelength / step, LIGHT_M_S / (frequency_step_hz(frequency_hz) * steep)
+    if extent_m is not None:
+        extent = min(extent[0], extent_m), min(extent[1], extent_m)
+    spacing = STEP * min(wavelength / span, LIGHT_M_S / (band * steep))
+    counts = tuple(max(2, math.ceil(x / spacing)) for x in extent)
+    axes = torch.zeros(2, 3, dtype=torch.float64, device=frequency_hz.device)
+    axes[0, :2], axes[1, :2] = across, away / steep
+    corner = middle - spacing * sum(n // 2 * axis for n, axis in zip(counts, axes, strict=True))
+    grid = ImageGrid(corner, axes, (counts[0], counts[1]), spacing)
+    places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
+    return TileOperator(TilePlan(frequency_hz, *places, grid, _ERROR_DB))

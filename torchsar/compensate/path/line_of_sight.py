@@ -1,0 +1,284 @@
+"""Autofocus of a path: one line-of-sight range per pulse, which moves phases and envelopes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.path.axes import three_axes
+from torchsar.compensate.path.envelopes import drift_m, matched_m, moved
+from torchsar.compensate.path.fringes import roughness, smooth_near, smoothest
+from torchsar.compensate.path.ground import STEP, for_each, ground_image, trials_of
+from torchsar.compensate.pulse_phase.data import without_line
+from torchsar.compensate.pulse_phase.imaging import Through
+from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.sharpen import Run, Weights, fixed_point, weighted
+from torchsar.compensate.pulse_phase.verdict import (
+    LEAST_ROWS,
+    LEAST_STREHL,
+    sharpness_beyond_speckle,
+    sharpness_of_noise,
+)
+from torchsar.core import Estimate, checked_samples, cis, real_dtype
+from torchsar.focus import TileOperator
+from torchsar.focus.spotlight import window_weights
+from torchsar.metrics import entropy
+from torchsar.radar import LIGHT_M_S, AntennaPath
+from torchsar.radar.antenna_path import refuse_unusable
+from torchsar.radar.spotlight import frequency_samples, range_profiles
+
+# share of the band of the first phases: envelopes that err by some range cells then matter little
+_FIRST_BAND = 0.25
+# rounds of the search, which end when the line of sight changes by less, rms, in fringes
+_ROUNDS, _SETTLED_FRINGES = 6, 1.0
+# largest errors of the envelopes that the rounds of the search correct, in range cells, by trial
+_REACH_CELLS = (4.0, 2.0, 0.5)
+# share of the band in the rounds of the search
+_BANDS = (0.5, 1.0, 1.0)
+# roughness below which fringes are those of a smooth line of sight, and standard deviation in
+# fringes of a measurement by envelopes: 0.3 to 0.6 for smooth errors, 1.0 for random walks
+_ROUGH, _NEAR_FRINGES = 0.75, 2.0
+# least weight of the window over pulses
+_LEAST_WEIGHT = 0.1
+# iterations of the fixed points, by trial, and phase step at which they end
+_COARSE, _FINE, _TOLERANCE_RAD = 30, 12, 0.03
+# fewest pulses
+_LEAST_PULSES = 8
+# factor by which the sharpness must exceed that of noise: more than for the phases of pulses, 1.5,
+# because envelopes and three axes are free too
+_MARGIN = 2.0
+
+
+def path_autofocus(
+    profiles: Tensor,
+    frequency_hz: Tensor,
+    antennas: AntennaPath,
+    *,
+    extent_m: float | None = None,
+    height_m: float = 0.0,
+    rounds: int = 4,
+) -> Estimate:
+    """Estimate the error of the recorded line of sight of each pulse, with whole fringes.
+
+    The recommended autofocus of antennas on any path, for spotlight scenes. Its steps:
+
+    1. Phases of the pulses, from the phases between adjacent pulses (`sca`), sharpen images of a
+       quarter of the band by iterations through the adjoint of the image formation.
+    2. Phases become ranges. If their second differences show a smooth motion, its fringes follow
+       from the phases, otherwise each pulse takes the range at which its envelope and its phase
+       match the sharpened image best. In up to six rounds with more of the band, envelopes move
+       too.
+    3. Envelopes may still drift slowly against the phases: polynomials of time that lower the
+       entropy while the phases of the carrier are kept; the drift is added in whole fringes.
+    4. Three axes, without windows: the phases of nine blocks of the image, against an estimate of
+       the scene that fits the samples, refine the line of sight. Errors across it, which act
+       differently over the scene, follow with a ridge: their spectrum is taken to be that of the
+       motion along the line of sight.
+
+    Not observable are a constant and a linear term, which move the image; they are zero in the
+    result. The fringes of rough errors are known as well as envelopes are, that is in part, so that
+    the result is to be judged modulo half a wavelength. Trials have plans of their own and are
+    processed one after another.
+
+    Args:
+        profiles: Range profiles, the unitary centred inverse FFT of a phase history, shape (...,
+            pulse, range), complex. Pulses that hold only zeros are left out; their errors are
+            interpolated.
+        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (range,).
+        antennas: Recorded path of the antennas, of all trials or of each of them. The scene is
+            about the origin.
+        extent_m: Side of the imaged square about the origin in metres, which should hold most of
+            the scatterers; by default that of the whole unambiguous ground, which takes longer.
+        height_m: Height z of the imaged plane in metres.
+        rounds: Rounds of the last step.
+
+    Returns:
+        `line_of_sight_m` of shape (..., pulse), float64: half the path over the middle of the
+        scene, recorded minus true; and `offset_m` of shape (..., pulse, 3): the error of the
+        positions, of both antennas alike, for `CorrectPath`. The standard deviation of the line of
+        sight is that modulo half a wavelength, from what a Wiener estimate of the scene leaves of
+        the samples. `quality` is the Strehl ratio predicted from it, times the share of the
+        sharpness that noise does not explain. `ok` is False unless the image is twice as sharp as
+        autofocus can make pure noise, more than one range cell makes the sharpness, and that
+        Strehl ratio exceeds 0.8. `info` holds "roughness" (about 1 if the fringes come from single
+        envelopes, less for smooth motions) and "entropy_nats" of the image, shape (...,).
+
+    Raises:
+        TypeError: If the profiles are not complex, or frequencies are not float64.
+        ValueError: If sizes do not match, values are not finite, or the line of sight does not
+            turn.
+    """
+    profiles = checked_samples(profiles, "path_autofocus", "pulse, range")
+    refuse_unusable(frequency_hz=frequency_hz)
+    trials = trials_of("path_autofocus", profiles, frequency_hz, antennas)
+    if extent_m is not None and not 0 < extent_m < math.inf:
+        raise ValueError(f"extent_m must be positive and finite, got {extent_m}")
+
+    @torch.no_grad()
+    def find(rows: Tensor, one: AntennaPath) -> Estimate:
+        operator = ground_image(frequency_hz, one, height_m, extent_m)
+        found = _nothing(rows)
+        present = (rows.real.square() + rows.imag.square()).sum(-1) > 0
+        if int(present.sum()) >= _LEAST_PULSES:
+            if not bool(present.all()):
+                operator = ground_image(frequency_hz, _only(one, present), height_m, extent_m)
+            some = rows[present]
+            some = some / some.abs().amax()
+            found = _Search(some, frequency_hz, operator, rounds).judged()
+            found = _spread(found, present)
+        return found
+
+    return for_each(find, profiles, antennas, trials)
+
+
+def _only(antennas: AntennaPath, present: Tensor) -> AntennaPath:
+    """The path of the pulses that are present."""
+    receiver = None if antennas.receiver_m is None else antennas.receiver_m[present]
+    return AntennaPath(antennas.transmitter_m[present], receiver, antennas.reference_m[present])
+
+
+def _nothing(rows: Tensor) -> Estimate:
+    """The estimate of a trial with too few pulses."""
+    zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
+    none = zero.new_zeros(())
+    info = {"roughness": none + 1, "entropy_nats": none}
+    value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
+    return Estimate(value, none, none > 0, {"line_of_sight_m": zero + 1}, info)
+
+
+def _spread(found: Estimate, present: Tensor) -> Estimate:
+    """The estimate of all pulses from that of those which are present."""
+    at = present.nonzero()[:, 0]
+    every = torch.arange(len(present), device=present.device)
+    high = torch.searchsorted(at, every).clamp(1, len(at) - 1)
+    share = ((every - at[high - 1]) / (at[high] - at[high - 1])).clamp(0, 1).double()
+
+    def of(x: Tensor) -> Tensor:
+        part = share.reshape(-1, *(1,) * (x.ndim - 1))
+        return x[high - 1] * (1 - part) + x[high] * part
+
+    value = {name: of(x) for name, x in found.value.items()}
+    return Estimate(value, found.quality, found.ok, {name: of(x) for name, x in found.std.items()}, found.info)
+
+
+def _intensity(power: Tensor, mean: Tensor) -> Tensor:
+    """Weights of image cells that sharpen by the sum of the squared intensity."""
+    return power / mean
+
+
+def _surprise(power: Tensor, mean: Tensor) -> Tensor:
+    """Weights of image cells that sharpen by the entropy, of those that are above its level."""
+    share = power / (mean * (power.shape[-1] * power.shape[-2]))
+    log = torch.log(share.clamp_min(torch.finfo(share.dtype).tiny))
+    return (log - (share * log).sum((-2, -1), keepdim=True)).clamp_min(0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search of one trial.
+
+    Args:
+        rows: Range profiles of the pulses that are present, (pulse, range).
+        frequency_hz: Frequencies.
+        imaging: Image formation along their recorded path.
+        rounds: Rounds of the last step.
+    """
+
+    rows: Tensor
+    frequency_hz: Tensor
+    imaging: TileOperator
+    rounds: int
+
+    @property
+    def _fringe_m(self) -> float:
+        return LIGHT_M_S / (2 * float(self.frequency_hz.mean()))
+
+    def metres(self, phase_rad: Tensor) -> Tensor:
+        return phase_rad.double() * (self._fringe_m / (2 * math.pi))
+
+    def line_free(self, range_m: Tensor) -> Tensor:
+        return without_line(range_m, torch.ones_like(range_m, dtype=torch.bool))
+
+    def windowed(self, share: float) -> Tensor:
+        """Profiles with Hann windows over pulses and over a share of the band."""
+        pulses, n = self.rows.shape
+        real = real_dtype(self.rows.dtype)
+        k = torch.linspace(-1, 1, n, dtype=torch.float64, device=self.rows.device) / share
+        over_band = torch.where(k.abs() < 1, (1 + torch.cos(math.pi * k)) / 2, 0).to(real)
+        over_pulses = window_weights("hann", pulses, self.rows.device).to(real).clamp_min(_LEAST_WEIGHT)
+        samples = frequency_samples(self.rows) * (over_pulses[:, None] * over_band)
+        return range_profiles(samples)
+
+    def sharpened(
+        self, rows: Tensor, range_m: Tensor, runs: list[tuple[Weights, int, float]], start: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Phases that sharpen the image of rows at a line of sight, and the corrected rows."""
+        at = moved(rows, self.frequency_hz, range_m)
+        columns = at.mT[None].contiguous()
+        phase = torch.zeros_like(columns[:, 0].real) if start is None else start[None]
+        for weights, count, tolerance in runs:
+            phase = fixed_point(columns, phase, Run(weights, Through(self.imaging), count, 1.0, tolerance))[0]
+        return phase[0], at
+
+    def search(self) -> tuple[Tensor, Tensor]:
+        """Line of sight before the last step, and its roughness."""
+        cell = LIGHT_M_S / (2 * float(self.frequency_hz[-1] - self.frequency_hz[0]))
+        range_m = torch.zeros(len(self.rows), dtype=torch.float64, device=self.rows.device)
+        both: list[tuple[Weights, int, float]] = [
+            (_intensity, _COARSE, _TOLERANCE_RAD),
+            (_surprise, _FINE, _TOLERANCE_RAD),
+        ]
+        rows = self.windowed(_FIRST_BAND)
+        columns = rows.mT[None]
+        start = pair_phase(columns, torch.ones_like(columns[:, 0].real, dtype=torch.bool))[0]
+        phase, _ = self.sharpened(rows, range_m, both, start)
+        carrier = self.metres(phase)
+        rough = roughness(carrier, self._fringe_m)
+        if rough < _ROUGH:
+            range_m, phase = self.line_free(smoothest(carrier, self._fringe_m)), None
+        for turn in range(_ROUNDS):
+            share, reach = _BANDS[min(turn, 2)], _REACH_CELLS[min(turn, 2)]
+            rows, before = self.windowed(share), range_m
+            phase, at = self.sharpened(rows, range_m, both, phase)
+            rough = roughness(range_m + self.metres(phase), self._fringe_m)
+            if share < 1 and rough >= _ROUGH:
+                continue
+            range_m, phase = self.with_envelopes(range_m, phase, at, reach * cell, rough), None
+            if share == 1:
+                rows = moved(rows, self.frequency_hz, range_m)
+                drift = drift_m(rows, self.frequency_hz, self.imaging, slopes=turn == 1)
+                range_m = range_m + self._fringe_m * torch.round(drift / self._fringe_m)
+            range_m = self.line_free(range_m)
+            if turn > 1 and (range_m - before).square().mean().sqrt() < _SETTLED_FRINGES * self._fringe_m:
+                break
+        return range_m, rough
+
+    def with_envelopes(self, range_m: Tensor, phase: Tensor, at: Tensor, reach_m: float, rough: Tensor) -> Tensor:
+        """Line of sight at which envelopes and phases match the image that phases sharpen."""
+        turned = at * cis(-phase)[:, None]
+        model = self.imaging.adjoint(weighted(self.imaging.image(turned[None]), _surprise))[0]
+        whole = moved(self.rows, self.frequency_hz, range_m)
+        near = range_m + matched_m(whole, model, self.frequency_hz, reach_m)
+        if rough >= _ROUGH:
+            return near
+        carrier = range_m + self.metres(phase)
+        bends = rough * (self._fringe_m / math.sqrt(12))
+        near_std = _NEAR_FRINGES * self._fringe_m
+        return smooth_near(carrier[None], near[None], self._fringe_m, near_std, bends[None])[0]
+
+    def judged(self) -> Estimate:
+        """The estimate with three axes, and its verdict."""
+        range_m, rough = self.search()
+        found = three_axes(self.rows, self.imaging, range_m, self.rounds)
+        std_rad = (found.std_m * (2 * math.pi / self._fringe_m)).square().mean().sqrt()
+        sharp, effective, telling = sharpness_beyond_speckle(found.image.mT)
+        noise = sharpness_of_noise((effective * STEP).clamp_min(1))
+        strehl = torch.exp(-std_rad.square())
+        quality = strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
+        ok = (sharp > _MARGIN * noise) & (telling > LEAST_ROWS) & (strehl > LEAST_STREHL)
+        value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
+        info = {"roughness": rough, "entropy_nats": entropy(found.image).double()}
+        return Estimate(value, quality, ok, {"line_of_sight_m": found.std_m}, info)

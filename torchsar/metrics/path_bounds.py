@@ -1,0 +1,83 @@
+"""Cramer-Rao bound of the line of sight along any path."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchsar.core import refuse_non_finite
+from torchsar.radar import LIGHT_M_S, AntennaPath
+from torchsar.radar.antenna_path import refuse_unusable
+
+# share of the largest eigenvalue that is added to the information about the scatterers, so that
+# those at the same place do not make it singular
+_RIDGE = 1e-12
+
+
+def line_of_sight_bound_m(
+    frequency_hz: Tensor, antennas: AntennaPath, points_m: Tensor, amplitude: Tensor, noise_std: float
+) -> Tensor:
+    """Compute the least error of the line of sight of all pulses, without its linear terms.
+
+    The samples are those of point scatterers in circular noise. Unknown are one range per pulse,
+    and the position on the ground and the complex amplitude of each scatterer. A constant and a
+    linear term of the range over the pulses, which act as a displacement of the scene, are not
+    part of the error.
+
+    Args:
+        frequency_hz: Frequencies in Hz, float64 (frequency,).
+        antennas: True path, without trials.
+        points_m: Positions of the scatterers in metres, float64 (point, 3).
+        amplitude: Their amplitudes, complex (point,).
+        noise_std: Standard deviation of the complex noise of a sample.
+
+    Returns:
+        Square root of the mean variance of the range (half the path) of a pulse in metres, float64
+        ().
+
+    Raises:
+        TypeError: If frequencies or positions are not float64.
+        ValueError: If values are not finite, the noise is not positive, there are fewer than three
+            pulses, or the path has trials.
+
+    Reference:
+        Kay 1993, Fundamentals of Statistical Signal Processing: Estimation Theory, Eq. (15.52):
+        the Fisher information of complex samples.
+    """
+    refuse_unusable(frequency_hz=frequency_hz, points_m=points_m)
+    refuse_non_finite(amplitude, "amplitude", "give each scatterer a finite amplitude", "values")
+    pulses = antennas.pulses
+    if antennas.trials or pulses < 3 or not 0 < noise_std < math.inf:
+        raise ValueError(
+            "line_of_sight_bound_m needs one path of at least three pulses and a positive noise_std, got a path of "
+            f"shape {(*antennas.trials, pulses)} and noise_std={noise_std}"
+        )
+    wave = frequency_hz * (2 * math.pi / LIGHT_M_S)
+    amplitude = amplitude.to(torch.complex128)
+    own = torch.zeros(pulses, dtype=torch.float64, device=wave.device)
+    scene = torch.zeros(4 * len(points_m), 4 * len(points_m), dtype=torch.float64, device=wave.device)
+    shared = torch.zeros(pulses, len(scene), dtype=torch.float64, device=wave.device)
+    for p in range(pulses):
+        legs = [place[p] - points_m for place in antennas.places]
+        units = [leg / torch.linalg.vector_norm(leg, dim=-1, keepdim=True) for leg in legs]
+        slope = -2 * torch.stack(units).mean(0)  # of the path by the position of the point
+        path = antennas.path_m(points_m, slice(p, p + 1))[0]
+        echo = torch.exp(-1j * torch.outer(wave, path))
+        moved = (-1j * wave)[:, None] * echo * amplitude
+        of_scene = torch.cat([echo, 1j * echo, moved * slope[:, 0], moved * slope[:, 1]], -1)
+        of_range = -2j * wave * (echo @ amplitude)
+        rows = torch.cat([of_scene.real, of_scene.imag])
+        column = torch.cat([of_range.real, of_range.imag])
+        scene += rows.mT @ rows
+        shared[p], own[p] = column @ rows, column.square().sum()
+    scale = scene.diagonal().clamp_min(torch.finfo(torch.float64).tiny).rsqrt()
+    scene, shared = scene * scale * scale[:, None], shared * scale
+    scene.diagonal().add_(_RIDGE * float(len(scene)))
+    information = (torch.diag(own) - shared @ torch.linalg.solve(scene, shared.mT)) * (2 / noise_std**2)
+    time = torch.linspace(-1, 1, pulses, dtype=torch.float64, device=wave.device)
+    line = torch.stack([torch.ones_like(time), time], -1)
+    free = torch.linalg.qr(line, mode="complete").Q[:, 2:]  # orthogonal to constant and linear terms
+    variance = torch.linalg.inv(free.mT @ information @ free).diagonal().sum() / pulses
+    return variance.sqrt()
