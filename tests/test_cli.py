@@ -65,6 +65,7 @@ def child_seconds(*arguments: str) -> tuple[float, subprocess.CompletedProcess[s
         (["requires"], 2, "arguments are required: config\n"),
         (["run", "stripmap_damaged", "--speed"], 2, "unrecognized arguments: --speed"),
         (["run", "nowhere"], 2, "there is no config file 'nowhere'"),
+        (["run", "sal_points", "--out", ""], 2, "the name of the folder is empty"),
     ],
 )
 def test_help_and_usage_errors_answer_at_once(arguments: list[str], status: int, said: str) -> None:

@@ -102,6 +102,14 @@ def test_the_benchmark_of_ladar_estimators_runs(printed: Printed) -> None:
     assert len(over) == 2 and all(0.4 < x < 0.7 for x in over)
 
 
+def test_the_benchmark_of_images_runs(printed: Printed) -> None:
+    text = printed(ROOT / "scripts" / "imaging_speed.py", ["--small", "--errors", "-60", "-90"])
+    noise = {line[:28].strip(): float(line.split()[-1]) for line in text.splitlines() if re.search(r"-?\d\.\d$", line)}
+    for form in ("kept", "moved", "new"):
+        assert noise[f"tiles -60 dB, {form}"] < -57 and noise[f"tiles -90 dB, {form}"] < -87
+    assert noise["direct sum"] < -90 < noise["polar format"]
+
+
 def test_readme_points_at_files_that_exist() -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text(encoding="utf-8")):
         assert target.startswith("http") or (ROOT / target).exists(), target

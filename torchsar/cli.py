@@ -48,7 +48,9 @@ def parser() -> argparse.ArgumentParser:
         one.add_argument(
             "overrides", nargs="*", default=[], metavar="key=value", help="overrides, such as world.noise.snr_db=10"
         )
-        one.add_argument("--out", type=Path, metavar="DIR", help=f"result folder (default: {_folder(name, 'CONFIG')})")
+        one.add_argument(
+            "--out", type=_place, metavar="DIR", help=f"result folder (default: {_folder(name, 'CONFIG')})"
+        )
         one.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), cuda, cuda:1, ...")
     sweep = commands.choices["sweep"]
     sweep.add_argument("--resume", action="store_true", help="go on with the sweep in the folder, if there is one")
@@ -69,6 +71,12 @@ def _positive(text: str) -> int:
             f"{textwrap.shorten(text, 50)!r} is not a whole number above 0, at most {_MOST}"
         )
     return int(text)
+
+
+def _place(text: str) -> Path:
+    if not text:  # such as a variable of the shell that is not set
+        raise argparse.ArgumentTypeError("the name of the folder is empty; '.' is the working folder")
+    return Path(text)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -138,6 +138,24 @@ def aligned(snr_db: float, size: float, even: bool = False) -> Callable[[int, in
     return draw
 
 
+def displaced(snr_db: float, points: int, jitter: float) -> Callable[[int, int], Batch]:
+    """Draw points whose pulses are displaced in range by `jitter` cells rms, with white phases."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        draws = Draws(seed + 9, trials=range(trials))
+        where, turns = draws.uniform("range", (points,), 0, CELLS), draws.uniform("cross range", (points,), -0.4, 0.4)
+        amplitude = draws.normal("amplitude", (points,), torch.complex128)
+        at = torch.fft.fftfreq(CELLS, dtype=F64) * where[..., None]
+        pulses = torch.exp(2j * math.pi * turns[..., None] * torch.arange(PULSES, dtype=F64))
+        spectrum = torch.einsum("tk,tkp,tkf->tpf", amplitude, pulses, torch.exp(-2j * math.pi * at))
+        course = jitter * draws.normal("displacement", (PULSES, 1))
+        moved = torch.fft.ifft(spectrum * torch.exp(-2j * math.pi * course * torch.fft.fftfreq(CELLS, dtype=F64)))
+        phase = white(trials, PULSES, seed + 1)
+        return Batch(signal(turned(noisy(CELLS**0.5 * moved, snr_db, seed + 2), phase)), {"phase_rad": phase})
+
+    return draw
+
+
 def gains(snr_db: float) -> Callable[[int, int], Batch]:
     """Draw focused scenes whose pulses have random gains of 2 dB."""
 
@@ -181,6 +199,7 @@ WORLDS = (
     World("direct", direct(10.0), 10.0),
     World("direct", direct(-10.0), -10.0),
     *(World("direct pulses", dechirped(snr), snr) for snr in (-5.0, 10.0)),
+    *(World(f"displaced {points} points", displaced(15.0, points, 0.6), 15.0) for points in (6, 60)),
 )
 ALIGN_WORLDS = (
     *nothing((PULSES, 128)),

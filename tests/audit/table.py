@@ -74,10 +74,6 @@ LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
     "standard deviations from halves of the range cells, compared without correction of migration, are too large": [
         *(("compensate.PathPhase", "own", snr_db) for snr_db in (10.0, 20.0, 40.0)),
     ],
-    "above 30 dB the residual is error of the model, not noise, and predicts 1.7 times the error of 0.05 % of k1": [
-        ("compensate.UnevenRotation", "own", 40.0),
-        ("compensate.UnevenRotation", "own", 60.0),
-    ],
 }
 
 

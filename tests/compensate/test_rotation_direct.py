@@ -60,6 +60,17 @@ def test_satellites_of_the_direct_generator_reach_the_bound_and_their_errors_are
     assert rms(torch.stack(list(over_std.values()))) > 0.6
 
 
+def test_what_is_left_of_scatterers_before_the_fit_converges_is_no_noise() -> None:
+    data, level = [], []
+    for seed in range(4):
+        noisy, std = NARROW.noisy(NARROW.echo(*NARROW.satellite(seed)), 30.0, 100 + seed)
+        data.append(noisy)
+        level.append(std**2)
+    found = uneven_rotation(torch.stack(data), **NARROW.options)
+    over_db = 10 * torch.log10(found.info["noise_power"] / torch.tensor(level))
+    assert over_db.abs().max() < 2
+
+
 def searched(data: Tensor, name: str) -> Estimate:
     entropy = ImageEntropy(data, EntropyObjective(oversampling=1.0), **OPTIONS)
     search = {"genetic": genetic_rotation, "evolution": evolve_rotation}[name]

@@ -188,3 +188,10 @@ def test_a_given_value_with_an_unknown_name_raises() -> None:
     for run in (chain, chain.trace):
         with pytest.raises(KeyError, match="doppler.doppler_h'.*the chain has the values"):
             run(recording, given={"doppler.doppler_h": torch.tensor(0.0, dtype=torch.float64)})
+
+
+def test_a_rerun_that_ends_before_it_starts_is_refused():
+    chain = squinted_chain(small_radar())
+    trace = chain.trace(small_recording(64, 32)[0])
+    with pytest.raises(ValueError, match="'doppler' does not follow 'focus'"):
+        chain.rerun(trace, "focus", stop="doppler")

@@ -174,6 +174,14 @@ def tile_plan(n_pulse: int, n: int) -> focus.TilePlan:
     return focus.TilePlan(frequency_hz, place, None, 2 * torch.linalg.vector_norm(place, dim=-1), grid)
 
 
+def compensated(x: Tensor) -> Tensor:
+    """Image of a history of any size by motion compensation and omega-K."""
+    plan = tile_plan(*x.shape[-2:])
+    place, reference = plan.antennas.transmitter_m, plan.antennas.reference_m
+    beam = focus.ProcessedBeam(0.3)
+    return focus.compensated_omega_k(x, plan.frequency_hz, place, reference, plan.grid, beam)
+
+
 def size(x: Tensor) -> Tensor:
     """Modulus; of bool, which has none, the values themselves."""
     return x if x.dtype == torch.bool else x.abs()
@@ -616,6 +624,7 @@ FUNCTIONS = [
     ),
     _entry("focus.backproject", "raw", direct_sum),
     _entry("focus.image_tiles", "raw", lambda x: tile_plan(*x.shape[-2:]).image(x)),
+    _entry("focus.compensated_omega_k", "raw", compensated),
     _entry("focus.omega_k", "raw", lambda x: focus.omega_k(x, RADAR, **DOPPLER)),
     _entry("focus.omega_k_stolt", "raw", lambda x: focus.omega_k_stolt(x, RADAR, **DOPPLER)),
     _entry("focus.range_doppler", "raw", lambda x: focus.range_doppler(x, RADAR, **DOPPLER)),
@@ -717,6 +726,8 @@ REASONS = {
     "core.is_out_of_memory": "takes an exception only",
     "core.take": "index arithmetic that callers inside the package have checked",
     "core.per_trial": "appends dimensions; no arithmetic",
+    "core.host_value": "reads one number",
+    "core.host_largest": "reads one number",
     "core.outer_phasor": "a product of two tables that phasor_tables has made",
     "core.real_dtype": "takes a dtype only",
     "radar.geometry_of": "builds a geometry, whose classes check their fields; tests/focus/test_spotlight.py",
@@ -730,6 +741,7 @@ REASONS = {
     "focus.PolarFormat": "resamples frequencies of a geometry; tests/focus/test_polar.py",
     "focus.SpotlightBackprojection": "the stage of backproject_spotlight, which is in the table",
     "focus.PathImage": "the base class of TileImage and DirectImage",
+    "focus.OmegaKImage": "the stage of compensated_omega_k; tests/focus/test_motion_compensation.py",
     "focus.TileImage": "the stage of image_tiles, which is in the table; tests/focus/test_path_image.py",
     "focus.DirectImage": "the stage of backproject, which is in the table; tests/focus/test_path_image.py",
     "focus.focus_strip": "runs a stage over blocks of lines; tests/focus/test_strip.py",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.focus.geometries import C128, F64, C, case
-from torchsar.focus import ImageGrid
+from tests.focus.geometries import C128, F64, C, Case, case
+from torchsar.focus import ImageGrid, TilePlan, image_tiles
 
 
 @pytest.mark.parametrize("seed", range(1000, 1016))
@@ -154,6 +155,96 @@ def test_trials_with_and_without_a_path_of_their_own() -> None:
         assert one.error_db(image[at]) < -67
 
 
+def hilly(drawn: Case, slope: float) -> Case:
+    """The same with heights of about `slope` times the extent of the image."""
+    grid = drawn.grid
+    i, j = (torch.arange(n, dtype=F64) / n for n in grid.counts)
+    height = slope * grid.step_m * max(grid.counts) * torch.sin(3 * i + 1)[:, None] * torch.cos(4 * j)
+    return replace(drawn, grid=replace(grid, height_m=height))
+
+
+@pytest.mark.parametrize("seed", range(1000, 1008))
+def test_the_promised_error_holds_on_hills(seed: int) -> None:
+    drawn = hilly(case(seed), 0.02)
+    plan = drawn.plan(-60.0)
+    assert drawn.error_db(plan.image(drawn.history)) < -57
+    assert drawn.error_db(plan.image(drawn.history.to(torch.complex64))) < -57
+    if seed == 1006:
+        turned = replace(drawn, grid=drawn.grid.transposed())
+        torch.testing.assert_close(turned.grid.pixels_m().transpose(0, 1), drawn.grid.pixels_m())
+        assert drawn.error_db(turned.plan(-60.0).image(drawn.history).mT) < -57
+
+
+def test_gradients_in_heights_are_those_of_the_direct_sum() -> None:
+    drawn = hilly(case(1006), 0.02)
+    grid = replace(drawn.grid, counts=(8, 6), height_m=drawn.grid.height_m[:8, :6])
+    weight, found = torch.randn(8, 6, dtype=C128), []
+    for tiles in (True, False):
+        height = grid.height_m.clone().requires_grad_()
+        tried = replace(drawn, grid=replace(grid, height_m=height))
+        image = tried.plan().image(drawn.history) if tiles else tried.direct(tried.grid.pixels_m().reshape(-1, 3))
+        image = image.view(8, 6)
+        found += torch.autograd.grad((image * weight).real.sum() + image.abs().square().mean(), height)
+    assert float((found[0] - found[1]).norm() / found[1].norm()) < 1e-3
+
+
+def strip(pulses: int = 400, pixels: int = 400) -> tuple[Case, Callable[[Tensor], Tensor]]:
+    """A straight path beside a strip of which each pulse lights a sixth."""
+    spacing, frequencies = 0.3, 64
+    x = (torch.arange(pulses, dtype=F64) - pulses / 2) * spacing
+    place = torch.stack([x, torch.full_like(x, -350.0), torch.full_like(x, 300.0)], -1)
+    grid = ImageGrid(
+        torch.tensor([-pixels / 2 * spacing, -8.0, 0.0], dtype=F64),
+        torch.eye(3, dtype=F64)[:2],
+        (pixels, 50),
+        spacing,
+    )
+    step = 300e6 / frequencies
+    drawn = Case(
+        10e9 + step * (torch.arange(frequencies, dtype=F64) - frequencies // 2),
+        place,
+        None,
+        2 * torch.linalg.vector_norm(place, dim=-1),
+        grid,
+        torch.randn(pulses, frequencies, dtype=C128),
+    )
+
+    def lit(points: Tensor) -> Tensor:
+        ends = points[:, :1] + torch.tensor([-10.0, 10.0], dtype=F64)
+        return torch.searchsorted(x, ends)
+
+    return drawn, lit
+
+
+def test_a_strip_sums_the_pulses_that_light_a_pixel() -> None:
+    drawn, lit = strip()
+    plan = TilePlan(drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m, drawn.grid, error_db=-70, lit=lit)
+    ranges = lit(drawn.grid.pixels_m().reshape(-1, 3)).view(*drawn.grid.counts, 2)
+    first, last = 180, 200
+    history = torch.zeros_like(drawn.history)
+    history[first:last] = drawn.history[first:last]
+    found = plan.image(history)
+    seen = ((ranges[..., 0] <= first) & (ranges[..., 1] >= last)).nonzero()[::37]
+    assert len(seen) > 20
+    i, j = seen.unbind(-1)
+    truth = replace(drawn, history=history).direct(drawn.grid.pixels_m()[i, j])
+    assert float((found[i, j] - truth).norm() / truth.norm()) < 10 ** (-67 / 20)
+    assert not found[:40].any() and not found[-40:].any()
+    moved = plan.moved(drawn.transmitter_m, None, drawn.reference_m).image(history)
+    torch.testing.assert_close(moved, found)
+
+
+def test_pixels_that_no_pulse_lights_are_zero() -> None:
+    drawn, lit = strip(pulses=60)
+    given = drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m
+    image = image_tiles(drawn.history, *given, drawn.grid, -60.0, lit)
+    assert image[200].abs().min() > 0 and not image[:40].any()
+    with pytest.raises(ValueError, match="lit must return int64 pulses"):
+        TilePlan(*given, drawn.grid, -60.0, lambda points: points)
+    with pytest.raises(ValueError, match="no pulse lights"):
+        TilePlan(*given, drawn.grid, -60.0, lambda points: torch.zeros(len(points), 2, dtype=torch.int64))
+
+
 def test_an_error_that_tiles_do_not_reach_is_refused_with_the_figure() -> None:
     drawn = case(1001)
     near = replace(drawn, grid=replace(drawn.grid, step_m=float(drawn.reference_m.mean())))
@@ -209,10 +300,12 @@ def test_histories_of_another_size_or_type_are_refused() -> None:
         {"counts": (0, 3)},
         {"step_m": 0.0},
         {"step_m": math.nan},
+        {"height_m": torch.zeros(3, 2, dtype=F64)},
+        {"height_m": torch.full((2, 3), math.nan, dtype=F64)},
     ],
 )
 def test_grids_that_make_no_sense_are_refused(change: dict) -> None:
-    with pytest.raises(ValueError, match="image grid|pixel spacing"):
+    with pytest.raises(ValueError, match="image grid|pixel spacing|NaN"):
         replace(ImageGrid(torch.zeros(3), torch.eye(3)[:2], (2, 3), 1.0), **change)
 
 

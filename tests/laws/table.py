@@ -95,7 +95,9 @@ NOT_SHIFTED = {
         "Backproject:backproject": _LINES,
         "focus.backproject_strip": _LINES,
         "focus.backproject_spotlight": _LINES,
-        "focus.image_tiles": "the path of a pulse depends on its number",
+        **dict.fromkeys(
+            ("focus.image_tiles", "focus.compensated_omega_k"), "the path of a pulse depends on its number"
+        ),
         "PaddedLines:padded": "appends zeros",
         "repair.split_record": "a sweep may begin in one block and end in the next",
         "focus.backproject": "the path of a pulse depends on its number",
@@ -149,6 +151,7 @@ NOT_SHIFTED = {
                 "focus.backproject",
                 "focus.backproject_strip",
                 "focus.backproject_spotlight",
+                "focus.compensated_omega_k",
                 "focus.image_tiles",
                 "focus.omega_k",
                 "focus.omega_k_stolt",

@@ -18,6 +18,7 @@ from torchsar.core.fft import (
     transform_in_blocks,
 )
 from torchsar.core.fingerprint import fingerprint
+from torchsar.core.host import host_largest, host_value
 from torchsar.core.memory import LargestTensor, PeakMemory, is_out_of_memory, keep_freed_memory, machine_memory_bytes
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
@@ -68,6 +69,8 @@ __all__ = [
     "fingerprint",
     "from_frequency",
     "group_attributes",
+    "host_largest",
+    "host_value",
     "is_out_of_memory",
     "is_sealed",
     "keep_freed_memory",

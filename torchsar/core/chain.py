@@ -301,6 +301,7 @@ class Chain(nn.Module):
 
         Raises:
             KeyError: If a stage or a given value has an unknown name.
+            ValueError: If `stop` runs before `start`.
         """
         part, known = self._part(trace, start, stop, given)
         return self._run(part, trace.inputs[start], known)
@@ -349,6 +350,8 @@ class Chain(nn.Module):
             if name not in names:
                 raise KeyError(f"the chain has no stage {name!r}; its stages are {names}")
         part = names[names.index(start) : names.index(stop) + 1 if stop else None]
+        if not part:
+            raise ValueError(f"the chain runs its stages in the order {names}: {stop!r} does not follow {start!r}")
         before = {name: estimate for name, estimate in trace.estimates.items() if name not in part}
         known = _Known(dict(trace.values), before).with_given(
             {} if given is None else given, dict(self.stages.named_children())

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchsar.core.host import host_value
+
 _COMPLEX = (torch.complex64, torch.complex128)
 _REAL = (torch.float32, torch.float64)
 
@@ -32,14 +34,11 @@ def refuse_non_finite(
     """
     # a lazily conjugated tensor has no real view; signs do not matter here
     x = x.detach().resolve_conj()
-    try:
-        total = torch.view_as_real(x).sum() if x.is_complex() else x.sum()
-        if bool(torch.isfinite(total)):
-            return
-        bad = ~torch.isfinite(x)
-        count = int(bad.sum())
-    except RuntimeError:  # inside vmap values cannot be read
+    total = torch.view_as_real(x).sum() if x.is_complex() else x.sum()
+    if host_value(torch.isfinite(total), True):
         return
+    bad = ~torch.isfinite(x)
+    count = int(bad.sum())
     if count:
         first = tuple(int(i) for i in bad.nonzero()[0])
         raise ValueError(f"{what}: {count} of {x.numel()} {noun} are NaN or Inf, the first at index {first}; {advice}")

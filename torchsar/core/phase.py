@@ -7,6 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+from torchsar.core.host import host_largest
+from torchsar.core.memory import is_out_of_memory
+
 # the distance of float64 numbers of this size is 6e-5 turn
 MAX_TURNS = 4e11
 # real dtype of each complex dtype
@@ -48,7 +51,9 @@ def cis(angle_rad: Tensor) -> Tensor:
         parts = angle_rad.new_empty((*angle_rad.shape, 2))
         torch.cos(angle_rad, out=parts[..., 0])
         torch.sin(angle_rad, out=parts[..., 1])
-    except RuntimeError:  # inside torch.func transforms `out=` is not available
+    except RuntimeError as error:  # inside torch.func transforms `out=` is not available
+        if is_out_of_memory(error):
+            raise
         return torch.complex(torch.cos(angle_rad), torch.sin(angle_rad))
     return torch.view_as_complex(parts)
 
@@ -101,10 +106,7 @@ def _check_resolution(turns: Tensor) -> None:
     """Raise ValueError for phases beyond the precision of float64."""
     if turns.numel() == 0:
         return
-    try:
-        worst = float(turns.detach().abs().max())
-    except RuntimeError:  # inside vmap values cannot be read
-        return
+    worst = host_largest(turns.detach().abs(), 0.0)
     if not worst <= MAX_TURNS:
         raise ValueError(
             f"the phase must be at most {MAX_TURNS:.0e} turns, beyond which float64 resolves only 1e-4 turn, "

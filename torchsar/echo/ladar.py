@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Truth, linear_phasor, real_dtype, unit_phasor
+from torchsar.core import Draws, Recording, Truth, host_largest, linear_phasor, real_dtype, unit_phasor
 from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over
 from torchsar.echo.stripmap import Impairment
 from torchsar.radar import TriangularLadar, sweep_middles
@@ -165,10 +165,7 @@ def refuse_beats(beat_hz: Tensor, shines: Tensor, radar: TriangularLadar) -> Non
     Raises:
         ValueError: If a contributing scatterer has too high a beat frequency.
     """
-    try:
-        worst = float(torch.where(shines, beat_hz.detach().abs(), 0.0).max())
-    except RuntimeError:  # values cannot be read inside vmap
-        return
+    worst = host_largest(torch.where(shines, beat_hz.detach().abs(), 0.0), 0.0)
     if not worst < radar.sample_rate_hz / 2:
         raise ValueError(
             f"the beat frequency of a scatterer must be below half the sampling rate, {radar.sample_rate_hz / 2e6:g} "

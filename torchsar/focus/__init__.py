@@ -17,9 +17,10 @@ from torchsar.focus.matched_fourier import (
     matched_fourier,
     range_phase,
 )
+from torchsar.focus.motion_compensation import MotionCompensation, ProcessedBeam, compensated_omega_k
 from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
 from torchsar.focus.omega_k import OmegaK, StoredOmegaK, omega_k
-from torchsar.focus.path_image import DirectImage, PathImage, TileImage
+from torchsar.focus.path_image import DirectImage, OmegaKImage, PathImage, TileImage
 from torchsar.focus.polar import PolarFormat, PolarOperator
 from torchsar.focus.range_doppler import RangeDoppler, range_doppler
 from torchsar.focus.reference import RangeCompress, flat_reference, matched_reference, phase_reference, range_compress
@@ -72,13 +73,16 @@ __all__ = [
     "Limit",
     "MatchedFourier",
     "MatchedFourierOperator",
+    "MotionCompensation",
     "Nufft",
     "OmegaK",
+    "OmegaKImage",
     "OmegaKStolt",
     "PaddedLines",
     "PathImage",
     "PolarFormat",
     "PolarOperator",
+    "ProcessedBeam",
     "QuickLook",
     "RangeCompress",
     "RangeDoppler",
@@ -100,6 +104,7 @@ __all__ = [
     "backproject_strip",
     "chirp_z",
     "closest_range",
+    "compensated_omega_k",
     "compress_dechirped",
     "compress_sweeps",
     "cross_range_of",

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from torchsar.core import block_bytes_of, over_blocks, real_dtype
+from torchsar.core import block_bytes_of, host_largest, over_blocks, real_dtype
 from torchsar.focus.nufft import Kernel, smooth_length
 
 # the three factors of the trilinear form, in the order of the arguments of `_Trilinear`
@@ -262,10 +262,7 @@ class PulseNufft:
         """Number of rows that the taps reach, so that rows beyond are not processed; all rows
         inside vmap, where values cannot be read.
         """
-        try:
-            return int(first.max()) + self.kernel.taps
-        except RuntimeError:
-            return self.length + self.kernel.taps + 1
+        return host_largest(first, self.length + 1) + self.kernel.taps
 
     def type1(self, y: Tensor, points: PulsePoints) -> Tensor:
         """Sum pulses into image lines q: sum_m y[m] exp(+2j pi p[m] (q - lines // 2)).

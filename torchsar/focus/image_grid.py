@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+
+from torchsar.radar.antenna_path import refuse_unusable
 
 # two axes count as perpendicular unit vectors within this deviation of their products
 _UNIT = 1e-6
@@ -13,9 +15,10 @@ _UNIT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ImageGrid:
-    """Pixels of a plane in local Cartesian coordinates.
+    """Pixels of a plane or of the ground above it, in local Cartesian coordinates.
 
-    Pixel (i, j) lies at origin_m + step_m (i axes[0] + j axes[1]).
+    Pixel (i, j) lies at origin_m + step_m (i axes[0] + j axes[1]) + height_m[i, j] n, where n =
+    axes[0] x axes[1] is the normal. Images are differentiable in the heights.
 
     Args:
         origin_m: Position of pixel (0, 0) in metres, float64 (3,).
@@ -23,16 +26,19 @@ class ImageGrid:
             other, float64 (2, 3).
         counts: Number of pixels along either axis.
         step_m: Pixel spacing in metres.
+        height_m: Heights of the pixels above the plane in metres, float64 (i, j); None for 0.
 
     Raises:
+        TypeError: If the heights are not float64.
         ValueError: If a shape is wrong, the axes are not perpendicular unit vectors, a count is
-            below 1, or the spacing is not positive and finite.
+            below 1, the spacing is not positive and finite, or a height is not finite.
     """
 
     origin_m: Tensor
     axes: Tensor
     counts: tuple[int, int]
     step_m: float
+    height_m: Tensor | None = None
 
     def __post_init__(self) -> None:
         origin, axes = (torch.as_tensor(v, dtype=torch.float64) for v in (self.origin_m, self.axes))
@@ -52,6 +58,13 @@ class ImageGrid:
             raise ValueError(f"an image grid needs two counts of at least 1 pixel, got {self.counts}")
         if not 0 < float(self.step_m) < float("inf"):
             raise ValueError(f"the pixel spacing step_m must be positive and finite, got {self.step_m} m")
+        if self.height_m is not None:
+            refuse_unusable(height_m=self.height_m)
+            if self.height_m.shape != counts:
+                raise ValueError(
+                    f"height_m of an image grid must have the shape of its counts {counts}, got "
+                    f"{tuple(self.height_m.shape)}"
+                )
         for name, value in {"origin_m": origin, "axes": axes, "counts": counts, "step_m": float(self.step_m)}.items():
             object.__setattr__(self, name, value)
 
@@ -66,4 +79,19 @@ class ImageGrid:
             torch.arange(n, dtype=torch.float64, device=self.origin_m.device)[part, None]
             for n, part in zip(self.counts, (rows, columns), strict=True)
         )
-        return self.origin_m + self.step_m * ((i * self.axes[0])[:, None] + j * self.axes[1])
+        plane = self.origin_m + self.step_m * ((i * self.axes[0])[:, None] + j * self.axes[1])
+        return plane if self.height_m is None else plane + self.height_m[rows, columns, None] * self.normal
+
+    @property
+    def normal(self) -> Tensor:
+        """Direction in which heights grow, float64 (3,)."""
+        return torch.linalg.cross(*self.axes)
+
+    def transposed(self) -> ImageGrid:
+        """Return the same pixels with the two indices exchanged."""
+        height = None if self.height_m is None else -self.height_m.mT
+        return replace(self, axes=self.axes.flip(0), counts=self.counts[::-1], height_m=height)
+
+    def detached(self) -> ImageGrid:
+        """Return the same pixels with heights of which no gradient is taken."""
+        return self if self.height_m is None else replace(self, height_m=self.height_m.detach())

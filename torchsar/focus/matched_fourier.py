@@ -35,6 +35,8 @@ from torchsar.core import (
     Signal,
     Stage,
     checked_samples,
+    host_largest,
+    host_value,
     outer_phasor,
     per_trial,
     phasor_tables,
@@ -477,10 +479,7 @@ def _warp_of(signal: Signal, k: Tensor | None) -> Tensor:
         )
     k, pulse = k.to(device=signal.data.device, dtype=torch.float64), signal.axis("pulse")
     least = least_rate(k.detach(), pulse.n * pulse.step)
-    try:
-        bad = int((~(least > 0)).sum())
-    except RuntimeError:  # inside vmap a value cannot be read
-        return k
+    bad = host_value((~(least > 0)).sum(), 0)
     if bad:
         raise ValueError(
             f"the rotation angle does not increase throughout the aperture in {bad} of {least.numel()} trials: "
@@ -507,10 +506,7 @@ def _check_pulse_rate(lines: CrossRangeLines, k: Tensor, pulse: Axis) -> None:
         / lines.wavelength_m
         * pulse.step
     )
-    try:
-        worst = float(share.max())
-    except RuntimeError:  # inside vmap a value cannot be read
-        return
+    worst = host_largest(share, 0.0)
     reach = (
         f"the outermost of {lines.count} lines {lines.step_m:g} m apart has a Doppler of {worst:.3g} times half "
         "the pulse rate"

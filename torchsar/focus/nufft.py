@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import checked_samples, real_dtype
+from torchsar.core import checked_samples, host_largest, real_dtype
 
 # fineness of the FFT grid relative to the samples, the usual choice in gridding
 OVERSAMPLING = 2
@@ -203,11 +203,7 @@ class Points:
         Returns:
             Points for `interpolate` and `spread`.
         """
-        try:
-            small = float(shift.detach().abs().max()) < _SINGLE
-        except RuntimeError:  # inside vmap a value cannot be read
-            small = False
-        if small:
+        if host_largest(shift.detach().abs(), math.inf) < _SINGLE:
             return Points.of(kernel, start, length, dtype, shift.to(dtype))
         return Points.of(kernel, start + shift, length, dtype)
 

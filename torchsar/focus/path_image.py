@@ -10,6 +10,7 @@ from torch import Tensor
 from torchsar.core import Axis, Signal, Stage, real_dtype
 from torchsar.focus.backprojection import backproject
 from torchsar.focus.image_grid import ImageGrid
+from torchsar.focus.motion_compensation import ProcessedBeam, compensated_omega_k, refuse_bistatic
 from torchsar.focus.spotlight import window_weights
 from torchsar.focus.tiles import TilePlan
 from torchsar.radar.antenna_path import AntennaPath
@@ -192,3 +193,63 @@ class DirectImage(PathImage):
         places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
         eps = 1e-10 if history.dtype == torch.complex128 else 1e-6
         return backproject(history, frequency_hz, *places, grid.pixels_m(), eps=eps)
+
+
+class OmegaKImage(PathImage):
+    """Stage that images nearly straight paths by motion compensation and omega-K.
+
+    See `compensated_omega_k`. Only pulses that see a pixel within the processed beam contribute to
+    it.
+
+    Args:
+        azimuth_m: Extent of the image along its azimuth axis in metres.
+        range_m: Extent along its range axis in metres.
+        step_m: Sample spacing in metres.
+        beam_deg: Width of the processed beam in degrees.
+        squint_deg: Angle of the middle of the beam ahead of broadside in degrees.
+        order: 1 to compensate for the middle of the swath only, 2 for all ranges.
+        centre_m: Position of the centre in metres along (range axis, azimuth axis).
+        range_axis_rad: Direction of the range axis in rad, from ground coordinate x towards y.
+        height_m: Height z of the imaged plane in metres.
+        window: "none", "hann" or "range", see `PathImage`.
+
+    Raises:
+        ValueError: If the beam is not valid, see `ProcessedBeam`, or the order is not 1 or 2.
+    """
+
+    def __init__(
+        self,
+        azimuth_m: float,
+        range_m: float,
+        step_m: float,
+        beam_deg: float,
+        squint_deg: float = 0.0,
+        order: int = 2,
+        centre_m: tuple[float, float] = (0.0, 0.0),
+        range_axis_rad: float = 0.0,
+        height_m: float = 0.0,
+        window: str = "range",
+    ) -> None:
+        super().__init__(azimuth_m, range_m, step_m, centre_m, range_axis_rad, height_m, window)
+        if order not in (1, 2):
+            raise ValueError(f"the order of motion compensation is 1 or 2, got {order}")
+        self.beam, self.order = ProcessedBeam(beam_deg, squint_deg), order
+
+    def form(self, history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid) -> Tensor:
+        """Form the image by motion compensation and omega-K.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+            frequency_hz: Frequencies in Hz, shape (frequency,).
+            antennas: Path of the antenna.
+            grid: Pixels.
+
+        Returns:
+            Image, shape (..., azimuth, range).
+
+        Raises:
+            ValueError: If the path is bistatic or does not suit, see `MotionCompensation`.
+        """
+        refuse_bistatic(antennas)
+        places = antennas.transmitter_m, antennas.reference_m
+        return compensated_omega_k(history, frequency_hz, *places, grid, self.beam, self.order)

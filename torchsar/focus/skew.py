@@ -17,8 +17,17 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, block_bytes_of, over_blocks, real_dtype, spectrum_in_blocks, transform_in_blocks
-from torchsar.focus.omega_k import BAND_EDGE, FrameGeometry, band_weight, through_doppler
+from torchsar.core import (
+    Signal,
+    block_bytes_of,
+    host_largest,
+    is_out_of_memory,
+    over_blocks,
+    real_dtype,
+    spectrum_in_blocks,
+    transform_in_blocks,
+)
+from torchsar.focus.omega_k import BAND_EDGE, FrameGeometry, band_weight, raised_cosine_band, through_doppler
 from torchsar.radar import StripmapRadar
 
 # tolerated excess of the band of an image over its sampling rate, relative to this rate; measured
@@ -39,10 +48,7 @@ def skew_hz(radar: StripmapRadar, doppler_hz: Tensor | float) -> float:
     Returns:
         Largest |doppler_hz| B / f0 of the trials in Hz; 0 inside vmap, where values are unknown.
     """
-    try:
-        largest = float(torch.as_tensor(doppler_hz, dtype=torch.float64).detach().abs().max())
-    except RuntimeError:  # inside vmap a value cannot be read
-        return 0.0
+    largest = host_largest(torch.as_tensor(doppler_hz, dtype=torch.float64).detach().abs(), 0.0)
     return largest * radar.pulse.bandwidth_hz / radar.carrier_hz
 
 
@@ -175,10 +181,7 @@ class DopplerSkew:
         """
         skewed = skew_hz(self.radar, self.centre_hz) * self.radar.sampling_hz / (2 * self.radar.pulse.bandwidth_hz)
         changes = math.ceil(skewed / self.radar.prf_hz) if skewed else 0
-        try:
-            one = float(self.radar.sin_squint(self.radar.prf_hz, geometry.velocity_m_s.detach()).max())
-        except RuntimeError:  # inside vmap a value cannot be read
-            return 0.0
+        one = host_largest(self.radar.sin_squint(self.radar.prf_hz, geometry.velocity_m_s.detach()), 0.0)
         return geometry.sin_reach + changes * one
 
     def orders(self, part: slice, scale: Tensor | float = 1.0) -> Tensor:
@@ -209,7 +212,9 @@ class DopplerSkew:
         try:
             rows = (ends != 0).any(-1).reshape(-1, ends.shape[-2]).any(0).nonzero()[:, 0].tolist()
             return rows, range(int(ends.min()), int(ends.max()) + 1)
-        except RuntimeError:
+        except RuntimeError as error:
+            if is_out_of_memory(error):
+                raise
             return slice(None), range(-1, 2)
 
     def changes(self, part: slice, rows: list[int] | slice) -> Tensor:
@@ -246,9 +251,7 @@ class DopplerSkew:
         scale = 1 + (lean if skewed else torch.zeros_like(lean[:1]))
         offset = self.base_hz[part, None] - self.centre_hz[..., None, None] * scale
         offset = offset - prf * torch.round(offset / prf)
-        beyond = (offset.abs() / self.band_hz - 0.5) / BAND_EDGE
-        weight = 0.5 - 0.5 * torch.sin(math.pi * beyond.clamp(-0.5, 0.5))
-        return rows * weight.to(real_dtype(rows.dtype))
+        return rows * raised_cosine_band(offset / self.band_hz).to(real_dtype(rows.dtype))
 
     def planes(self, part: slice, change: int) -> Tensor:
         """Compute which multiple of the PRF the rows occupy in the spectrum of the image.

@@ -12,6 +12,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchsar.core import host_value
 from torchsar.radar import BistaticRadar, InverseRadar
 
 Value = Tensor | float
@@ -30,11 +31,7 @@ def nonnegative(value: Value) -> Tensor:
         ValueError: If an element is negative.
     """
     value = torch.as_tensor(value, dtype=torch.float64)
-    try:
-        negative = bool((value.detach() < 0).any())
-    except RuntimeError:  # inside vmap values cannot be read
-        return value
-    if negative:
+    if host_value((value.detach() < 0).any(), False):
         raise ValueError(
             "the parameters of a bound (SNR as a power ratio, durations, wavelengths, counts) must not be negative, "
             f"got {float(value.detach().min()):g}"
@@ -58,11 +55,7 @@ def range_of_point(radar: BistaticRadar, range_m: Value | None) -> Value:
     if range_m is None:
         return radar.reference_range_m
     value = torch.as_tensor(range_m).detach()
-    try:
-        good = bool(((value > 0) & value.isfinite()).all())
-    except RuntimeError:  # inside vmap values cannot be read
-        return range_m
-    if not good:
+    if not host_value(((value > 0) & value.isfinite()).all(), True):
         raise ValueError(f"range_m must be positive and finite, got {float(value.min()):g} m")
     return range_m
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, level_of, unit_level
+from torchsar.core import Signal, host_value, level_of, unit_level
 
 # quantities that sharpness is defined for, with their power of the modulus |I|
 _OF = {"intensity": 2, "amplitude": 1}
@@ -94,10 +94,7 @@ def _holds_weights(mask: Tensor) -> bool:
     """Whether all values are finite and 0 or more; True inside vmap, where values cannot be
     read.
     """
-    try:
-        return mask.dtype == torch.bool or not mask.numel() or bool(((mask >= 0) & torch.isfinite(mask)).all())
-    except RuntimeError:  # inside vmap a value cannot be read
-        return True
+    return mask.dtype == torch.bool or host_value(((mask >= 0) & torch.isfinite(mask)).all(), True)
 
 
 def entropy(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None = None) -> Tensor:

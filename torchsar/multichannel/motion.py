@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchsar.core import per_trial
+from torchsar.core import host_largest, host_value, per_trial
 from torchsar.radar import BistaticRadar
 
 Number = Tensor | float
@@ -153,15 +154,12 @@ class PointMotion:
 
 def _check_motion(motion: PointMotion) -> None:
     """Raise ValueError for motions that are not finite, overtake the receiver or have no range."""
-    try:
-        slowest, nearest = float(motion.along_m_s.detach().min()), float(motion.range_m.detach().min())
-        not_finite = [
-            name
-            for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
-            if not bool(torch.isfinite(getattr(motion, name)).all())
-        ]
-    except RuntimeError:  # values cannot be read inside vmap
-        return
+    slowest, nearest = (-host_largest(-v.detach(), -math.inf) for v in (motion.along_m_s, motion.range_m))
+    not_finite = [
+        name
+        for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+        if not host_value(torch.isfinite(getattr(motion, name)).all(), True)
+    ]
     if not_finite:
         raise ValueError(
             f"velocity and position of a point must be finite, got NaN or Inf in {', '.join(not_finite)}; "

@@ -32,6 +32,8 @@ POOR = 5.0
 # Damping relative to the largest eigenvalue of the normal matrix: it acts on singular values below
 # 1 / SINGULAR of the largest.
 _TINY = SINGULAR**-2
+# Doppler bands that contain clutter illuminated through an antenna pattern
+_CLUTTER_BANDS = 5
 
 
 def first_bin(n_pulse: int, bands: int) -> int:
@@ -352,6 +354,27 @@ def clutter_covariance(
     shared = shared_response(radar, motion, n_pulse, bands, torch.complex128).T[..., None]
     response = shared * band_matrix(radar, motion, bands)
     return torch.roll((response * power) @ response.mH, first_bin(n_pulse, bands), 0)
+
+
+def noise_and_clutter(radar: BistaticRadar, lit_s: float | None, n_pulse: int, power_db: Tensor | float) -> Tensor:
+    """Return the covariance across channels of white noise of unit variance and stationary clutter.
+
+    Args:
+        radar: Radar parameters.
+        lit_s: Time in seconds for which clutter is lit with constant amplitude; None for the
+            pattern of a channel.
+        n_pulse: Number of pulses.
+        power_db: Power of the clutter over the noise in dB, a number or shape (...,).
+
+    Returns:
+        Covariance per Doppler bin, complex128 (..., n_pulse, channel, channel).
+    """
+    band = None if lit_s is None else radar.speed_m_s**2 * lit_s / (radar.wavelength_m * radar.reference_range_m)
+    prior = ElementPattern() if band is None else FlatBand(band)
+    clutter = clutter_covariance(radar, prior, n_pulse, _CLUTTER_BANDS)
+    level = 10 ** (torch.as_tensor(power_db, dtype=torch.float64) / 10)
+    mean = clutter.diagonal(dim1=-2, dim2=-1).real.mean()
+    return clutter * (level[..., None, None, None] / mean) + torch.eye(radar.channels, dtype=clutter.dtype)
 
 
 def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchsar.core import take
+from torchsar.core import host_value, take
 
 # maps one number per trial (...,) to one cost per trial (...,)
 Cost = Callable[[Tensor], Tensor]
@@ -129,10 +129,7 @@ def _finished(active: Tensor) -> bool:
     """Whether no trial is active; False inside vmap, where values cannot be read and all rounds are
     made.
     """
-    try:
-        return not bool(active.any())
-    except RuntimeError:  # inside vmap a value cannot be read
-        return False
+    return not host_value(active.any(), True)
 
 
 def _slope(cost: Cost, x: Tensor) -> Tensor:

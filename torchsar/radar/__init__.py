@@ -17,6 +17,7 @@ from torchsar.radar.spotlight import (
     plane_wave_loss,
     range_profiles,
 )
+from torchsar.radar.straight_track import StraightTrack
 from torchsar.radar.stripmap import LIGHT_M_S, StripmapRadar
 from torchsar.radar.timing import TimingDiagram, timing_diagram
 from torchsar.radar.waveform import LinearFM
@@ -33,6 +34,7 @@ __all__ = [
     "Orbit",
     "PlaneWaveLoss",
     "Spotlight",
+    "StraightTrack",
     "StripmapRadar",
     "TimingDiagram",
     "TriangularLadar",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_phasor
+from torchsar.core import host_value, linear_phasor
 
 
 def delayed(lines: Tensor, fraction: Tensor, analytic: bool = False) -> Tensor:
@@ -42,7 +42,4 @@ def _positive(n: int, device: torch.device) -> Tensor:
 
 def _all_zero(x: Tensor) -> bool:
     """Whether x is zero and constant; False inside vmap, where values cannot be read."""
-    try:
-        return not x.requires_grad and not bool(x.any())
-    except RuntimeError:  # inside vmap values cannot be read
-        return False
+    return not x.requires_grad and not host_value(x.any(), True)

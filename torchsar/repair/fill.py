@@ -15,7 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, Stage, checked_samples, level_of, per_trial, real_dtype, unit_phasor
+from torchsar.core import Signal, Stage, checked_samples, host_value, level_of, per_trial, real_dtype, unit_phasor
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 from torchsar.repair.sparse import conjugate_fill, sparse_fill
@@ -33,10 +33,7 @@ def _mask(lines: Tensor, missing: Tensor) -> Tensor:
 
 def _nothing_missing(missing: Tensor) -> bool:
     """Whether no line is missing; False inside vmap, where values cannot be read."""
-    try:
-        return not bool(missing.any())
-    except RuntimeError:
-        return False
+    return not host_value(missing.any(), True)
 
 
 def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:

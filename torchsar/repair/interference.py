@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples, level_of, unit_level
+from torchsar.core import Estimate, Signal, Stage, checked_samples, host_largest, level_of, unit_level
 from torchsar.repair.interference_band import find_band, subtract_band
 from torchsar.repair.interference_detect import THRESHOLD, Level, clean_level, line_spectra, stands_out
 from torchsar.repair.interference_tone import Tone, anything, find_tones, subtract_tones
@@ -224,10 +224,7 @@ def _contaminated(raw: Tensor, found: Contamination, threshold: float) -> Tensor
 
 def _selection(lines: Tensor) -> Tensor:
     """Indices of the marked lines of each trial, rising; unmarked ones follow."""
-    try:
-        count = int(lines.sum(-1).max())
-    except RuntimeError:  # inside vmap values cannot be read
-        count = lines.shape[-1]
+    count = host_largest(lines.sum(-1), lines.shape[-1])
     return torch.argsort((~lines).to(torch.int8), dim=-1, stable=True)[..., :count]
 
 

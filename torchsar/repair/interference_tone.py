@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import unit_phasor
+from torchsar.core import host_value, unit_phasor
 from torchsar.repair.interference_detect import THRESHOLD, Level, line_spectra, stands_out
 
 # Largest drift within a line and largest error of the initial frequency that are searched, in
@@ -505,7 +505,4 @@ def anything(mask: Tensor) -> bool:
     Returns:
         Whether any entry is True, or may be True.
     """
-    try:
-        return bool(mask.any())
-    except RuntimeError:
-        return True
+    return host_value(mask.any(), True)

@@ -19,7 +19,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, Stage, checked_samples, cis, linear_phasor, real_dtype, refuse_non_finite_values
+from torchsar.core import (
+    Signal,
+    Stage,
+    checked_samples,
+    cis,
+    host_largest,
+    linear_phasor,
+    real_dtype,
+    refuse_non_finite_values,
+)
 
 # Smallest distance of sample instants, in samples. Limit of conditioning, by choice: noise grows
 # about as 1 / gap.
@@ -51,10 +60,7 @@ def refuse_crossing(offset_samples: Tensor) -> None:
         ValueError: If an offset is not finite, or instants are too close, coincide or cross.
     """
     offsets = offset_samples.detach()
-    try:
-        worst = float(torch.nan_to_num(smallest_gap(offsets), nan=-math.inf).min())
-    except RuntimeError:  # inside vmap values cannot be read
-        return
+    worst = -host_largest(torch.nan_to_num(-smallest_gap(offsets), nan=math.inf), -math.inf)
     if not worst >= MIN_GAP:
         shown = [round(x, 3) for x in offsets.reshape(-1, offsets.shape[-1])[0].tolist()]
         raise ValueError(

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples
+from torchsar.core import Estimate, Signal, Stage, checked_samples, host_largest, host_value
 
 # line number of padding at the end of a trial, by convention: no line has a negative number
 PADDING = -1
@@ -249,12 +249,9 @@ def _check(lines: Tensor, line_number: Tensor, longest_gap: int) -> None:
 
 def _check_consistency(ok: Tensor, trusted: Tensor, single: Tensor) -> None:
     """Raise ValueError if no trial has a consistent set of numbers."""
-    try:
-        if bool(ok.any()) or ok.numel() == 0:
-            return
-        accepted, total = int(trusted.sum()), int(single.sum())
-    except RuntimeError:
+    if ok.numel() == 0 or host_value(ok.any(), True):
         return
+    accepted, total = int(trusted.sum()), int(single.sum())
     raise ValueError(
         f"line numbers cannot be reconciled: only {accepted} of {total} agree with those of neighbouring "
         "lines, and at least half must; check that the numbers rise from line to line, or raise longest_gap"
@@ -263,12 +260,9 @@ def _check_consistency(ok: Tensor, trusted: Tensor, single: Tensor) -> None:
 
 def _check_grid(inside: Tensor, verified: Tensor, rows: int) -> None:
     """Raise ValueError if the grid holds none of the lines."""
-    try:
-        if bool(inside.any()) or not bool((verified != PADDING).any()):
-            return
-        low, high = int(verified[verified != PADDING].min()), int(verified.max())
-    except RuntimeError:  # inside vmap values cannot be read
+    if host_value(inside.any(), True) or not bool((verified != PADDING).any()):
         return
+    low, high = int(verified[verified != PADDING].min()), int(verified.max())
     raise ValueError(
         f"none of the line numbers, {low} to {high}, lies on the grid of {rows} rows from first_number on; choose "
         "first_number and n_lines so that the grid holds the recording"
@@ -283,10 +277,7 @@ def _first(verified: Tensor) -> Tensor:
 
 def _rows(slot: Tensor, verified: Tensor, n: int) -> int:
     """Number of rows that holds every line of every trial, at least n."""
-    try:
-        return max(n, 1 + int(torch.where(verified != PADDING, slot, 0).max()))
-    except RuntimeError:  # inside vmap values cannot be read
-        return n
+    return max(n, 1 + host_largest(torch.where(verified != PADDING, slot, 0), 0))
 
 
 def _sources(slot: Tensor, inside: Tensor, rows: int) -> Tensor:

@@ -38,7 +38,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Estimate, Signal, Stage, checked_samples
+from torchsar.core import Axis, Estimate, Signal, Stage, checked_samples, host_value
 from torchsar.radar import TriangularLadar
 from torchsar.repair.analytic import delayed
 from torchsar.repair.trigger import find_trigger
@@ -214,10 +214,7 @@ def _taken(lines: Tensor, start: Tensor, n: int) -> Tensor:
 
 def _any(condition: Tensor) -> bool:
     """Whether a condition holds for any trial; False inside vmap, where values cannot be read."""
-    try:
-        return bool(condition.detach().any())
-    except RuntimeError:
-        return False
+    return host_value(condition.detach().any(), False)
 
 
 def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Tensor:

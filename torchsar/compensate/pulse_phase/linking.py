@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.alignment import Displacement, coherent_jitter, displacement
 from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare, starting_phase
 from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, describe, power_groups
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
@@ -72,11 +73,12 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         left out of the standard deviation. `quality` is the predicted Strehl ratio times the share
         of the likelihood that noise does not explain. `ok` is False where the Strehl ratio for 1.9
         times the standard deviation is below 0.8, the gain in likelihood below twice that of noise,
-        a single range cell holds nearly all of the energy, adjacent pulses are not coherent in any
-        ten range cells of similar power, or a sparse description of the scene with the phases that
-        sharpen it is more likely: in sparse scenes the spectrum adapts to phase errors, which the
-        standard deviation does not contain. `info` holds "gain_nats" of shape
-        (...,): log likelihood minus that of white noise.
+        a single range cell holds nearly all of the energy, the range profiles are not aligned (see
+        `Displacement`), adjacent pulses are not coherent in any ten range cells of similar power,
+        or a sparse description of the scene with the phases that sharpen it is more likely: in
+        sparse scenes the spectrum adapts to phase errors, which the standard deviation does not
+        contain. `info` holds, of shape (...,), "gain_nats" (log likelihood minus that of white
+        noise), "jitter_cells" and "migration_cells".
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -110,10 +112,13 @@ def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
     rows, n = pulses.rows, pulses.n
     size = max(1, _BLOCK_BYTES // (16 * n * (6 * n + 2 * rows.shape[1])))
     parts = [slice(first, first + size) for first in range(0, max(1, len(rows)), size)]
-    done: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+    done: dict[int, tuple[Tensor, ...]] = {}
 
     def work(part: slice) -> None:
-        done[part.start] = _linked(rows[part], pulses.present[part], None if start is None else start[part])
+        found = _linked(rows[part], pulses.present[part], None if start is None else start[part])
+        moved = displacement(rows[part], pulses.present[part])
+        jitter = torch.maximum(moved.jitter, coherent_jitter(rows[part], pulses.present[part]))
+        done[part.start] = *found, jitter, moved.migration
 
     if rows.requires_grad and torch.is_grad_enabled():
         for part in parts:
@@ -121,11 +126,11 @@ def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
     else:
         with torch.no_grad():
             over_blocks(work, parts, rows)
-    phase, std, gain = (torch.cat([done[part.start][i] for part in parts]) for i in range(3))
-    return _estimate(pulses, phase, std, gain)
+    phase, std, gain, *moved = (torch.cat([done[part.start][i] for part in parts]) for i in range(5))
+    return _estimate(pulses, phase, std, gain, Displacement(*moved))
 
 
-def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor) -> Estimate:
+def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor, moved: Displacement) -> Estimate:
     real, trials = pulses.rows.real.dtype, pulses.trials
     noise = _NOISE_NATS * pulses.present.sum(-1)
     scene = (1 - noise / or_one(gain)).clamp(0, 1)
@@ -133,14 +138,17 @@ def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor) -> Estim
     strehl = torch.exp(-(std.square() * pulses.present).sum(-1) / pulses.present.sum(-1).clamp_min(1))
     row = (pulses.rows.detach().real.square() + pulses.rows.detach().imag.square()).sum(-1, dtype=torch.float64)
     effective = row.sum(-1).square() / or_one(row.square().sum(-1))
+    fitted = (strehl ** (_SPREAD**2) > LEAST_STREHL) & (gain > _MARGIN * noise) & (effective > LEAST_ROWS)
     return Estimate(
         value={"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
         std={"phase_rad": std.reshape(*trials, pulses.n).to(real)},
         quality=(strehl * scene).reshape(trials).to(real),
-        ok=((strehl ** (_SPREAD**2) > LEAST_STREHL) & (gain > _MARGIN * noise) & (effective > LEAST_ROWS)).reshape(
-            trials
-        ),
-        info={"gain_nats": gain.reshape(trials)},
+        ok=(fitted & moved.aligned).reshape(trials),
+        info={
+            "gain_nats": gain.reshape(trials),
+            "jitter_cells": moved.jitter.reshape(trials),
+            "migration_cells": moved.migration.reshape(trials),
+        },
     )
 
 

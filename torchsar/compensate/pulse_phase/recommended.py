@@ -80,8 +80,10 @@ def autofocus(
         deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of
         speckle. Phases of `link_phases` have its standard deviations, `quality` and `ok`. `info`
         holds "homogeneous" of shape (...,), bool, True where the homogeneous description is more
-        likely; `ok` is False if linked phases then do not confirm that. Range profiles that are not
-        aligned are not detected: `ok` may then be True although the phase is wrong.
+        likely; `ok` is False if linked phases then do not confirm that. It also holds
+        "jitter_cells" and "migration_cells", the displacement of the range profiles from pulse to
+        pulse and of groups of pulses in cells rms: `ok` is False from 0.25 and 0.4 cell on, because
+        the phases may then be wrong. `imaging` corrects displacements, which are not examined then.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.

@@ -207,7 +207,8 @@ def entropy_fixed_point(
         phase, taken = in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
         return phase, taken, settled
 
-    return estimated(pulses, starting_phase(start, pulses, "entropy_fixed_point"), find, at_rest=True)
+    begin = starting_phase(start, pulses, "entropy_fixed_point")
+    return estimated(pulses, begin, find, at_rest=True, compare=imaging is None)
 
 
 def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, Tensor]:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.alignment import Displacement, displacement
 from torchsar.compensate.pulse_phase.data import Pulses, or_one, rotate, safe_angle
 from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.compensate.pulse_phase.imaging import Imaging
@@ -136,8 +137,8 @@ def estimated(
             phase) that continues the method from a phase, on all or on half of the rows.
         at_rest: True if continuing the method does not move its result; the second
             standard deviation is then left out.
-        compare: False if the scene is not to be compared with a homogeneous one, because its image
-            is not the Fourier transform along pulses.
+        compare: False if the image is not the Fourier transform along pulses. The scene is then
+            not compared with a homogeneous one, and the alignment of the profiles not examined.
         imaging: Image formation of all trials, from rows (trial, range, pulse) to images (trial,
             line, range), with which the sharpness is measured; by default a Fourier transform. All
             trials are then processed at once.
@@ -146,17 +147,19 @@ def estimated(
         `phase_rad` of shape (..., pulse) with its standard deviation. Sharpness is the amount by
         which the image entropy lies below that of speckle. `quality` is the Strehl ratio predicted
         from the standard deviation, times the share of the sharpness that noise does not explain.
-        `ok` is False unless the image is 1.5 times as sharp as autofocus can make pure noise, more
-        than one row contributes to the sharpness, that Strehl ratio exceeds 0.8, and a homogeneous
-        description of the scene is not more likely (see `describe`), because sharpness does not
-        find the phases of homogeneous clutter. It is True for a single point if that Strehl ratio
-        exceeds 0.8, the scatter of its modulus is below 0.25, and there are 32 pulses. `info` holds
+        `ok` is False unless that Strehl ratio exceeds 0.8, the profiles are aligned (see
+        `Displacement`; not examined without `compare`), the image is 1.5 times as sharp as
+        autofocus can make pure noise, more than one row contributes to the sharpness, and a
+        homogeneous description of the scene is not more likely (see `describe`), because sharpness
+        does not find the phases of homogeneous clutter. The last three need not hold for a single
+        point whose modulus scatters by less than 0.25, with 32 pulses or more. `info` holds
         "present", shape (..., pulse), False for pulses that hold only zeros; and, of shape (...,),
         "homogeneous" (True where that description is more likely), "sparse_gain_nats" (gain of the
-        log likelihood of the sparse description over white noise), "iterations",
-        "sharpness_nats", "noise_sharpness_nats" (the largest sharpness that noise can reach),
-        "effective_rows" (number of rows over which the energy is spread) and "telling_rows" (number
-        of rows over which the sharpness is spread).
+        log likelihood of the sparse description over white noise), "jitter_cells" and
+        "migration_cells" (see `Displacement`), "iterations", "sharpness_nats",
+        "noise_sharpness_nats" (the largest sharpness that noise can reach), "effective_rows"
+        (number of rows over which the energy is spread) and "telling_rows" (number of rows over
+        which the sharpness is spread).
     """
     rows, present = pulses.rows, pulses.present
     if not len(rows) or pulses.n < 3:
@@ -187,7 +190,8 @@ def _assessed(
 ) -> tuple[Tensor, ...]:
     """Phase, iterations, sharpness, effective rows of both, std, and the descriptions per trial.
 
-    The last is True where a single point makes the image sharp.
+    The last three are True where a single point makes the image sharp, the jitter and the
+    migration.
     """
     phase, taken, again = find(rows, present, start)
     with torch.no_grad():
@@ -204,19 +208,22 @@ def _assessed(
         if not at_rest:
             std = torch.maximum(std, _drift(rows, present, phase, again))
         scene = describe(rows, phase, occupied)
+        moved = displacement(rows, present) if compare else Displacement(0 * sharp, 0 * sharp)
     homogeneous = scene.homogeneous & compare & ~lone
-    return phase, taken, sharp, effective * occupied, sharpness_rows, std, scene.sparse, homogeneous, lone
+    scene_rows = effective * occupied, sharpness_rows
+    return phase, taken, sharp, *scene_rows, std, scene.sparse, homogeneous, lone, moved.jitter, moved.migration
 
 
 def _no_estimate(rows: Tensor) -> tuple[Tensor, ...]:
     """The result of `_assessed` where no phase can be found: too few pulses, or no trials."""
     zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
-    return rows[:, 0].real * 0, zero.long(), zero, zero, zero, zero + math.pi / math.sqrt(3), zero, zero > 0, zero > 0
+    std, no = zero + math.pi / math.sqrt(3), zero > 0
+    return rows[:, 0].real * 0, zero.long(), zero, zero, zero, std, zero, no, no, zero, zero
 
 
 def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     """Estimate from the results of all blocks of trials."""
-    phase, taken, sharp, effective, sharpness_rows, std_rad, sparse, homogeneous, lone = (
+    phase, taken, sharp, effective, sharpness_rows, std_rad, sparse, homogeneous, lone, jitter, migration = (
         torch.cat(pieces) for pieces in zip(*parts, strict=True)
     )
     present, shape = pulses.present, pulses.trials
@@ -225,7 +232,8 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     strehl = torch.exp(-std_rad.square())
     quality = torch.where(enough_pulses, strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1)), 0)
     distinct = (sharp > _MARGIN * noise) & (sharpness_rows > LEAST_ROWS) & ~homogeneous
-    ok = enough_pulses & (distinct | (lone & (sharp > noise))) & (strehl > LEAST_STREHL)
+    distinct = distinct | (lone & (sharp > noise))
+    ok = enough_pulses & distinct & (strehl > LEAST_STREHL) & Displacement(jitter, migration).aligned
     phase = torch.where(enough_pulses[:, None], phase, 0)
     info = {
         "iterations": taken,
@@ -235,6 +243,8 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
         "telling_rows": sharpness_rows,
         "sparse_gain_nats": sparse,
         "homogeneous": homogeneous,
+        "jitter_cells": jitter,
+        "migration_cells": migration,
     }
     std = std_rad[:, None].expand(-1, pulses.n).to(phase.dtype)
     return Estimate(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from torchsar.compensate.radial.bands import refuse_other_sweeps
 from torchsar.compensate.radial.trajectory import sweep_motion
-from torchsar.core import Axis, checked_samples, cis, linear_phasor, real_dtype, unit_phasor
+from torchsar.core import Axis, checked_samples, cis, host_largest, host_value, linear_phasor, real_dtype, unit_phasor
 from torchsar.radar import TriangularLadar
 
 # phases in turns that are lost in the rounding of a phasor, by precision
@@ -81,11 +83,7 @@ def refuse_other_velocity(velocity_m_s: Tensor, sweeps: Tensor, what: str) -> No
             f"{what}: velocity_m_s must hold one velocity per period, shape (..., {sweeps.shape[-2]}), got shape "
             f"{tuple(velocity_m_s.shape)}"
         )
-    try:
-        finite = bool(torch.isfinite(velocity_m_s.detach()).all())
-    except RuntimeError:  # inside vmap values cannot be read
-        return
-    if not finite:
+    if not host_value(torch.isfinite(velocity_m_s.detach()).all(), True):
         raise ValueError(
             f"{what}: {int((~torch.isfinite(velocity_m_s.detach())).sum())} velocities are NaN or "
             "Inf; use an estimate whose `ok` is True, or replace these velocities first"
@@ -158,7 +156,4 @@ def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) 
 
 def _largest(x: Tensor) -> float:
     """Largest magnitude; infinite inside vmap, where values cannot be read."""
-    try:
-        return float(x.detach().abs().max())
-    except RuntimeError:
-        return torch.inf
+    return host_largest(x.detach().abs(), math.inf)

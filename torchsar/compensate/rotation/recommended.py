@@ -80,9 +80,9 @@ def uneven_rotation(
         mirrored in cross range. Standard deviations are averages of what the noise explains (the
         Fisher information of the scatterers found) and of what the differences between these
         scatterers show, which counts the more, the more of them contribute; they are larger where
-        energy is left that neither the scatterers nor the noise explain. From 40 dB they may be 1.7
-        times the errors, since residuals of the model then count as noise. quality is the share of
-        the energy above the noise that the scatterers explain.
+        energy is left that neither the scatterers nor the noise explain. From 30 dB the error is
+        mostly that of scatterers in one resolution cell, which the differences show. quality is the
+        share of the energy above the noise that the scatterers explain.
 
         info["focused"] is True where the rotation is good enough to form an image: at least 3
         scatterers are found, they explain half of the energy or more, their phase histories agree

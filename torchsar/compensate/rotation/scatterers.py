@@ -218,9 +218,9 @@ def fit_scatterers(
 ) -> Fit:
     """Fit the rotation of a target and all its scatterers by maximum likelihood.
 
-    The first, third and fifth round search for further scatterers. From the fifth step on, a trial
-    ends when a step changes each parameter of the rotation by at most a fifth of its standard
-    deviation.
+    The first, third and fifth round search for further scatterers. Each round from then on measures
+    the noise anew. From the fifth step on, a trial ends when a step changes each parameter of the
+    rotation by at most a fifth of its standard deviation.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
@@ -251,6 +251,10 @@ def fit_scatterers(
         new, noise = None, fit.noise
         if iteration in _SEARCHES:
             new, noise = _new_scatterers(residual, sampling, fit, present, math.ceil(count * _SEARCHES[iteration]))
+        elif iteration > max(_SEARCHES):
+            # the residual of the last search was larger: the fit had not converged
+            image = image_of(residual, sampling, fit.motion, oversampling=1)
+            _, noise = _noise(image.real.square() + image.imag.square(), sampling, fit, present)
         if step is not None:
             fit = _after_step(
                 fit,
@@ -293,12 +297,7 @@ def _new_scatterers(
     """
     image = image_of(residual, sampling, fit.motion, oversampling=_OVERSAMPLING)
     power = image.real.square() + image.imag.square()
-    brightest = torch.cat(
-        [fit.scatterers.amplitude.abs().square(), power.flatten(1).amax(-1, keepdim=True) / sampling.pulses], -1
-    )
-    # of a pixel; missing pulses add no noise
-    floor = torch.maximum(noise_power(power).double(), _MODEL * brightest.amax(-1))
-    noise = torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
+    floor, noise = _noise(power, sampling, fit, present)
     known = (fit.scatterers.amplitude != 0).sum(-1)
     peaks = find_peaks(
         power, (floor * threshold(power[0].numel())).to(power.dtype), bound, _SHARE, _LINES, _CELLS
@@ -308,6 +307,20 @@ def _new_scatterers(
     ) / math.sqrt(sampling.pulses)
     cell, row = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING, peaks.cell.to(torch.float64)
     return Scatterers(torch.where(peaks.power > 0, value, 0), cell, row), noise
+
+
+def _noise(power: Tensor, sampling: Sampling, fit: Fit, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Noise power of a pixel and of a sample, (trial,) each.
+
+    power: that of the image of the residual. The noise power of a sample is at most that of the
+    fit.
+    """
+    brightest = torch.cat(
+        [fit.scatterers.amplitude.abs().square(), power.flatten(1).amax(-1, keepdim=True) / sampling.pulses], -1
+    )
+    # of a pixel; missing pulses add no noise
+    floor = torch.maximum(noise_power(power).double(), _MODEL * brightest.amax(-1))
+    return floor, torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
 
 
 def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:

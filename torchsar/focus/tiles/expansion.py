@@ -20,7 +20,7 @@ tile, and all that multiply y, are expanded to second order (`remainders`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -75,6 +75,21 @@ def curvatures(places: Sequence[Tensor], centre: Tensor, axes: Tensor) -> Tensor
     return (3 - len(places)) * total
 
 
+def climb(places: Sequence[Tensor], centre: Tensor, axes: Tensor) -> Tensor:
+    """Derivative of the path length along the normal of the image.
+
+    Args:
+        places: Positions of one or two antennas in metres, as in `slopes`.
+        centre: Positions of the centres in metres, float64 (tile, 3).
+        axes: Unit vectors, float64 (2, 3).
+
+    Returns:
+        Derivatives, float64 (tile, ..., pulse).
+    """
+    axis = torch.linalg.cross(*axes)
+    return slopes(places, centre, torch.stack([axis, axis]))[1]
+
+
 @dataclass(frozen=True, eq=False)
 class Expansion:
     """Polynomials of s that describe the path lengths of tiles.
@@ -86,9 +101,10 @@ class Expansion:
         path_m: Path of the reference, float64 (tile, 1).
         a: Derivative of the path of the reference along x, float64 (tile, 1).
         b: Derivative of the path of the reference along y, float64 (tile, 1).
+        c: Derivative of the path of the reference along the normal, float64 (tile, 1).
         curvature: Second derivatives xx, xy, yy of the reference, float64 (tile, 3).
-        fit: Coefficients of s and s^2 for (xx, xy, yy, eps), float64 (tile, 2, 4).
-        common: Means of a and of the coefficients over the tiles, float64 (), (2, 4).
+        fit: Coefficients of s and s^2 for (xx, xy, yy, eps, c), float64 (tile, 2, 5).
+        common: Means of a and of the coefficients over the tiles, float64 (), (2, 5).
         carrier: Wave number k_c in rad/m.
     """
 
@@ -98,6 +114,7 @@ class Expansion:
     path_m: Tensor
     a: Tensor
     b: Tensor
+    c: Tensor
     curvature: Tensor
     fit: Tensor
     common: tuple[Tensor, Tensor]
@@ -123,50 +140,62 @@ class Expansion:
         s = a / stretch - a0
         scale = s.abs().amax(-1, keepdim=True).clamp_min(1e-30)
         t = s / scale
-        wanted = torch.cat(
-            [curvatures(places, centre, axes) / stretch[..., None] - h0[:, None], (stretch - 1)[..., None]], -1
-        )
+        c0 = climb(reference, centre, axes)
+        bends = curvatures(places, centre, axes) / stretch[..., None] - h0[:, None]
+        climbs = climb(places, centre, axes) / stretch - c0
+        wanted = torch.cat([bends, (stretch - 1)[..., None], climbs[..., None]], -1)
         powers = torch.stack([t, t * t], -1)
         fit = torch.linalg.pinv(powers, rtol=1e-8) @ wanted
         fit = fit / torch.stack([scale, scale * scale], -2)
-        return cls(centre, axes, reference, path, a0, b0, h0, fit, (a0.mean(), fit.mean(0)), carrier)
+        return cls(centre, axes, reference, path, a0, b0, c0, h0, fit, (a0.mean(), fit.mean(0)), carrier)
 
-    def common_phase(self, s: Tensor, q: Tensor, x: Tensor) -> Tensor:
-        """Phase in rad that all tiles share, of mutually broadcasting s, q in rad/m and x in m."""
+    def common_phase(self, s: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Phase in rad that all tiles share at the carrier, and its derivative in m with respect to
+        the wave number, of mutually broadcasting s and x in m.
+        """
         a, fit = self.common
         bend = 0.5 * (fit[0, 0] * s + fit[1, 0] * s * s)
         stretch = fit[0, 3] * s + fit[1, 3] * s * s
-        return (self.carrier + q) * (x * s + x * x * bend) + q * x * (a + s) * stretch
+        path = x * s + x * x * bend
+        return self.carrier * path, path + x * (a + s) * stretch
 
-    def tile_phase(self, q: Tensor, x: Tensor) -> Tensor:
-        """Phase in rad of each tile over q (wave number, 1, 1) and x, (wave number, tile, x)."""
-        return q * (self.a * x + 0.5 * self.curvature[:, :1] * x * x)
+    def rows(self, rows: slice) -> Expansion:
+        """Return the expansion of some of the tiles."""
+        mine = {name: getattr(self, name)[rows] for name in ("centre", "path_m", "a", "b", "c", "curvature", "fit")}
+        return replace(self, **mine)
 
-    def range_phase(self, q: Tensor, y: Tensor) -> Tensor:
-        """Phase in rad of each tile over q (wave number,) and y (y,), (tile, wave number, y)."""
-        return q[:, None] * (self.b[..., None] * y + 0.5 * self.curvature[:, 2, None, None] * y * y)
+    def tile_path(self, x: Tensor) -> Tensor:
+        """Path in m that is due to x (x,) alone, (tile, x)."""
+        return self.a * x + 0.5 * self.curvature[:, :1] * x * x
 
-    def remainders(self, q: Tensor, x: Tensor, order: int, dims: int = 1) -> list[list[Tensor]]:
-        """Complex weights of the moments of s: a list over powers of y of lists over powers of s.
+    def range_path(self, y: Tensor) -> Tensor:
+        """Path in m that is due to y (y,) alone, (tile, y)."""
+        return self.b * y + 0.5 * self.curvature[:, 2:] * y * y
 
-        The remaining phase of a tile is alpha(s) + y beta(s) + y^2 gamma(s); its exponential is
-        expanded to second order, with the powers of s up to the second and those of y up to
-        `order`.
+    def remainders(
+        self, q: Tensor, x: Tensor, order: int, dims: int = 1, *, heights: bool = False
+    ) -> list[list[Tensor]]:
+        """Complex weights of the moments of s: a list over `factors` of lists over powers of s.
+
+        The remaining phase of a tile is alpha(s) + y beta(s) + y^2 gamma(s) + h delta(s) at the
+        height h; its exponential is expanded to second order, with the powers of s up to the second
+        and those of y up to `order`.
 
         Args:
             q: Wave numbers relative to the carrier in rad/m.
             x: Positions in m.
             order: Highest power of y, 1 or 2.
             dims: Dimensions of the weights behind that of the tiles, with which q and x broadcast.
+            heights: Whether pixels have heights.
 
         Returns:
             Weights, complex128.
         """
         behind = (-1, *(1,) * dims)
-        (xx1, xy1, yy1, e1), (xx2, xy2, yy2, e2) = (
+        (xx1, xy1, yy1, e1, c1), (xx2, xy2, yy2, e2, c2) = (
             tuple(v.reshape(behind) for v in part.unbind(-1)) for part in self.fit.unbind(1)
         )
-        a, b, xy0 = (v.reshape(behind) for v in (self.a, self.b, self.curvature[:, 1]))
+        a, b, c, xy0 = (v.reshape(behind) for v in (self.a, self.b, self.c, self.curvature[:, 1]))
         mean_a, mean = self.common
         k = self.carrier + q
         # what the terms common to all tiles leave
@@ -186,9 +215,25 @@ class Expansion:
                     1j * gamma2 - beta1 * beta1 / 2 - beta0 * beta2,
                 ]
             )
+        if heights:
+            none = torch.zeros_like(beta0)
+            delta1, delta2 = k * c1 + q * c * e1, k * c2 + q * c * e2
+            weights += [
+                [none, none + 1j * delta1, 1j * delta2 - alpha1 * delta1],
+                [none, -beta0 * delta1, -beta1 * delta1 - beta0 * delta2],
+                [none, none, none - delta1 * delta1 / 2],
+            ]
         return weights
 
-    def error(self, places: Sequence[Tensor], wave: Tensor, x: Tensor, y: Tensor, order: int) -> Tensor:
+    @staticmethod
+    def factors(y: Tensor, order: int, height_m: Tensor | None = None) -> list[Tensor]:
+        """Factors of the weights of `remainders` at positions y in m and heights in m."""
+        powers = [y**power for power in range(order + 1)]
+        return powers if height_m is None else [*powers, height_m, y * height_m, height_m * height_m]
+
+    def error(
+        self, places: Sequence[Tensor], wave: Tensor, x: Tensor, y: Tensor, order: int, height_m: float = 0.0
+    ) -> Tensor:
         """Phasor that a tile gives to a single sample, relative to the exact one, less 1.
 
         Args:
@@ -197,6 +242,7 @@ class Expansion:
             x: Positions from the centre in m, float64 (x,).
             y: Positions from the centre in m, float64 (y,).
             order: Highest power of y, 1 or 2.
+            height_m: Height of the pixels above the plane of the tile in m.
 
         Returns:
             Errors, complex128 (tile, pulse, wave number, x, y).
@@ -208,7 +254,9 @@ class Expansion:
         )
         shape = (len(self.centre), len(x), len(y))
 
-        def excess(of: Sequence[Tensor], centre_m: Tensor) -> Tensor:
+        above = pixels + height_m * torch.linalg.cross(*self.axes)
+
+        def excess(of: Sequence[Tensor], centre_m: Tensor, pixels: Tensor = above) -> Tensor:
             far = slopes(of, pixels, self.axes)[0].unflatten(0, shape).movedim(-1, 1)
             return (far - centre_m[..., None, None])[:, :, None]
 
@@ -216,11 +264,15 @@ class Expansion:
         s = (a / stretch - self.a)[..., None, None, None]
         q = wave[:, None, None] - (self.carrier / stretch)[..., None, None, None]
         xx0, _, yy0 = (v.reshape(-1, 1, 1, 1, 1) for v in self.curvature.unbind(-1))
-        phase = self.common_phase(s, q, x) + self.carrier * excess(self.reference, self.path_m)
+        constant, per_wave = self.common_phase(s, x)
+        exact = excess(self.reference, self.path_m)
+        phase = constant + q * per_wave + self.carrier * exact
+        phase = phase + q * (exact - excess(self.reference, self.path_m, pixels))
         phase = phase + q * (a0 * x + 0.5 * xx0 * x * x + b0 * y + 0.5 * yy0 * y * y)
         phase = phase - wave[:, None, None] * excess(places, path)
+        factors = self.factors(y, order, torch.full_like(y, height_m))
         parts = (
-            y**power * sum(weight * s**moment for moment, weight in enumerate(weights))
-            for power, weights in enumerate(self.remainders(q, x, order, 4))
+            factor * sum(weight * s**moment for moment, weight in enumerate(weights))
+            for factor, weights in zip(factors, self.remainders(q, x, order, 4, heights=True), strict=True)
         )
         return torch.exp(1j * phase) * sum(parts) - 1

@@ -16,8 +16,10 @@ from torchsar.focus.tiles.choice import CHUNK, Choice, even_length, profile_leng
 from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
 from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, node_values, spread_kernel, window_slope
 
-# pulses to which the polynomials of a part are fitted
-_FIT_PULSES = 64
+# pulses to which the polynomials of a part are fitted, and samples of s for each node
+_FIT_PULSES, _FIT_DENSITY = 64, 2
+# degrees of the remainders in the wave number and in x
+_WAVE_DEGREE, _PIXEL_DEGREE = 2, 4
 # share of the extent of s that is added at either end for changes of the path, and least margin
 _MARGIN, _LEAST_MARGIN = 0.02, 1e-6
 _TURN = 2 * math.pi
@@ -52,8 +54,9 @@ class Band:
 
     def profiles(self, history: Tensor) -> Tensor:
         """Range profiles (..., length) of a history (..., frequency), from difference zero on."""
-        padded = pad(history, (0, self.length - self.n))
-        return torch.fft.ifft(torch.roll(padded, -(self.n // 2), -1), dim=-1, norm="forward")
+        low, high = history[..., : self.n // 2], history[..., self.n // 2 :]
+        padded = torch.cat([high, history.new_zeros(*history.shape[:-1], self.length - self.n), low], -1)
+        return torch.fft.ifft(padded, dim=-1, norm="forward")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,32 +84,37 @@ class Part:
     Args:
         band: Frequencies and profiles.
         choice: Sizes.
-        places: Nominal positions of one or two antennas over the pulses of the part, float64
-            (pulse, 3).
+        pulses: First pulse of the part and the pulse after the last.
+        places: Nominal positions of one or two antennas, float64 (pulse, 3).
         every: Positions of all paths, float64 (path, pulse, 3), for the extents.
         centre: Centres of the tiles, float64 (tile, 3).
         grid: Pixels, with the second axis nearer to the range direction.
+        relief_m: Largest height of a pixel above the plane of its tile in metres.
     """
 
     def __init__(
         self,
         band: Band,
         choice: Choice,
+        pulses: tuple[int, int],
         places: Sequence[Tensor],
         every: Sequence[Tensor],
         centre: Tensor,
         grid: ImageGrid,
+        relief_m: float = 0.0,
     ) -> None:
-        axes = grid.axes
+        axes, self.relief_m = grid.axes, relief_m
         self.band, self.choice, self.centre, self.axes = band, choice, centre, axes
-        self.pulses = pulses = len(places[0])
-        fitted = torch.linspace(0, pulses - 1, min(pulses, _FIT_PULSES)).round().long()
-        self.reference = [v[pulses // 2, None] for v in places]
+        first, last = pulses
+        self.pulses, self.count = slice(first, last), last - first
+        fitted = torch.linspace(first, last - 1, min(last - first, _FIT_PULSES)).round().long()
+        self.reference = [v[(first + last) // 2, None] for v in places]
         self.expansion = Expansion.of([v[fitted] for v in places], self.reference, centre, axes, band.carrier)
         self.x, self.y = (
             (torch.arange(n, dtype=torch.float64, device=centre.device) - (n - 1) / 2) * grid.step_m
             for n in (choice.width, choice.depth)
         )
+        every = [v[:, self.pulses] for v in every]
         low, high = self._extent(every)
         margin = _MARGIN * (high - low) + _LEAST_MARGIN
         extent = low - margin, high + margin
@@ -115,11 +123,9 @@ class Part:
         self.low = extent[0] - taps / 2 * self.node_step
         self.nodes = math.ceil((extent[1] - extent[0]) / self.node_step) + taps + 1
         self.extent = extent
-        flat = 2 * self._reach(every) + 1
-        self.length = even_length(flat + choice.rise)
+        self.length = even_length(2 * self._reach(every) + 1 + choice.rise)
         self.slope = window_slope(choice.rise, choice.guard).to(centre.device)
         self.samples = self.length + choice.rise
-        self._across(extent)
 
     def _extent(self, places: Sequence[Tensor]) -> tuple[float, float]:
         """Least and largest s of the pulses in the tiles."""
@@ -133,52 +139,86 @@ class Part:
         half = float(self.x[-1]), float(self.y[-1])
         bend = float(curvatures([v[..., ::16, :] for v in places], self.centre, self.axes).abs().max())
         reach = float((a.abs() * half[0] + b.abs() * half[1]).max()) + bend * (half[0] + half[1]) ** 2 / 2
-        return reach / self.band.step_m
+        return (reach + 2 * self.relief_m) / self.band.step_m
 
     def covers(self, places: Sequence[Tensor]) -> bool:
         """Whether other positions, each float64 (path, pulse, 3), stay within nodes and windows."""
+        places = [v[:, self.pulses] for v in places]
         low, high = self._extent(places)
         inside = self.extent[0] <= low and high <= self.extent[1]
         return inside and 2 * self._reach(places) + 1 <= self.length - self.choice.rise
 
-    def _across(self, extent: tuple[float, float]) -> None:
-        """Matrices from nodes to pixels across the range, and the weights of the tiles."""
-        m = torch.arange(self.length, dtype=torch.float64, device=self.centre.device) - self.length // 2
-        q = m * (_TURN / (self.length * self.band.step_m))
-        s = torch.linspace(*extent, 3 * self.nodes, dtype=torch.float64, device=self.centre.device)
+    @property
+    def weight_count(self) -> int:
+        """Number of complex values in `across` and in the weights of all tiles."""
+        wide, deep, powers = len(self.x), len(self.y), self.choice.order + 1
+        of_tile = self.length * powers * (MOMENTS * wide + deep) + wide * deep
+        if self.relief_m:
+            of_tile += wide * deep * 3 * math.isqrt(self.length)
+        return MOMENTS * self.length * self.nodes * wide + len(self.centre) * of_tile
+
+    def across(self, dtype: torch.dtype) -> list[Tensor]:
+        """Matrices from nodes to pixels across the range, one for each moment of s.
+
+        Args:
+            dtype: Precision of the history.
+
+        Returns:
+            Matrices (wave number, node, x) that all tiles of the part share.
+        """
+        s = torch.linspace(*self.extent, _FIT_DENSITY * self.nodes, dtype=torch.float64, device=self.centre.device)
         values = node_values((s - self.low) / self.node_step, self.nodes, self.choice.taps) / self.length
-        phase = self.expansion.common_phase(s, q[:, None, None], self.x[:, None]) / _TURN
-        phasor = unit_phasor(phase, torch.complex128)
-        moments = torch.cat([phasor * s**power for power in range(MOMENTS)], 1)  # (wave number, moment x, sample)
-        across = torch.complex(moments.real @ values.mT, moments.imag @ values.mT)
-        cut = q[:, None, None]
-        tile = unit_phasor(self.expansion.tile_phase(cut, self.x) / _TURN, torch.complex128)
-        weights = [
-            [weight * tile for weight in weights]
-            for weights in self.expansion.remainders(cut, self.x, self.choice.order)
-        ]
-        along = unit_phasor(self.expansion.range_phase(q, self.y) / _TURN, torch.complex128)
-        self._matrices = {
-            torch.complex128: Matrices(
-                across.mT.contiguous(),
-                [[w.expand(-1, len(self.centre), -1) for w in row] for row in weights],
-                [along * self.y**power for power in range(self.choice.order + 1)],
-                self._pixel_phasors(),
-            )
-        }
+        constant, path = self.expansion.common_phase(s[:, None], self.x)  # (sample, x)
+        per_wave = path / (self.length * self.band.step_m)
+        # in double precision, since the matrix has large values of either sign
+        phasor = _ramp(constant / _TURN - self.length // 2 * per_wave, per_wave, self.length, torch.complex128)
+        moments = torch.cat([values * s**power for power in range(MOMENTS)])
+        found = moments @ torch.view_as_real(phasor).reshape(len(s), -1)
+        found = torch.view_as_complex(found.view(MOMENTS, self.nodes, len(self.x), self.length, 2))
+        return list(found.to(dtype).permute(0, 3, 1, 2).contiguous())
 
-    def _pixel_phasors(self) -> Tensor:
-        """Carrier phase of the pixels at the reference place, complex128 (tile, x, y)."""
-        along = self.x[:, None, None] * self.axes[0] + self.y[:, None] * self.axes[1]
-        pixels = self.centre[:, None, None] + along
-        path = slopes(self.reference, pixels.reshape(-1, 3), self.axes)[0].reshape(pixels.shape[:-1])
-        return unit_phasor((path - self.expansion.path_m[..., None]) * (self.band.carrier / _TURN), torch.complex128)
+    def weights(self, rows: slice, dtype: torch.dtype, height_m: Tensor | None = None) -> Weights:
+        """Compute what forms the pixels of some tiles, for any history.
 
-    def matrices(self, dtype: torch.dtype) -> Matrices:
-        """Matrices in the precision of a history."""
-        if dtype not in self._matrices:
-            self._matrices[dtype] = self._matrices[torch.complex128].to(dtype)
-        return self._matrices[dtype]
+        Args:
+            rows: Tiles of the part.
+            dtype: Precision of the history.
+            height_m: Heights of the pixels above the centres of their tiles in metres, float64
+                (tile, x, y); None for 0. Differentiable.
+        """
+        of, step = self.expansion.rows(rows), 1 / (self.length * self.band.step_m)
+        # the phases of tiles are linear in the wave number
+        tile = _ramp(-(self.length // 2) * step * of.tile_path(self.x), step * of.tile_path(self.x), self.length, dtype)
+        tile = tile.movedim(-1, 0).contiguous()
+        # the remainders are polynomials of the wave number and of x
+        waves = torch.arange(self.length, dtype=torch.float64, device=self.centre.device) - self.length // 2
+        q, to_waves = _interpolation(waves * (_TURN * step), _WAVE_DEGREE)
+        x, to_pixels = _interpolation(self.x, _PIXEL_DEGREE)
+        order, raised = self.choice.order, height_m is not None
+        some = of.remainders(q[:, None, None], x, order, heights=raised)
+        few = torch.stack([w.expand(-1, len(tile[0]), -1) for row in some for w in row])
+        every = to_waves.to(dtype) @ (few.to(dtype) @ to_pixels.mT.to(dtype)).flatten(-2)
+        moments = every.view(len(some), -1, *tile.shape).mul_(tile)
+        path, along = self._pixel_path(rows, height_m), of.range_path(self.y)
+        if height_m is not None:
+            along = along[:, None] + path - self._pixel_path(rows)
+        ramps = phasor_tables(step * along, -(self.length // 2), self.length, dtype)
+        pixels = unit_phasor((path - of.path_m[..., None]) * (self.band.carrier / _TURN), dtype)
+        factors = [factor.to(pixels.real.dtype) for factor in of.factors(self.y, order, height_m)]
+        if raised:
+            return RaisedWeights(moments, ramps, [factor.expand_as(pixels.real)[:, None] for factor in factors], pixels)
+        shared = outer_phasor(*ramps, self.length).mT.contiguous()
+        return FlatWeights(moments, [shared * factor for factor in factors], pixels)
+
+    def _pixel_path(self, rows: slice, height_m: Tensor | None = None) -> Tensor:
+        """Path of the pixels of some tiles at the reference place in m, float64 (tile, x, y)."""
+        frame = torch.cat([self.axes, torch.linalg.cross(*self.axes)[None]])
+        total = torch.zeros((), dtype=torch.float64, device=self.centre.device)
+        for place in self.reference:
+            u, v, w = ((self.centre[rows] - place) @ frame.mT)[..., None, None].unbind(1)
+            w = w if height_m is None else w + height_m
+            total = total + ((u + self.x[:, None]).square() + ((v + self.y).square() + w.square())).sqrt()
+        return (3 - len(self.reference)) * total
 
     def tables(self, rows: slice, places: Sequence[Tensor], reference_m: Tensor, dtype: torch.dtype) -> Tables:
         """Compute the tables of some tiles.
@@ -191,8 +231,8 @@ class Part:
         """
         band, taps, of = self.band, self.choice.taps, self.expansion
         device, real = self.centre.device, real_dtype(dtype)
-        path, a, b = slopes(places, self.centre[rows], self.axes)
-        path, stretch = path - reference_m, b / of.b[rows, :, None]
+        path, a, b = slopes([v[:, self.pulses] for v in places], self.centre[rows], self.axes)
+        path, stretch = path - reference_m[:, self.pulses], b / of.b[rows, :, None]
         s = a / stretch - of.a[rows, :, None]
         at = path / band.step_m
         nearest = torch.round(at.detach())
@@ -202,9 +242,9 @@ class Part:
         per_sample = band.carrier * band.step_m / _TURN * (1 - 1 / stretch)
         start = band.carrier / _TURN * path - per_sample * (fraction + self.samples // 2)
         before = _ramp(start + self.samples // 2 * 0.5, per_sample + 0.5, self.samples, dtype)
-        parts, rise = torch.view_as_real(before), self.choice.rise
-        parts[..., :rise, :] *= self.slope.to(real)[:, None]
-        parts[..., -rise:, :] *= self.slope.to(real).flip(0)[:, None]
+        rise, slope = self.choice.rise, self.slope.to(dtype)
+        before[..., :rise] *= slope
+        before[..., -rise:] *= slope.flip(0)
         after = _ramp(-fraction / 2, fraction / self.length + 0.5, self.length, dtype)
         position = (s - self.low) / self.node_step
         below = torch.ceil(position.detach() - taps / 2)
@@ -212,24 +252,22 @@ class Part:
         weights = spread_kernel(away.to(real), taps)
         return Tables(first, before, after, *_spreading(below.long(), weights, self.nodes))
 
-    def nodes_of(self, profiles: Tensor, tables: Tables) -> Tensor:
-        """Sum the windows of the pulses at the nodes of some tiles.
+    def add_nodes(self, nodes: Tensor, profiles: Tensor, tables: Tables) -> None:
+        """Add the windows of the pulses to the nodes of some tiles.
 
         Args:
+            nodes: Sums at the nodes, real (tile * path * node, trial * wave number * 2); changed in
+                place.
             profiles: Range profiles, extended circularly, complex (path, pulse, trial, sample).
             tables: Tables of the tiles.
-
-        Returns:
-            Real and imaginary parts, real (tile * path, node, trial * wave number * 2).
         """
         tiles, paths, pulses = tables.first.shape
         trials, stride = profiles.shape[-2:]
         base = torch.arange(paths * pulses * trials, device=profiles.device).reshape(paths, pulses, trials) * stride
         index = (tables.first[..., None] + base).reshape(-1)
-        x = _Cut.apply(profiles.reshape(-1), index, self.samples)
-        x = _times(x.view(tiles, paths, pulses, trials, self.samples), tables.before[..., None, :])
-        rise = self.samples - self.length
-        half = rise // 2
+        x = _Cut.apply(profiles.reshape(-1), index, self.samples).view(tiles, paths, pulses, trials, self.samples)
+        x = _times(x, tables.before[..., None, :])
+        half = (self.samples - self.length) // 2
         # the slopes overlap outside the part that is used
         y = x[..., half : half + self.length].clone()
         y[..., :half] += x[..., half + self.length :]
@@ -243,65 +281,111 @@ class Part:
         z = torch.bmm(tables.spread.reshape(-1, joined, height), y.view(tiles * paths * chunks, height, width))
         block = torch.arange(tiles * paths, device=y.device) * self.nodes
         target = tables.node.reshape(tiles * paths, -1) + block[:, None]
-        out = z.new_zeros(tiles * paths * self.nodes, width).index_add(0, target.reshape(-1), z.reshape(-1, width))
-        return out.view(tiles * paths, self.nodes, width)
+        nodes.index_add_(0, target.reshape(-1), z.reshape(-1, width))
 
-    def pixels_of(self, nodes: Tensor, rows: slice, trials: int) -> Tensor:
+    def pixels_of(self, nodes: Tensor, across: Sequence[Tensor], weights: Weights) -> Tensor:
         """Form the pixels of some tiles.
 
         Args:
-            nodes: Sums at the nodes, real (tile * path, node, trial * wave number * 2).
-            rows: Tiles of the part.
-            trials: Trials of a path.
+            nodes: Sums at the nodes, real (tile * path * node, trial * wave number * 2).
+            across: Matrices of `across`.
+            weights: Weights of the tiles.
 
         Returns:
             Pixels, complex (tile, path * trial, x, y).
         """
-        tiles = len(self.centre[rows])
-        z = torch.view_as_complex(nodes.view(-1, self.nodes, trials, self.length, 2))
+        tiles, width = len(weights.pixels), len(self.x)
+        z = torch.view_as_complex(nodes.view(-1, self.nodes, nodes.shape[-1] // (2 * self.length), self.length, 2))
         z = z.permute(3, 0, 2, 1).reshape(self.length, -1, self.nodes)
-        matrices = self.matrices(z.dtype)
-        moments = torch.bmm(z, matrices.across).view(self.length, tiles, -1, MOMENTS, len(self.x)).unbind(-2)
-        image: Tensor | None = None
-        for weights, along in zip(matrices.weights, matrices.along, strict=True):
-            part = moments[0] * weights[0][:, rows, None]
-            for moment, weight in zip(moments[1:], weights[1:], strict=True):
-                part = torch.addcmul(part, moment, weight[:, rows, None])
-            part = part.permute(1, 2, 3, 0).reshape(tiles, -1, self.length)
-            image = torch.bmm(part, along[rows]) if image is None else torch.baddbmm(image, part, along[rows])
-        assert image is not None
-        return _times(image.view(tiles, -1, len(self.x), len(self.y)), matrices.pixels[rows, None])
+        moments = [torch.bmm(z, matrix).view(self.length, tiles, -1, width) for matrix in across]
+        parts = []
+        for row in weights.moments:
+            part = moments[0] * row[0][:, :, None]
+            for moment, weight in zip(moments[1:], row[1:], strict=True):
+                part.addcmul_(moment, weight[:, :, None])
+            parts.append(part)
+        return _times(weights.sums(parts), weights.pixels[:, None])
 
 
 @dataclass(frozen=True, eq=False)
-class Matrices:
-    """Constant matrices of a part.
+class FlatWeights:
+    """What forms the pixels of some tiles in the plane of the image.
 
     Args:
-        across: Nodes to pixels across the range, (wave number, node, moment * x).
-        weights: Weights of the moments, by power of y and moment, (wave number, tile, x).
-        along: Wave numbers to pixels along the range, by power of y, (tile, wave number, y).
+        moments: Weights of the moments of s, (factor, moment, wave number, tile, x).
+        along: Wave numbers to pixels along the range, by factor, (tile, wave number, y).
         pixels: Carrier phase of the pixels, (tile, x, y).
     """
 
-    across: Tensor
-    weights: list[list[Tensor]]
+    moments: Tensor
     along: list[Tensor]
     pixels: Tensor
 
-    def to(self, dtype: torch.dtype) -> Matrices:
-        """Return the matrices in another precision."""
-        return Matrices(
-            self.across.to(dtype),
-            [[w.to(dtype) for w in row] for row in self.weights],
-            [v.to(dtype) for v in self.along],
-            self.pixels.to(dtype),
-        )
+    def sums(self, parts: Sequence[Tensor]) -> Tensor:
+        """Sums of the parts (wave number, tile, trial, x) over wave numbers and factors, (tile,
+        trial, x, y).
+        """
+        image: Tensor | None = None
+        for part, along in zip(parts, self.along, strict=True):
+            rows = part.flatten(2).permute(1, 2, 0)
+            image = torch.bmm(rows, along) if image is None else image.baddbmm_(rows, along)
+        assert image is not None
+        return image.unflatten(1, parts[0].shape[2:])
+
+
+@dataclass(frozen=True, eq=False)
+class RaisedWeights:
+    """What forms the pixels of some tiles at heights above the plane of the image.
+
+    Args:
+        moments: Weights of the moments of s, (factor, moment, wave number, tile, x).
+        ramps: The two tables (`phasor_tables`) of the phasors of each pixel over the wave numbers,
+            (tile, x, y, entry).
+        factors: Factors of the pixels, (tile, 1, x, y).
+        pixels: Carrier phase of the pixels, (tile, x, y).
+    """
+
+    moments: Tensor
+    ramps: tuple[Tensor, Tensor]
+    factors: list[Tensor]
+    pixels: Tensor
+
+    def sums(self, parts: Sequence[Tensor]) -> Tensor:
+        """Sums of the parts (wave number, tile, trial, x) over wave numbers and factors, (tile,
+        trial, x, y).
+        """
+        fine, coarse = self.ramps
+        inner, outer = fine.shape[-1], coarse.shape[-1]
+        image: Tensor | None = None
+        for part, factor in zip(parts, self.factors, strict=True):
+            rows = pad(part.movedim(0, -1), (0, inner * outer - len(part))).transpose(1, 2)
+            blocks = rows.unflatten(-1, (outer, inner)).flatten(2, 3)  # (tile, x, trial * outer, inner)
+            sums = (blocks @ fine.mT).unflatten(2, (-1, outer))  # (tile, x, trial, outer, y)
+            pixels = factor * (sums * coarse.mT[:, :, None]).sum(-2).transpose(1, 2)
+            image = pixels if image is None else image + pixels
+        assert image is not None
+        return image
+
+
+Weights = FlatWeights | RaisedWeights
 
 
 def _times(x: Tensor, factor: Tensor) -> Tensor:
     """Product, in the memory of x where no gradient is asked for."""
     return x * factor if x.requires_grad or factor.requires_grad else x.mul_(factor)
+
+
+def _interpolation(wanted: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+    """Positions at which a polynomial is to be known, float64 (known,), and the matrix from its
+    values to those at the positions wanted, (wanted, known).
+    """
+    at = torch.arange(degree + 1, dtype=wanted.dtype, device=wanted.device)
+    at = -torch.cos((at + 0.5) * (math.pi / (degree + 1)))
+    half, middle = (wanted.max() - wanted.min()) / 2, (wanted.max() + wanted.min()) / 2
+    t = (wanted - middle) / half.clamp_min(torch.finfo(half.dtype).tiny)
+    powers = torch.arange(degree + 1, device=wanted.device)
+    matrix = torch.linalg.solve((at[:, None] ** powers).mT, (t[:, None] ** powers).mT).mT
+    return middle + half * at, matrix
 
 
 def _ramp(start: Tensor, step: Tensor, n: int, dtype: torch.dtype) -> Tensor:

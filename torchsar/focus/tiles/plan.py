@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import replace
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,17 +14,19 @@ from torch.utils.checkpoint import checkpoint
 from torchsar.core import block_bytes_of, checked_samples, over_blocks
 from torchsar.focus.backprojection import expanded_history
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.tiles.choice import Scene, choose, part_bounds, tile_centres, zones
+from torchsar.focus.tiles.choice import Lit, Scene, choose, part_bounds, tile_centres, tile_heights
 from torchsar.focus.tiles.expansion import slopes
 from torchsar.focus.tiles.part import Band, Part, Tables
 from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S
 
-# tables of a plan up to this size are kept between images
-_KEPT_BYTES = 1 << 28
+# tables of the pulses, and weights of the tiles, up to this size each are kept between images
+_KEPT_BYTES = 3 << 27
 # tiles and trials whose pixels are formed at once
-_GROUP = 32
+_GROUP = 16
+# profiles that are formed at once
+_PROFILE_BYTES = 1 << 25
 
 
 class TilePlan:
@@ -42,8 +45,8 @@ class TilePlan:
 
     Leading dimensions of the positions are trials with paths of their own. Their mean is the
     nominal path, from which they may differ as motion errors do. The image is differentiable in
-    the history, the positions and the reference; memory for gradients is limited to that of some
-    tiles at a time.
+    the history, the positions, the reference and the heights of the pixels; memory for gradients is
+    limited to that of some tiles at a time.
 
     Args:
         frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
@@ -54,6 +57,11 @@ class TilePlan:
             monostatic radar), float64 (..., pulse).
         grid: Pixels. The plan is fastest if one of its axes is that of the range.
         error_db: Largest rms error relative to the image of a history of white noise, in dB.
+        lit: For a beam that lights a part of the image at a time: function of positions in metres,
+            float64 (point, 3), that returns the first pulse that lights each point and the pulse
+            after the last, int64 (point, 2). It decides which pulses are summed for some tiles at a
+            time; pulses before and after those that light a pixel may be included. None for all
+            pulses.
 
     Raises:
         TypeError: If frequencies or positions are not float64.
@@ -69,8 +77,9 @@ class TilePlan:
         reference_m: Tensor,
         grid: ImageGrid,
         error_db: float = -70.0,
+        lit: Lit | None = None,
     ) -> None:
-        self.frequency_hz, self.grid, self.error_db = frequency_hz, grid, float(error_db)
+        self.frequency_hz, self.grid, self.error_db, self.lit = frequency_hz, grid, float(error_db), lit
         refuse_unusable(frequency_hz=frequency_hz)
         frequency_step_hz(frequency_hz)
         self._set_path(transmitter_m, receiver_m, reference_m)
@@ -83,7 +92,7 @@ class TilePlan:
         size = *antennas.trials, antennas.pulses
         self._places = [place.expand(*size, 3).reshape(-1, *size[-1:], 3) for place in antennas.places]
         self._reference_m = reference_m.expand(size).reshape(-1, *size[-1:])
-        self._kept: dict[tuple, Tables] = {}
+        self._tables: dict[tuple, Tables] = {}
 
     def _plan(self, every: Sequence[Tensor]) -> None:
         """Choose the sizes and compute what does not depend on the history."""
@@ -94,32 +103,27 @@ class TilePlan:
         # the second axis of a tile is that of the range
         self._swapped = float(a.abs().mean()) > float(b.abs().mean())
         if self._swapped:
-            grid = replace(grid, axes=grid.axes.flip(0), counts=grid.counts[::-1])
-        self.choice = choice = choose(Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid), self.error_db)
-        size = choice.width, choice.depth
+            grid = grid.transposed()
+        scene = Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid, self.lit)
+        self.choice = choice = choose(scene, self.error_db)
+        self._size = size = choice.width, choice.depth
         self._band = Band.of(self.frequency_hz, LIGHT_M_S, choice.oversampling)
-        self._bounds = part_bounds(nominal[0].shape[0], choice.parts)
         self._tiles = tuple(-(-n // m) for n, m in zip(grid.counts, size, strict=True))
-        numbers, self._zones = [], []
-        for block in zones(grid.counts, *size):
+        self._numbers: list[Tensor] = []
+        self._zones: list[list[Part]] = []
+        mean, relief = scene.relief(*size)
+        for block in scene.zones(*size):
             i, j = (torch.arange(s.start, s.stop, device=grid.origin_m.device) for s in block)
-            numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
-            self._zones.append(
-                [
-                    Part(
-                        self._band,
-                        choice,
-                        [place[first:last] for place in nominal],
-                        [place[:, first:last] for place in every],
-                        tile_centres(grid, *size, i, j),
-                        grid,
-                    )
-                    for first, last in self._bounds
-                ]
-            )
-        self._order = torch.argsort(torch.cat(numbers))
-        samples = sum(len(part.centre) * part.pulses * (part.samples + part.length) for z in self._zones for part in z)
-        self._keeps = samples * len(every[0]) * 8 <= _KEPT_BYTES
+            self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
+            centre = tile_centres(grid, *size, i, j, mean)
+            bounds = part_bounds(*scene.pulses_of(block, *size), choice.parts)
+            given = nominal, every, centre, grid, relief
+            self._zones.append([Part(self._band, choice, pulses, *given) for pulses in bounds])
+        parts = [part for zone in self._zones for part in zone]
+        samples = sum(len(part.centre) * part.count * (part.samples + part.length) for part in parts)
+        self._keeps_tables = samples * len(every[0]) * 8 <= _KEPT_BYTES
+        self._keeps_weights = 8 * sum(part.weight_count for part in parts) <= _KEPT_BYTES
+        self._weights: dict[tuple, Any] = {}
 
     def moved(self, transmitter_m: Tensor, receiver_m: Tensor | None, reference_m: Tensor) -> TilePlan:
         """Return the plan of a path that differs little, such as by a change of its motion errors.
@@ -145,9 +149,7 @@ class TilePlan:
         places = [place.detach() for place in plan._places]
         with torch.no_grad():
             if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places] or not all(
-                part.covers([place[:, first:last] for place in places])
-                for zone in self._zones
-                for part, (first, last) in zip(zone, self._bounds, strict=True)
+                part.covers(places) for zone in self._zones for part in zone
             ):
                 plan._plan(places)
         return plan
@@ -175,24 +177,7 @@ class TilePlan:
         order = sorted(range(len(lead)), key=lambda d: own[d] != lead[d])
         paths = len(self._reference_m)
         data = history.permute(*order, -2, -1).reshape(paths, -1, *size)
-        trials = data.shape[1]
-        profiles = self._profiles(data.transpose(1, 2))
-        step = max(1, _GROUP // (paths * trials))
-        groups = [
-            (zone, slice(first, min(first + step, len(zone[0].centre))))
-            for zone in self._zones
-            for first in range(0, len(zone[0].centre), step)
-        ]
-        if torch.is_grad_enabled() and any(v.requires_grad for v in (history, *self._places, self._reference_m)):
-            found = [checkpoint(self._pixels, *group, profiles, use_reentrant=False) for group in groups]
-        else:
-            found = [history] * len(groups)
-
-            def work(at: int) -> None:
-                found[at] = self._pixels(*groups[at], profiles)
-
-            over_blocks(work, range(len(groups)), history)
-        tiles = torch.cat(found)[self._order].unflatten(0, self._tiles)  # (tile, tile, path * trial, x, y)
+        tiles = self._formed(data.transpose(1, 2)).unflatten(0, self._tiles)  # (tile, tile, path * trial, x, y)
         image = tiles.permute(2, 0, 3, 1, 4).flatten(1, 2).flatten(-2)
         if self._swapped:
             image = image.mT
@@ -200,40 +185,93 @@ class TilePlan:
         image = image.reshape(*(lead[d] for d in order), *self.grid.counts)
         return image.permute(*(order.index(d) for d in range(len(lead))), -2, -1)
 
-    def _profiles(self, data: Tensor) -> list[Tensor]:
-        """Range profiles of each sub-aperture, extended by the longest window, for data (path,
-        pulse, trial, frequency).
-        """
-        out = []
-        for k, (first, last) in enumerate(self._bounds):
-            x = self._band.profiles(data[:, first:last])
-            longest = max(zone[k].samples for zone in self._zones)
-            out.append(x[..., torch.arange(x.shape[-1] + longest, device=x.device) % x.shape[-1]])
-        return out
+    def _formed(self, data: Tensor) -> Tensor:
+        """All tiles, (tile, path * trial, x, y), of data (path, pulse, trial, frequency)."""
+        profiles = self._profiles(data)
+        paths, _, trials, _ = data.shape
+        step = max(1, _GROUP // (paths * trials))
+        heights = tile_heights(self.grid.transposed() if self._swapped else self.grid, *self._size)
+        if heights is not None:
+            heights = (heights - heights.detach().mean((-2, -1), keepdim=True)).flatten(0, 1)
+        found: list[Tensor] = []
+        given = [data, *self._places, self._reference_m, *([] if heights is None else [heights])]
+        grad = torch.is_grad_enabled() and any(v.requires_grad for v in given)
+        count = 0 if grad else math.prod(self._tiles)
+        tiles = data.new_empty(count, paths * trials, *self._size)
+        for zone, numbers in zip(self._zones, self._numbers, strict=True):
+            across = [self._keep((part, data.dtype), part.across, data.dtype) for part in zone]
+            above = None if heights is None else heights[numbers]
+            rows = [slice(i, min(i + step, len(numbers))) for i in range(0, len(numbers), step)]
+            if grad:
+                fixed = across, profiles, above
+                found += [checkpoint(self._pixels, zone, some, *fixed, use_reentrant=False) for some in rows]
+                continue
 
-    def _pixels(self, zone: Sequence[Part], rows: slice, profiles: Sequence[Tensor]) -> Tensor:
+            def work(some: slice) -> None:
+                tiles[numbers[some]] = self._pixels(zone, some, across, profiles, above)  # noqa: B023
+
+            over_blocks(work, rows, data)
+        return torch.cat(found)[torch.argsort(torch.cat(self._numbers))] if grad else tiles
+
+    def _profiles(self, data: Tensor) -> Tensor:
+        """Range profiles of data (path, pulse, trial, frequency), their first samples repeated."""
+        longest = max((part.samples for zone in self._zones for part in zone), default=0)
+        length = self._band.length
+        whole = data.new_empty(*data.shape[:-1], length + longest)
+        step = max(1, _PROFILE_BYTES // (whole[:, :1].numel() * whole.element_size()))
+        for i in range(0, data.shape[1], step):
+            whole[:, i : i + step, :, :length] = self._band.profiles(data[:, i : i + step])
+        whole[..., length:] = whole[..., torch.arange(longest, device=data.device) % length]
+        return whole
+
+    def _pixels(
+        self,
+        zone: Sequence[Part],
+        rows: slice,
+        across: Sequence[list[Tensor]],
+        profiles: Tensor,
+        height_m: Tensor | None,
+    ) -> Tensor:
         """Pixels of some tiles, summed over the sub-apertures, (tile, path * trial, x, y)."""
-        total: Tensor | None = None
-        for k, (part, x) in enumerate(zip(zone, profiles, strict=True)):
-            size = part.samples * x[..., 0].numel() * x.element_size()
-            step = max(1, block_bytes_of(x.device) // size)
-            blocks = [slice(i, min(i + step, rows.stop)) for i in range(rows.start, rows.stop, step)]
-            nodes = torch.cat([part.nodes_of(x, self._tables(part, k, block, x.dtype)) for block in blocks])
-            image = part.pixels_of(nodes, rows, x.shape[-2])
+        paths, _, trials, _ = profiles.shape
+        dtype, height_m = profiles.dtype, None if height_m is None else height_m[rows]
+        total = profiles.new_zeros(rows.stop - rows.start, paths * trials, *self._size) if not zone else None
+        for part, matrices in zip(zone, across, strict=True):
+            x = profiles[:, part.pulses]
+            step = max(1, block_bytes_of(x.device) // (part.samples * x[..., 0].numel() * x.element_size()))
+            height = paths * part.nodes
+            nodes = x.real.new_zeros((rows.stop - rows.start) * height, trials * part.length * 2)
+            for i in range(rows.start, rows.stop, step):
+                some = slice(i, min(i + step, rows.stop))
+                where = slice((some.start - rows.start) * height, (some.stop - rows.start) * height)
+                part.add_nodes(nodes[where], x, self._tables_of(part, some, dtype))
+            if height_m is not None and height_m.requires_grad:
+                weights = part.weights(rows, dtype, height_m)
+            else:
+                weights = self._keep((part, rows.start, rows.stop, dtype), part.weights, rows, dtype, height_m)
+            image = part.pixels_of(nodes, matrices, weights)
             total = image if total is None else total + image
         assert total is not None
         return total
 
-    def _tables(self, part: Part, k: int, rows: slice, dtype: torch.dtype) -> Tables:
+    def _keep(self, key: tuple, make: Callable, *given: Any) -> Any:
+        """What depends on the plan alone, from the last image if it is kept."""
+        if key in self._weights:
+            return self._weights[key]
+        with torch.no_grad():
+            found = make(*given)
+        if self._keeps_weights:
+            self._weights[key] = found
+        return found
+
+    def _tables_of(self, part: Part, rows: slice, dtype: torch.dtype) -> Tables:
         """Tables of some tiles, from the last image if they are kept."""
-        key = id(part), rows.start, rows.stop, dtype
-        if key in self._kept:
-            return self._kept[key]
-        pulses = slice(*self._bounds[k])
-        places = [place[:, pulses] for place in self._places]
-        tables = part.tables(rows, places, self._reference_m[:, pulses], dtype)
-        if self._keeps and not tables.before.requires_grad:
-            self._kept[key] = tables
+        key = part, rows.start, rows.stop, dtype
+        if key in self._tables:
+            return self._tables[key]
+        tables = part.tables(rows, self._places, self._reference_m, dtype)
+        if self._keeps_tables and not tables.before.requires_grad:
+            self._tables[key] = tables
         return tables
 
 
@@ -245,6 +283,7 @@ def image_tiles(
     reference_m: Tensor,
     grid: ImageGrid,
     error_db: float = -70.0,
+    lit: Lit | None = None,
 ) -> Tensor:
     """Form the image of a phase history by tiles; see `TilePlan`, which serves several histories.
 
@@ -256,6 +295,7 @@ def image_tiles(
         reference_m: Path to which the phases refer in metres, float64 (..., pulse).
         grid: Pixels.
         error_db: Largest rms error relative to the image of a history of white noise, in dB.
+        lit: Pulses that light each point, see `TilePlan`; None for all.
 
     Returns:
         Image, shape (..., i, j), complex.
@@ -265,4 +305,4 @@ def image_tiles(
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
             equal steps, or tiles do not reach the error in this geometry.
     """
-    return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db).image(history)
+    return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit).image(history)

@@ -243,6 +243,7 @@ FOCUS: dict[str, Callable[..., Any]] = {
     "closest_range": focus.ClosestRange,
     "tile_image": focus.TileImage,
     "direct_image": focus.DirectImage,
+    "omega_k_image": focus.OmegaKImage,
     "compress_dechirped": focus.CompressDechirped,
     "azimuth_transform": focus.AzimuthTransform,
     "target_image": focus.TargetImage,

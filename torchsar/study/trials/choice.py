@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from torchsar.metrics.direct_images import DirectlySummed
+
 
 @dataclass(frozen=True)
 class Alternative:
@@ -68,3 +70,25 @@ class Choice:
     alternatives: Sequence[Alternative]
     measured: Callable[[], Measured] | None = None
     yardstick: Alternative | None = None
+
+
+def beside_direct_sum(prepared: Callable[[], DirectlySummed], neglects: str) -> Choice:
+    """Return the comparison of the recommended image with the direct sum at random pixels.
+
+    Args:
+        prepared: Function that prepares the image.
+        neglects: What the recommended image neglects.
+    """
+
+    def measured() -> Measured:
+        of = prepared()
+        return Measured(
+            lambda one: of.exact() if one.keys else of.image(),
+            lambda one, made: {"image_error_db": of.error_db(made if one.keys else of.at(made))},
+            lambda one: of.share if one.keys else 1.0,
+        )
+
+    exact = Alternative("direct sum, times extrapolated from random pixels", {"exact": True})
+    return Choice(
+        "image beside the direct sum", "image", [Alternative("recommended image", {}, None, neglects), exact], measured
+    )

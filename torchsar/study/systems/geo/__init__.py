@@ -21,8 +21,7 @@ from torchsar.metrics.moving_point import (
     ideal_responses,
     point_responses,
 )
-from torchsar.multichannel import ElementPattern, FlatBand
-from torchsar.multichannel.response import clutter_covariance
+from torchsar.multichannel.response import noise_and_clutter
 from torchsar.radar import BistaticRadar
 from torchsar.study.names.registry import MULTICHANNEL_IMPAIRMENTS
 from torchsar.study.output.pictures import Drawn
@@ -35,8 +34,6 @@ from torchsar.study.trials.batch import Batch, Found, Judged, Outcome, Result, T
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Column, System
 
-# Doppler bands that contain clutter illuminated through an antenna pattern
-_CLUTTER_BANDS = 5
 _IMAGES = (("azimuth",), ("azimuth", "range"))
 
 
@@ -280,13 +277,7 @@ def _clutter(world: Points, radar: BistaticRadar) -> Tensor | None:
     if world.sea is None:
         return None
     gate = world.gate if world.sea_gate is None else world.sea_gate
-    lit = getattr(gate, "duration_s", None)
-    band = None if lit is None else radar.speed_m_s**2 * lit / (radar.wavelength_m * radar.reference_range_m)
-    prior = ElementPattern() if band is None else FlatBand(band)
-    clutter = clutter_covariance(radar, prior, world.pulses, _CLUTTER_BANDS)
-    level = 10 ** (torch.as_tensor(world.sea.power_db, dtype=torch.float64) / 10)
-    mean = clutter.diagonal(dim1=-2, dim2=-1).real.mean()
-    return clutter * (level[..., None, None, None] / mean) + torch.eye(radar.channels, dtype=clutter.dtype)
+    return noise_and_clutter(radar, getattr(gate, "duration_s", None), world.pulses, world.sea.power_db)
 
 
 SYSTEM = Geo

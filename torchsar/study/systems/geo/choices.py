@@ -12,9 +12,11 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Alternate, Chain, Draws, Signal
+from torchsar.echo import bistatic_echo
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_db
+from torchsar.metrics.direct_images import DirectlySummed, points_at_rest
 from torchsar.metrics.moving_point import FocusedPoint, PeakCuts, point_responses, worst_image_error_db
 from torchsar.metrics.replicas import azimuth_response
 from torchsar.multichannel import (
@@ -27,7 +29,9 @@ from torchsar.multichannel import (
     MultichannelUse,
     NoMigration,
     Reconstruct,
+    RemoveTransmitRange,
     StaticBulk,
+    StationaryImage,
     known_motion_chain,
     multichannel_limits,
     multichannel_requirements,
@@ -42,11 +46,11 @@ from torchsar.multichannel.velocity import (
     SignalIntensityRatio,
 )
 from torchsar.multichannel.velocity.migrating import MigratingLines
-from torchsar.scene import BandLimited, ExactRange, LitPoints, TaylorRange
+from torchsar.scene import BandLimited, ExactRange, LitPoints, MovingPoints, TaylorRange
 from torchsar.study.systems.geo.world import TRUTHS, Level, Points
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 
 _ESTIMATORS: dict[type, Estimator] = {
     SignalIntensityRatio: "sir",
@@ -185,6 +189,7 @@ def choices(bench: Bench) -> list[Choice]:
         Choice("range to the receiver", "world.receive", series, partial(_received, bench)),
         Choice("dimensions", "world.samples", dimensions, partial(_dimensions, bench)),
         Choice("precision", "precision", precisions, partial(_precisions, bench)),
+        beside_direct_sum(partial(_summed, bench), "ambiguities that reconstruction suppresses"),
     ]
 
 
@@ -320,3 +325,18 @@ def _dimensions(bench: Bench) -> Measured:
         return {"width_change_percent": float((100 * (width(image) / exact - 1)).abs().max())}
 
     return Measured(run, loss, lambda one: share)
+
+
+def _summed(bench: Bench) -> DirectlySummed:
+    """Image of points at rest by the bands that are reconstructed for known motion."""
+    radar, size = bench.radar, _cropped(bench)
+    gate, pulses, samples = size["gate"], size["pulses"], _LINES
+
+    def echo(azimuth_m: Tensor, range_m: Tensor) -> Tensor:
+        still = torch.zeros_like(range_m)
+        movers = MovingPoints(still, still, azimuth_m, range_m).movers(radar, Draws(0))
+        made = bistatic_echo(movers, radar, pulses, samples, gate=gate, dtype=torch.complex128)
+        return RemoveTransmitRange(radar)(Signal(made, radar.axes(pulses, samples))).data
+
+    stage, draws = StationaryImage(radar, LeastSquares(min(2, radar.channels))), Draws(bench.config.seed)
+    return points_at_rest(radar, stage, (pulses, samples), gate.duration_s, draws, bench.dtype, echo)

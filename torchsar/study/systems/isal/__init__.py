@@ -11,11 +11,14 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate import autofocus
-from torchsar.core import Draws, Recording, Trace
+from torchsar.core import Draws, Recording, Signal, Trace
+from torchsar.echo.turntable import rotation_angle
+from torchsar.focus import AzimuthTransform
 from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.io import read_inverse
 from torchsar.metrics import phase_rmse
+from torchsar.metrics.direct_images import DirectlySummed, turning_target
 from torchsar.radar import InverseRadar, geometry_of
 from torchsar.scene import PhaseOnly, Sinusoid, displacement_m
 from torchsar.study.names.factories import with_wavelength
@@ -27,7 +30,7 @@ from torchsar.study.systems.isal.judge import received, whole_phase
 from torchsar.study.systems.isal.world import Target, echo_choices
 from torchsar.study.trials.batch import Judged, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 from torchsar.study.trials.system import Column, System
 
 _GEOMETRY = ("frequency_hz", "angle_rad", "position_m", "reference_m")
@@ -45,7 +48,7 @@ class Isal(System):
     impairments = TARGET_IMPAIRMENTS
     reads = "range profile or phase history"
     ending = "azimuth_transform or target_image"
-    tolerance = {"echo_error_db": -20.0, "residual_phase_rms_rad": 0.1}
+    tolerance = {"echo_error_db": -20.0, "image_error_db": -20.0, "residual_phase_rms_rad": 0.1}
     exact = {"world.fidelity": {"kind": "dechirped"}}
     definitions = {
         "snr": "mean power of all range-compressed samples over noise variance, dB",
@@ -120,8 +123,12 @@ class Isal(System):
                 "use a config that simulates the echoes"
             )
         efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
+        # without a rotation rate the image has no cross range
+        known = bench.radar.rotation_rad_s is not None
+        images = [beside_direct_sum(partial(_summed, bench), "migration while the target turns")] * known
         return [
             *echo_choices(bench),
+            *images,
             Choice("effort of autofocus", "autofocus.search", efforts, partial(_efforts, bench)),
         ]
 
@@ -148,6 +155,19 @@ def _efforts(bench: Bench) -> Measured:
         return {"residual_phase_rms_rad": float((error(phase) - best).max())}
 
     return Measured(lambda one: autofocus(data, **one.keys)["phase_rad"], loss)
+
+
+def _summed(bench: Bench) -> DirectlySummed:
+    """Image of white noise by the transform along the pulses."""
+    world, radar = bench.world(), bench.radar
+    axes = radar.raw_axes(world.pulses, world.samples)
+    rate = radar.rotation_rad_s if world.rotation_rad_s is None else world.rotation_rad_s
+    turning = float(torch.as_tensor(rate).reshape(-1)[0])
+    angle = rotation_angle(radar, world.pulses, turning, torch.empty(()))
+    # the axis has the scale of the assumed rate
+    cross, image = radar.image_axes(axes)[0].values() * (radar.rotation_rad_s / turning), AzimuthTransform(radar)
+    about = (radar, angle, cross, 0.0, world.samples, Draws(bench.config.seed))
+    return turning_target(*about, lambda noise: image(Signal(noise.to(bench.dtype), axes)).data)
 
 
 SYSTEM = Isal

@@ -25,12 +25,13 @@ from torchsar.focus.rotation_requirements import (
     rotation_requirements,
 )
 from torchsar.metrics import error_db, rotation_bounds
+from torchsar.metrics.direct_images import DirectlySummed, turning_target
 from torchsar.scene import PhaseOnly, Points
 from torchsar.study.systems.isal.world import echo_choices
 from torchsar.study.systems.isal_rotation.world import Rotating, first_values, k_of
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 from torchsar.study.trials.system import Noise
 
 # products of pulses, lines and range cells up to which the sum itself is the yardstick
@@ -91,6 +92,7 @@ def choices(bench: Bench) -> list[Choice]:
         Choice("order of the rotation", "rotation.order", orders, partial(_orders, bench)),
         Choice("range term", "range_phase", range_terms, partial(_range_terms, bench)),
         Choice("transform", "matched_fourier.transform", transforms, partial(_transforms, bench)),
+        beside_direct_sum(partial(_summed, bench), "migration, range in a cell"),
         Choice("estimator of the rotation", "estimator", found, partial(_estimates, bench)),
         *echo_choices(bench),
     ]
@@ -228,6 +230,22 @@ def _transforms(bench: Bench) -> Measured:
         return matched_fourier(data, k, bench.radar.prf_hz, transform=made)
 
     return Measured(run, lambda one, image: {"image_error_db": float(error_db(image.to(truth), truth).max())})
+
+
+def _summed(bench: Bench) -> DirectlySummed:
+    """Image of white noise by the true rotation of the first trial."""
+    (omega, k, yc), radar, world, lines = _rotation(bench.world()), bench.radar, bench.world(), DopplerLines()
+    range_m, count = radar.raw_axes(world.pulses, world.samples)[1].values(), lines.number(world.pulses)
+    phi = warp(torch.arange(world.pulses + 1, dtype=torch.float64) / radar.prf_hz, k)
+    # lines lie at equal steps of the Doppler at the mean rate
+    doppler = (torch.arange(count, dtype=torch.float64) - count // 2) / (lines.oversampling * phi[-1])
+
+    def image(noise: Tensor) -> Tensor:
+        about = (range_m, radar.wavelength_m, radar.prf_hz, omega, k, yc)
+        return matched_fourier(range_phase(noise.to(bench.dtype), *about), k, radar.prf_hz, lines=lines)
+
+    cross = radar.wavelength_m * doppler / (2 * omega)
+    return turning_target(radar, omega * phi[:-1], cross, yc, world.samples, Draws(bench.config.seed), image)
 
 
 def _draws(bench: Bench) -> Draws:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Trace
-from torchsar.focus import PathImage, TilePlan, backproject
+from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
+from torchsar.focus.motion_compensation import possible_compensations
 from torchsar.io import read_path
 from torchsar.metrics import error_db, registered_error_db
+from torchsar.metrics.direct_images import some_pixels, white_noise
 from torchsar.radar import AntennaPath, InverseRadar
 from torchsar.study.names.registry import PATH_IMPAIRMENTS
 from torchsar.study.output.pictures import Drawn, comparisons
@@ -26,8 +28,6 @@ from torchsar.study.trials.system import Column, System
 
 # errors of tiles that are compared, in dB
 _ERRORS_DB = (-20.0, -40.0, -60.0, -80.0)
-# pixels, by choice, at which images are compared with the direct sum
-_PIXELS = 256
 
 
 class AnyPath(System):
@@ -39,7 +39,7 @@ class AnyPath(System):
     World = Flown
     impairments = PATH_IMPAIRMENTS
     reads = "phase history with positions"
-    ending = "tile_image or direct_image"
+    ending = "tile_image, omega_k_image or direct_image"
     tolerance = {"image_error_db": -40.0}
     exact = {"stage": {"stage": "direct_image"}}
     definitions = {
@@ -48,7 +48,7 @@ class AnyPath(System):
         "contrast": "standard deviation over mean of the intensity |I|^2",
         "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB, I0 from the reference method, after the shift, the "
         "linear phase over the image and the complex gain g that fit best, which autofocus cannot observe; in `trade`: "
-        "of the image of white noise, without registration",
+        "of the image of white noise, without registration, relative to the direct sum over the same pulses",
         "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
         "corrected minus true, without constant and linear terms; modulo half a wavelength where the path or phases of "
         "pulses are corrected",
@@ -113,23 +113,38 @@ class AnyPath(System):
         aux, grid = clean.aux, stage.grid
         antennas = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
         geometry = (aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
-        plans: dict[float, TilePlan] = {}
+        tiles: dict[float, float] = {}
         for error in _ERRORS_DB:
             try:
-                plans[error] = TilePlan(*geometry, grid, error)
+                tiles[error] = TilePlan(*geometry, grid, error).choice.error_db
             except ValueError:  # the geometry does not allow it
                 break
         alternatives = [
             Alternative(
                 f"tiles at {error:g} dB",
                 {"stage": "tile_image", "error_db": error},
-                {"image_error_db": plan.choice.error_db},
+                {"image_error_db": predicted},
                 "higher terms of the path within tiles",
             )
-            for error, plan in plans.items()
+            for error, predicted in tiles.items()
+        ]
+        # by the beam of the method that uses omega-K, if there is one
+        stages = [one for chain in bench.chains.values() for one in chain.stages.values()]
+        pattern = None if bench.recording is not None else bench.world().lit_power
+        beams = [one.beam for one in stages if isinstance(one, OmegaKImage)]
+        straight = {} if not beams else possible_compensations(geometry[0], antennas, grid, beams[0])
+        compensated = [
+            Alternative(
+                f"omega-K after motion compensation of order {order}",
+                {"stage": "omega_k_image", "order": order, "beam_deg": one.beam.width_deg},
+                {"image_error_db": one.predicted_db(pattern)},
+                "change of motion errors with the angle" + (" and with the range" if order == 1 else ""),
+            )
+            for order, one in straight.items()
         ]
         exact = Alternative("direct sum", {"stage": "direct_image"}, {})
-        return [Choice("image", "stage", [*alternatives, exact], partial(_measured, bench, geometry, plans, stage))]
+        measured = partial(_measured, bench, geometry, tiles, straight, stage)
+        return [Choice("image", "stage", [*compensated, *alternatives, exact], measured)]
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         yield partial(comparisons, results, self.columns)
@@ -138,27 +153,39 @@ class AnyPath(System):
             yield partial(figures.paths, case, result)
 
 
-def _measured(bench: Bench, geometry: tuple, plans: Mapping[float, TilePlan], stage: PathImage) -> Measured:
-    """Images of white noise by tiles, at random pixels beside the direct sum."""
+def _measured(
+    bench: Bench,
+    geometry: tuple[Tensor, Tensor, Tensor | None, Tensor],
+    tiles: Iterable[float],
+    straight: Mapping[int, MotionCompensation],
+    stage: PathImage,
+) -> Measured:
+    """Images of white noise, at random pixels beside the direct sum."""
     frequency, place, receiver, reference = geometry
-    size = (place.shape[-2], len(frequency))
-    noise = Draws(bench.config.seed).normal("trade.noise", size, torch.complex128)
+    draws = Draws(bench.config.seed)
+    noise = white_noise(draws, place.shape[-2], len(frequency))
     counts = stage.grid.counts
-    some = Draws(bench.config.seed).subset("trade.pixels", counts[0] * counts[1], min(_PIXELS, counts[0] * counts[1]))
+    some = some_pixels(draws, counts[0] * counts[1])
     pixels = stage.grid.pixels_m().reshape(-1, 3)[some]
-    exact = backproject(noise, frequency, place, receiver, reference, pixels)
-    history = noise.to(bench.dtype)
+    whole = backproject(noise, frequency, place, receiver, reference, pixels)
+    history, plans = noise.to(bench.dtype), {error: TilePlan(*geometry, stage.grid, error) for error in tiles}
 
     def run(one: Alternative) -> Tensor:
         if "error_db" in one.keys:
             return plans[one.keys["error_db"]].image(history)
+        if "order" in one.keys:
+            return straight[one.keys["order"]].image(history)
         return backproject(history, frequency, place, receiver, reference, pixels, eps=1e-6)
 
     def loss(one: Alternative, image: Tensor) -> dict[str, float]:
-        made = image.flatten(-2)[..., some] if "error_db" in one.keys else image
+        exact = straight[one.keys["order"]].exact(noise, pixels) if "order" in one.keys else whole
+        made = image if one.keys["stage"] == "direct_image" else image.flatten(-2)[..., some]
         return {"image_error_db": float(error_db(made[..., None, :].to(exact.dtype), exact[..., None, :]).max())}
 
-    return Measured(run, loss, lambda one: 1.0 if "error_db" in one.keys else len(some) / (counts[0] * counts[1]))
+    def share(one: Alternative) -> float:
+        return len(some) / (counts[0] * counts[1]) if one.keys["stage"] == "direct_image" else 1.0
+
+    return Measured(run, loss, share)
 
 
 SYSTEM = AnyPath

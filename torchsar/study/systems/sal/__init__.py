@@ -74,7 +74,7 @@ class Sal(System):
     World = Ground
     Judging = Judging
     ending = "azimuth_matched_filter"
-    tolerance = {"echo_error_db": -20.0, "velocity_rmse_m_s": 1e-4}
+    tolerance = {"echo_error_db": -20.0, "image_error_db": -20.0, "velocity_rmse_m_s": 1e-4}
     exact = {"world.fidelity": {"kind": "every_sample", "without": []}}
     definitions = {
         "snr": "per sample before any compression, of a scatterer of amplitude 1 against the variance of the complex "

@@ -15,16 +15,18 @@ from torchsar.compensate.radial import mirror_product, radial_motion, segmented_
 from torchsar.compensate.radial.mirror import Intercept
 from torchsar.core import Draws, Estimate
 from torchsar.echo import range_model_error_db
+from torchsar.focus import AzimuthMatchedFilter
 from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_after_gain_db
+from torchsar.metrics.direct_images import DirectlySummed, ladar_strip
 from torchsar.metrics.radial_motion import lit_periods
 from torchsar.scene import drawn_motion
 from torchsar.scene.moved_scene import Moved
 from torchsar.study.names.registry import SWEEP_FIDELITIES
 from torchsar.study.systems.sal.world import Ground
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 from torchsar.study.trials.system import Noise
 
 # limits that stop only methods with such a stage, whose key has that value
@@ -111,9 +113,12 @@ def choices(bench: Bench, seen: Moved) -> list[Choice]:
     # a continuous record knows no single range of a sweep
     possible = [entry for entry in _MODELS if bench.world().record is None or not entry[0].startswith("one_per")]
     models = [_model(bench, seen, *entry) for entry in possible]
+    filters = [n for n, s in bench.chains["recommended"].stages.items() if isinstance(s, AzimuthMatchedFilter)]
+    images = [beside_direct_sum(partial(_summed, bench, n), "migration while a point is seen") for n in filters[-1:]]
     return [
         Choice("echo model", "world.fidelity", models, partial(_echoes, bench, seen)),
         Choice("estimator of the velocity", "estimator", found, partial(_estimates, bench)),
+        *images,
     ]
 
 
@@ -171,3 +176,11 @@ def _estimates(bench: Bench) -> Measured:
 
     best = error(radial_motion(sweeps.data, bench.radar, pulse, window_m=window))
     return Measured(run, lambda one, estimate: {"velocity_rmse_m_s": error(estimate) - best})
+
+
+def _summed(bench: Bench, name: str) -> DirectlySummed:
+    """Image of white noise by a filter of the recommended method, on the axes of its data."""
+    draws, chain = Draws(bench.config.seed), bench.chains["recommended"]
+    data = chain.trace(bench.trials(Draws(bench.config.seed, "trade", [0])).recording).inputs[name]
+    beam = getattr(chain.stages[name], "beam_rad", None) or bench.radar.beam_rad
+    return ladar_strip(bench.radar, data.axes[-2], data.axes[-1], beam, draws, bench.dtype)

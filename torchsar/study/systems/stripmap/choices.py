@@ -17,12 +17,13 @@ from torchsar.echo.jitter import sample_unevenly
 from torchsar.focus.patches import HALF, PointPatches
 from torchsar.focus.requirements import Requirement, full_swath_m, requirements
 from torchsar.metrics import error_after_gain_db, error_db
+from torchsar.metrics.direct_images import PIXELS, DirectlySummed, points_of_a_strip
 from torchsar.radar import StripmapRadar
 from torchsar.repair.jitter import BandLimited, Exact, Lagrange
 from torchsar.scene import Dwell, Hyperbola, Parabola, Points, StripmapWorld
 from torchsar.study.names.registry import FOCUS
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 
 # a period of four timing offsets (samples) as in Tsvetkov 2017, and raw lines enough to time them
 _OFFSETS, _LINES = (0.0, 0.18, -0.12, 0.07), 1024
@@ -133,6 +134,7 @@ def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
     found = [
         Choice("focusing form", "stage", forms, partial(_forms, bench), exact),
         Choice("precision", "precision", precisions, partial(_precisions, bench)),
+        beside_direct_sum(partial(_summed, bench), "change of migration over the swath"),
     ]
     if bench.recording is None:
         probe = probe_of(bench)
@@ -174,12 +176,30 @@ def _forms(bench: Bench) -> Measured:
     return Measured(run, loss, lambda one: 1.0 if one.keys else exact.numel() / signal.data.numel())
 
 
+def _form_of(bench: Bench) -> str:
+    """The form of focusing of the recommended method."""
+    names = [entry["stage"] for entry in (bench.config.processor["recommended"].stages or {}).values()]
+    return next((name for name in names if name in FORMS), "omega_k")
+
+
+def _summed(bench: Bench) -> DirectlySummed:
+    """Points at random positions of the swath, by the recommended form."""
+    probe, radar = probe_of(bench), bench.radar
+    reach = max(0.0, probe.size[0] / radar.prf_hz - probe.dwell_s) / 2 * radar.velocity_m_s
+    at = Draws(bench.config.seed).uniform("trade.points", (2, PIXELS))
+    low, high = min(probe.edges_m), max(probe.edges_m)
+    scene = Points(((2 * at[0] - 1) * reach).tolist(), (low + at[1] * (high - low)).tolist())
+    recording, truth = replace(probe, world=replace(probe.world, scene=scene)).recorded(torch.complex128)
+    raw, used, of = recording.signal, recording.signal.to(bench.dtype), truth.values
+    places, known = (of["zero_doppler_s"], of["closest_range_m"]), (of["doppler_hz"], of["velocity_m_s"])
+    return points_of_a_strip(radar, raw, *places, *probe.motion, lambda: _focused(bench, _form_of(bench), used, known))
+
+
 def _precisions(bench: Bench) -> Measured:
     """The recommended form in single precision against double precision."""
     probe = probe_of(bench)
     raw, patches, known = probe.seen()
-    names = [entry["stage"] for entry in (bench.config.processor["recommended"].stages or {}).values()]
-    form = next((name for name in names if name in FORMS), "omega_k")
+    form = _form_of(bench)
     signals = {name: raw.to(getattr(torch, name)) for name in ("complex64", "complex128")}
     exact = patches.cut(_focused(bench, form, raw, known))
 

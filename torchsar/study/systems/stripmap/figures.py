@@ -16,11 +16,11 @@ from torchsar.compensate.velocity import EffectiveVelocity
 from torchsar.core import Signal
 from torchsar.metrics.cuts import impulse_cuts
 from torchsar.metrics.spectra import azimuth_spectrum, phase_increments, range_spectrum
+from torchsar.metrics.strip_image import focus_name, window
 from torchsar.repair.response import band_grid
 from torchsar.study.names.registry import group_of
 from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.cases import titled, word_of
-from torchsar.study.systems.stripmap.judge import focus_name, window
 from torchsar.study.trials.batch import IMAGE, Result, image_of
 
 # the part of the velocity curve that is drawn finely: half its extent in steps of the grid, and its

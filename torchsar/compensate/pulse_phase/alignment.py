@@ -1,0 +1,166 @@
+"""Whether the range profiles of pulses are aligned, which every estimate of their phases requires.
+
+A pulse that is displaced in range puts the echo of a scatterer into other range cells, where the
+phases of other scatterers are. The image can then be sharpened, and two halves of the range cells
+agree, although the phases are wrong: displacements of 0.3 cell rms from pulse to pulse suffice in a
+scene of six scatterers at 15 dB.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.pulse_phase.data import or_one
+
+# Displacements in cells rms from which on profiles are not aligned, from pulse to pulse and slow
+# ones. Found by trial on 2 to 300 scatterers: the phases may be wrong from 0.2 and 0.45 on, and
+# interference of scatterers that are not resolved displaces aligned profiles by 0.25 at most.
+_LARGEST_JITTER, _LARGEST_MIGRATION = 0.25, 0.4
+# deviations by which a displacement must differ from none
+_SIGNIFICANT = 3.0
+# fewest range cells and pulses whose displacement is estimated; number of groups of pulses
+_LEAST_CELLS, _LEAST_PULSES, _GROUPS = 8, 8, 16
+# largest displacement between adjacent pulses of clutter, in cells, and the values that are tried
+_FARTHEST, _STEPS = 1.5, 61
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Displacements in range of the profiles of pulses, in range cells rms, shape (trial,) each.
+
+    Args:
+        jitter: Displacement from pulse to pulse; 0 where not significant.
+        migration: Displacement of the mean of neighbouring pulses; 0 where not significant.
+    """
+
+    jitter: Tensor
+    migration: Tensor
+
+    @property
+    def aligned(self) -> Tensor:
+        """True where the jitter is below 0.25 cell and the migration below 0.4 cell, (trial,)."""
+        return (self.jitter < _LARGEST_JITTER) & (self.migration < _LARGEST_MIGRATION)
+
+
+@torch.no_grad()
+def displacement(rows: Tensor, present: Tensor) -> Displacement:
+    """Estimate the rms displacement in range of the profiles of pulses from their mean.
+
+    The displacement of a pulse is the projection of its profile |s| on the derivative of the mean
+    profile. It is estimated from each half of the band separately, because their noise and the
+    speckle of unresolved scatterers are independent: only what both halves have in common is a
+    displacement. The jitter is that of pulses within 16 groups, the migration that of the mean
+    power of the groups, in which noise is weaker. Displacements of more than a cell are
+    underestimated, but remain above one cell. Displacements that weak echoes hide, such as a drift
+    by tens of cells of a dense scene at 0 dB, are not found; the standard deviation of the phases
+    is large there.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        present: False where a pulse holds only zeros, shape (trial, pulse).
+
+    Returns:
+        The displacements; 0 where they do not differ from none by 3 standard deviations, and where
+        there are fewer than 8 range cells or 8 pulses.
+    """
+    cells, n = rows.shape[-2:]
+    if cells < _LEAST_CELLS or n < _LEAST_PULSES:
+        return Displacement(*torch.zeros(2, len(rows), dtype=torch.float64, device=rows.device))
+    powers = [_power(half).to(torch.float64) for half in _halves(rows)]
+    length = -(-n // _GROUPS)
+
+    def grouped(x: Tensor) -> Tensor:
+        return torch.nn.functional.pad(x, (0, -n % length)).unflatten(-1, (-1, length))
+
+    count = grouped(present).sum(-1)
+    slow = [_displacements(grouped(power).sum(-1), count > 0) for power in powers]
+    fast = []
+    for power in powers:
+        single = grouped(_displacements(power, present))
+        within = single - (single.sum(-1) / count.clamp_min(1))[..., None]
+        fast.append(torch.where(grouped(present), within, 0).flatten(-2))
+    return Displacement(_common(fast, present.sum(-1) - (count > 0).sum(-1)), _common(slow, (count > 0).sum(-1)))
+
+
+@torch.no_grad()
+def coherent_jitter(rows: Tensor, present: Tensor) -> Tensor:
+    """Estimate the rms displacement in range between adjacent pulses of homogeneous clutter.
+
+    The profile of clutter is speckle without features, but that of the next pulse is coherent with
+    it. A displacement between both is the slope of the phase of their conjugate product over range
+    frequency. As in `displacement`, only what both halves of the band have in common counts.
+    In Doppler bands of more than 0.7 PRF adjacent pulses are hardly coherent, and half of the
+    displacements or more are not found; the standard deviation of the phases is large there.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        present: False where a pulse holds only zeros, shape (trial, pulse).
+
+    Returns:
+        Jitter in cells rms, shape (trial,); 0 where it does not differ from none by 3 standard
+        deviations, and where there are fewer than 8 range cells or 8 pulses.
+    """
+    cells, n = rows.shape[-2:]
+    if cells < _LEAST_CELLS or n < _LEAST_PULSES:
+        return torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
+    spectrum, offset = _about_centroid(rows)
+    products = spectrum[..., 1:] * spectrum[..., :-1].conj()
+    both = present[:, 1:] & present[:, :-1]
+    steps = torch.linspace(-_FARTHEST, _FARTHEST, _STEPS, dtype=offset.dtype, device=rows.device)
+    slopes = []
+    for half in (offset > 0, offset <= 0):
+        turns = torch.exp(2j * torch.pi * steps[:, None] * offset[:, None]) * half[:, None]
+        slope = steps[_power(turns.to(products.dtype) @ products).argmax(-2)] * both
+        slopes.append(torch.where(both, slope - _mean(slope, both)[:, None], 0))
+    return _common(slopes, both.sum(-1)) / 2**0.5
+
+
+def _halves(rows: Tensor) -> list[Tensor]:
+    """Profiles of the two halves of the band, about its centroid, on the same range cells."""
+    spectrum, offset = _about_centroid(rows)
+    return [torch.fft.ifft(spectrum * half[..., None], dim=-2) for half in (offset > 0, offset <= 0)]
+
+
+def _about_centroid(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Spectrum along range (trial, range, pulse), and frequencies from the centroid of its band.
+
+    The latter have the shape (trial, range) and lie within -0.5 to 0.5 cycles per cell.
+    """
+    spectrum = torch.fft.fft(rows, dim=-2)
+    frequency = torch.fft.fftfreq(rows.shape[-2], dtype=torch.float64, device=rows.device)
+    density = _power(spectrum).sum(-1, dtype=torch.float64)
+    turn = torch.exp(2j * torch.pi * frequency)
+    centre = (density.to(turn.dtype) @ turn)[:, None]
+    return spectrum, (turn * centre.conj()).angle() / (2 * torch.pi)
+
+
+def _common(halves: list[Tensor], count: Tensor) -> Tensor:
+    """Displacement in cells rms that both halves share, (trial,), of a number of free values."""
+    lower, upper = halves
+    scatter = (lower.square().sum(-1) * upper.square().sum(-1)).sqrt()
+    shared = (lower * upper).sum(-1)
+    correlation = (shared / or_one(scatter)).clamp(-1 + 1e-12, 1 - 1e-12)
+    significant = torch.atanh(correlation) * (count - 3).clamp_min(0).sqrt() > _SIGNIFICANT
+    return torch.where(significant, (shared / count.clamp_min(1)).sqrt(), 0)
+
+
+def _displacements(power: Tensor, present: Tensor) -> Tensor:
+    """Displacements in cells, (trial, pulse), of mean zero, and zero where no pulse is present."""
+    profile = power.sqrt() / or_one(power.sum(-2, keepdim=True)).sqrt()
+    mean = profile.sum(-1)
+    slope = (mean.roll(-1, -1) - mean.roll(1, -1)) / 2
+    count = present.sum(-1, keepdim=True).clamp_min(1)
+    found = -(profile * slope[..., None]).sum(-2) * count / or_one(slope.square().sum(-1, keepdim=True))
+    return torch.where(present, found - _mean(found, present)[:, None], 0)
+
+
+def _mean(values: Tensor, present: Tensor) -> Tensor:
+    """Mean of the values that are present, along the last dim."""
+    return (values * present).sum(-1) / present.sum(-1).clamp_min(1)
+
+
+def _power(samples: Tensor) -> Tensor:
+    return samples.real.square() + samples.imag.square()

@@ -1,0 +1,620 @@
+"""Motion compensation of a nearly straight path, so that omega-K can image its data.
+
+The nominal track is a straight line, see `StraightTrack`. A pulse at the coordinate u along the
+track has the deviation d from it, perpendicular to the track. A point of the imaged plane lies at
+the closest range R in the direction of the unit vector e(R), and is seen at the angle theta ahead
+of broadside, at the range r = R / cos(theta) from the nominal track. From the true position its
+range is
+
+    r' = sqrt(r^2 - 2 R e.d + |d|^2),    D(theta, R) = r' - r = -cos(theta) e.d + O(|d|^2 / r).
+
+Compensation subtracts the range D at one angle per pulse, as if the beam were narrow. Its cosine is
+the mean over the processed beam, cos(m), which leaves the least mean square error:
+
+1. First order: the whole echo of a pulse is moved by D(m) for the middle of the swath, phase and
+   envelope, in the domain of frequencies.
+2. Second order: after range compression, the range cell at r is multiplied by the phase of D(m) at
+   R = r cos(m) less that of the first order. The envelope does not move.
+
+What remains for a point (theta, R) at the frequency f0 + g is the phase
+
+    phi = (4 pi / c) [f0 (D(theta, R) - D2(r)) + g (D(theta, R) - D1)],
+
+where D1 and D2 are the corrections of the first and of both orders. It has three parts: the change
+of D with the angle, (cos(theta) - cos(m)) e.d, which is the narrow-beam approximation; the
+correction of a cell instead of a closest range, since a point migrates over cells while it is seen,
+(R / cos(theta) cos(m) - R) de/dR.d; and the envelope that the second order does not move. For white
+noise each pulse, range, angle and frequency contributes independently to the image, so that the
+relative image error is the mean of |exp(j phi) - 1|^2 over them, which
+`MotionCompensation.predicted_db` evaluates. For lit points the mean over angles has the pattern of
+the antenna as weight.
+
+Uneven steps along the track are resampled by a non-uniform Fourier transform, the sum over pulses
+in which backprojection also adds them, with the weight of the processed beam.
+
+Reference:
+    Moreira and Huang 1994; Fornaro 1999 (first-order and range-dependent compensation).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchsar.core import checked_samples, unit_phasor
+from torchsar.focus.backprojection import direct_sum, expanded_history
+from torchsar.focus.gridding import PulseNufft
+from torchsar.focus.image_grid import ImageGrid
+from torchsar.focus.nufft import Kernel, Nufft, Points, smooth_length
+from torchsar.focus.omega_k import BAND_EDGE, STATIONARY_TURNS, raised_cosine_band
+from torchsar.focus.stolt import omega_k_stolt
+from torchsar.radar import (
+    LIGHT_M_S,
+    AntennaPath,
+    LinearFM,
+    StraightTrack,
+    StripmapRadar,
+    frequency_samples,
+    range_profiles,
+)
+from torchsar.radar.antenna_path import refuse_unusable
+from torchsar.radar.spotlight import frequency_step_hz
+
+# nodes of the quadrature of the residual phase over angles, closest ranges and frequencies, and the
+# number of pulses, by choice
+_ANGLES, _RANGES, _FREQUENCIES, _PULSES = 24, 9, 5, 512
+# samples of frequency on each side that hold what leaks there, found by trial
+_MARGIN = 16
+# error power beyond the margin times its samples and those of the history, measured for white noise
+_LEAK = 0.025
+# relative errors of interpolations by dtype, by choice
+_EPS = {torch.complex64: 1e-5, torch.complex128: 1e-11}
+# pixels that are interpolated at a time, by choice
+_PIXELS = 1 << 18
+# a path is too far from straight if compensation leaves a larger error than this, by choice: half
+# the amplitude
+_WORST_DB = -6.0
+
+
+@dataclass(frozen=True)
+class ProcessedBeam:
+    """Angles ahead of broadside that are processed, with raised-cosine edges.
+
+    Args:
+        width_deg: Width between half weights in degrees.
+        squint_deg: Angle of the middle ahead of broadside in degrees.
+
+    Raises:
+        ValueError: If a number is not finite, the width is not positive, or an edge lies 80 degrees
+            or more from broadside.
+    """
+
+    width_deg: float
+    squint_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.width_deg > 0 and abs(self.squint_deg) + self.width_deg / 2 < 80):
+            raise ValueError(
+                "a processed beam needs a positive width_deg and edges less than 80 degrees from broadside, got "
+                f"width_deg={self.width_deg}, squint_deg={self.squint_deg}"
+            )
+
+    @property
+    def edges(self) -> tuple[float, float]:
+        """Sines of the angles at half weight."""
+        low, high = (math.sin(math.radians(self.squint_deg + side * self.width_deg / 2)) for side in (-1, 1))
+        return low, high
+
+    @property
+    def middle(self) -> float:
+        """Mean of the sines of both edges."""
+        return sum(self.edges) / 2
+
+    @property
+    def band(self) -> float:
+        """Difference of the sines of both edges."""
+        return self.edges[1] - self.edges[0]
+
+    @property
+    def steepest(self) -> float:
+        """Largest magnitude of the tangent of an angle with a weight."""
+        sine = abs(self.middle) + (1 + BAND_EDGE) * self.band / 2
+        return sine / math.sqrt(1 - sine**2)
+
+    @property
+    def mean_cosine(self) -> float:
+        """Mean of the cosine of the angle over the shares of `quadrature`."""
+        sine, share = self.quadrature()
+        return float((share * torch.sqrt(1 - sine.square())).sum())
+
+    def weight(self, sine: Tensor) -> Tensor:
+        """Return the weight of a line of sight, 0 to 1, in the shape of the argument.
+
+        Args:
+            sine: Sine of its angle ahead of broadside, any shape.
+        """
+        return raised_cosine_band((sine - self.middle) / self.band)
+
+    def quadrature(self) -> tuple[Tensor, Tensor]:
+        """Return sines of angles, and their shares of the power of an image of white noise.
+
+        The share of a pulse is its squared weight. Pulses are even along the track, and have the
+        density (1 - s^2)^(-3/2) over the sine s.
+
+        Returns:
+            Sines and shares, whose sum is 1, float64 (angle,).
+        """
+        node, weight = _gauss(_ANGLES)
+        sine = self.middle + node * (1 + BAND_EDGE) * self.band / 2
+        share = weight * self.weight(sine).square() * (1 - sine.square()) ** -1.5
+        return sine, share / share.sum()
+
+
+def _gauss(n: int) -> tuple[Tensor, Tensor]:
+    """Nodes from -1 to 1 and weights of the Gauss-Legendre quadrature."""
+    node, weight = np.polynomial.legendre.leggauss(n)
+    return torch.from_numpy(node), torch.from_numpy(weight)
+
+
+def refuse_bistatic(antennas: AntennaPath) -> None:
+    """Raise an error unless one antenna transmits and receives.
+
+    Args:
+        antennas: Path of the antennas.
+
+    Raises:
+        ValueError: If there is a receiver of its own.
+    """
+    if antennas.receiver_m is not None:
+        raise ValueError(
+            "motion compensation refers to the straight track of one antenna, but this path is bistatic; image it by "
+            "tiles"
+        )
+
+
+class MotionCompensation:
+    """Motion compensation and omega-K imaging of one nearly straight path.
+
+    The geometry is computed once, for any number of histories, whose phases are those of
+    `backproject`. Differentiable in the histories.
+
+    Args:
+        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
+        antennas: Path of an antenna that transmits and receives, without leading dimensions.
+        grid: Pixels; the points of the scene are supposed to lie in their plane.
+        beam: Processed beam.
+        order: 1 to compensate for the middle of the swath only, 2 for all ranges.
+
+    Raises:
+        TypeError: If the frequencies are not float64.
+        ValueError: If the path is bistatic or has leading dimensions, the antenna does not advance,
+            the pulses undersample the beam, the image does not lie to one side of the track, or the
+            path is too far from straight.
+    """
+
+    def __init__(
+        self, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid, beam: ProcessedBeam, order: int = 2
+    ) -> None:
+        refuse_unusable(frequency_hz=frequency_hz)
+        refuse_bistatic(antennas)
+        if antennas.trials or order not in (1, 2):
+            raise ValueError(
+                "motion compensation has the order 1 or 2 and takes one path at a time, got the order "
+                f"{order} and {math.prod(antennas.trials)} paths"
+            )
+        n, step_hz = len(frequency_hz), frequency_step_hz(frequency_hz)
+        self.frequency_hz, self.antennas, self.grid, self.beam, self.order = frequency_hz, antennas, grid, beam, order
+        self.carrier_hz, self.sampling_hz = float(frequency_hz[n // 2]), n * step_hz
+        self.track = StraightTrack.fitted(antennas.transmitter_m)
+        self._refuse_undersampled()
+        self._set_plane()
+        # the range to which all pulses refer
+        self.window_m = float(antennas.reference_m.mean()) / 2
+        middle = torch.full_like(self._pulse_m, sum(self._closest_m) / 2 / beam.mean_cosine)
+        self._first_m = self._correction_m(middle[:, None])[:, 0]
+        self._set_cells(step_hz)
+        left = self.predicted_db()
+        if left > _WORST_DB:
+            raise ValueError(
+                f"the path is too far from straight, {float(self._off_m.abs().max()):.3g} m at most: motion "
+                f"compensation would leave an image error of {left:.3g} dB; choose a narrower beam or image it by tiles"
+            )
+
+    def _refuse_undersampled(self) -> None:
+        """Raise ValueError unless pulses sample the processed beam at each frequency."""
+        beam, spread = self.beam, self.sampling_hz / self.carrier_hz
+        band = beam.band * (1 + BAND_EDGE) * (1 + spread / 2) + abs(beam.middle) * spread
+        needed, held = 2 * self.carrier_hz / LIGHT_M_S * band, 1 / self.track.step_m
+        if needed > held:
+            raise ValueError(
+                f"pulses {self.track.step_m:.4g} m apart hold {held:.4g} cycles/m along the track, but a processed "
+                f"beam of {beam.width_deg:g} degrees has {needed:.4g} with its edges; choose a narrower beam or image "
+                "it by tiles"
+            )
+
+    def _set_cells(self, step_hz: float) -> None:
+        """Choose the frequencies of the compensated data, beyond those of the history, and compute
+        the ranges of the cells.
+        """
+        n, beam = len(self.frequency_hz), self.beam
+        window = LIGHT_M_S / (2 * step_hz)
+        if not self.window_m > window / 2:
+            raise ValueError(
+                f"the range window of {window:.4g} m about {self.window_m:.4g} m reaches the antenna; choose larger "
+                "steps of frequency or image it by tiles"
+            )
+        # omega-K lowers frequencies by their distance from the middle of the beam, and the second
+        # order moves them by the slope of the correction; zeros make room for them, and for what
+        # frequencies between two samples leak
+        lowered = 1 - math.cos(math.atan(beam.steepest) - math.asin(abs(beam.middle)))
+        ends = torch.tensor([self._closest_m], dtype=torch.float64, device=self._pulse_m.device)
+        change = self._correction_m(ends / beam.mean_cosine).diff(dim=-1)
+        slope = float(change.abs().max()) / max(self._closest_m[1] - self._closest_m[0], window / n)
+        self.cells = smooth_length(n + 2 * _MARGIN + math.ceil(2 * self.carrier_hz * (lowered + slope) / step_hz))
+        cell = torch.arange(self.cells, dtype=torch.float64, device=self.frequency_hz.device) - self.cells // 2
+        self.range_m = self.window_m + cell * (window / self.cells)
+        self._all_hz = self.carrier_hz + cell * step_hz
+
+    def _set_plane(self) -> None:
+        """Compute pulses and corners of the image in coordinates of the track."""
+        grid, track = self.grid, self.track
+        normal = torch.linalg.cross(grid.axes[0], grid.axes[1])
+        up = normal - (normal @ track.along) * track.along
+        tilt = torch.linalg.vector_norm(up).clamp_min(1e-6)
+        side = torch.linalg.cross(track.along, up / tilt)
+        pixels = grid.pixels_m(*(slice(None, None, max(1, n - 1)) for n in grid.counts)).reshape(-1, 3)
+        across = track.across_m(pixels)
+        off = across @ side
+        if not bool((off > 0).all() | (off < 0).all()):
+            raise ValueError(
+                "motion compensation needs an image to one side of the track, but this one lies "
+                f"{float(off.min()):.4g} m to {float(off.max()):.4g} m across; image it by tiles"
+            )
+        along, closest = track.along_m(pixels), torch.linalg.vector_norm(across, dim=-1)
+        self._closest_m = float(closest.min()), float(closest.max())
+        self._along_m = float(along.min()), float(along.max())
+        # height of the plane above the track along `up`, and its slope along the track
+        self._height_m = normal @ (grid.origin_m - track.origin_m) / tilt
+        self._slope = normal @ track.along / tilt
+        place = self.antennas.transmitter_m
+        self._pulse_m = track.along_m(place)
+        # deviations of the pulses to the side of the image and up, (pulse, 2)
+        self._off_m = track.across_m(place) @ torch.stack([side * torch.sign(off[0]), up / tilt], -1)
+        reach = self._closest_m[1] * self.beam.steepest
+        first = min(float(self._pulse_m.min()), float(along.min()) - reach)
+        last = max(float(self._pulse_m.max()), float(along.max()) + reach)
+        self.start_m, self.lines = first, smooth_length(math.ceil((last - first) / track.step_m) + 1)
+
+    def _excess(self, along_m: Tensor, closest_m: Tensor, off_m: Tensor) -> Tensor:
+        """Squared range of points from deviating pulses minus that from the track, in m^2.
+
+        The points of the plane have the given coordinate along the track and closest range; off_m
+        (..., 2) broadcasts with them.
+        """
+        sine = ((self._height_m - self._slope * along_m) / closest_m).clamp(-1, 1)
+        toward = torch.sqrt(1 - sine.square()) * off_m[..., 0] + sine * off_m[..., 1]
+        return off_m.square().sum(-1) - 2 * closest_m * toward
+
+    def _correction_m(self, range_m: Tensor) -> Tensor:
+        """Range from each pulse minus that from the track that is compensated at a range from the
+        track, float64 (pulse, range).
+        """
+        along = self._pulse_m[:, None] + self.beam.middle * range_m
+        excess = self._excess(along, self.beam.mean_cosine * range_m, self._off_m[:, None])
+        return excess / (torch.sqrt((range_m.square() + excess).clamp_min(0)) + range_m)
+
+    def predicted_db(self, pattern: Callable[[Tensor], Tensor] | None = None) -> float:
+        """Predict the error of `image` relative to `exact`.
+
+        Args:
+            pattern: Power of the echo of a point over the sine of its angle ahead of broadside,
+                such as that of an antenna; None for a history of white noise, which has all angles
+                alike.
+
+        Returns:
+            Relative square error in dB: the mean of |exp(j phi) - 1|^2 over pulses, angles, closest
+            ranges and frequencies, phi being the phase that motion compensation leaves; plus the
+            change of the Fresnel ripple of the beam's edges over the swath; plus what leaks beyond
+            the band.
+        """
+        node, weight = _gauss(_RANGES)
+        low, high = self._closest_m
+        closest = (low + high) / 2 + node * (high - low) / 2
+        weight = weight * closest / (weight * closest).sum()
+        # the ripple depends on the product of range and frequency
+        spread = self.sampling_hz / self.carrier_hz / math.sqrt(12)
+        ripple = torch.stack([self._ripple_error(closest * (1 + sign * spread)) for sign in (-1, 1)]).mean(0)
+        error = float((weight * (self._phase_error(closest, pattern) + ripple)).sum())
+        return 10 * math.log10(error + _LEAK / (_MARGIN * len(self.frequency_hz)))
+
+    def _phase_error(self, closest_m: Tensor, pattern: Callable[[Tensor], Tensor] | None) -> Tensor:
+        """Mean of |exp(j phi) - 1|^2 at closest ranges, float64 (range,)."""
+        sine, share = self.beam.quadrature()
+        share = share if pattern is None else share * pattern(sine)
+        some = slice(None, None, max(1, len(self._pulse_m) // _PULSES))
+        # (pulse, range, angle)
+        range_m = closest_m[:, None] / torch.sqrt(1 - sine.square())
+        along = self._pulse_m[some, None, None] + range_m * sine
+        low, high = self._along_m
+        share = share * ((along >= low) & (along <= high))
+        excess = self._excess(along, closest_m[:, None], self._off_m[some, None, None])
+        true = excess / (torch.sqrt(range_m.square() + excess) + range_m)
+        first = self._first_m[some, None, None]
+        both = self._correction_m(range_m.reshape(1, -1))[some].reshape(true.shape) if self.order == 2 else first
+        wave = 4 * math.pi / LIGHT_M_S
+        error = torch.zeros_like(true)
+        for offset, part in zip(*_gauss(_FREQUENCIES), strict=True):
+            phase = self.carrier_hz * (true - both) + offset * self.sampling_hz / 2 * (true - first)
+            error += part * (1 - torch.cos(wave * phase))
+        return (share * error).sum((0, 2)) / share.sum((0, 2)).clamp_min(1e-30)
+
+    def _ripple_error(self, closest_m: Tensor) -> Tensor:
+        """Relative square error of the spectrum along the track by the filter of the middle of the
+        swath, at closest ranges, float64 (range,).
+        """
+        used, *exact = (self._filter(float(r)) for r in (sum(self._closest_m) / 2, *closest_m))
+        return torch.stack([(used - one).abs().square().sum() / one.abs().square().sum() for one in exact])
+
+    def first_order(self, history: Tensor) -> Tensor:
+        """Move the echoes of each pulse so that the middle of the swath has its nominal range.
+
+        Phases then refer to the range `window_m` at all pulses.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+
+        Returns:
+            Phase history, same shape.
+        """
+        moved = 2 * (self._first_m + self.window_m) - self.antennas.reference_m
+        return history * unit_phasor(moved[:, None] * self.frequency_hz / LIGHT_M_S, history.dtype)
+
+    def second_order(self, profiles: Tensor) -> Tensor:
+        """Multiply each range cell by the phase that the first order leaves there.
+
+        Args:
+            profiles: Range profiles after the first order at `range_m`, shape (..., pulse, range),
+                complex.
+
+        Returns:
+            Range profiles, same shape.
+        """
+        left = self._correction_m(self.range_m[None]) - self._first_m[:, None]
+        return profiles * unit_phasor(2 * self.carrier_hz / LIGHT_M_S * left, profiles.dtype)
+
+    def even_pulses(self, profiles: Tensor) -> Tensor:
+        """Resample compensated pulses to even steps along the track, within the processed beam.
+
+        Args:
+            profiles: Range profiles, shape (..., pulse, range), complex.
+
+        Returns:
+            Range profiles of the nominal track, shape (..., line, range). Line i lies at start_m +
+            i step_m along the track.
+        """
+        dtype, f, length = profiles.dtype, self._all_hz, self.lines * self.track.step_m
+        number = self._bins()
+        first = int(number[0])
+        plan = PulseNufft(self.lines, Kernel.of(_EPS[dtype]), dtype, f.device)
+        point = (self.start_m - self._pulse_m) / length
+        samples = frequency_samples(profiles) * unit_phasor(point * (first + self.lines // 2), dtype)[:, None]
+        spectrum = plan.type1(samples, plan.points(point))
+        filtered = self._filter(sum(self._closest_m) / 2)
+        # the filter depends on the angle, at each frequency on another line
+        at = (number[:, None] * (self.carrier_hz / f) - first).clamp(0, self.lines - 1.001)
+        below = at.floor().long()
+        weight = torch.lerp(filtered[below], filtered[below + 1], (at - below).to(filtered))
+        weight = weight * torch.sqrt(self.carrier_hz / f)
+        spectrum = (spectrum * weight.to(dtype)).roll(first, -2)
+        return range_profiles(torch.fft.ifft(spectrum, dim=-2))
+
+    def _bins(self) -> Tensor:
+        """Numbers of the frequencies along the track in cycles per circular length of all lines,
+        about the middle of the beam, float64 (line,).
+        """
+        middle = 2 * self.carrier_hz / LIGHT_M_S * self.beam.middle * self.lines * self.track.step_m
+        number = torch.arange(self.lines, dtype=torch.float64, device=self._pulse_m.device)
+        return number + (round(middle) - self.lines // 2)
+
+    def _filter(self, closest_m: float) -> Tensor:
+        """Spectrum along the track of the weighted sum over pulses for a point at a closest range,
+        relative to that of omega-K, complex128 (line,).
+
+        By stationary phase it is the weight at the angle times cos^(-3/2). The exact sum has the
+        Fresnel ripple of the edges of the beam as well.
+        """
+        step, wave, r = self.track.step_m, 2 * self.carrier_hz / LIGHT_M_S, closest_m
+        number = torch.arange(self.lines, dtype=torch.float64, device=self._pulse_m.device)
+        behind = step * torch.where(2 * number < self.lines, number, number - self.lines)
+        slant = torch.sqrt(r**2 + behind.square())
+        kernel = self.beam.weight(-behind / slant) * unit_phasor(wave * behind.square() / (slant + r), torch.complex128)
+        number = self._bins()
+        exact = torch.fft.ifft(kernel, norm="forward")[number.long() % self.lines]
+        sine = (number / (self.lines * step * wave)).clamp(-1, 1)
+        turns = -wave * r * sine.square() / (1 + torch.sqrt(1 - sine.square())) + STATIONARY_TURNS
+        return exact * unit_phasor(-turns, torch.complex128) * (step * math.sqrt(wave / r))
+
+    def straight(self, history: Tensor) -> Tensor:
+        """Compute the range profiles that the nominal track would have recorded at even pulses.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+
+        Returns:
+            Range profiles, shape (..., line, range), see `even_pulses`.
+        """
+        before = self.cells // 2 - history.shape[-1] // 2
+        after = self.cells - history.shape[-1] - before
+        profiles = range_profiles(pad(self.first_order(history), (before, after)))
+        return self.even_pulses(self.second_order(profiles) if self.order == 2 else profiles)
+
+    def image(self, history: Tensor) -> Tensor:
+        """Form the image by motion compensation and omega-K.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+
+        Returns:
+            Image, shape (..., i, j), the sum of `backproject` over pulses with the weights of the
+            processed beam.
+
+        Raises:
+            TypeError: If the history is not complex64 or complex128.
+            ValueError: If its size is not that of the path and the frequencies.
+        """
+        history = checked_samples(history, "motion compensation", "pulse, frequency", finite=False)
+        history = expanded_history(history, self.antennas, self.frequency_hz, "motion compensation")
+        data = self.straight(history)
+        step, beam = self.track.step_m, self.beam
+        doppler = 2 * self.carrier_hz / LIGHT_M_S * beam.middle
+        sampling = self.sampling_hz * self.cells / len(self.frequency_hz)
+        near = self.window_m - self.cells // 2 * LIGHT_M_S / (2 * sampling)
+        # slow time is the coordinate along the track, at 1 m/s; the aperture is that of the beam
+        pulse, aperture = LinearFM(self.sampling_hz, 1.0), near * beam.band / (1 - beam.middle**2)
+        radar = StripmapRadar(self.carrier_hz, pulse, sampling, 1 / step, 1.0, near, None, aperture)
+        eps = 1e-12 if data.dtype == torch.complex128 else 2e-4
+        return self._on_grid(omega_k_stolt(data, radar, doppler_hz=doppler, eps=eps))
+
+    def _on_grid(self, image: Tensor) -> Tensor:
+        """Interpolate the image of omega-K at the pixels, with the phase and scale of the sum."""
+        lines, n = image.shape[-2:]
+        step, sine = self.track.step_m * self.lines / lines, self.beam.middle
+        cosine, wave = math.sqrt(1 - sine**2), 2 * self.carrier_hz / LIGHT_M_S
+        middle = round(wave * sine * lines * step)
+        eps = _EPS[image.dtype]
+        plans = [Nufft(size, eps, image.dtype, image.device) for size in (lines, n)]
+        spectrum = torch.fft.fft2(image).roll((lines // 2 - middle, n // 2), (-2, -1)) / (lines * n)
+        grid = plans[0].grid(plans[1].grid(spectrum).mT)  # (..., range, line)
+        made = []
+        for pixels in self.grid.pixels_m().reshape(-1, 3).split(_PIXELS):
+            closest = torch.linalg.vector_norm(self.track.across_m(pixels), dim=-1)
+            slant = closest / cosine
+            line = (self.track.along_m(pixels) - sine * slant - self.start_m) / step
+            beyond = slant - self.window_m
+            cell = beyond * (2 * self.sampling_hz / LIGHT_M_S * n / len(self.frequency_hz)) + n // 2
+            points = [plan.points(-at / size) for plan, at, size in zip(plans, (line, cell), (lines, n), strict=True)]
+            turns = wave * beyond + middle / lines * line
+            scale = torch.sqrt(closest * n / wave) / self.track.step_m
+            made.append(interpolate_plane(grid, points[1], points[0]) * unit_phasor(turns, image.dtype) * scale)
+        return torch.cat(made, -1).to(image.dtype).unflatten(-1, self.grid.counts)
+
+    def exact(self, history: Tensor, pixels_m: Tensor, eps: float = 1e-10) -> Tensor:
+        """Sum over the pulses of the true path with the weights of the processed beam: the direct
+        sum that `image` approximates.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+            pixels_m: Positions of pixels in metres, float64 (pixel, 3).
+            eps: Relative error of the interpolation in range.
+
+        Returns:
+            Image, shape (..., pixel).
+        """
+        along, closest = self.track.along_m(pixels_m), torch.linalg.vector_norm(self.track.across_m(pixels_m), dim=-1)
+
+        def path(pulses: slice, pixels: slice) -> tuple[Tensor, Tensor]:
+            ahead = along[pixels] - self._pulse_m[pulses, None]
+            weight = self.beam.weight(ahead / torch.sqrt(ahead.square() + closest[pixels].square()))
+            return self.antennas.path_m(pixels_m[pixels], pulses), weight
+
+        return direct_sum(history, self.frequency_hz, path, len(pixels_m), eps=eps)
+
+
+def possible_compensations(
+    frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid, beam: ProcessedBeam
+) -> dict[int, MotionCompensation]:
+    """Prepare motion compensation of both orders, as far as the path suits.
+
+    Args:
+        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
+        antennas: Path of the antennas, without leading dimensions.
+        grid: Pixels.
+        beam: Processed beam.
+
+    Returns:
+        Motion compensation by its order, 1 or 2; empty if the path does not suit.
+    """
+    found: dict[int, MotionCompensation] = {}
+    for order in (1, 2):
+        with suppress(ValueError):
+            found[order] = MotionCompensation(frequency_hz, antennas, grid, beam, order)
+    return found
+
+
+def compensated_omega_k(
+    history: Tensor,
+    frequency_hz: Tensor,
+    transmitter_m: Tensor,
+    reference_m: Tensor,
+    grid: ImageGrid,
+    beam: ProcessedBeam,
+    order: int = 2,
+) -> Tensor:
+    """Form the image of one antenna on a nearly straight path by motion compensation and omega-K.
+
+    It takes a fraction of the time of tiles, with the error that `MotionCompensation.predicted_db`
+    predicts; `image_tiles` serves any path. Differentiable in the history.
+
+    Args:
+        history: Phase history, shape (..., pulse, frequency), complex.
+        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
+        transmitter_m: Positions of the antenna in metres, float64 (..., pulse, 3).
+        reference_m: Path to which the phases refer in metres, twice the reference range, float64
+            (..., pulse).
+        grid: Pixels; the points of the scene are supposed to lie in their plane.
+        beam: Processed beam.
+        order: 1 to compensate for the middle of the swath only, 2 for all ranges.
+
+    Returns:
+        Image, shape (..., i, j), the sum of `backproject` over pulses with the weights of the
+        processed beam.
+
+    Raises:
+        TypeError: If the history is not complex64 or complex128, or frequencies or positions are
+            not float64.
+        ValueError: If shapes do not match, values are not finite, or a path does not suit, see
+            `MotionCompensation`.
+    """
+    antennas = AntennaPath(transmitter_m, None, reference_m)
+    history = checked_samples(history, "compensated_omega_k", "pulse, frequency", finite=False)
+    history = expanded_history(history, antennas, frequency_hz, "compensated_omega_k")
+    if not antennas.trials:
+        return MotionCompensation(frequency_hz, antennas, grid, beam, order).image(history)
+    trials, size = history.shape[:-2], (antennas.pulses,)
+    place = transmitter_m.expand(*trials, *size, 3).reshape(-1, *size, 3)
+    reference = reference_m.expand(*trials, *size).reshape(-1, *size)
+    images = [
+        MotionCompensation(frequency_hz, AntennaPath(p, None, r), grid, beam, order).image(one)
+        for p, r, one in zip(place, reference, history.reshape(-1, *history.shape[-2:]), strict=True)
+    ]
+    return torch.stack(images).unflatten(0, trials)
+
+
+def interpolate_plane(grid: Tensor, rows: Points, columns: Points) -> Tensor:
+    """Interpolate a periodic grid at points of a plane.
+
+    Args:
+        grid: Grid, shape (..., row, column), complex.
+        rows: Coordinates of the points along the rows, shape (m,).
+        columns: Coordinates along the columns, shape (m,).
+
+    Returns:
+        Values at the points, shape (..., m).
+    """
+    size = grid.shape[-2:]
+    flat = grid.flatten(-2)
+    value = None
+    for i, across in enumerate(rows.weights):
+        row = (rows.first + i) % size[0] * size[1]
+        for j, along in enumerate(columns.weights):
+            one = flat.index_select(-1, row + (columns.first + j) % size[1]) * (across * along)
+            value = one if value is None else value + one
+    assert value is not None
+    return value
