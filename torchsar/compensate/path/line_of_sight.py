@@ -25,7 +25,7 @@ from torchsar.compensate.pulse_phase.verdict import (
 from torchsar.core import Estimate, checked_samples, cis, real_dtype
 from torchsar.focus import TileOperator
 from torchsar.focus.spotlight import window_weights
-from torchsar.metrics import entropy
+from torchsar.metrics import entropy, residual_phase
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
 from torchsar.radar.spotlight import frequency_samples, range_profiles
@@ -176,6 +176,13 @@ def _surprise(power: Tensor, mean: Tensor) -> Tensor:
     return (log - (share * log).sum((-2, -1), keepdim=True)).clamp_min(0)
 
 
+# what a search sharpens by, iterations and phase step at which they end
+_BOTH: list[tuple[Weights, int, float]] = [
+    (_intensity, _COARSE, _TOLERANCE_RAD),
+    (_surprise, _FINE, _TOLERANCE_RAD),
+]
+
+
 @dataclass(frozen=True, eq=False)
 class _Search:
     """The search of one trial.
@@ -223,18 +230,22 @@ class _Search:
             phase = fixed_point(columns, phase, Run(weights, Through(self.imaging), count, 1.0, tolerance))[0]
         return phase[0], at
 
-    def search(self) -> tuple[Tensor, Tensor]:
-        """Line of sight before the last step, and its roughness."""
+    def by_phases(self) -> Tensor:
+        """Line of sight within a fringe, from phases that sharpen the image with envelopes at rest."""
+        rows, rest = self.windowed(1.0), torch.zeros(len(self.rows), dtype=torch.float64, device=self.rows.device)
+        return self.metres(self.sharpened(rows, rest, _BOTH, self.adjacent(rows))[0])
+
+    def adjacent(self, rows: Tensor) -> Tensor:
+        """Phases of the pulses from those between adjacent pulses, (pulse,)."""
+        columns = rows.mT[None]
+        return pair_phase(columns, torch.ones_like(columns[:, 0].real, dtype=torch.bool))[0]
+
+    def by_envelopes(self) -> tuple[Tensor, Tensor]:
+        """Line of sight with whole fringes before the last step, and its roughness."""
         cell = LIGHT_M_S / (2 * float(self.frequency_hz[-1] - self.frequency_hz[0]))
         range_m = torch.zeros(len(self.rows), dtype=torch.float64, device=self.rows.device)
-        both: list[tuple[Weights, int, float]] = [
-            (_intensity, _COARSE, _TOLERANCE_RAD),
-            (_surprise, _FINE, _TOLERANCE_RAD),
-        ]
         rows = self.windowed(_FIRST_BAND)
-        columns = rows.mT[None]
-        start = pair_phase(columns, torch.ones_like(columns[:, 0].real, dtype=torch.bool))[0]
-        phase, _ = self.sharpened(rows, range_m, both, start)
+        phase, _ = self.sharpened(rows, range_m, _BOTH, self.adjacent(rows))
         carrier = self.metres(phase)
         rough = roughness(carrier, self._fringe_m)
         if rough < _ROUGH:
@@ -242,7 +253,7 @@ class _Search:
         for turn in range(_ROUNDS):
             share, reach = _BANDS[min(turn, 2)], _REACH_CELLS[min(turn, 2)]
             rows, before = self.windowed(share), range_m
-            phase, at = self.sharpened(rows, range_m, both, phase)
+            phase, at = self.sharpened(rows, range_m, _BOTH, phase)
             rough = roughness(range_m + self.metres(phase), self._fringe_m)
             if share < 1 and rough >= _ROUGH:
                 continue
@@ -270,10 +281,15 @@ class _Search:
         return smooth_near(carrier[None], near[None], self._fringe_m, near_std, bends[None])[0]
 
     def judged(self) -> Estimate:
-        """The estimate with three axes, and its verdict."""
-        range_m, rough = self.search()
-        found = three_axes(self.rows, self.imaging, range_m, self.rounds)
-        std_rad = (found.std_m * (2 * math.pi / self._fringe_m)).square().mean().sqrt()
+        """The estimate of the sharper image with three axes, and its verdict."""
+        range_m, rough = self.by_envelopes()
+        both = [three_axes(self.rows, self.imaging, start, self.rounds) for start in (range_m, self.by_phases())]
+        found, other = sorted(both, key=lambda one: float(entropy(one.image)))
+        # both have the errors by noise in common; what differs comes from the search
+        radians = 2 * math.pi / self._fringe_m
+        apart = residual_phase(radians * found.line_of_sight_m, radians * other.line_of_sight_m) / radians
+        std_m = (found.std_m.square() + apart.square().mean() / 2).sqrt()
+        std_rad = (std_m * radians).square().mean().sqrt()
         sharp, effective, telling = sharpness_beyond_speckle(found.image.mT)
         noise = sharpness_of_noise((effective * STEP).clamp_min(1))
         strehl = torch.exp(-std_rad.square())
@@ -281,4 +297,4 @@ class _Search:
         ok = (sharp > _MARGIN * noise) & (telling > LEAST_ROWS) & (strehl > LEAST_STREHL)
         value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
         info = {"roughness": rough, "entropy_nats": entropy(found.image).double()}
-        return Estimate(value, quality, ok, {"line_of_sight_m": found.std_m}, info)
+        return Estimate(value, quality, ok, {"line_of_sight_m": std_m}, info)
