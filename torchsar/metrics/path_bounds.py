@@ -11,8 +11,8 @@ from torchsar.core import refuse_non_finite
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
 
-# share of the largest eigenvalue that is added to the information about the scatterers, so that
-# those at the same place do not make it singular
+# share of the trace that is added to the information about the scatterers, so that those at the
+# same position do not make it singular
 _RIDGE = 1e-12
 
 
@@ -21,14 +21,14 @@ def line_of_sight_bound_m(
 ) -> Tensor:
     """Compute the least error of the line of sight of all pulses, without its linear terms.
 
-    The samples are those of point scatterers in circular noise. Unknown are one range per pulse,
-    and the position on the ground and the complex amplitude of each scatterer. A constant and a
-    linear term of the range over the pulses, which act as a displacement of the scene, are not
-    part of the error.
+    The samples are those of point scatterers in white circular Gaussian noise. Unknown are one
+    range per pulse, and the horizontal position and the complex amplitude of each scatterer. A
+    constant and a linear term of the range over the pulses, which act as a displacement of the
+    scene, are not part of the error.
 
     Args:
         frequency_hz: Frequencies in Hz, float64 (frequency,).
-        antennas: True path, without trials.
+        antennas: True path, without leading dimensions.
         points_m: Positions of the scatterers in metres, float64 (point, 3).
         amplitude: Their amplitudes, complex (point,).
         noise_std: Standard deviation of the complex noise of a sample.
@@ -40,7 +40,7 @@ def line_of_sight_bound_m(
     Raises:
         TypeError: If frequencies or positions are not float64.
         ValueError: If values are not finite, the noise is not positive, there are fewer than three
-            pulses, or the path has trials.
+            pulses, or the path has leading dimensions.
 
     Reference:
         Kay 1993, Fundamentals of Statistical Signal Processing: Estimation Theory, Eq. (15.52):

@@ -74,9 +74,9 @@ class AntennaPath:
 
         Returns:
             `transmitter_m`, `receiver_m` unless both share an antenna, and `path_reference_m`, the
-            three fields of the path, for the stages `TileImage` and `DirectImage`. If they share an
-            antenna also `position_m` and `reference_m`, half the reference path, for `PolarFormat`
-            and `SpotlightBackprojection`.
+            three fields of the path, for the stages `TileImage`, `OmegaKImage` and `DirectImage`.
+            If they share an antenna also `position_m` and `reference_m`, half the reference path,
+            for `PolarFormat` and `SpotlightBackprojection`.
         """
         shared = {"transmitter_m": self.transmitter_m, "path_reference_m": self.reference_m}
         if self.receiver_m is not None:

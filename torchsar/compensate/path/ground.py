@@ -64,7 +64,9 @@ def path_of(antennas: AntennaPath, trials: tuple[int, ...], index: tuple[int, ..
 def for_each(
     find: Callable[[Tensor, AntennaPath], Estimate], profiles: Tensor, antennas: AntennaPath, trials: torch.Size
 ) -> Estimate:
-    """Join the estimates of single trials; each has a plan of its own, whose image fills the cache.
+    """Join the estimates of single trials.
+
+    Trials are processed one after another, because each has an image plan of its own.
 
     Args:
         find: Estimator of one trial, given its profiles (pulse, range) and its path.

@@ -23,9 +23,8 @@ def path_phase(
     """Estimate the phase of each pulse that sharpens the image of a spotlight scene on any path.
 
     It is `autofocus` with images by tiles along the recorded path, in which scatterers do not
-    migrate. They cover the whole unambiguous ground, about a quarter of an image per pulse and
-    second on one core for some hundred pulses. The middle of the scene, to which phases refer, is
-    the origin.
+    migrate. They cover the whole unambiguous ground. The middle of the scene, to which phases
+    refer, is the origin.
 
     Args:
         profiles: Range profiles, the unitary centred inverse FFT of a phase history, shape (...,
