@@ -41,6 +41,7 @@ Reference:
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from contextlib import suppress
@@ -594,12 +595,10 @@ def compensated_omega_k(
     history = expanded_history(history, antennas, frequency_hz, "compensated_omega_k")
     if not antennas.trials:
         return MotionCompensation(frequency_hz, antennas, grid, beam, order).image(history)
-    trials, size = history.shape[:-2], (antennas.pulses,)
-    place = transmitter_m.expand(*trials, *size, 3).reshape(-1, *size, 3)
-    reference = reference_m.expand(*trials, *size).reshape(-1, *size)
+    trials = history.shape[:-2]
     images = [
-        MotionCompensation(frequency_hz, AntennaPath(p, None, r), grid, beam, order).image(one)
-        for p, r, one in zip(place, reference, history.reshape(-1, *history.shape[-2:]), strict=True)
+        MotionCompensation(frequency_hz, antennas.of_trial(index, trials), grid, beam, order).image(history[index])
+        for index in itertools.product(*map(range, trials))
     ]
     return torch.stack(images).unflatten(0, trials)
 
