@@ -4,16 +4,17 @@ fastsar.
     python scripts/imaging_speed.py [--pulses 512] [--frequencies 1024] [--pixels 512]
         [--errors -72 -80 -90] [--threads 1] [--rounds 9] [--small] [--memory]
 
-X band at 5 km and 45 deg depression, 600 MHz, a straight path over which the resolution is that of
-the range, pixels of 0.2 m. All forms run in turn in one process; the time is the median of the
-rounds, `x fastsar` the median of the ratios to fastsar's exact form in the same round. `kept`
-reuses the plan, `moved` also computes the tables of a changed path, `new` plans anew. The direct
-sum forms a part of the pixels, and its time is scaled to all. Errors are relative to sums over all
-samples in float64, at random pixels of the image of white noise, and at the pixels next to random
-points and random other ones together; that of polar format is mostly the neglected curvature of the
-wavefront. fastsar (extra `peer`; it needs a C++ compiler, its factorised form also jax) is left out
-where it is not installed. `--memory` measures, in a process of its own, the processor time and the
-peak memory of planning and imaging, above that of the libraries and relative to history and image.
+X band at 5 km and 45 deg depression, 600 MHz, a straight path over which the resolution in azimuth
+equals that in range, pixels of 0.2 m. All forms run in turn in one process; the time is the median
+of the rounds. `x fastsar` is the median of the time of fastsar's exact form over that of this form
+in the same round: above 1 is faster. `kept` reuses the plan, `moved` also computes the tables of a
+changed path, `new` plans anew. The direct sum forms a part of the pixels, and its time is scaled to
+all. Errors are relative to sums over all samples in float64, at random pixels: of the image of
+white noise, and of the image of points that lie next to some of these pixels. That of polar format
+is mostly the neglected curvature of the wavefront. fastsar (extra `peer`; it needs a C++ compiler,
+its factorised form also jax) is left out where it is not installed. `--memory` measures, in a
+process of its own, the processor time and the peak memory of planning and imaging, above that of
+the libraries and relative to history and image.
 """
 
 from __future__ import annotations
@@ -137,9 +138,7 @@ def peer_forms(scene: Scene) -> dict[str, Callable[[Tensor], Tensor]]:
     return {name: lambda history, form=form: torch.as_tensor(form(history.numpy())) for name, form in forms.items()}
 
 
-def measure(
-    scene: Scene, errors: list[float], rounds: int, checked: int = 100
-) -> list[tuple[str, list[float], float, float]]:
+def measure(scene: Scene, errors: list[float], rounds: int, checked: int = 100) -> list[Row]:
     """Times and errors of every form."""
     source = torch.Generator().manual_seed(0)
     size = len(scene.place_m), len(scene.frequency_hz)

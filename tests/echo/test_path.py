@@ -141,6 +141,16 @@ def test_the_beam_lights_targets_for_its_width() -> None:
         assert float(lit.mean()) == pytest.approx(middle, abs=1) and len(lit) == pytest.approx(79, abs=2)
 
 
+def test_the_mean_power_of_a_beam_is_that_over_its_sway() -> None:
+    edge = torch.sin(torch.deg2rad(torch.tensor([0.0, 0.75], dtype=F64)))
+    steady = SideBeam(1.5).mean_power(edge)
+    torch.testing.assert_close(steady, torch.tensor([1.0, 0.25], dtype=F64), rtol=0, atol=1e-3)
+    time = torch.linspace(0, 4, 2001, dtype=F64)[:-1]  # of two periods
+    swaying = SideBeam(torch.tensor([1.5, 3.0], dtype=F64), sway_deg=0.5, sway_hz=0.5)
+    mean = swaying.gain(time, edge.expand(len(time), -1)).pow(4).mean(-2)
+    torch.testing.assert_close(swaying.mean_power(edge), mean, rtol=0, atol=1e-3)
+
+
 def test_a_strip_has_a_constant_window_and_records_what_it_holds() -> None:
     radar, flight = InverseRadar(9.6e9, 300e6, 10.0), Flight(StraightPath((-400.0, -300.0, 300.0), (0.0, 60.0, 0.0)))
     world = PathWorld(Points([-200.0, 200.0], [0.0, 0.0]), flight, beam=SideBeam(10.0), window_range_m=500.0)

@@ -740,7 +740,7 @@ REASONS = {
     "multichannel.body_echo": "works on the Body that find_body, which is in the table, has made",
     "focus.PolarFormat": "resamples frequencies of a geometry; tests/focus/test_polar.py",
     "focus.SpotlightBackprojection": "the stage of backproject_spotlight, which is in the table",
-    "focus.PathImage": "the base class of TileImage and DirectImage",
+    "focus.PathImage": "the base class of TileImage, OmegaKImage and DirectImage",
     "focus.OmegaKImage": "the stage of compensated_omega_k; tests/focus/test_motion_compensation.py",
     "focus.TileImage": "the stage of image_tiles, which is in the table; tests/focus/test_path_image.py",
     "focus.DirectImage": "the stage of backproject, which is in the table; tests/focus/test_path_image.py",

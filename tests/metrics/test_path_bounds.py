@@ -34,12 +34,15 @@ def test_the_bound_exceeds_that_of_a_known_scene_and_follows_the_noise() -> None
     assert 0.9 * known_scene(AMPLITUDE, 0.3) < bound < 2 * known_scene(AMPLITUDE, 0.3)
     double = line_of_sight_bound_m(FREQUENCY, ANTENNAS, POINTS, 2 * AMPLITUDE, 0.6)
     torch.testing.assert_close(double, bound)
+    noise = torch.tensor([0.3, 0.6], dtype=F64)
+    both = line_of_sight_bound_m(FREQUENCY, ANTENNAS, POINTS, torch.stack([AMPLITUDE, 2 * AMPLITUDE]), noise)
+    torch.testing.assert_close(both, bound.expand(2))
     pair = AntennaPath(PLACE, PLACE.clone(), ANTENNAS.reference_m)
     torch.testing.assert_close(line_of_sight_bound_m(FREQUENCY, pair, POINTS, AMPLITUDE, 0.3), bound)
 
 
 def test_other_paths_and_noise_are_refused() -> None:
-    with pytest.raises(ValueError, match="one path of at least three pulses and a positive noise_std"):
+    with pytest.raises(ValueError, match="at least three pulses and a positive finite noise_std"):
         line_of_sight_bound_m(FREQUENCY, ANTENNAS, POINTS, AMPLITUDE, 0.0)
     with pytest.raises(TypeError, match="float64"):
         line_of_sight_bound_m(FREQUENCY, ANTENNAS, POINTS.float(), AMPLITUDE, 1.0)

@@ -88,10 +88,9 @@ class ImageGrid:
         return torch.linalg.cross(*self.axes)
 
     def transposed(self) -> ImageGrid:
-        """Return the same pixels with the two indices exchanged."""
+        """Return the same pixels with the two indices exchanged.
+
+        The normal is then reversed, and the heights change their sign.
+        """
         height = None if self.height_m is None else -self.height_m.mT
         return replace(self, axes=self.axes.flip(0), counts=self.counts[::-1], height_m=height)
-
-    def detached(self) -> ImageGrid:
-        """Return the same pixels with heights of which no gradient is taken."""
-        return self if self.height_m is None else replace(self, height_m=self.height_m.detach())

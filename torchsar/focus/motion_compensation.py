@@ -20,24 +20,28 @@ What remains for a point (theta, R) at the frequency f0 + g is the phase
 
     phi = (4 pi / c) [f0 (D(theta, R) - D2(r)) + g (D(theta, R) - D1)],
 
-where D1 and D2 are the corrections of the first and of both orders. It has three parts: the change
-of D with the angle, (cos(theta) - cos(m)) e.d, which is the narrow-beam approximation; the
-correction of a cell instead of a closest range, since a point migrates over cells while it is seen,
-(R / cos(theta) cos(m) - R) de/dR.d; and the envelope that the second order does not move. For white
-noise each pulse, range, angle and frequency contributes independently to the image, so that the
-relative image error is the mean of |exp(j phi) - 1|^2 over them, which
-`MotionCompensation.predicted_db` evaluates. For lit points the mean over angles has the pattern of
-the antenna as weight.
+where D1 and D2 are the corrections of the first and of both orders. To first order in d it has
+three parts: the change of D with the angle, -(cos(theta) - cos(m)) e.d, which a narrow beam would
+not have; the correction of a range cell in place of a closest range, since a point migrates over
+cells while it is seen, cos(m) (R cos(m) / cos(theta) - R) (de/dR).d; and the envelope that the
+second order does not move. For white noise each pulse, range, angle and frequency contributes
+independently to the image, so that the relative image error is the mean of |exp(j phi) - 1|^2 over
+them, which `MotionCompensation.predicted_db` evaluates. For points in a beam the mean over angles
+is weighted by the pattern of the antenna.
 
 Uneven steps along the track are resampled by a non-uniform Fourier transform, the sum over pulses
 in which backprojection also adds them, with the weight of the processed beam.
 
 Reference:
-    Moreira and Huang 1994; Fornaro 1999 (first-order and range-dependent compensation).
+    Moreira and Huang 1994, Airborne SAR processing of highly squinted data using a chirp scaling
+    approach with integrated motion compensation, IEEE Trans. Geosci. Remote Sens. 32(5); Fornaro
+    1999, Trajectory deviations in airborne SAR: analysis and compensation, IEEE Trans. Aerosp.
+    Electron. Syst. 35(3) (first-order and range-dependent compensation).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from contextlib import suppress
@@ -70,9 +74,11 @@ from torchsar.radar.spotlight import frequency_step_hz
 # nodes of the quadrature of the residual phase over angles, closest ranges and frequencies, and the
 # number of pulses, by choice
 _ANGLES, _RANGES, _FREQUENCIES, _PULSES = 24, 9, 5, 512
-# samples of frequency on each side that hold what leaks there, found by trial
+# zero samples that are appended to the frequencies on each side, into which the spectrum of moved
+# envelopes may spread, found by trial
 _MARGIN = 16
-# error power beyond the margin times its samples and those of the history, measured for white noise
+# relative error power that spreads beyond this margin is _LEAK / (_MARGIN * samples of a pulse),
+# measured for white noise
 _LEAK = 0.025
 # relative errors of interpolations by dtype, by choice
 _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-11}
@@ -194,9 +200,11 @@ class MotionCompensation:
 
     Raises:
         TypeError: If the frequencies are not float64.
-        ValueError: If the path is bistatic or has leading dimensions, the antenna does not advance,
-            the pulses undersample the beam, the image does not lie to one side of the track, or the
-            path is too far from straight.
+        ValueError: If the path is bistatic or has leading dimensions, the order is not 1 or 2, the
+            frequencies do not rise in equal steps, the antenna does not advance, the pulses
+            undersample the beam, the image does not lie to one side of the track, the range window
+            reaches the antenna, or the path is so far from straight that the predicted error
+            exceeds -6 dB.
     """
 
     def __init__(
@@ -206,8 +214,8 @@ class MotionCompensation:
         refuse_bistatic(antennas)
         if antennas.trials or order not in (1, 2):
             raise ValueError(
-                "motion compensation has the order 1 or 2 and takes one path at a time, got the order "
-                f"{order} and {math.prod(antennas.trials)} paths"
+                "motion compensation has the order 1 or 2 and takes one path without leading dimensions, got the order "
+                f"{order} and leading dimensions {tuple(antennas.trials)}"
             )
         n, step_hz = len(frequency_hz), frequency_step_hz(frequency_hz)
         self.frequency_hz, self.antennas, self.grid, self.beam, self.order = frequency_hz, antennas, grid, beam, order
@@ -530,7 +538,7 @@ class MotionCompensation:
 def possible_compensations(
     frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid, beam: ProcessedBeam
 ) -> dict[int, MotionCompensation]:
-    """Prepare motion compensation of both orders, as far as the path suits.
+    """Prepare motion compensation of those orders that a path allows.
 
     Args:
         frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
@@ -539,7 +547,7 @@ def possible_compensations(
         beam: Processed beam.
 
     Returns:
-        Motion compensation by its order, 1 or 2; empty if the path does not suit.
+        Motion compensation by its order, 1 or 2, without those that `MotionCompensation` refuses.
     """
     found: dict[int, MotionCompensation] = {}
     for order in (1, 2):
@@ -587,12 +595,10 @@ def compensated_omega_k(
     history = expanded_history(history, antennas, frequency_hz, "compensated_omega_k")
     if not antennas.trials:
         return MotionCompensation(frequency_hz, antennas, grid, beam, order).image(history)
-    trials, size = history.shape[:-2], (antennas.pulses,)
-    place = transmitter_m.expand(*trials, *size, 3).reshape(-1, *size, 3)
-    reference = reference_m.expand(*trials, *size).reshape(-1, *size)
+    trials = history.shape[:-2]
     images = [
-        MotionCompensation(frequency_hz, AntennaPath(p, None, r), grid, beam, order).image(one)
-        for p, r, one in zip(place, reference, history.reshape(-1, *history.shape[-2:]), strict=True)
+        MotionCompensation(frequency_hz, antennas.of_trial(index, trials), grid, beam, order).image(history[index])
+        for index in itertools.product(*map(range, trials))
     ]
     return torch.stack(images).unflatten(0, trials)
 

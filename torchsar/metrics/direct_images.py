@@ -74,8 +74,8 @@ class DirectlySummed:
         antennas: Positions of the antennas at the pulses, without leading dimensions.
         pixels_m: Positions in metres of the pixels that are compared, float64 (pixel, 3).
         image: Function that forms the whole image by the recommended method.
-        at: Function of that image that returns the pixels that are compared, complex (pixel,), in
-            the phase of the direct sum.
+        at: Function of that image that returns the pixels that are compared, complex (pixel,), with
+            the phase convention of the direct sum.
         share: Number of these pixels over that of the whole image.
         weight: Weights of some pulses (a slice) at positions (pixel, 3) in the sum, float64 (pulse,
             pixel); None for all pulses alike.
@@ -127,9 +127,12 @@ def turning_target(
 ) -> DirectlySummed:
     """Describe the image of white noise as that of a turning target, with the antenna on a far arc.
 
+    At the angle phi the antenna lies in the direction -(sin phi, cos phi) from the centre of
+    rotation, in coordinates of cross range and range.
+
     Args:
         radar: Radar parameters.
-        angle_rad: Angle of the target at each pulse, float64 (pulse,).
+        angle_rad: Angle of the target at each pulse in rad, float64 (pulse,).
         cross_m: Cross range of the lines of the image in metres, float64 (azimuth,).
         centre_m: Distance of range zero from the centre of rotation in metres.
         samples: Number of range cells.

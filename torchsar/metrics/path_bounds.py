@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
@@ -11,36 +12,36 @@ from torchsar.core import refuse_non_finite
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
 
-# share of the largest eigenvalue that is added to the information about the scatterers, so that
-# those at the same place do not make it singular
+# share of the trace that is added to the information about the scatterers, so that those at the
+# same position do not make it singular
 _RIDGE = 1e-12
 
 
 def line_of_sight_bound_m(
-    frequency_hz: Tensor, antennas: AntennaPath, points_m: Tensor, amplitude: Tensor, noise_std: float
+    frequency_hz: Tensor, antennas: AntennaPath, points_m: Tensor, amplitude: Tensor, noise_std: Tensor | float
 ) -> Tensor:
     """Compute the least error of the line of sight of all pulses, without its linear terms.
 
-    The samples are those of point scatterers in circular noise. Unknown are one range per pulse,
-    and the position on the ground and the complex amplitude of each scatterer. A constant and a
-    linear term of the range over the pulses, which act as a displacement of the scene, are not
-    part of the error.
+    The samples are those of point scatterers in white circular Gaussian noise. Unknown are one
+    range per pulse, and the horizontal position and the complex amplitude of each scatterer. A
+    constant and a linear term of the range over the pulses, which act as a displacement of the
+    scene, are not part of the error.
 
     Args:
         frequency_hz: Frequencies in Hz, float64 (frequency,).
-        antennas: True path, without trials.
-        points_m: Positions of the scatterers in metres, float64 (point, 3).
-        amplitude: Their amplitudes, complex (point,).
-        noise_std: Standard deviation of the complex noise of a sample.
+        antennas: True path.
+        points_m: Positions of the scatterers in metres, float64 (..., point, 3).
+        amplitude: Their amplitudes, complex (..., point).
+        noise_std: Standard deviation of the complex noise of a sample, a number or shape (...,).
 
     Returns:
         Square root of the mean variance of the range (half the path) of a pulse in metres, float64
-        ().
+        (...,). The leading dimensions are those to which all arguments broadcast.
 
     Raises:
         TypeError: If frequencies or positions are not float64.
-        ValueError: If values are not finite, the noise is not positive, there are fewer than three
-            pulses, or the path has trials.
+        ValueError: If values are not finite, the noise is not positive, or there are fewer than
+            three pulses.
 
     Reference:
         Kay 1993, Fundamentals of Statistical Signal Processing: Estimation Theory, Eq. (15.52):
@@ -48,12 +49,22 @@ def line_of_sight_bound_m(
     """
     refuse_unusable(frequency_hz=frequency_hz, points_m=points_m)
     refuse_non_finite(amplitude, "amplitude", "give each scatterer a finite amplitude", "values")
-    pulses = antennas.pulses
-    if antennas.trials or pulses < 3 or not 0 < noise_std < math.inf:
+    noise = torch.as_tensor(noise_std, dtype=torch.float64)
+    if antennas.pulses < 3 or not bool(((noise > 0) & noise.isfinite()).all()):
         raise ValueError(
-            "line_of_sight_bound_m needs one path of at least three pulses and a positive noise_std, got a path of "
-            f"shape {(*antennas.trials, pulses)} and noise_std={noise_std}"
+            "line_of_sight_bound_m needs at least three pulses and a positive finite noise_std, got "
+            f"{antennas.pulses} pulses and a least noise_std of {float(noise.min()):g}"
         )
+    trials = torch.broadcast_shapes(antennas.trials, points_m.shape[:-2], amplitude.shape[:-1], noise.shape)
+    points, amplitude = points_m.expand(*trials, *points_m.shape[-2:]), amplitude.expand(*trials, amplitude.shape[-1])
+    every = itertools.product(*map(range, trials))
+    std = [_unit_std_m(frequency_hz, antennas.of_trial(one, trials), points[one], amplitude[one]) for one in every]
+    return torch.stack(std).reshape(trials) * noise
+
+
+def _unit_std_m(frequency_hz: Tensor, antennas: AntennaPath, points_m: Tensor, amplitude: Tensor) -> Tensor:
+    """The bound of one trial for noise of unit variance."""
+    pulses = antennas.pulses
     wave = frequency_hz * (2 * math.pi / LIGHT_M_S)
     amplitude = amplitude.to(torch.complex128)
     own = torch.zeros(pulses, dtype=torch.float64, device=wave.device)
@@ -75,7 +86,7 @@ def line_of_sight_bound_m(
     scale = scene.diagonal().clamp_min(torch.finfo(torch.float64).tiny).rsqrt()
     scene, shared = scene * scale * scale[:, None], shared * scale
     scene.diagonal().add_(_RIDGE * float(len(scene)))
-    information = (torch.diag(own) - shared @ torch.linalg.solve(scene, shared.mT)) * (2 / noise_std**2)
+    information = (torch.diag(own) - shared @ torch.linalg.solve(scene, shared.mT)) * 2
     time = torch.linspace(-1, 1, pulses, dtype=torch.float64, device=wave.device)
     line = torch.stack([torch.ones_like(time), time], -1)
     free = torch.linalg.qr(line, mode="complete").Q[:, 2:]  # orthogonal to constant and linear terms

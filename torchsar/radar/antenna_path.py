@@ -69,14 +69,33 @@ class AntennaPath:
         """Number of pulses."""
         return self.reference_m.shape[-1]
 
+    def of_trial(self, index: tuple[int, ...], trials: Sequence[int] | None = None) -> AntennaPath:
+        """Return the path of one trial, without leading dimensions.
+
+        Args:
+            index: Number of the trial in each leading dimension.
+            trials: Leading dimensions to which those of the path broadcast; None for those of the
+                path.
+
+        Returns:
+            The path.
+        """
+        lead = self.trials if trials is None else trials
+
+        def of(x: Tensor, behind: int) -> Tensor:
+            return x.expand(*lead, *x.shape[x.ndim - behind :])[index]
+
+        receiver = None if self.receiver_m is None else of(self.receiver_m, 2)
+        return AntennaPath(of(self.transmitter_m, 2), receiver, of(self.reference_m, 1))
+
     def side_data(self) -> dict[str, Tensor]:
         """Return the side data of a recording (`Recording.aux`) that describe the path.
 
         Returns:
             `transmitter_m`, `receiver_m` unless both share an antenna, and `path_reference_m`, the
-            three fields of the path, for the stages `TileImage` and `DirectImage`. If they share an
-            antenna also `position_m` and `reference_m`, half the reference path, for `PolarFormat`
-            and `SpotlightBackprojection`.
+            three fields of the path, for the stages `TileImage`, `OmegaKImage` and `DirectImage`.
+            If they share an antenna also `position_m` and `reference_m`, half the reference path,
+            for `PolarFormat` and `SpotlightBackprojection`.
         """
         shared = {"transmitter_m": self.transmitter_m, "path_reference_m": self.reference_m}
         if self.receiver_m is not None:

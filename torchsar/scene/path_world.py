@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
@@ -16,6 +16,8 @@ from torchsar.scene.trials import positive, refuse_unless, refuse_unless_finite
 
 # one-way amplitude pattern sinc(x) of a uniform aperture: x at half power, where sinc^2 is 1/2
 _HALF_POWER = 0.442946
+# times within a period of the sway at which its power is averaged, by choice
+_SWAY_TIMES = 64
 
 
 class Ground(Protocol):
@@ -175,6 +177,21 @@ class SideBeam:
         centre = squint + yaw + sway * torch.sin(2 * math.pi * hz * time_s[:, None])
         off = ahead - torch.sin(torch.deg2rad(centre))
         return torch.sinc(_HALF_POWER * off / torch.sin(torch.deg2rad(width) / 2))
+
+    def mean_power(self, ahead: Tensor) -> Tensor:
+        """Return the two-way power gain of an antenna that transmits and receives.
+
+        It is the mean over a period of the sway.
+
+        Args:
+            ahead: Sine of the angle of the line of sight ahead of broadside, shape (point,).
+
+        Returns:
+            Gain, shape (..., point), float64.
+        """
+        time_s = torch.arange(_SWAY_TIMES, dtype=torch.float64) / _SWAY_TIMES
+        beam = replace(self, sway_hz=torch.as_tensor(self.sway_hz).sign())  # one period in a second, if it sways
+        return beam.gain(time_s, ahead.expand(_SWAY_TIMES, -1)).pow(4).mean(-2)
 
 
 @dataclass(frozen=True)

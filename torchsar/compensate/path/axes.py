@@ -15,14 +15,16 @@ from torchsar.core import cis
 from torchsar.focus import TileOperator
 from torchsar.radar import LIGHT_M_S, AntennaPath
 
-# blocks of the image along either axis, by choice: many levers, each with several scatterers
+# blocks of the image along either axis, by choice: several scatterers in each, yet blocks so far
+# apart that errors across the line of sight act differently on them
 _BLOCKS = 3
-# steps that fit the scene to the samples, by trial
-# steps that fit the scene to the samples, by trial, and share of the rest below which one counts
+# steps that fit the scene to the samples, and share of the residual energy that a step may leave to
+# be kept, by trial
 _FITS, _WORTH = 6, 0.8
-# share of the mean power of the blocks that is added, so that empty blocks have no gain
+# share of the mean power of the blocks that is added as a ridge, so that empty blocks get no gain
 _RIDGE = 1e-3
-# neighbourhood over which the spectrum of the motion is averaged, relative and in coefficients
+# neighbourhood over which the spectrum of the motion is averaged: share of the number of the
+# coefficient, plus a number of coefficients
 _WIDE, _LEAST_WIDE = 0.25, 2
 # lowest coefficients, of the constant and the linear term, which are not observable
 _UNSEEN = 2
@@ -49,8 +51,9 @@ class Found:
     """Errors of the positions of one trial.
 
     Args:
-        line_of_sight_m: Half the path over the middle, recorded minus true, float64 (pulse,).
-        offset_m: Error of the positions, float64 (pulse, 3).
+        line_of_sight_m: Half the path over the middle of the scene in metres, recorded minus true,
+            float64 (pulse,).
+        offset_m: Error of the positions in metres, recorded minus true, float64 (pulse, 3).
         std_m: Standard deviation of the line of sight in metres, float64 (pulse,).
         image: Image with the errors removed, complex (azimuth, range).
     """
@@ -73,8 +76,8 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, rou
     Args:
         rows: Range profiles, shape (pulse, range), complex.
         imaging: Image formation along the recorded path.
-        line_of_sight_m: Recorded minus true half path as found so far, float64 (pulse,).
-        rounds: Rounds of measurement and correction.
+        line_of_sight_m: Recorded minus true half path in metres as found so far, float64 (pulse,).
+        rounds: Rounds of measurement and correction, at least 1.
 
     Returns:
         The errors.
@@ -128,10 +131,11 @@ def _masks(counts: tuple[int, int], device: torch.device) -> Tensor:
 
 
 def _scene(rows: Tensor, operator: TileOperator) -> tuple[Tensor, Tensor]:
-    """Scene (azimuth, range) whose echo fits the samples, where the image exceeds its mean, and the
-    variance of the samples that a Wiener estimate of it leaves.
+    """Scene (azimuth, range) whose echo fits the samples, and the variance of the samples that a
+    Wiener estimate of it leaves.
 
-    Steps of least residual, each through the image of what is left, weighted by that estimate.
+    Each step adds the image of the residual samples, weighted by the Wiener estimate, with the
+    factor that leaves the least residual.
     """
     left, noise = rows[None], torch.zeros_like(rows.real[0, 0]).double()
     image = operator.image(left)
@@ -153,8 +157,8 @@ def _scene(rows: Tensor, operator: TileOperator) -> tuple[Tensor, Tensor]:
 
 
 def _measured(rows: Tensor, operator: TileOperator, masks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Phases of each pulse in the blocks (pulse, block), their information (pulse, block, block),
-    and the middles of the blocks.
+    """Phases in rad of each pulse in the blocks (pulse, block), their Fisher information (pulse,
+    block, block), and the centroids of the power of the blocks in metres (block, 3).
 
     Blocks at the same range overlap in a pulse; least squares fit all blocks at once, each with a
     complex gain.
@@ -191,8 +195,9 @@ def _levers(antennas: AntennaPath, places_m: Tensor, axes: Tensor) -> Tensor:
 def _fitted(range_m: Tensor, information: Tensor, lever: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     """Least-squares step of the motion (pulse, 3), and standard deviation of the line of sight.
 
-    range_m: errors of half the path in the blocks, (pulse, block), with their information (pulse,
-    block, block); lever: (pulse, block, axis).
+    range_m: errors of half the path in the blocks, (pulse, block), with their Fisher information
+    (pulse, block, block); lever: change of half the path by a unit of each axis, (pulse, block,
+    axis).
     """
     pull = (lever.mT @ (information @ range_m[..., None]))[..., 0]  # (pulse, axis)
     normal = lever.mT @ information @ lever

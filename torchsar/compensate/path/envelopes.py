@@ -51,8 +51,8 @@ def matched_m(profiles: Tensor, model: Tensor, frequency_hz: Tensor, reach_m: fl
         reach_m: Largest error in metres.
 
     Returns:
-        Error of the line of sight in metres, at which envelope and phase match best, float64
-        (pulse,).
+        Error of the line of sight in metres, recorded minus true, at which envelope and phase match
+        best, float64 (pulse,).
     """
     products = frequency_samples(profiles) * frequency_samples(model).conj()
     step = LIGHT_M_S / (2 * float(frequency_hz.mean())) / _PER_FRINGE
@@ -79,7 +79,8 @@ def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging, slopes: bo
         slopes: Whether to try slopes of some range cells first, each with one image.
 
     Returns:
-        Range by which each envelope is too far in metres, float64 (pulse,).
+        Range by which each envelope is too near in metres, to be removed by `moved`, float64
+        (pulse,).
     """
     samples, pulses = frequency_samples(profiles), len(profiles)
     cell = LIGHT_M_S / (2 * float(frequency_hz[-1] - frequency_hz[0]))

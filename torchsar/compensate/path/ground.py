@@ -1,4 +1,4 @@
-"""The ground that autofocus images along a path, and the paths of single trials."""
+"""The ground that autofocus images along a path, and estimates of single trials."""
 
 from __future__ import annotations
 
@@ -41,30 +41,12 @@ def trials_of(name: str, profiles: Tensor, frequency_hz: Tensor, antennas: Anten
     return torch.broadcast_shapes(profiles.shape[:-2], antennas.trials)
 
 
-def path_of(antennas: AntennaPath, trials: tuple[int, ...], index: tuple[int, ...]) -> AntennaPath:
-    """Return the path of one trial.
-
-    Args:
-        antennas: Paths.
-        trials: Leading dimensions to which they broadcast; () for those that they have.
-        index: Number of the trial in each of them.
-
-    Returns:
-        The path, without leading dimensions.
-    """
-
-    def of(x: Tensor, behind: int) -> Tensor:
-        lead = trials or tuple(antennas.trials)
-        return x.expand(*lead, *x.shape[x.ndim - behind :])[index]
-
-    receiver = None if antennas.receiver_m is None else of(antennas.receiver_m, 2)
-    return AntennaPath(of(antennas.transmitter_m, 2), receiver, of(antennas.reference_m, 1))
-
-
 def for_each(
     find: Callable[[Tensor, AntennaPath], Estimate], profiles: Tensor, antennas: AntennaPath, trials: torch.Size
 ) -> Estimate:
-    """Join the estimates of single trials; each has a plan of its own, whose image fills the cache.
+    """Join the estimates of single trials.
+
+    Trials are processed one after another, because each has an image plan of its own.
 
     Args:
         find: Estimator of one trial, given its profiles (pulse, range) and its path.
@@ -77,7 +59,7 @@ def for_each(
     """
     data = profiles.expand(*trials, *profiles.shape[-2:])
     every = itertools.product(*map(range, trials))
-    found = [find(data[index], path_of(antennas, tuple(trials), index)) for index in every]
+    found = [find(data[index], antennas.of_trial(index, trials)) for index in every]
 
     def joined(parts: list[Tensor]) -> Tensor:
         return torch.stack(parts).reshape((*trials, *parts[0].shape))

@@ -30,13 +30,14 @@ from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
 from torchsar.radar.spotlight import frequency_samples, range_profiles
 
-# share of the band of the first phases: envelopes that err by some range cells then matter little
+# share of the band in step 1, in which range cells are four times as long
 _FIRST_BAND = 0.25
 # rounds of the search, which end when the line of sight changes by less, rms, in fringes
 _ROUNDS, _SETTLED_FRINGES = 6, 1.0
-# largest errors of the envelopes that the rounds of the search correct, in range cells, by trial
+# largest errors of the envelopes that the first, the second and the later rounds of the search
+# correct, in range cells, by trial
 _REACH_CELLS = (4.0, 2.0, 0.5)
-# share of the band in the rounds of the search
+# share of the band in the first, the second and the later rounds of the search
 _BANDS = (0.5, 1.0, 1.0)
 # roughness below which fringes are those of a smooth line of sight, and standard deviation in
 # fringes of a measurement by envelopes: 0.3 to 0.6 for smooth errors, 1.0 for random walks
@@ -61,27 +62,30 @@ def path_autofocus(
     height_m: float = 0.0,
     rounds: int = 4,
 ) -> Estimate:
-    """Estimate the error of the recorded line of sight of each pulse, with whole fringes.
+    """Estimate the error of the recorded path at each pulse, along and across the line of sight.
 
-    The recommended autofocus of antennas on any path, for spotlight scenes. Its steps:
+    The recommended autofocus of antennas on any path, for spotlight scenes. The phase of a pulse
+    gives its error along the line of sight modulo a fringe, half a wavelength; the envelope of its
+    range profile shows how many fringes the error has. The steps are:
 
-    1. Phases of the pulses, from the phases between adjacent pulses (`sca`), sharpen images of a
-       quarter of the band by iterations through the adjoint of the image formation.
+    1. The phases of the pulses are found in a quarter of the band, where errors of the envelopes
+       matter little. They start from the phases between adjacent pulses (`sca`); iterations through
+       the image formation and its adjoint then sharpen the image.
     2. Phases become ranges. If their second differences show a smooth motion, its fringes follow
-       from the phases, otherwise each pulse takes the range at which its envelope and its phase
-       match the sharpened image best. In up to six rounds with more of the band, envelopes move
-       too.
-    3. Envelopes may still drift slowly against the phases: polynomials of time that lower the
-       entropy while the phases of the carrier are kept; the drift is added in whole fringes.
-    4. Three axes, without windows: the phases of nine blocks of the image, against an estimate of
-       the scene that fits the samples, refine the line of sight. Errors across it, which act
-       differently over the scene, follow with a ridge: their spectrum is taken to be that of the
+       from the phases; otherwise each pulse takes the range at which its envelope and its phase
+       match the sharpened image best. This is repeated in up to six rounds with half and then all
+       of the band, in which the envelopes are corrected too.
+    3. Envelopes may still drift slowly against the phases. The drift is the polynomial of time of
+       least image entropy at unchanged phases of the carrier; it is added in whole fringes.
+    4. The phases of each pulse in nine blocks of the image, without windows and relative to an
+       estimate of the scene, refine the line of sight. Errors across it, which act differently over
+       the scene, are fitted with a ridge, for which they are supposed to have the spectrum of the
        motion along the line of sight.
 
     Not observable are a constant and a linear term, which move the image; they are zero in the
-    result. The fringes of rough errors are known as well as envelopes are, that is in part, so that
-    the result is to be judged modulo half a wavelength. Trials have plans of their own and are
-    processed one after another.
+    result. Where the errors are rough from pulse to pulse, fringes follow from single envelopes and
+    are partly wrong; the result then holds modulo half a wavelength. Trials have image plans of
+    their own and are processed one after another.
 
     Args:
         profiles: Range profiles, the unitary centred inverse FFT of a phase history, shape (...,
@@ -93,29 +97,34 @@ def path_autofocus(
         extent_m: Side of the imaged square about the origin in metres, which should hold most of
             the scatterers; by default that of the whole unambiguous ground, which takes longer.
         height_m: Height z of the imaged plane in metres.
-        rounds: Rounds of the last step.
+        rounds: Rounds of step 4, at least 1.
 
     Returns:
-        `line_of_sight_m` of shape (..., pulse), float64: half the path over the middle of the
-        scene, recorded minus true; and `offset_m` of shape (..., pulse, 3): the error of the
-        positions, of both antennas alike, for `CorrectPath`. The standard deviation of the line of
-        sight is that modulo half a wavelength, from what a Wiener estimate of the scene leaves of
-        the samples. `quality` is the Strehl ratio predicted from it, times the share of the
-        sharpness that noise does not explain. `ok` is False unless the image is twice as sharp as
-        autofocus can make pure noise, more than one range cell makes the sharpness, and that
-        Strehl ratio exceeds 0.8. `info` holds "roughness" (about 1 if the fringes come from single
-        envelopes, less for smooth motions) and "entropy_nats" of the image, shape (...,).
+        `line_of_sight_m` of shape (..., pulse), float64: half the path over the middle of the scene
+        in metres, recorded minus true; and `offset_m` of shape (..., pulse, 3): the error of the
+        positions in metres, recorded minus true, of both antennas alike, for `CorrectPath`. The
+        standard deviation, of `line_of_sight_m` only, is that modulo half a wavelength; it follows
+        from what a Wiener estimate of the scene leaves of the samples. `quality` is the Strehl
+        ratio predicted from it, times the share of the sharpness that noise does not explain.
+        Sharpness is the amount by which the image entropy lies below that of speckle. `ok` is False
+        unless the image is twice as sharp as autofocus can make pure noise, more than one range
+        cell contributes to the sharpness, and that Strehl ratio exceeds 0.8; it does not say
+        whether fringes are right. It is False for fewer than 8 pulses with samples. `info` holds
+        "roughness" (see `roughness`: about 1 if the fringes come from single envelopes, less for
+        smooth motions) and "entropy_nats" of the image, shape (...,).
 
     Raises:
         TypeError: If the profiles are not complex, or frequencies are not float64.
-        ValueError: If sizes do not match, values are not finite, or the line of sight does not
-            turn.
+        ValueError: If sizes do not match, values are not finite, the line of sight does not turn,
+            the extent is not positive, or there is no round.
     """
     profiles = checked_samples(profiles, "path_autofocus", "pulse, range")
     refuse_unusable(frequency_hz=frequency_hz)
     trials = trials_of("path_autofocus", profiles, frequency_hz, antennas)
     if extent_m is not None and not 0 < extent_m < math.inf:
         raise ValueError(f"extent_m must be positive and finite, got {extent_m}")
+    if rounds < 1:
+        raise ValueError(f"path_autofocus needs at least one round, got rounds={rounds}")
 
     @torch.no_grad()
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
@@ -204,9 +213,11 @@ class _Search:
         return LIGHT_M_S / (2 * float(self.frequency_hz.mean()))
 
     def metres(self, phase_rad: Tensor) -> Tensor:
+        """Range that has a phase."""
         return phase_rad.double() * (self._fringe_m / (2 * math.pi))
 
     def line_free(self, range_m: Tensor) -> Tensor:
+        """Ranges without constant and linear terms."""
         return without_line(range_m, torch.ones_like(range_m, dtype=torch.bool))
 
     def windowed(self, share: float) -> Tensor:

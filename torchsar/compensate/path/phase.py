@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchsar.compensate.path.ground import for_each, ground_image, path_of, trials_of
+from torchsar.compensate.path.ground import for_each, ground_image, trials_of
 from torchsar.compensate.pulse_phase.recommended import autofocus
 from torchsar.core import Estimate, Signal, Stage, checked_samples
 from torchsar.radar import AntennaPath
@@ -23,9 +23,8 @@ def path_phase(
     """Estimate the phase of each pulse that sharpens the image of a spotlight scene on any path.
 
     It is `autofocus` with images by tiles along the recorded path, in which scatterers do not
-    migrate. They cover the whole unambiguous ground, about a quarter of an image per pulse and
-    second on one core for some hundred pulses. The middle of the scene, to which phases refer, is
-    the origin.
+    migrate. They cover the whole unambiguous ground. The middle of the scene, to which phases
+    refer, is the origin.
 
     Args:
         profiles: Range profiles, the unitary centred inverse FFT of a phase history, shape (...,
@@ -54,7 +53,7 @@ def path_phase(
     refuse_unusable(frequency_hz=frequency_hz)
     trials = trials_of("path_phase", profiles, frequency_hz, antennas)
     if antennas.trials.numel() == 1:
-        one = path_of(antennas, (), (0,) * len(antennas.trials))
+        one = antennas.of_trial((0,) * len(antennas.trials))
         return autofocus(profiles, search=search, polish=polish, imaging=ground_image(frequency_hz, one, height_m))
 
     def find(rows: Tensor, one: AntennaPath) -> Estimate:

@@ -10,13 +10,15 @@ from torchsar.radar import AntennaPath
 
 
 class PathAutofocus(Stage):
-    """Error of the recorded line of sight of every pulse, with whole fringes; see `path_autofocus`.
+    """Error of the recorded path at every pulse, along and across the line of sight.
+
+    See `path_autofocus`.
 
     Args:
         extent_m: Side of the imaged square about the origin in metres; None for the whole
             unambiguous ground.
         height_m: Height z of the imaged plane in metres.
-        rounds: Rounds of the last step.
+        rounds: Rounds of the last step, at least 1.
     """
 
     provides = ("line_of_sight_m", "offset_m")
@@ -71,13 +73,14 @@ class CorrectPath(Stage):
 
         Args:
             signal: Range profiles.
-            offset_m: Errors of the recorded positions in metres, (..., pulse, 3), the same for both
-                antennas.
+            offset_m: Errors of the recorded positions in metres, recorded minus true, float64 (...,
+                pulse, 3), the same for both antennas.
             transmitter_m: Recorded positions of the transmitter in metres, float64 (..., pulse, 3).
             receiver_m: Recorded positions of the receiver in metres; None if both share an antenna.
 
         Returns:
-            `Estimate` of `transmitter_m`, and of `receiver_m` if there is one, (..., pulse, 3).
+            `Estimate` of `transmitter_m`, and of `receiver_m` if there is one, float64 (..., pulse,
+            3). It is always `ok`; a chain replaces an offset that is not `ok` by zero.
         """
         places = {"transmitter_m": transmitter_m, "receiver_m": receiver_m}
         value = {name: place - offset_m for name, place in places.items() if place is not None}

@@ -19,7 +19,7 @@ from torchsar.compensate.pulse_phase.data import or_one
 # ones. Found by trial on 2 to 300 scatterers: the phases may be wrong from 0.2 and 0.45 on, and
 # interference of scatterers that are not resolved displaces aligned profiles by 0.25 at most.
 _LARGEST_JITTER, _LARGEST_MIGRATION = 0.25, 0.4
-# deviations by which a displacement must differ from none
+# standard deviations by which a displacement must differ from zero
 _SIGNIFICANT = 3.0
 # fewest range cells and pulses whose displacement is estimated; number of groups of pulses
 _LEAST_CELLS, _LEAST_PULSES, _GROUPS = 8, 8, 16

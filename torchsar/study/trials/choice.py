@@ -88,7 +88,12 @@ def beside_direct_sum(prepared: Callable[[], DirectlySummed], neglects: str) -> 
             lambda one: of.share if one.keys else 1.0,
         )
 
-    exact = Alternative("direct sum, times extrapolated from random pixels", {"exact": True})
     return Choice(
-        "image beside the direct sum", "image", [Alternative("recommended image", {}, None, neglects), exact], measured
+        "image beside the direct sum",
+        "image",
+        [
+            Alternative("recommended image", {}, None, neglects),
+            Alternative("direct sum, times extrapolated from random pixels", {"exact": True}),
+        ],
+        measured,
     )

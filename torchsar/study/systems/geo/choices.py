@@ -338,5 +338,7 @@ def _summed(bench: Bench) -> DirectlySummed:
         made = bistatic_echo(movers, radar, pulses, samples, gate=gate, dtype=torch.complex128)
         return RemoveTransmitRange(radar)(Signal(made, radar.axes(pulses, samples))).data
 
-    stage, draws = StationaryImage(radar, LeastSquares(min(2, radar.channels))), Draws(bench.config.seed)
-    return points_at_rest(radar, stage, (pulses, samples), gate.duration_s, draws, bench.dtype, echo)
+    return points_at_rest(
+        *(radar, StationaryImage(radar, LeastSquares(min(2, radar.channels))), (pulses, samples), gate.duration_s),
+        *(Draws(bench.config.seed), bench.dtype, echo),
+    )

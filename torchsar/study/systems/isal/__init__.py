@@ -123,12 +123,11 @@ class Isal(System):
                 "use a config that simulates the echoes"
             )
         efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
-        # without a rotation rate the image has no cross range
-        known = bench.radar.rotation_rad_s is not None
-        images = [beside_direct_sum(partial(_summed, bench), "migration while the target turns")] * known
+        image = beside_direct_sum(partial(_summed, bench), "migration while the target turns")
         return [
             *echo_choices(bench),
-            *images,
+            # without a rotation rate the image has no cross range
+            *([] if bench.radar.rotation_rad_s is None else [image]),
             Choice("effort of autofocus", "autofocus.search", efforts, partial(_efforts, bench)),
         ]
 
@@ -166,8 +165,10 @@ def _summed(bench: Bench) -> DirectlySummed:
     angle = rotation_angle(radar, world.pulses, turning, torch.empty(()))
     # the axis has the scale of the assumed rate
     cross, image = radar.image_axes(axes)[0].values() * (radar.rotation_rad_s / turning), AzimuthTransform(radar)
-    about = (radar, angle, cross, 0.0, world.samples, Draws(bench.config.seed))
-    return turning_target(*about, lambda noise: image(Signal(noise.to(bench.dtype), axes)).data)
+    return turning_target(
+        *(radar, angle, cross, 0.0, world.samples, Draws(bench.config.seed)),
+        lambda noise: image(Signal(noise.to(bench.dtype), axes)).data,
+    )
 
 
 SYSTEM = Isal

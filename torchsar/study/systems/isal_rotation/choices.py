@@ -239,13 +239,12 @@ def _summed(bench: Bench) -> DirectlySummed:
     phi = warp(torch.arange(world.pulses + 1, dtype=torch.float64) / radar.prf_hz, k)
     # lines lie at equal steps of the Doppler at the mean rate
     doppler = (torch.arange(count, dtype=torch.float64) - count // 2) / (lines.oversampling * phi[-1])
-
-    def image(noise: Tensor) -> Tensor:
-        about = (range_m, radar.wavelength_m, radar.prf_hz, omega, k, yc)
-        return matched_fourier(range_phase(noise.to(bench.dtype), *about), k, radar.prf_hz, lines=lines)
-
     cross = radar.wavelength_m * doppler / (2 * omega)
-    return turning_target(radar, omega * phi[:-1], cross, yc, world.samples, Draws(bench.config.seed), image)
+    about = (range_m, radar.wavelength_m, radar.prf_hz, omega, k, yc)
+    return turning_target(
+        *(radar, omega * phi[:-1], cross, yc, world.samples, Draws(bench.config.seed)),
+        lambda noise: matched_fourier(range_phase(noise.to(bench.dtype), *about), k, radar.prf_hz, lines=lines),
+    )
 
 
 def _draws(bench: Bench) -> Draws:

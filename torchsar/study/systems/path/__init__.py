@@ -129,22 +129,20 @@ class AnyPath(System):
             for error, predicted in tiles.items()
         ]
         # by the beam of the method that uses omega-K, if there is one
-        stages = [one for chain in bench.chains.values() for one in chain.stages.values()]
-        pattern = None if bench.recording is not None else bench.world().lit_power
-        beams = [one.beam for one in stages if isinstance(one, OmegaKImage)]
+        lit = None if bench.recording is not None else bench.world().beam
+        beams = [s.beam for c in bench.chains.values() for s in c.stages.values() if isinstance(s, OmegaKImage)]
         straight = {} if not beams else possible_compensations(geometry[0], antennas, grid, beams[0])
         compensated = [
             Alternative(
                 f"omega-K after motion compensation of order {order}",
                 {"stage": "omega_k_image", "order": order, "beam_deg": one.beam.width_deg},
-                {"image_error_db": one.predicted_db(pattern)},
+                {"image_error_db": one.predicted_db(None if lit is None else lit.mean_power)},
                 "change of motion errors with the angle" + (" and with the range" if order == 1 else ""),
             )
             for order, one in straight.items()
         ]
-        exact = Alternative("direct sum", {"stage": "direct_image"}, {})
-        measured = partial(_measured, bench, geometry, tiles, straight, stage)
-        return [Choice("image", "stage", [*compensated, *alternatives, exact], measured)]
+        every = [*compensated, *alternatives, Alternative("direct sum", {"stage": "direct_image"}, {})]
+        return [Choice("image", "stage", every, partial(_measured, bench, geometry, tiles, straight, stage))]
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         yield partial(comparisons, results, self.columns)
@@ -161,13 +159,11 @@ def _measured(
     stage: PathImage,
 ) -> Measured:
     """Images of white noise, at random pixels beside the direct sum."""
-    frequency, place, receiver, reference = geometry
-    draws = Draws(bench.config.seed)
-    noise = white_noise(draws, place.shape[-2], len(frequency))
-    counts = stage.grid.counts
-    some = some_pixels(draws, counts[0] * counts[1])
-    pixels = stage.grid.pixels_m().reshape(-1, 3)[some]
-    whole = backproject(noise, frequency, place, receiver, reference, pixels)
+    draws, every = Draws(bench.config.seed), stage.grid.pixels_m().reshape(-1, 3)
+    noise = white_noise(draws, geometry[1].shape[-2], len(geometry[0]))
+    some = some_pixels(draws, len(every))
+    pixels = every[some]
+    whole = backproject(noise, *geometry, pixels)
     history, plans = noise.to(bench.dtype), {error: TilePlan(*geometry, stage.grid, error) for error in tiles}
 
     def run(one: Alternative) -> Tensor:
@@ -175,17 +171,15 @@ def _measured(
             return plans[one.keys["error_db"]].image(history)
         if "order" in one.keys:
             return straight[one.keys["order"]].image(history)
-        return backproject(history, frequency, place, receiver, reference, pixels, eps=1e-6)
+        return backproject(history, *geometry, pixels, eps=1e-6)
 
     def loss(one: Alternative, image: Tensor) -> dict[str, float]:
         exact = straight[one.keys["order"]].exact(noise, pixels) if "order" in one.keys else whole
         made = image if one.keys["stage"] == "direct_image" else image.flatten(-2)[..., some]
         return {"image_error_db": float(error_db(made[..., None, :].to(exact.dtype), exact[..., None, :]).max())}
 
-    def share(one: Alternative) -> float:
-        return len(some) / (counts[0] * counts[1]) if one.keys["stage"] == "direct_image" else 1.0
-
-    return Measured(run, loss, share)
+    part = len(some) / len(every)
+    return Measured(run, loss, lambda one: part if one.keys["stage"] == "direct_image" else 1.0)
 
 
 SYSTEM = AnyPath

@@ -80,23 +80,13 @@ def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
     std = truth.get("noise_std")
     if bench.recording is not None or std is None or not bool((std > 0).all()):
         return {}
-    x, y, z, amplitude = (truth[name] for name in ("range_m", "azimuth_m", "height_m", "amplitude"))
+    points = torch.stack(torch.broadcast_tensors(*(truth[f"{axis}_m"] for axis in ("range", "azimuth", "height"))), -1)
     aux = batch.trials.clean.aux
     antennas = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
-    if antennas.pulses * len(aux["frequency_hz"]) * x.shape[-1] > _MOST_WORK or bench.world().beam is not None:
+    if antennas.pulses * len(aux["frequency_hz"]) * points.shape[-2] > _MOST_WORK or bench.world().beam is not None:
         return {}
-
-    def of(value: Tensor, i: int, behind: int) -> Tensor:
-        return value.expand(count, *value.shape[value.ndim - behind :])[i]
-
-    found = []
-    for i in range(count):
-        receiver = None if antennas.receiver_m is None else of(antennas.receiver_m, i, 2)
-        one = AntennaPath(of(antennas.transmitter_m, i, 2), receiver, of(antennas.reference_m, i, 1))
-        points = torch.stack([of(v, i, 1) for v in (x, y, z)], -1)
-        noise = float(of(std, i, 0))
-        found.append(line_of_sight_bound_m(aux["frequency_hz"], one, points, of(amplitude, i, 1), noise))
-    return {"path_residual_rms_m": {"Cramer-Rao": torch.stack(found)}}
+    bound = line_of_sight_bound_m(aux["frequency_hz"], antennas, points, truth["amplitude"], std)
+    return {"path_residual_rms_m": {"Cramer-Rao": bound.expand(count)}}
 
 
 def _positions(targets: Mapping[str, Metrics]) -> dict[str, Tensor]:

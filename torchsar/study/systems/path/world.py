@@ -142,15 +142,6 @@ class Flown(World):
         assert truth.clean is not None
         return Trials(recording, truth.clean, truth.values, len(draws.trials or (0,)), world)
 
-    def lit_power(self, sine: Tensor) -> Tensor:
-        """Mean power of the echo of a point of unit amplitude over the sines of its angles ahead of
-        broadside, for an antenna that transmits and receives.
-        """
-        if self.beam is None:
-            return torch.ones_like(sine)
-        time_s = torch.linspace(0, 1, 64, dtype=torch.float64) / max(float(self.beam.sway_hz), 1e-9)
-        return self.beam.gain(time_s, sine.expand(64, -1)).pow(4).mean(0)
-
     @property
     def named_points(self) -> dict[str, tuple[Tensor | float, Tensor | float]]:
         """Azimuth and range in metres of the points of the scene, by names such as `corners.0`."""
