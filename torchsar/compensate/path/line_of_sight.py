@@ -81,6 +81,8 @@ def path_autofocus(
        estimate of the scene, refine the line of sight. Errors across it, which act differently over
        the scene, are fitted with a ridge, for which they are supposed to have the spectrum of the
        motion along the line of sight.
+    5. Step 4 is repeated from another start: phases of the whole band, with envelopes at rest. The
+       sharper of the two images counts.
 
     Not observable are a constant and a linear term, which move the image; they are zero in the
     result. Where the errors are rough from pulse to pulse, fringes follow from single envelopes and
@@ -104,14 +106,15 @@ def path_autofocus(
         in metres, recorded minus true; and `offset_m` of shape (..., pulse, 3): the error of the
         positions in metres, recorded minus true, of both antennas alike, for `CorrectPath`. The
         standard deviation, of `line_of_sight_m` only, is that modulo half a wavelength; it follows
-        from what a Wiener estimate of the scene leaves of the samples. `quality` is the Strehl
-        ratio predicted from it, times the share of the sharpness that noise does not explain.
-        Sharpness is the amount by which the image entropy lies below that of speckle. `ok` is False
-        unless the image is twice as sharp as autofocus can make pure noise, more than one range
-        cell contributes to the sharpness, and that Strehl ratio exceeds 0.8; it does not say
-        whether fringes are right. It is False for fewer than 8 pulses with samples. `info` holds
-        "roughness" (see `roughness`: about 1 if the fringes come from single envelopes, less for
-        smooth motions) and "entropy_nats" of the image, shape (...,).
+        from what a Wiener estimate of the scene leaves of the samples, and from the difference
+        between the two starts. `quality` is the Strehl ratio predicted from it, times the share of
+        the sharpness that noise does not explain. Sharpness is the amount by which the image
+        entropy lies below that of speckle. `ok` is False unless the image is twice as sharp as
+        autofocus can make pure noise, more than one range cell contributes to the sharpness, and
+        that Strehl ratio exceeds 0.8; it does not say whether fringes are right. It is False for
+        fewer than 8 pulses with samples. `info` holds "roughness" (see `roughness`: about 1 if the
+        fringes come from single envelopes, less for smooth motions) and "entropy_nats" of the
+        image, shape (...,).
 
     Raises:
         TypeError: If the profiles are not complex, or frequencies are not float64.
@@ -242,7 +245,7 @@ class _Search:
         return phase[0], at
 
     def by_phases(self) -> Tensor:
-        """Line of sight within a fringe, from phases that sharpen the image with envelopes at rest."""
+        """Line of sight within a fringe: phases that sharpen the image, with envelopes at rest."""
         rows, rest = self.windowed(1.0), torch.zeros(len(self.rows), dtype=torch.float64, device=self.rows.device)
         return self.metres(self.sharpened(rows, rest, _BOTH, self.adjacent(rows))[0])
 
