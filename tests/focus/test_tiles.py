@@ -90,6 +90,9 @@ def test_the_axis_of_the_range_may_be_the_first() -> None:
     turned = replace(drawn, grid=replace(grid, axes=grid.axes.flip(0), counts=grid.counts[::-1]))
     image = turned.plan().image(drawn.history)
     assert turned.error_db(image) < -67
+    some = torch.arange(0, image.numel(), 31)
+    exact = turned.plan().exact(drawn.history, turned.grid.pixels_m().reshape(-1, 3)[some])
+    assert float((image.flatten()[some] - exact).norm() / exact.norm()) < 10 ** (-67 / 20)
     assert drawn.error_db(image.mT) < -67
 
 
@@ -231,6 +234,12 @@ def test_a_strip_sums_the_pulses_that_light_a_pixel() -> None:
     truth = replace(drawn, history=history).direct(drawn.grid.pixels_m()[i, j])
     assert float((found[i, j] - truth).norm() / truth.norm()) < 10 ** (-67 / 20)
     assert not found[:40].any() and not found[-40:].any()
+    some = torch.arange(0, found.numel(), 53)
+    exact, made = (
+        plan.exact(drawn.history, drawn.grid.pixels_m().reshape(-1, 3)[some]),
+        plan.image(drawn.history).flatten()[some],
+    )
+    assert float((made - exact).norm() / exact.norm()) < 10 ** (-67 / 20)
     moved = plan.moved(drawn.transmitter_m, None, drawn.reference_m).image(history)
     torch.testing.assert_close(moved, found)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torchsar.core import block_bytes_of, checked_samples, over_blocks
-from torchsar.focus.backprojection import expanded_history
+from torchsar.focus.backprojection import direct_sum, expanded_history
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import Lit, Scene, choose, part_bounds, tile_centres, tile_heights
 from torchsar.focus.tiles.expansion import slopes
@@ -206,6 +206,39 @@ class TilePlan:
         image = image[:, : self.grid.counts[0], : self.grid.counts[1]]
         image = image.reshape(*(lead[d] for d in order), *self.grid.counts)
         return image.permute(*(order.index(d) for d in range(len(lead))), -2, -1)
+
+    def exact(self, history: Tensor, pixels_m: Tensor, eps: float = 1e-10) -> Tensor:
+        """Compute pixels by the direct sum over the pulses that `image` sums for each of them.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+            pixels_m: Positions of pixels of the grid in metres, float64 (pixel, 3).
+            eps: Relative error of the interpolation in range.
+
+        Returns:
+            Image, shape (..., pixel), complex.
+
+        Raises:
+            TypeError: If the history is not complex64 or complex128.
+            ValueError: If its size is not that of the plan.
+        """
+        history = checked_samples(history, "TilePlan.exact", "pulse, frequency", finite=False)
+        history = expanded_history(history, self.antennas, self.frequency_hz, "TilePlan.exact")
+        device = pixels_m.device
+        ends = torch.zeros(*self._tiles, 2, dtype=torch.int64, device=device)
+        for zone, numbers in zip(self._zones, self._numbers, strict=True):
+            if zone:
+                ends.flatten(0, 1)[numbers] = torch.tensor([zone[0].pulses.start, zone[-1].pulses.stop], device=device)
+        grid = self.grid.transposed() if self._swapped else self.grid
+        at = ((pixels_m - grid.origin_m) @ grid.axes.mT / grid.step_m).round().long()
+        first, last = ends[at[:, 0] // self._size[0], at[:, 1] // self._size[1]].unbind(-1)
+
+        def path(pulses: slice, some: slice) -> tuple[Tensor, Tensor]:
+            number = torch.arange(pulses.start, pulses.stop, device=device)[:, None]
+            summed = (first[some] <= number) & (number < last[some])
+            return self.antennas.path_m(pixels_m[some], pulses), summed.to(torch.float64)
+
+        return direct_sum(history, self.frequency_hz, path, len(pixels_m), eps=eps)
 
     def _formed(self, data: Tensor) -> Tensor:
         """All tiles, (tile, path * trial, x, y), of data (path, pulse, trial, frequency)."""
