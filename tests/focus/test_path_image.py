@@ -9,9 +9,9 @@ import torch
 
 from tests.focus.geometries import case
 from torchsar.core import Signal
-from torchsar.focus import DirectImage, TileImage
+from torchsar.focus import DirectImage, ProcessedBeam, TileImage
 from torchsar.metrics import error_db
-from torchsar.radar import InverseRadar, range_profiles
+from torchsar.radar import InverseRadar, StraightTrack, range_profiles
 
 DRAWN = case(1002)
 N = len(DRAWN.frequency_hz)
@@ -52,6 +52,41 @@ def test_trials_have_paths_of_their_own() -> None:
     assert both.data.shape == (2, 16, 16)
     one = stage(signal(DRAWN.history), **values(transmitter_m=moved[1]))
     assert float(error_db(both.data[1], one.data)) < -55
+
+
+def test_tiles_sum_the_pulses_that_see_them_within_the_beam() -> None:
+    """A beam of 6 degrees at 466 m sees 54 m of a track of 160 m, and a zone some metres more."""
+    y = 0.4 * torch.arange(-200.0, 200.0, dtype=torch.float64)
+    place = torch.stack([-450.0 + 0.2 * torch.sin(y / 9), y, torch.full_like(y, 120.0)], -1)
+    path = {"transmitter_m": place, "receiver_m": None, "path_reference_m": 2 * torch.linalg.vector_norm(place, dim=-1)}
+    history = torch.randn(400, N, dtype=torch.complex128)
+    stage = TileImage(4.0, 4.0, STEP_M, window="range", error_db=-80.0, beam_deg=6.0)
+    lit = y.abs() <= 466 * math.tan(math.radians(3.3)) - 2.5
+    wide = y.abs() <= 466 * math.tan(math.radians(3.3)) + 5.0
+    parts = [stage(signal(history * some[:, None]), **values(**path)).data for some in (lit, wide, wide | ~wide)]
+    exact = DirectImage(4.0, 4.0, STEP_M, window="range")(signal(history * lit[:, None]), **values(**path)).data
+    assert float(error_db(parts[0], exact)) < -75
+    torch.testing.assert_close(parts[1], parts[2])
+    assert float(error_db(parts[0], parts[1])) > -15
+    both = {**path, "transmitter_m": torch.stack([place, place + 0.01])}
+    assert stage(signal(history), **values(**both)).data.shape == (2, 11, 11)
+
+
+def test_the_beam_lights_the_pulses_with_a_weight() -> None:
+    """Of an antenna that advances unevenly, and turns back at times."""
+    y = torch.arange(-100.0, 100.0, dtype=torch.float64)
+    y = y + 3 * torch.sin(y / 2)
+    place = torch.stack([-300.0 + torch.sin(y / 9), y, torch.full_like(y, 90.0)], -1)
+    points = torch.stack([torch.linspace(-30, 30, 41), torch.linspace(-400, 400, 41), torch.zeros(41)], -1).double()
+    beam, track = ProcessedBeam(8.0, 3.0), StraightTrack.fitted(place)
+    ahead = track.along_m(points) - track.along_m(place)[:, None]
+    sine = ahead / torch.hypot(ahead, torch.linalg.vector_norm(track.across_m(points), dim=-1))
+    seen = beam.weight(sine) > 0
+    for (first, last), pulses in zip(beam.lit_pulses(place, points).tolist(), seen.unbind(-1), strict=True):
+        lit = pulses.nonzero()[:, 0].tolist()
+        assert (first, last) == (lit[0], lit[-1] + 1) if lit else first >= last
+    with pytest.raises(ValueError, match="does not advance"):
+        beam.lit_pulses(place[:1].expand(5, 3), points)
 
 
 @pytest.mark.parametrize(

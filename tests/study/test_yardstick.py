@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.study.scenes import PATH, bench_of, world
+from tests.study.scenes import bench_of, world
 from torchsar.study.trials.auto import choices_of
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Choice
@@ -56,14 +56,15 @@ def test_omega_k_stands_beside_tiles_where_a_method_uses_it(tmp_path: Path) -> N
         "window": "none",
         "uses": {name: f"aux.{name}" for name in ("frequency_hz", "transmitter_m", "path_reference_m")},
     }
-    methods = {**PATH["processor"], "omega_k": {"stages": {"image": strip}}}
+    tiles = {**strip, "stage": "tile_image"}
+    methods = {"recommended": {"stages": {"image": tiles}}, "omega_k": {"stages": {"image": strip}}}
     # pulses 0.05 m apart, so that they sample the beam
     track = {
         "nominal": {"kind": "straight", "start_m": [-1500.0, -10.0, 1500.0], "velocity_m_s": [0.0, 5.0, 0.0]},
         "x": {"sway": {"kind": "sinusoid", "amplitude_m": 0.2, "frequency_hz": 0.3}},
     }
     scene = world("path", pulses=400, transmitter=track, navigation=None)
-    bench = bench_of(tmp_path, "path", processor=methods, world=scene)
+    bench = bench_of(tmp_path, "path", processor=methods, world=scene, metrics={})
     (choice,) = choices_of(bench)
     assert choice.measured is not None
     measured = choice.measured()
@@ -71,3 +72,7 @@ def test_omega_k_stands_beside_tiles_where_a_method_uses_it(tmp_path: Path) -> N
     assert one.loss is not None
     loss = measured.loss(one, measured.run(one))["image_error_db"]
     assert abs(loss - one.loss["image_error_db"]) < 3.5 and loss < -20
+    # tiles sum the pulses of the same beam
+    tiles = next(one for one in choice.alternatives if one.name == "tiles at -40 dB")
+    assert tiles.loss is not None
+    assert measured.loss(tiles, measured.run(tiles))["image_error_db"] < tiles.loss["image_error_db"] + 3

@@ -148,6 +148,35 @@ class ProcessedBeam:
         """
         return raised_cosine_band((sine - self.middle) / self.band)
 
+    def lit_pulses(self, position_m: Tensor, points_m: Tensor) -> Tensor:
+        """Return the pulses that see points at an angle with a weight.
+
+        Angles are those from the straight track of the antenna (`StraightTrack`), in the plane of
+        the track and the point.
+
+        Args:
+            position_m: Positions of the antenna in metres, float64 (pulse, 3).
+            points_m: Points in metres, float64 (point, 3).
+
+        Returns:
+            First pulse that sees each point and the pulse after the last, int64 (point, 2); alike
+            where none sees it.
+
+        Raises:
+            TypeError: If the positions are not float64.
+            ValueError: If there are fewer than two positions, the antenna does not advance, or
+                values are not finite.
+        """
+        track = StraightTrack.fitted(position_m)
+        pulse, along = track.along_m(position_m), track.along_m(points_m)
+        closest = torch.linalg.vector_norm(track.across_m(points_m), dim=-1)
+        sines = (self.middle + side * (1 + BAND_EDGE) * self.band / 2 for side in (1, -1))
+        low, high = (along - closest * math.tan(math.asin(sine)) for sine in sines)
+        # an antenna that turns back may pass a coordinate several times
+        first = torch.searchsorted(pulse.cummax(0).values, low)
+        last = torch.searchsorted(pulse.flip(0).cummin(0).values.flip(0), high, right=True)
+        return torch.stack([first, torch.maximum(first, last)], -1)
+
     def quadrature(self) -> tuple[Tensor, Tensor]:
         """Return sines of angles, and their shares of the power of an image of white noise.
 

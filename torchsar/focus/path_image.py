@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.motion_compensation import ProcessedBeam, compensated_omega_k, refuse_bistatic
 from torchsar.focus.spotlight import window_weights
 from torchsar.focus.tiles import TilePlan
+from torchsar.focus.tiles.choice import Lit
 from torchsar.radar.antenna_path import AntennaPath
 from torchsar.radar.spotlight import frequency_samples
 
@@ -97,6 +99,17 @@ class PathImage(Stage):
         """
         raise NotImplementedError
 
+    def lit(self, antennas: AntennaPath) -> Lit | None:
+        """Return the function of the pulses that are summed for a point, see `TilePlan`.
+
+        Args:
+            antennas: Path of the antennas.
+
+        Returns:
+            Function, or None for all pulses.
+        """
+        return None
+
     def forward(
         self,
         signal: Signal,
@@ -140,6 +153,13 @@ class TileImage(PathImage):
         height_m: Height z of the imaged plane in metres.
         window: "none", "hann" or "range", see `PathImage`.
         error_db: Largest rms error relative to the image of white noise, in dB.
+        beam_deg: Width of the processed beam in degrees, for strips: only the pulses that see a
+            tile within it, with its edges, are summed, and few others beside them. None for all
+            pulses.
+        squint_deg: Angle of the middle of the beam ahead of broadside in degrees.
+
+    Raises:
+        ValueError: If the beam is not valid, see `ProcessedBeam`.
     """
 
     def __init__(
@@ -152,9 +172,30 @@ class TileImage(PathImage):
         height_m: float = 0.0,
         window: str = "hann",
         error_db: float = -60.0,
+        beam_deg: float | None = None,
+        squint_deg: float = 0.0,
     ) -> None:
         super().__init__(azimuth_m, range_m, step_m, centre_m, range_axis_rad, height_m, window)
         self.error_db = error_db
+        self.beam = None if beam_deg is None else ProcessedBeam(beam_deg, squint_deg)
+
+    def lit(self, antennas: AntennaPath) -> Lit | None:
+        """Return the function of the pulses that see a point within the beam, see `TilePlan`.
+
+        Args:
+            antennas: Path of the antennas. The beam is that of the receiver, seen from the mean
+                path of all trials.
+
+        Returns:
+            Function, or None for all pulses.
+
+        Raises:
+            ValueError: If the receiver does not advance, see `StraightTrack.fitted`.
+        """
+        if self.beam is None:
+            return None
+        place = antennas.places[-1].detach()
+        return partial(self.beam.lit_pulses, place.reshape(-1, antennas.pulses, 3).mean(0))
 
     def form(self, history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid) -> Tensor:
         """Form the image by tiles.
@@ -169,7 +210,7 @@ class TileImage(PathImage):
             Image, shape (..., azimuth, range).
         """
         places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
-        return TilePlan(frequency_hz, *places, grid, self.error_db).image(history)
+        return TilePlan(frequency_hz, *places, grid, self.error_db, self.lit(antennas)).image(history)
 
 
 class DirectImage(PathImage):

@@ -149,6 +149,12 @@ class Part:
         return inside and 2 * self._reach(places) + 1 <= self.length - self.choice.rise
 
     @property
+    def table_count(self) -> int:
+        """Largest number of complex values in the tables of all tiles for one path."""
+        # positions in the window are whole numbers, weights at nodes real numbers: two make one
+        return len(self.centre) * self.count * (self.samples + self.length + self.nodes // 2 + 1)
+
+    @property
     def weight_count(self) -> int:
         """Number of complex values in `across` and in the weights of all tiles."""
         wide, deep, powers = len(self.x), len(self.y), self.choice.order + 1

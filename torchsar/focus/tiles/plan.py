@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torchsar.core import block_bytes_of, checked_samples, over_blocks
-from torchsar.focus.backprojection import expanded_history
+from torchsar.focus.backprojection import direct_sum, expanded_history
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import Lit, Scene, choose, part_bounds, tile_centres, tile_heights
 from torchsar.focus.tiles.expansion import slopes
@@ -21,12 +21,35 @@ from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S
 
-# tables of the pulses, and weights of the tiles, up to this size each are kept between images
+# tables of the pulses, and weights of the tiles, up to this size each are kept for the next image
 _KEPT_BYTES = 3 << 27
 # tiles and trials whose pixels are formed at once
 _GROUP = 16
 # profiles that are formed at once
 _PROFILE_BYTES = 1 << 25
+
+
+class _Kept(dict):
+    """What an image has computed and the next one of the same form needs.
+
+    Args:
+        count: Largest number of complex values that one image adds.
+    """
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.count, self.form = count, None
+
+    def begin(self, dtype: torch.dtype, tiles: int) -> None:
+        """Forget what images of another precision or number of tiles at once have left."""
+        if self.form != (dtype, tiles):
+            self.clear()
+            self.form = dtype, tiles
+
+    def keep(self, key: tuple, value: Any, dtype: torch.dtype) -> None:
+        """Keep a value unless those of an image of the precision are too large together."""
+        if self.count * dtype.itemsize <= _KEPT_BYTES:
+            self[key] = value
 
 
 class TilePlan:
@@ -92,7 +115,6 @@ class TilePlan:
         size = *antennas.trials, antennas.pulses
         self._places = [place.expand(*size, 3).reshape(-1, *size[-1:], 3) for place in antennas.places]
         self._reference_m = reference_m.expand(size).reshape(-1, *size[-1:])
-        self._tables: dict[tuple, Tables] = {}
 
     def _plan(self, every: Sequence[Tensor]) -> None:
         """Choose the sizes and compute what does not depend on the history."""
@@ -120,10 +142,9 @@ class TilePlan:
             given = nominal, every, centre, grid, relief
             self._zones.append([Part(self._band, choice, pulses, *given) for pulses in bounds])
         parts = [part for zone in self._zones for part in zone]
-        samples = sum(len(part.centre) * part.count * (part.samples + part.length) for part in parts)
-        self._keeps_tables = samples * len(every[0]) * 8 <= _KEPT_BYTES
-        self._keeps_weights = 8 * sum(part.weight_count for part in parts) <= _KEPT_BYTES
-        self._weights: dict[tuple, Any] = {}
+        self._table_count = sum(part.table_count for part in parts)
+        self._tables = _Kept(len(every[0]) * self._table_count)
+        self._weights = _Kept(sum(part.weight_count for part in parts))
 
     def moved(self, transmitter_m: Tensor, receiver_m: Tensor | None, reference_m: Tensor) -> TilePlan:
         """Return the plan of a path that differs little, such as by a change of its motion errors.
@@ -147,6 +168,7 @@ class TilePlan:
         plan = copy.copy(self)
         plan._set_path(transmitter_m, receiver_m, reference_m)
         places = [place.detach() for place in plan._places]
+        plan._tables = _Kept(len(places[0]) * plan._table_count)
         with torch.no_grad():
             if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places] or not all(
                 part.covers(places) for zone in self._zones for part in zone
@@ -185,11 +207,46 @@ class TilePlan:
         image = image.reshape(*(lead[d] for d in order), *self.grid.counts)
         return image.permute(*(order.index(d) for d in range(len(lead))), -2, -1)
 
+    def exact(self, history: Tensor, pixels_m: Tensor, eps: float = 1e-10) -> Tensor:
+        """Compute pixels by the direct sum over the pulses that `image` sums for each of them.
+
+        Args:
+            history: Phase history, shape (..., pulse, frequency), complex.
+            pixels_m: Positions of pixels of the grid in metres, float64 (pixel, 3).
+            eps: Relative error of the interpolation in range.
+
+        Returns:
+            Image, shape (..., pixel), complex.
+
+        Raises:
+            TypeError: If the history is not complex64 or complex128.
+            ValueError: If its size is not that of the plan.
+        """
+        history = checked_samples(history, "TilePlan.exact", "pulse, frequency", finite=False)
+        history = expanded_history(history, self.antennas, self.frequency_hz, "TilePlan.exact")
+        device = pixels_m.device
+        ends = torch.zeros(*self._tiles, 2, dtype=torch.int64, device=device)
+        for zone, numbers in zip(self._zones, self._numbers, strict=True):
+            if zone:
+                ends.flatten(0, 1)[numbers] = torch.tensor([zone[0].pulses.start, zone[-1].pulses.stop], device=device)
+        grid = self.grid.transposed() if self._swapped else self.grid
+        at = ((pixels_m - grid.origin_m) @ grid.axes.mT / grid.step_m).round().long()
+        first, last = ends[at[:, 0] // self._size[0], at[:, 1] // self._size[1]].unbind(-1)
+
+        def path(pulses: slice, some: slice) -> tuple[Tensor, Tensor]:
+            number = torch.arange(pulses.start, pulses.stop, device=device)[:, None]
+            summed = (first[some] <= number) & (number < last[some])
+            return self.antennas.path_m(pixels_m[some], pulses), summed.to(torch.float64)
+
+        return direct_sum(history, self.frequency_hz, path, len(pixels_m), eps=eps)
+
     def _formed(self, data: Tensor) -> Tensor:
         """All tiles, (tile, path * trial, x, y), of data (path, pulse, trial, frequency)."""
         profiles = self._profiles(data)
         paths, _, trials, _ = data.shape
         step = max(1, _GROUP // (paths * trials))
+        for kept in (self._tables, self._weights):
+            kept.begin(data.dtype, step)
         heights = tile_heights(self.grid.transposed() if self._swapped else self.grid, *self._size)
         if heights is not None:
             heights = (heights - heights.detach().mean((-2, -1), keepdim=True)).flatten(0, 1)
@@ -199,7 +256,7 @@ class TilePlan:
         count = 0 if grad else math.prod(self._tiles)
         tiles = data.new_empty(count, paths * trials, *self._size)
         for zone, numbers in zip(self._zones, self._numbers, strict=True):
-            across = [self._keep((part, data.dtype), part.across, data.dtype) for part in zone]
+            across = [self._weights_of((part,), data.dtype, part.across, data.dtype) for part in zone]
             above = None if heights is None else heights[numbers]
             rows = [slice(i, min(i + step, len(numbers))) for i in range(0, len(numbers), step)]
             if grad:
@@ -248,20 +305,20 @@ class TilePlan:
             if height_m is not None and height_m.requires_grad:
                 weights = part.weights(rows, dtype, height_m)
             else:
-                weights = self._keep((part, rows.start, rows.stop, dtype), part.weights, rows, dtype, height_m)
+                weights = self._weights_of((part, rows.start, rows.stop), dtype, part.weights, rows, dtype, height_m)
             image = part.pixels_of(nodes, matrices, weights)
             total = image if total is None else total + image
         assert total is not None
         return total
 
-    def _keep(self, key: tuple, make: Callable, *given: Any) -> Any:
-        """What depends on the plan alone, from the last image if it is kept."""
+    def _weights_of(self, key: tuple, dtype: torch.dtype, make: Callable, *given: Any) -> Any:
+        """What depends on the plan and the precision alone, from the last image if it is kept."""
+        key = *key, dtype
         if key in self._weights:
             return self._weights[key]
         with torch.no_grad():
             found = make(*given)
-        if self._keeps_weights:
-            self._weights[key] = found
+        self._weights.keep(key, found, dtype)
         return found
 
     def _tables_of(self, part: Part, rows: slice, dtype: torch.dtype) -> Tables:
@@ -270,8 +327,8 @@ class TilePlan:
         if key in self._tables:
             return self._tables[key]
         tables = part.tables(rows, self._places, self._reference_m, dtype)
-        if self._keeps_tables and not tables.before.requires_grad:
-            self._tables[key] = tables
+        if not tables.before.requires_grad:
+            self._tables.keep(key, tables, dtype)
         return tables
 
 

@@ -113,10 +113,12 @@ class AnyPath(System):
         aux, grid = clean.aux, stage.grid
         antennas = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
         geometry = (aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
+        # tiles sum the pulses of the recommended method
+        plan_of = partial(TilePlan, *geometry, grid, lit=stage.lit(antennas))
         tiles: dict[float, float] = {}
         for error in _ERRORS_DB:
             try:
-                tiles[error] = TilePlan(*geometry, grid, error).choice.error_db
+                tiles[error] = plan_of(error).choice.error_db
             except ValueError:  # the geometry does not allow it
                 break
         alternatives = [
@@ -142,7 +144,8 @@ class AnyPath(System):
             for order, one in straight.items()
         ]
         every = [*compensated, *alternatives, Alternative("direct sum", {"stage": "direct_image"}, {})]
-        return [Choice("image", "stage", every, partial(_measured, bench, geometry, tiles, straight, stage))]
+        measured = partial(_measured, bench, geometry, plan_of, tiles, straight, stage)
+        return [Choice("image", "stage", every, measured)]
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         yield partial(comparisons, results, self.columns)
@@ -154,6 +157,7 @@ class AnyPath(System):
 def _measured(
     bench: Bench,
     geometry: tuple[Tensor, Tensor, Tensor | None, Tensor],
+    plan_of: Callable[[float], TilePlan],
     tiles: Iterable[float],
     straight: Mapping[int, MotionCompensation],
     stage: PathImage,
@@ -164,17 +168,17 @@ def _measured(
     some = some_pixels(draws, len(every))
     pixels = every[some]
     whole = backproject(noise, *geometry, pixels)
-    history, plans = noise.to(bench.dtype), {error: TilePlan(*geometry, stage.grid, error) for error in tiles}
+    history, plans = noise.to(bench.dtype), {**straight, **{error: plan_of(error) for error in tiles}}
+
+    def plan(one: Alternative) -> MotionCompensation | TilePlan | None:
+        return plans.get(one.keys.get("order", one.keys.get("error_db", 0)))
 
     def run(one: Alternative) -> Tensor:
-        if "error_db" in one.keys:
-            return plans[one.keys["error_db"]].image(history)
-        if "order" in one.keys:
-            return straight[one.keys["order"]].image(history)
-        return backproject(history, *geometry, pixels, eps=1e-6)
+        exact = partial(backproject, history, *geometry, pixels, eps=1e-6)
+        return exact() if (of := plan(one)) is None else of.image(history)
 
     def loss(one: Alternative, image: Tensor) -> dict[str, float]:
-        exact = straight[one.keys["order"]].exact(noise, pixels) if "order" in one.keys else whole
+        exact = whole if (of := plan(one)) is None else of.exact(noise, pixels)
         made = image if one.keys["stage"] == "direct_image" else image.flatten(-2)[..., some]
         return {"image_error_db": float(error_db(made[..., None, :].to(exact.dtype), exact[..., None, :]).max())}
 
