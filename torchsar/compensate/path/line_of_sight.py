@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.path.axes import three_axes
+from torchsar.compensate.path.axes import Found, three_axes
 from torchsar.compensate.path.envelopes import drift_m, matched_m, moved
 from torchsar.compensate.path.fringes import roughness, smooth_near, smoothest
 from torchsar.compensate.path.ground import STEP, for_each, ground_image, trials_of
@@ -32,6 +32,8 @@ from torchsar.radar.spotlight import frequency_samples, range_profiles
 
 # share of the band in step 1, in which range cells are four times as long
 _FIRST_BAND = 0.25
+# the same share for a further start
+_OTHER_BAND = 0.5
 # rounds of the search, which end when the line of sight changes by less, rms, in fringes
 _ROUNDS, _SETTLED_FRINGES = 6, 1.0
 # largest errors of the envelopes that the first, the second and the later rounds of the search
@@ -51,6 +53,9 @@ _LEAST_PULSES = 8
 # factor by which the sharpness must exceed that of noise: more than for the phases of pulses, 1.5,
 # because envelopes and three axes are free too
 _MARGIN = 2.0
+# standard deviations that may not lower the Strehl ratio below its limit: two starts say little of
+# the error where they differ
+_SPREAD = 1.5
 
 
 def path_autofocus(
@@ -81,8 +86,9 @@ def path_autofocus(
        estimate of the scene, refine the line of sight. Errors across it, which act differently over
        the scene, are fitted with a ridge, for which they are supposed to have the spectrum of the
        motion along the line of sight.
-    5. Step 4 is repeated from another start: phases of the whole band, with envelopes at rest. The
-       sharper of the two images counts.
+    5. Step 4 is repeated from another start: phases of the whole band, with envelopes at rest; and
+       from a third one, half of the band in step 1, if the results differ. The sharpest image
+       counts.
 
     Not observable are a constant and a linear term, which move the image; they are zero in the
     result. Where the errors are rough from pulse to pulse, fringes follow from single envelopes and
@@ -107,14 +113,14 @@ def path_autofocus(
         positions in metres, recorded minus true, of both antennas alike, for `CorrectPath`. The
         standard deviation, of `line_of_sight_m` only, is that modulo half a wavelength; it follows
         from what a Wiener estimate of the scene leaves of the samples, and from the difference
-        between the two starts. `quality` is the Strehl ratio predicted from it, times the share of
-        the sharpness that noise does not explain. Sharpness is the amount by which the image
-        entropy lies below that of speckle. `ok` is False unless the image is twice as sharp as
-        autofocus can make pure noise, more than one range cell contributes to the sharpness, and
-        that Strehl ratio exceeds 0.8; it does not say whether fringes are right. It is False for
-        fewer than 8 pulses with samples. `info` holds "roughness" (see `roughness`: about 1 if the
-        fringes come from single envelopes, less for smooth motions) and "entropy_nats" of the
-        image, shape (...,).
+        from the nearest result of another start. `quality` is the Strehl ratio predicted from it,
+        times the share of the sharpness that noise does not explain. Sharpness is the amount by
+        which the image entropy lies below that of speckle. `ok` is False unless the image is twice
+        as sharp as autofocus can make pure noise, more than one range cell contributes to the
+        sharpness, and the Strehl ratio for 1.5 standard deviations exceeds 0.8; it does not say
+        whether fringes are right. It is False for fewer than 8 pulses with samples. `info` holds
+        "roughness" (see `roughness`: about 1 if the fringes come from single envelopes, less for
+        smooth motions) and "entropy_nats" of the image, shape (...,).
 
     Raises:
         TypeError: If the profiles are not complex, or frequencies are not float64.
@@ -254,11 +260,14 @@ class _Search:
         columns = rows.mT[None]
         return pair_phase(columns, torch.ones_like(columns[:, 0].real, dtype=torch.bool))[0]
 
-    def by_envelopes(self) -> tuple[Tensor, Tensor]:
-        """Line of sight with whole fringes before the last step, and its roughness."""
+    def by_envelopes(self, first_band: float) -> tuple[Tensor, Tensor]:
+        """Line of sight with whole fringes before the last step, and its roughness.
+
+        first_band: Share of the band in which the first phases are found.
+        """
         cell = LIGHT_M_S / (2 * float(self.frequency_hz[-1] - self.frequency_hz[0]))
         range_m = torch.zeros(len(self.rows), dtype=torch.float64, device=self.rows.device)
-        rows = self.windowed(_FIRST_BAND)
+        rows = self.windowed(first_band)
         phase, _ = self.sharpened(rows, range_m, _BOTH, self.adjacent(rows))
         carrier = self.metres(phase)
         rough = roughness(carrier, self._fringe_m)
@@ -294,21 +303,38 @@ class _Search:
         near_std = _NEAR_FRINGES * self._fringe_m
         return smooth_near(carrier[None], near[None], self._fringe_m, near_std, bends[None])[0]
 
-    def judged(self) -> Estimate:
-        """The estimate of the sharper image with three axes, and its verdict."""
-        range_m, rough = self.by_envelopes()
-        both = [three_axes(self.rows, self.imaging, start, self.rounds) for start in (range_m, self.by_phases())]
-        found, other = sorted(both, key=lambda one: float(entropy(one.image)))
-        # both have the errors by noise in common; what differs comes from the search
+    def refined(self, range_m: Tensor) -> Found:
+        """The last step from a start."""
+        return three_axes(self.rows, self.imaging, range_m, self.rounds)
+
+    def nearest(self, found: list[Found]) -> tuple[Found, Tensor]:
+        """The result of the sharpest image, and the standard deviation of its line of sight (m).
+
+        The latter contains the difference from the nearest other result. All have the errors by
+        noise in common; what differs comes from the search.
+        """
+        best, *others = sorted(found, key=lambda one: float(entropy(one.image)))
         radians = 2 * math.pi / self._fringe_m
-        apart = residual_phase(radians * found.line_of_sight_m, radians * other.line_of_sight_m) / radians
-        std_m = (found.std_m.square() + apart.square().mean() / 2).sqrt()
-        std_rad = (std_m * radians).square().mean().sqrt()
+        apart = [residual_phase(radians * best.line_of_sight_m, radians * one.line_of_sight_m) for one in others]
+        least = torch.stack([x.square().mean() for x in apart]).amin() / radians**2
+        return best, (best.std_m.square() + least / 2).sqrt()
+
+    def strehl(self, std_m: Tensor) -> Tensor:
+        """Strehl ratio for a standard deviation of the line of sight."""
+        return torch.exp(-(std_m * (2 * math.pi / self._fringe_m)).square().mean())
+
+    def judged(self) -> Estimate:
+        """The estimate of the sharpest image with three axes, and its verdict."""
+        range_m, rough = self.by_envelopes(_FIRST_BAND)
+        results = [self.refined(range_m), self.refined(self.by_phases())]
+        found, std_m = self.nearest(results)
+        if self.strehl(_SPREAD * std_m) <= LEAST_STREHL:
+            results.append(self.refined(self.by_envelopes(_OTHER_BAND)[0]))
+            found, std_m = self.nearest(results)
         sharp, effective, telling = sharpness_beyond_speckle(found.image.mT)
         noise = sharpness_of_noise((effective * STEP).clamp_min(1))
-        strehl = torch.exp(-std_rad.square())
-        quality = strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
-        ok = (sharp > _MARGIN * noise) & (telling > LEAST_ROWS) & (strehl > LEAST_STREHL)
+        quality = self.strehl(std_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
+        ok = (sharp > _MARGIN * noise) & (telling > LEAST_ROWS) & (self.strehl(_SPREAD * std_m) > LEAST_STREHL)
         value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
         info = {"roughness": rough, "entropy_nats": entropy(found.image).double()}
         return Estimate(value, quality, ok, {"line_of_sight_m": std_m}, info)
