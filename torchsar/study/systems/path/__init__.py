@@ -174,8 +174,7 @@ def _measured(
         return plans.get(one.keys.get("order", one.keys.get("error_db", 0)))
 
     def run(one: Alternative) -> Tensor:
-        exact = partial(backproject, history, *geometry, pixels, eps=1e-6)
-        return exact() if (of := plan(one)) is None else of.image(history)
+        return backproject(history, *geometry, pixels, eps=1e-6) if (of := plan(one)) is None else of.image(history)
 
     def loss(one: Alternative, image: Tensor) -> dict[str, float]:
         exact = whole if (of := plan(one)) is None else of.exact(noise, pixels)
