@@ -32,7 +32,7 @@ from torchsar.radar.spotlight import frequency_samples, range_profiles
 
 # share of the band in step 1, in which range cells are four times as long
 _FIRST_BAND = 0.25
-# the same share for a further start
+# share of the band with which step 1 begins in the third start
 _OTHER_BAND = 0.5
 # rounds of the search, which end when the line of sight changes by less, rms, in fringes
 _ROUNDS, _SETTLED_FRINGES = 6, 1.0
@@ -53,8 +53,8 @@ _LEAST_PULSES = 8
 # factor by which the sharpness must exceed that of noise: more than for the phases of pulses, 1.5,
 # because envelopes and three axes are free too
 _MARGIN = 2.0
-# standard deviations that may not lower the Strehl ratio below its limit: two starts say little of
-# the error where they differ
+# number of standard deviations that may not lower the Strehl ratio below its limit, by choice: the
+# difference of two starts is itself uncertain
 _SPREAD = 1.5
 
 

@@ -89,7 +89,8 @@ class TilePlan:
     Raises:
         TypeError: If frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
-            equal steps, or tiles do not reach the error in this geometry.
+            equal steps, `lit` returns other shapes, no pulse lights the corners and the middle of
+            the image, or tiles do not reach the error in this geometry.
     """
 
     def __init__(
@@ -360,6 +361,7 @@ def image_tiles(
     Raises:
         TypeError: If the history is not complex, or frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
-            equal steps, or tiles do not reach the error in this geometry.
+            equal steps, `lit` returns other shapes, no pulse lights the corners and the middle of
+            the image, or tiles do not reach the error in this geometry.
     """
     return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit).image(history)
