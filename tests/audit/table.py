@@ -71,9 +71,6 @@ LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
     "range cells shows: `ok` is False where a sparse description is more likely": [
         *(("compensate.LinkPhases", "own", snr_db) for snr_db in (20.0, 60.0)),
     ],
-    "standard deviations from halves of the range cells, compared without correction of migration, are too large": [
-        *(("compensate.PathPhase", "own", snr_db) for snr_db in (10.0, 20.0, 40.0)),
-    ],
 }
 
 

@@ -72,6 +72,14 @@ def test_white_phases_of_migrating_scatterers_are_found_and_noise_is_not() -> No
     assert bool((error < 2.5 * std).all()), (error, std)
 
 
+def test_migration_does_not_widen_the_deviation() -> None:
+    recording, phase = recorded(3, snr_db=30.0), white(3)
+    data = turned(recording.signal.data, phase)
+    found = path_phase(data, recording.aux["frequency_hz"], path_of(recording), **QUICK)
+    error, std = phase_rmse(found["phase_rad"], phase), found.std["phase_rad"][:, 0]
+    assert bool((error > std / 2).all()) and bool((error < 2 * std).all()), (error, std)
+
+
 def test_trials_with_paths_of_their_own_equal_singles() -> None:
     recording, phase = recorded(2, seed=3), white(2, 7)
     frequency = recording.aux["frequency_hz"]

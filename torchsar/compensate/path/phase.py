@@ -40,9 +40,7 @@ def path_phase(
         `phase_rad` of shape (..., pulse), to be removed, with its standard deviation, `quality` and
         `ok` as for `autofocus`. They describe errors of one phase per pulse: errors of the path
         that move envelopes by a range cell or act differently across the scene are not part of
-        them. The halves of the range cells, whose difference gives the standard deviation, are
-        compared without correction of migration: above about 10 dB it is two to four times too
-        large where scatterers migrate through several cells.
+        them.
 
     Raises:
         TypeError: If the profiles are not complex, or frequencies are not float64.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from torchsar.compensate.pulse_phase.data import Pulses, prepare, refuse_odd_cou
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.linking import linked
 from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn, settled
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate
 from torchsar.metrics import entropy
@@ -26,6 +27,8 @@ _FIRST_FLOOR, _FIRST_ITERATIONS = 5.0, 6
 # on scenes at 30 dB, 3 of 32 trials of the entropy fixed point ended in a local minimum without
 # over-relaxation and none with this one
 _RELAXATION = 1.8
+# lines of the image in a strip, by choice: more than the response of a point is wide
+_STRIP = 4
 _SLOPES = 48  # slopes tried over one turn per pulse, found by trial: spacing against time
 
 
@@ -65,25 +68,27 @@ def autofocus(
         tolerance_rad: Phase change in rad, rms over the pulses, below which the iterations of the
             third step end.
         imaging: Image formation that corrects range migration, for data in which scatterers migrate
-            through range cells; see `entropy_fixed_point`. Its image must cover the whole
-            unambiguous cross range. A slope of the phase over pulses displaces the image, and a
-            displaced image has the wrong migration; therefore the slope is then estimated too.
+            through range cells; see `entropy_fixed_point`. Its image, with the range as last
+            dimension, must cover the whole unambiguous cross range. A slope of the phase over
+            pulses displaces the image, and a displaced image has the wrong migration; therefore the
+            slope is then estimated too.
             After the three steps, 48 slopes over one turn per pulse are tried and the best is
             refined; then the second and the third step are repeated with `imaging`. The scene is
             then taken to be sparse.
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
-        halves of the range cells; for point targets it is close to the true error. `ok` is False
-        unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
-        cell or a single point makes the sharpness, and the Strehl ratio predicted from the standard
-        deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of
-        speckle. Phases of `link_phases` have its standard deviations, `quality` and `ok`. `info`
-        holds "homogeneous" of shape (...,), bool, True where the homogeneous description is more
-        likely; `ok` is False if linked phases then do not confirm that. It also holds
-        "jitter_cells" and "migration_cells", the displacement of the range profiles from pulse to
-        pulse and of groups of pulses in cells rms: `ok` is False from 0.25 and 0.4 cell on, because
-        the phases may then be wrong. `imaging` corrects displacements, which are not examined then.
+        halves of the range cells, or of the image by `imaging`; for point targets it is close to
+        the true error. `ok` is False unless the image is 1.5 times as sharp as autofocus can make
+        pure noise, more than one range cell or a single point makes the sharpness, and the Strehl
+        ratio predicted from the standard deviation exceeds 0.8. Sharpness is the amount by which
+        the image entropy lies below that of speckle. Phases of `link_phases` have its standard
+        deviations, `quality` and `ok`. `info` holds "homogeneous" of shape (...,), bool, True where
+        the homogeneous description is more likely; `ok` is False if linked phases then do not
+        confirm that. It also holds "jitter_cells" and "migration_cells", the displacement of the
+        range profiles from pulse to pulse and of groups of pulses in cells rms: `ok` is False from
+        0.25 and 0.4 cell on, because the phases may then be wrong. `imaging` corrects
+        displacements, which are not examined then.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -92,7 +97,9 @@ def autofocus(
     """
     pulses = prepare(data, "autofocus")
     refuse_odd_counts("autofocus", 0, search=search, polish=polish)
-    again = Run(Wiener(), AlongPulses(2), 6, 1.0, tolerance_rad)
+    through = None if imaging is None else Through(imaging)
+    coarse, fine = (AlongPulses(), AlongPulses(2)) if through is None else (through, through)
+    again = Run(Wiener(), fine, 6, 1.0, tolerance_rad) if polish else Run(LogAbove(_FLOOR), coarse, 4, _RELAXATION, 0.0)
 
     def runs(coarse: Imaging, fine: Imaging) -> list[Run]:
         return [
@@ -111,15 +118,17 @@ def autofocus(
         phase, taken = in_turn(
             rows, pair_phase(rows, present) if begin is None else begin, [first, *runs(AlongPulses(), AlongPulses(2))]
         )
-        if imaging is not None:
-            through = Through(imaging)
+        if through is not None:
             phase, more = _WithSlope(through, runs(through, through))(rows, phase)
             taken = taken + more
-        return phase, taken, (lambda some, _, at: fixed_point(some, at, again)[0]) if polish else settled
+        return phase, taken, lambda some, _, at: fixed_point(some, at, again)[0]
 
-    sharpest = estimated(
-        pulses, starting_phase(start, pulses, "autofocus"), find, at_rest=True, compare=imaging is None
-    )
+    begin = starting_phase(start, pulses, "autofocus")
+    if through is None:
+        sharpest = estimated(pulses, begin, find, at_rest=True)
+    else:
+        halves = partial(halves_of_image, through)
+        sharpest = estimated(pulses, begin, find, at_rest=True, compare=False, halves=halves)
     return _with_linked(pulses, sharpest)
 
 
@@ -147,6 +156,30 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
         ok=mixed(sharpest.ok, some.ok),
         info=sharpest.info,
     )
+
+
+def halves_of_image(imaging: Imaging, rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
+    """Divide pulses into those of two halves of their image.
+
+    Range cells do not divide scatterers that migrate through them. The strips of four range lines
+    of the image, sorted by energy, are taken alternately.
+
+    Args:
+        imaging: Image formation of pulses (trial, range, pulse), with the range as last dimension
+            of the image.
+        rows: Pulses, shape (trial, range, pulse), complex.
+        phase: Phase that focuses them in rad, shape (trial, pulse).
+
+    Returns:
+        Pulses of both halves, of the shape of the rows.
+    """
+    image = imaging.image(rotate(rows, phase))
+    strip = torch.arange(image.shape[-1], device=image.device) // _STRIP
+    energy = (image.real.square() + image.imag.square()).sum(-2)
+    strips = energy.new_zeros(len(energy), int(strip[-1]) + 1).index_add_(1, strip, energy)
+    place = strips.argsort(-1, descending=True).argsort(-1)[:, strip]
+    one, other = (rotate(imaging.adjoint(torch.where(place[:, None] % 2 == half, image, 0)), -phase) for half in (0, 1))
+    return one, other
 
 
 def _first_floor(rows: Tensor) -> Tensor:

@@ -40,6 +40,7 @@ _ROUNDS = 6
 _FAR_RAD = 0.1
 
 Again = Callable[[Tensor, Tensor, Tensor], Tensor]
+Halves = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Found = tuple[Tensor, Tensor, Again]
 Find = Callable[[Tensor, Tensor, Tensor | None], Found]
 
@@ -113,6 +114,7 @@ def estimated(
     at_rest: bool = False,
     compare: bool = True,
     imaging: Imaging | None = None,
+    halves: Halves | None = None,
 ) -> Estimate:
     """Run an autofocus method on all trials and predict the accuracy of its phases.
 
@@ -142,6 +144,8 @@ def estimated(
         imaging: Image formation of all trials, from rows (trial, range, pulse) to images (trial,
             line, range), with which the sharpness is measured; by default a Fourier transform. All
             trials are then processed at once.
+        halves: Function of (rows, phase) that divides the pulses into two, whose noise is
+            independent and which both determine all phases; by default the rows are divided.
 
     Returns:
         `phase_rad` of shape (..., pulse) with its standard deviation. Sharpness is the amount by
@@ -165,14 +169,14 @@ def estimated(
     if not len(rows) or pulses.n < 3:
         return _gathered(pulses, [_no_estimate(rows)])
     if imaging is not None or len(rows) == 1 or (rows.requires_grad and torch.is_grad_enabled()):
-        return _gathered(pulses, [_assessed(rows, present, start, find, at_rest, compare, imaging)])
+        return _gathered(pulses, [_assessed(rows, present, start, find, at_rest, compare, imaging, halves)])
     height = max(1, block_bytes_of(rows.device) // (rows[0].numel() * rows.element_size()))
     parts = [slice(first, first + height) for first in range(0, len(rows), height)]
     done: dict[int, tuple[Tensor, ...]] = {}
 
     def work(part: slice) -> None:
         begin = None if start is None else start[part]
-        done[part.start] = _assessed(rows[part], present[part], begin, find, at_rest, compare)
+        done[part.start] = _assessed(rows[part], present[part], begin, find, at_rest, compare, halves=halves)
 
     with torch.no_grad():
         over_blocks(work, parts, rows)
@@ -187,6 +191,7 @@ def _assessed(
     at_rest: bool,
     compare: bool,
     imaging: Imaging | None = None,
+    halves: Halves | None = None,
 ) -> tuple[Tensor, ...]:
     """Phase, iterations, sharpness, effective rows of both, std, and the descriptions per trial.
 
@@ -202,9 +207,8 @@ def _assessed(
         scatter, rest = _of_point(focused, present)
         lone = (sharpness_rows <= LEAST_ROWS) & (scatter < _STEADY) & (present.sum(-1) >= _LEAST_PULSES)
         lone = lone & (imaging is None) & (rows.shape[-2] > 1)
-        std = torch.where(
-            lone, torch.hypot(scatter, rest), _half_difference(rows, present, phase, again) / occupied.sqrt()
-        )
+        apart = _half_difference(rows, present, phase, again, halves or halves_of_rows) / occupied.sqrt()
+        std = torch.where(lone, torch.hypot(scatter, rest), apart)
         if not at_rest:
             std = torch.maximum(std, _drift(rows, present, phase, again))
         scene = describe(rows, phase, occupied)
@@ -277,18 +281,31 @@ def _of_point(focused: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(mean > 0, spread.sqrt() / or_one(mean), torch.pi), phase_rmse(angle, 0 * angle, present)
 
 
-def _half_difference(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:
-    """Std of the phase (rad) from the differences between two halves of the rows, (trial,).
+def halves_of_rows(rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
+    """Divide the rows, sorted by energy, alternately into two halves.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        phase: Phase in rad, shape (trial, pulse); not used.
+
+    Returns:
+        Both halves, shape (trial, range of the half, pulse).
+    """
+    order = (rows.real.square() + rows.imag.square()).sum(-1).argsort(-1, descending=True)
+    one, other = (
+        rows.gather(1, order[:, part::2].sort(-1).values[..., None].expand(-1, -1, rows.shape[-1])) for part in (0, 1)
+    )
+    return one, other
+
+
+def _half_difference(rows: Tensor, present: Tensor, phase: Tensor, again: Again, halves: Halves) -> Tensor:
+    """Std of the phase (rad) from the differences between two halves of the pulses, (trial,).
 
     It is pi / sqrt(3), as for a random phase, if there is only one row.
     """
     if rows.shape[-2] < 2:
         return torch.full(rows.shape[:1], math.pi / math.sqrt(3), dtype=torch.float64, device=rows.device)
-    order = (rows.real.square() + rows.imag.square()).sum(-1).argsort(-1, descending=True)
-    halves = (order[:, part::2].sort(-1).values for part in (0, 1))
-    one, other = (
-        again(rows.gather(1, half[..., None].expand(-1, -1, rows.shape[-1])), present, phase) for half in halves
-    )
+    one, other = (again(half, present, phase) for half in halves(rows, phase))
     apart = residual_phase(one, other, present)
     apart = torch.where(apart.abs() > _APART_RAD, apart, apart / 2)
     return (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
