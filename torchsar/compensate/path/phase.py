@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchsar.compensate.path.ground import for_each, ground_image, trials_of
 from torchsar.compensate.pulse_phase.recommended import autofocus
-from torchsar.core import Estimate, Signal, Stage, checked_samples
+from torchsar.core import Estimate, checked_samples
 from torchsar.radar import AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
 
@@ -58,45 +58,3 @@ def path_phase(
         return autofocus(rows, search=search, polish=polish, imaging=ground_image(frequency_hz, one, height_m))
 
     return for_each(find, profiles, antennas, trials)
-
-
-class PathPhase(Stage):
-    """Phase per pulse that sharpens the image along any path; see `path_phase`.
-
-    Args:
-        height_m: Height z of the imaged plane in metres.
-        search: Largest number of iterations of the entropy fixed point, approximately.
-        polish: Largest number of further iterations, which compare each pulse with a Wiener
-            estimate of the scene.
-    """
-
-    provides = ("phase_rad",)
-    neutral = {"phase_rad": 0.0}
-
-    def __init__(self, height_m: float = 0.0, search: int = 120, polish: int = 20) -> None:
-        super().__init__()
-        self.height_m, self.search, self.polish = height_m, search, polish
-
-    def forward(
-        self,
-        signal: Signal,
-        frequency_hz: Tensor,
-        transmitter_m: Tensor,
-        path_reference_m: Tensor,
-        receiver_m: Tensor | None = None,
-    ) -> Estimate:
-        """Estimate the phase error of every pulse of a signal with the axes (pulse, range).
-
-        Args:
-            signal: Range profiles.
-            frequency_hz: Frequencies in Hz, float64 (range,).
-            transmitter_m: Positions of the transmitter in metres, float64 (..., pulse, 3).
-            path_reference_m: Path to which phases refer in metres, float64 (..., pulse).
-            receiver_m: Positions of the receiver in metres; None if both share an antenna.
-
-        Returns:
-            `Estimate` by `path_phase` with `phase_rad` of shape (..., pulse), to be removed.
-        """
-        antennas = AntennaPath(transmitter_m, receiver_m, path_reference_m)
-        how = {"height_m": self.height_m, "search": self.search, "polish": self.polish}
-        return path_phase(signal.data, frequency_hz, antennas, **how)

@@ -1,0 +1,157 @@
+"""Search for the line of sight of each pulse: its phase, and its envelope for whole fringes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.path.envelopes import drift_m, matched_m, moved
+from torchsar.compensate.path.fringes import roughness, smooth_near, smoothest
+from torchsar.compensate.pulse_phase.data import without_line
+from torchsar.compensate.pulse_phase.imaging import Through
+from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.sharpen import Run, Weights, fixed_point, weighted
+from torchsar.core import cis, real_dtype
+from torchsar.focus import TileOperator
+from torchsar.focus.spotlight import window_weights
+from torchsar.radar import LIGHT_M_S
+from torchsar.radar.spotlight import frequency_samples, range_profiles
+
+# rounds of the search, which end when the line of sight changes by less, rms, in fringes
+_ROUNDS, _SETTLED_FRINGES = 6, 1.0
+# largest errors of the envelopes that the first, the second and the later rounds of the search
+# correct, in range cells, by trial
+_REACH_CELLS = (4.0, 2.0, 0.5)
+# share of the band in the first, the second and the later rounds of the search
+_BANDS = (0.5, 1.0, 1.0)
+# roughness below which fringes are those of a smooth line of sight, and standard deviation in
+# fringes of a measurement by envelopes: 0.3 to 0.6 for smooth errors, 1.0 for random walks
+_ROUGH, _NEAR_FRINGES = 0.75, 2.0
+# least weight of the window over pulses
+_LEAST_WEIGHT = 0.1
+# iterations of the fixed points, by trial, and phase step at which they end
+_COARSE, _FINE, _TOLERANCE_RAD = 30, 12, 0.03
+
+
+def _intensity(power: Tensor, mean: Tensor) -> Tensor:
+    """Weights of image cells that sharpen by the sum of the squared intensity."""
+    return power / mean
+
+
+def _surprise(power: Tensor, mean: Tensor) -> Tensor:
+    """Weights of image cells that sharpen by the entropy, of those that are above its level."""
+    share = power / (mean * (power.shape[-1] * power.shape[-2]))
+    log = torch.log(share.clamp_min(torch.finfo(share.dtype).tiny))
+    return (log - (share * log).sum((-2, -1), keepdim=True)).clamp_min(0)
+
+
+# what a search sharpens by, iterations and phase step at which they end
+_BOTH: list[tuple[Weights, int, float]] = [
+    (_intensity, _COARSE, _TOLERANCE_RAD),
+    (_surprise, _FINE, _TOLERANCE_RAD),
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """The search of one trial.
+
+    Args:
+        rows: Range profiles of the pulses that are present, (pulse, range).
+        frequency_hz: Frequencies.
+        imaging: Image formation along their recorded path.
+    """
+
+    rows: Tensor
+    frequency_hz: Tensor
+    imaging: TileOperator
+
+    @property
+    def fringe_m(self) -> float:
+        """Half a wavelength."""
+        return LIGHT_M_S / (2 * float(self.frequency_hz.mean()))
+
+    def metres(self, phase_rad: Tensor) -> Tensor:
+        """Range that has a phase."""
+        return phase_rad.double() * (self.fringe_m / (2 * math.pi))
+
+    def line_free(self, range_m: Tensor) -> Tensor:
+        """Ranges without constant and linear terms."""
+        return without_line(range_m, torch.ones_like(range_m, dtype=torch.bool))
+
+    def windowed(self, share: float) -> Tensor:
+        """Profiles with Hann windows over pulses and over a share of the band."""
+        pulses, n = self.rows.shape
+        real = real_dtype(self.rows.dtype)
+        k = torch.linspace(-1, 1, n, dtype=torch.float64, device=self.rows.device) / share
+        over_band = torch.where(k.abs() < 1, (1 + torch.cos(math.pi * k)) / 2, 0).to(real)
+        over_pulses = window_weights("hann", pulses, self.rows.device).to(real).clamp_min(_LEAST_WEIGHT)
+        samples = frequency_samples(self.rows) * (over_pulses[:, None] * over_band)
+        return range_profiles(samples)
+
+    def sharpened(
+        self, rows: Tensor, range_m: Tensor, runs: list[tuple[Weights, int, float]], start: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Phases that sharpen the image of rows at a line of sight, and the corrected rows."""
+        at = moved(rows, self.frequency_hz, range_m)
+        columns = at.mT[None].contiguous()
+        phase = torch.zeros_like(columns[:, 0].real) if start is None else start[None]
+        for weights, count, tolerance in runs:
+            phase = fixed_point(columns, phase, Run(weights, Through(self.imaging), count, 1.0, tolerance))[0]
+        return phase[0], at
+
+    def by_phases(self) -> Tensor:
+        """Line of sight within a fringe: phases that sharpen the image, with envelopes at rest."""
+        rows, rest = self.windowed(1.0), torch.zeros(len(self.rows), dtype=torch.float64, device=self.rows.device)
+        return self.metres(self.sharpened(rows, rest, _BOTH, self.adjacent(rows))[0])
+
+    def adjacent(self, rows: Tensor) -> Tensor:
+        """Phases of the pulses from those between adjacent pulses, (pulse,)."""
+        columns = rows.mT[None]
+        return pair_phase(columns, torch.ones_like(columns[:, 0].real, dtype=torch.bool))[0]
+
+    def by_envelopes(self, first_band: float) -> tuple[Tensor, Tensor]:
+        """Line of sight with whole fringes before the last step, and its roughness.
+
+        first_band: Share of the band in which the first phases are found.
+        """
+        cell = LIGHT_M_S / (2 * float(self.frequency_hz[-1] - self.frequency_hz[0]))
+        range_m = torch.zeros(len(self.rows), dtype=torch.float64, device=self.rows.device)
+        rows = self.windowed(first_band)
+        phase, _ = self.sharpened(rows, range_m, _BOTH, self.adjacent(rows))
+        carrier = self.metres(phase)
+        rough = roughness(carrier, self.fringe_m)
+        if rough < _ROUGH:
+            range_m, phase = self.line_free(smoothest(carrier, self.fringe_m)), None
+        for turn in range(_ROUNDS):
+            share, reach = _BANDS[min(turn, 2)], _REACH_CELLS[min(turn, 2)]
+            rows, before = self.windowed(share), range_m
+            phase, at = self.sharpened(rows, range_m, _BOTH, phase)
+            rough = roughness(range_m + self.metres(phase), self.fringe_m)
+            if share < 1 and rough >= _ROUGH:
+                continue
+            range_m, phase = self.with_envelopes(range_m, phase, at, reach * cell, rough), None
+            if share == 1:
+                rows = moved(rows, self.frequency_hz, range_m)
+                drift = drift_m(rows, self.frequency_hz, self.imaging, slopes=turn == 1)
+                range_m = range_m + self.fringe_m * torch.round(drift / self.fringe_m)
+            range_m = self.line_free(range_m)
+            if turn > 1 and (range_m - before).square().mean().sqrt() < _SETTLED_FRINGES * self.fringe_m:
+                break
+        return range_m, rough
+
+    def with_envelopes(self, range_m: Tensor, phase: Tensor, at: Tensor, reach_m: float, rough: Tensor) -> Tensor:
+        """Line of sight at which envelopes and phases match the image that phases sharpen."""
+        turned = at * cis(-phase)[:, None]
+        model = self.imaging.adjoint(weighted(self.imaging.image(turned[None]), _surprise))[0]
+        whole = moved(self.rows, self.frequency_hz, range_m)
+        near = range_m + matched_m(whole, model, self.frequency_hz, reach_m)
+        if rough >= _ROUGH:
+            return near
+        carrier = range_m + self.metres(phase)
+        bends = rough * (self.fringe_m / math.sqrt(12))
+        near_std = _NEAR_FRINGES * self.fringe_m
+        return smooth_near(carrier[None], near[None], self.fringe_m, near_std, bends[None])[0]
