@@ -9,7 +9,7 @@ from torchsar.metrics.bounds import (
     tone_frequency_bound_hz,
     velocity_bound_m_s,
 )
-from torchsar.metrics.image import contrast, correlation, entropy, error_after_gain_db, error_db, registered_error_db
+from torchsar.metrics.image import contrast, correlation, entropy, error_after_gain_db, error_db
 from torchsar.metrics.impulse import impulse_response
 from torchsar.metrics.intervals import finite_rms, half_width_ratio, share_interval, trial_statistics
 from torchsar.metrics.ladar_bounds import (
@@ -21,6 +21,7 @@ from torchsar.metrics.ladar_bounds import (
 )
 from torchsar.metrics.path_bounds import line_of_sight_bound_m
 from torchsar.metrics.phase import phase_rmse, residual_phase, strehl
+from torchsar.metrics.registration import registered_error_db
 from torchsar.metrics.replicas import azimuth_response, replica_level, replica_zones
 from torchsar.metrics.rotation_bounds import rotation_bounds
 

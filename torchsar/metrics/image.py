@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -11,8 +9,6 @@ from torchsar.core import Signal, host_value, level_of, unit_level
 
 # quantities that sharpness is defined for, with their power of the modulus |I|
 _OF = {"intensity": 2, "amplitude": 1}
-# chosen: Newton steps that refine shift or slope of two images, and rounds of both in turn
-_REFINED, _ROUNDS = 4, 3
 # precision in which images of half precision are evaluated
 _WORKING = {torch.float16: torch.float32, torch.bfloat16: torch.float32, torch.complex32: torch.complex64}
 
@@ -33,8 +29,20 @@ def _tensor(image: Tensor | Signal) -> Tensor:
     return x.to(_WORKING.get(x.dtype, x.dtype if x.is_floating_point() or x.is_complex() else torch.float64))
 
 
-def _pair(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor, Tensor]:
-    """Samples of two complex images of equal size; raises ValueError for others."""
+def pair_of(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor, Tensor]:
+    """Return the samples of two complex images of equal size.
+
+    Args:
+        image: Image, shape (..., azimuth, range), complex, or a Signal.
+        reference: Image of the same size.
+
+    Returns:
+        The samples of both.
+
+    Raises:
+        TypeError: If one of them is not a tensor of numbers.
+        ValueError: If they are not complex images of equal size.
+    """
     a, b = _tensor(image), _tensor(reference)
     if not (a.is_complex() and b.is_complex()) or a.shape[-2:] != b.shape[-2:]:
         raise ValueError(
@@ -183,7 +191,7 @@ def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
         TypeError: If one of them is not a tensor of numbers.
         ValueError: If they are not complex images of equal size.
     """
-    a, b = (unit_level(x) for x in _pair(image, reference))
+    a, b = (unit_level(x) for x in pair_of(image, reference))
     product = (a * b.conj()).sum((-2, -1), dtype=torch.complex128).abs()
     norms = _norm(a) * _norm(b)
     return product / torch.where(norms > 0, norms, 1)
@@ -205,7 +213,7 @@ def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
         TypeError: If one of them is not a tensor of numbers.
         ValueError: If they are not complex images of equal size.
     """
-    a, b = _pair(image, reference)
+    a, b = pair_of(image, reference)
     norm = _norm(b)
     ratio = _norm(a - b) / torch.where(norm == 0, 1, norm)
     return 20 * torch.log10(ratio.clamp_min(torch.finfo(ratio.dtype).tiny))
@@ -228,99 +236,12 @@ def error_after_gain_db(images: Tensor, references: Tensor) -> Tensor:
         TypeError: If one of them is not a tensor of numbers.
         ValueError: If they are not complex images of equal size.
     """
-    a, b = _pair(images, references)
+    a, b = pair_of(images, references)
     # one level for all images, so that the gain is common
     a, b = (x / level_of(x, x.ndim) for x in (a, b))
     energy = (a.real.square() + a.imag.square()).sum(dtype=torch.float64)
     gain = (a.conj() * b).sum(dtype=torch.complex128) / torch.where(energy == 0, 1, energy)
     return error_db(a * gain.to(a.dtype), b)
-
-
-def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
-    """Compute the relative error of an image, registered to its reference, of each trial.
-
-    Registration removes what autofocus cannot observe of a path: a shift, fractions of a sample
-    included, which constant and linear errors of the path cause; a linear phase over the image,
-    which a turned path causes; and a complex gain. The shift is that of the largest correlation of
-    the intensities, refined with the phases of the images. The pixels that both images show after
-    the shift are compared.
-
-    Args:
-        image: Image I, shape (..., azimuth, range), complex, or a Signal.
-        reference: Image I0, same size.
-
-    Returns:
-        Error |registered(I) - I0|^2 / |I0|^2 in dB, shape (...,), float64; 0 dB where the images
-        have nothing in common.
-
-    Raises:
-        TypeError: If one of them is not a tensor of numbers.
-        ValueError: If they are not complex images of equal size.
-    """
-    a, b = (unit_level(x).to(torch.complex128) for x in _pair(image, reference))
-    size = a.shape[-2:]
-    bright = [torch.fft.fft2(x.abs().square()) for x in (a, b)]
-    place = [torch.arange(n, dtype=torch.float64, device=a.device) / n for n in size]
-    place = [place[0][:, None], place[1]]
-    spectrum = torch.fft.fft2(a)
-    turns = [_turns(torch.fft.fft2(b), dim) for dim in (-2, -1)]
-    even = [torch.fft.fftfreq(n, dtype=torch.float64, device=a.device) for n in size]
-    shift = _peak(bright[0].conj() * bright[1], [even[0][:, None], even[1]])
-    slope, moved = None, a
-    for _ in range(_ROUNDS):
-        moved = torch.fft.ifft2(spectrum * _ramp(turns, shift).conj())
-        slope = _peak((moved.conj() * b).conj(), place, slope)
-        flat = b * _ramp(place, slope).conj()
-        shift = _peak(spectrum.conj() * torch.fft.fft2(flat), turns, shift)
-    moved = torch.fft.ifft2(spectrum * _ramp(turns, shift).conj()) * _ramp(place, slope or [])
-    # pixels that the shift moved in from the other side are not compared
-    kept = [
-        (t * n >= d.clamp(min=0).ceil()) & (t * n < n + d.clamp(max=0).floor())
-        for t, n, d in zip(place, size, shift, strict=True)
-    ]
-    moved, b = (torch.where(kept[0] & kept[1], x, 0) for x in (moved, b))
-    energy = moved.abs().square().sum((-2, -1), keepdim=True)
-    gain = (moved.conj() * b).sum((-2, -1), keepdim=True) / torch.where(energy == 0, 1, energy)
-    return error_db(gain * moved, b)
-
-
-def _ramp(turns: list[Tensor], at: list[Tensor]) -> Tensor:
-    """exp(2j pi (turns . at)), shape (..., n, m)."""
-    return torch.exp(2j * math.pi * (turns[0] * at[0] + turns[1] * at[1]))
-
-
-def _peak(z: Tensor, turns: list[Tensor], start: list[Tensor] | None = None) -> list[Tensor]:
-    """Arguments d of the largest |sum z exp(2j pi turns . d)| for turns in steps of 1/n.
-
-    The start, if none is given, is found by an inverse FFT, and refined by Newton steps.
-    """
-    size = z.shape[-2:]
-    if start is None:
-        at = torch.fft.ifft2(z).abs().flatten(-2).argmax(-1)[..., None, None]
-        start = [
-            torch.where(i > n // 2, i - n, i).to(torch.float64)
-            for i, n in zip((at // size[1], at % size[1]), size, strict=True)
-        ]
-    found = list(start)
-    for _ in range(_REFINED):
-        for dim, t in enumerate(turns):  # along one axis after the other
-            turned, w = z * _ramp(turns, found), 2 * math.pi * t
-            s0, s1, s2 = (x.sum((-2, -1), keepdim=True) for x in (turned, 1j * w * turned, -w.square() * turned))
-            rise = 2 * (s1 * s0.conj()).real
-            bend = 2 * (s1.abs().square() + (s2 * s0.conj()).real)
-            step = torch.where(bend < 0, -rise / torch.where(bend < 0, bend, -1), 0)
-            found[dim] = found[dim] + step.clamp(-0.5, 0.5)
-    return found
-
-
-def _turns(spectrum: Tensor, dim: int) -> Tensor:
-    """Frequencies of a spectrum in turns per sample, within half a turn of its circular middle."""
-    n, other = spectrum.shape[dim], -3 - dim
-    f = torch.fft.fftfreq(n, dtype=torch.float64, device=spectrum.device)
-    power = spectrum.abs().square().sum(other)
-    middle = torch.angle((power * torch.exp(2j * math.pi * f)).sum(-1, keepdim=True)) / (2 * math.pi)
-    off = f - middle
-    return (off - torch.round(off)).unsqueeze(other)
 
 
 def rolled_to(image: Signal, reference: Signal) -> Signal:

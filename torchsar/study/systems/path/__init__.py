@@ -46,15 +46,16 @@ class AnyPath(System):
         "snr": "mean power of the samples of lit pulses over noise variance, dB",
         "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
         "contrast": "standard deviation over mean of the intensity |I|^2",
-        "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB, I0 from the reference method, after the shift, the "
-        "linear phase over the image and the complex gain g that fit best, which autofocus cannot observe; in `trade`: "
-        "of the image of white noise, without registration, relative to the direct sum over the same pulses",
+        "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB, I0 from the reference method, after the shift, "
+        "rotation and stretch, the linear phase over the image and the complex gain g that fit best, which autofocus "
+        "cannot observe; in `trade`: of the image of white noise, without registration, relative to the direct sum "
+        "over the same pulses",
         "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
         "corrected minus true, without constant and linear terms; modulo half a wavelength where the path or phases of "
         "pulses are corrected",
         "image_shift_m": "mean displacement of the named points, which autofocus cannot observe, m",
         "position_error_rms_m": "rms over the named points of the distance of the peak from the true position, without "
-        "the common shift of all points, m",
+        "the common shift of all points, and of more than three without a common rotation and stretch, m",
         "entropy_above_ideal_nats": "entropy minus that of the reference method",
     }
     columns = {

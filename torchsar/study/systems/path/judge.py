@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -41,9 +40,8 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -
     if trace.signal.names == IMAGE:
         metrics |= {"entropy_nats": entropy(trace.signal), "contrast": contrast(trace.signal)}
         if bench.recording is None:
-            targets, outside = _points(bench, chain, trace.signal, trials)
-        if targets:
-            metrics |= _positions(targets)
+            targets, outside, positions = _points(bench, chain, trace.signal, trials)
+            metrics |= positions
     metrics = {key: value.double().expand(trials.count) for key, value in metrics.items()}
     return Judged(metrics, targets if detail else {}, outside if detail else (), view=left)
 
@@ -89,19 +87,26 @@ def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
     return {"path_residual_rms_m": {"Cramer-Rao": bound.expand(count)}}
 
 
-def _positions(targets: Mapping[str, Metrics]) -> dict[str, Tensor]:
-    """The common shift of all points in m, and the rms distance that is left of them in m."""
-    off = torch.stack([torch.stack([one[f"displacement_{axis}_m"] for axis in IMAGE]) for one in targets.values()])
-    shift = off.mean(0)
-    left = (off - shift).square().sum(1).mean(0).sqrt()
-    return {"image_shift_m": shift.square().sum(0).sqrt(), "position_error_rms_m": left}
+def _positions(off: Tensor, at: Tensor) -> dict[str, Tensor]:
+    """The common shift of points in m, (trial,), and the rms distance that is left of them in m.
+
+    Of more than three points a linear displacement is removed besides: rotation and stretch of the
+    image. off: displacements (trial, point, 2); at: places (trial, point, 2).
+    """
+    basis = torch.cat([torch.ones_like(at[..., :1]), at[..., : 2 * (at.shape[1] > 3)]], -1)
+    left = (off - basis @ (torch.linalg.pinv(basis) @ off)).square().sum((1, 2)) / (off.shape[1] - basis.shape[-1] + 1)
+    return {"image_shift_m": off.mean(1).square().sum(-1).sqrt(), "position_error_rms_m": left.sqrt()}
 
 
-def _points(bench: Bench, chain: Chain, image: Signal, trials: Trials) -> tuple[dict[str, Metrics], list[str]]:
-    """Metrics of the named points in the image, and the names of those outside it."""
+def _points(
+    bench: Bench, chain: Chain, image: Signal, trials: Trials
+) -> tuple[dict[str, Metrics], list[str], dict[str, Tensor]]:
+    """Metrics of the named points in the image, the names of those outside it, and what their
+    displacements have in common.
+    """
     stage = next((one for one in reversed(list(chain.stages.values())) if isinstance(one, PathImage)), None)
     if stage is None:
-        return {}, []
+        return {}, [], {}
     (_, cos, _), (_, sin, _) = stage.grid.axes.tolist()  # azimuth and range axes of the image
     places, outside = {}, []
     image = image.with_data(image.data.expand(trials.count, *image.data.shape[-2:]))
@@ -114,10 +119,12 @@ def _points(bench: Bench, chain: Chain, image: Signal, trials: Trials) -> tuple[
         else:
             outside.append(name)
     if not places:
-        return {}, outside
+        return {}, outside, {}
     at = torch.stack([*places.values()], 1)  # (trial, point, 2)
     apart = torch.cdist(at, at) + 2 * _SEARCH_M * torch.eye(len(places), dtype=torch.float64)
     search_m = max(image.axes[0].step, min(_SEARCH_M, float(apart.min()) / 2))
     found = impulse_response(image, (at[..., 0], at[..., 1]), search_m=search_m)
-    found |= {f"displacement_{axis}_m": found[f"position_{axis}_m"] - at[..., i] for i, axis in enumerate(IMAGE)}
-    return {name: {key: found[key][:, i] for key in _OF_POINT} for i, name in enumerate(places)}, outside
+    off = torch.stack([found[f"position_{axis}_m"] for axis in IMAGE], -1) - at
+    found |= {f"displacement_{axis}_m": off[..., i] for i, axis in enumerate(IMAGE)}
+    targets: dict[str, Metrics] = {name: {key: found[key][:, i] for key in _OF_POINT} for i, name in enumerate(places)}
+    return targets, outside, _positions(off, at)

@@ -1,0 +1,61 @@
+"""Error of images after registration: what it removes, and what it leaves."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchsar.metrics import error_db, registered_error_db
+
+F64 = torch.float64
+
+
+def test_registration_ignores_shift_slope_gain_and_phase() -> None:
+    """Band-limited noise whose spectrum wraps, in two trials with shifts of their own."""
+    made = torch.randn(2, 64, 48, dtype=torch.complex128, generator=torch.Generator().manual_seed(3))
+    bands = [((torch.fft.fftfreq(n, dtype=torch.float64) + 0.5).remainder(1) - 0.5).abs() < 0.3 for n in (64, 48)]
+    spectrum = torch.fft.fft2(made) * bands[0][:, None] * bands[1]
+    f, g = torch.fft.fftfreq(64, dtype=torch.float64)[:, None], torch.fft.fftfreq(48, dtype=torch.float64)
+    shift = torch.tensor([[3.3, -7.45], [0.2, 0.0]], dtype=torch.float64)[..., None, None]
+    carrier = torch.exp(2j * math.pi * (28 / 64 * torch.arange(64)[:, None] - 15 / 48 * torch.arange(48)))
+    image = torch.fft.ifft2(spectrum) * carrier
+    moved = torch.fft.ifft2(spectrum * torch.exp(-2j * math.pi * (f * shift[:, 0] + g * shift[:, 1]))) * carrier
+    assert bool((error_db(moved, image) > -14).all())
+    tilt = torch.exp(2j * math.pi * (0.02 * torch.arange(64)[:, None] - 0.013 * torch.arange(48)))
+    assert bool((registered_error_db((0.5 - 2j) * moved, image) < -90).all())
+    assert bool((registered_error_db((image * tilt).roll((3, -7), (-2, -1)), image) < -90).all())
+    spoilt = moved + 0.1 * image.flip(-1)
+    torch.testing.assert_close(registered_error_db(spoilt, image), torch.full((2,), -20.0).double(), rtol=0, atol=0.2)
+    zeros = registered_error_db(torch.zeros_like(image), image)
+    torch.testing.assert_close(zeros, torch.zeros(2, dtype=torch.float64))
+
+
+def points(places: Tensor, amplitude: Tensor, size: tuple[int, int]) -> Tensor:
+    """Points with a Gaussian response at places (..., point, 2) in samples."""
+    u, v = (torch.arange(n, dtype=F64) for n in size)
+    rows, columns = (torch.exp(-(x - places[..., i, None]).square() / 8) for i, x in enumerate((u, v)))
+    return torch.einsum("...pi,...pj,p->...ij", rows.to(amplitude.dtype), columns.to(amplitude.dtype), amplitude)
+
+
+def test_registration_removes_a_rotation_a_stretch_and_a_shear() -> None:
+    """Displacements of the edges by up to 0.6 sample, other in each trial, and an error besides."""
+    made = torch.Generator().manual_seed(4)
+    size = (96, 80)
+    middle = torch.tensor([(n - 1) / 2 for n in size], dtype=F64)
+    off = (torch.rand(40, 2, generator=made, dtype=F64) - 0.5) * torch.tensor([80, 64])
+    amplitude = torch.randn(40, generator=made, dtype=torch.complex128)
+    image = points(middle + off, amplitude, size)
+    linear = torch.tensor([[[0.0, 0.015], [-0.015, 0.0]], [[0.012, 0.0], [0.004, -0.01]]], dtype=F64)
+    moved = points(middle + off + off @ linear.mT + torch.tensor([2.3, -1.6]), amplitude, size)
+    found = registered_error_db(1j * moved, image)
+    assert bool((error_db(moved, image) > -10).all()) and bool((found < -38).all()), found
+    spoilt = moved + 0.1 * image.flip(-1)
+    torch.testing.assert_close(registered_error_db(spoilt, image), torch.full((2,), -20.0).double(), rtol=0, atol=0.4)
+
+
+def test_images_that_have_nothing_in_common_keep_their_error() -> None:
+    made = torch.randn(2, 2, 40, 30, dtype=torch.complex128, generator=torch.Generator().manual_seed(5))
+    found = registered_error_db(made[0], made[1])
+    assert bool((found < 1e-9).all()) and bool((found > -0.3).all())

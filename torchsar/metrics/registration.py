@@ -1,0 +1,207 @@
+"""Error of an image after registration to its reference."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Signal, unit_level
+from torchsar.metrics.image import error_db, pair_of
+
+# chosen: Newton steps that refine shift or slope of two images, and rounds of both in turn
+_REFINED, _ROUNDS = 4, 3
+# chosen: steps of the affine registration, and rows of the image whose derivatives are held at once
+_STEPS, _BLOCK_ROWS = 4, 256
+
+
+def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
+    """Compute the relative error of an image, registered to its reference, of each trial.
+
+    Registration removes what autofocus cannot observe of a path. Constant and linear errors of the
+    path shift the image, rotate and stretch it slightly about its middle (by as much as points at
+    its edges move less or more than others), turn the phase linearly over it, and give it a complex
+    gain. The shift is that of the largest correlation of the intensities, refined with the phases
+    of the images; rotation, stretch and shear are a linear displacement that is fitted to the
+    difference of the images. The pixels that both images show after the registration are compared.
+
+    Args:
+        image: Image I, shape (..., azimuth, range), complex, or a Signal.
+        reference: Image I0, same size.
+
+    Returns:
+        Error |registered(I) - I0|^2 / |I0|^2 in dB, shape (...,), float64; 0 dB where the images
+        have nothing in common.
+
+    Raises:
+        TypeError: If one of them is not a tensor of numbers.
+        ValueError: If they are not complex images of equal size.
+    """
+    a, b = (unit_level(x).to(torch.complex128) for x in pair_of(image, reference))
+    lead = torch.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    a, b = (x.expand(*lead, *x.shape[-2:]).reshape(-1, *x.shape[-2:]) for x in (a, b))
+    spectrum = torch.fft.fft2(a)
+    turns = [_turns(torch.fft.fft2(b), dim) for dim in (-2, -1)]
+    map_, slope = _shifted(a, b, spectrum, turns)
+    moved, seen = _displaced(spectrum, turns, map_)
+    best = _error(moved, b, seen, slope)
+    for _ in range(_STEPS):
+        step_map, step_slope = _step(moved, b, seen, slope, turns)
+        trial_map, trial_slope = map_ + step_map, slope + step_slope
+        trial_moved, trial_seen = _displaced(spectrum, turns, trial_map)
+        error = _error(trial_moved, b, trial_seen, trial_slope)
+        better = error < best
+
+        def chosen(new: Tensor, old: Tensor, better: Tensor = better) -> Tensor:
+            return torch.where(better.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
+
+        map_, slope, best = chosen(trial_map, map_), chosen(trial_slope, slope), chosen(error, best)
+        moved, seen = chosen(trial_moved, moved), chosen(trial_seen, seen)
+    return best.reshape(lead)
+
+
+def _from_middle(n: int, like: Tensor) -> Tensor:
+    """Places of n samples from their middle, float64 (n,)."""
+    return torch.arange(n, dtype=torch.float64, device=like.device) - (n - 1) / 2
+
+
+def _shifted(a: Tensor, b: Tensor, spectrum: Tensor, turns: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Displacement (trial, axis, 3) of image a, a shift only, and slope of its phase (trial, axis)
+    in turns per sample, that register it to b.
+
+    The displacement along an axis is in samples of a; its coefficients are those of 1, of the
+    azimuth and of the range sample from the middle.
+    """
+    size = a.shape[-2:]
+    bright = [torch.fft.fft2(x.abs().square()) for x in (a, b)]
+    place = [torch.arange(n, dtype=torch.float64, device=a.device) / n for n in size]
+    place = [place[0][:, None], place[1]]
+    even = [torch.fft.fftfreq(n, dtype=torch.float64, device=a.device) for n in size]
+    shift = _peak(bright[0].conj() * bright[1], [even[0][:, None], even[1]])
+    slope = None
+    for _ in range(_ROUNDS):
+        moved = torch.fft.ifft2(spectrum * _ramp(turns, shift).conj())
+        slope = _peak((moved.conj() * b).conj(), place, slope)
+        flat = b * _ramp(place, slope).conj()
+        shift = _peak(spectrum.conj() * torch.fft.fft2(flat), turns, shift)
+    assert slope is not None
+    map_ = torch.zeros(len(a), 2, 3, dtype=torch.float64, device=a.device)
+    map_[..., 0] = -torch.cat(shift, -1)[:, 0]
+    return map_, torch.cat(slope, -1)[:, 0] / torch.tensor(size, device=a.device)
+
+
+def _displaced(spectrum: Tensor, turns: list[Tensor], map_: Tensor) -> tuple[Tensor, Tensor]:
+    """The image of a spectrum, displaced along azimuth and then along range, and the pixels whose
+    sources lie inside it.
+    """
+    u, v = (_from_middle(n, map_) for n in spectrum.shape[-2:])
+    of_range = torch.fft.ifft(spectrum, dim=-1)  # azimuth spectra of the range lines
+    image = _stretched(of_range, turns[0], u, map_[:, 0, 0, None] + map_[:, 0, 2, None] * v, map_[:, 0, 1])
+    back = torch.fft.fft(image, dim=-1).mT
+    image = _stretched(back, turns[1].mT, v, map_[:, 1, 0, None] + map_[:, 1, 1, None] * u, map_[:, 1, 2]).mT
+    seen = torch.ones_like(image.real, dtype=torch.bool)
+    for dim, (at, n) in enumerate(zip((u[:, None], v), spectrum.shape[-2:], strict=True)):
+        linear = (
+            map_[:, dim, 0, None, None] + map_[:, dim, 1, None, None] * u[:, None] + map_[:, dim, 2, None, None] * v
+        )
+        source = at + linear + (n - 1) / 2
+        # rounding may not hide the outermost pixels of an image at its place
+        seen = seen & (source > -1e-6) & (source < n - 1 + 1e-6)
+    return image, seen
+
+
+def _stretched(spectrum: Tensor, turns: Tensor, at: Tensor, shift: Tensor, stretch: Tensor) -> Tensor:
+    """Samples at the places `at` (1 + stretch) + shift along the last but one dimension.
+
+    spectrum: (trial, n, column) along that dimension; turns: (trial, n, 1); at: (n,) from the
+    middle; shift: (trial, column); stretch: (trial,). The middle of the spectrum keeps its phase.
+    """
+    n = len(at)
+    grid = torch.fft.fftfreq(n, dtype=torch.float64, device=at.device) * (at[:, None] + (n - 1) / 2)
+    waves = torch.exp(2j * math.pi * (grid + stretch[:, None, None] * at[:, None] * turns.mT))
+    return waves @ (spectrum * torch.exp(2j * math.pi * turns * shift[:, None])) / n
+
+
+def _sloped(image: Tensor, slope: Tensor) -> Tensor:
+    """The image with a linear phase over its samples."""
+    u, v = (_from_middle(n, slope) for n in image.shape[-2:])
+    rows, columns = (torch.exp(2j * math.pi * slope[:, i, None] * x) for i, x in enumerate((u, v)))
+    return image * rows[..., None] * columns[:, None]
+
+
+def _error(moved: Tensor, b: Tensor, seen: Tensor, slope: Tensor) -> Tensor:
+    """Error in dB of the pixels that are seen, after the best gain, (trial,)."""
+    a, b = torch.where(seen, _sloped(moved, slope), 0), torch.where(seen, b, 0)
+    energy = a.abs().square().sum((-2, -1), keepdim=True)
+    gain = (a.conj() * b).sum((-2, -1), keepdim=True) / torch.where(energy == 0, 1, energy)
+    return error_db(gain * a, b)
+
+
+def _step(moved: Tensor, b: Tensor, seen: Tensor, slope: Tensor, turns: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Gauss-Newton step of the displacement (trial, axis, 3) and of the slope (trial, axis)."""
+    a = torch.where(seen, _sloped(moved, slope), 0)
+    b = torch.where(seen, b, 0)
+    energy = a.abs().square().sum((-2, -1), keepdim=True)
+    gain = (a.conj() * b).sum((-2, -1), keepdim=True) / torch.where(energy == 0, 1, energy)
+    spectrum = torch.fft.fft2(moved)
+    along = [torch.fft.ifft2(spectrum * (2j * math.pi * t)) for t in turns]
+    along = [gain * torch.where(seen, _sloped(x, slope), 0) for x in along]
+    a, left = gain * a, b - gain * a
+    n, m = a.shape[-2:]
+    u, v = _from_middle(n, slope) / n, _from_middle(m, slope) / m  # of the order of 1, for the condition
+    normal, right = 0.0, 0.0
+    for first in range(0, n, _BLOCK_ROWS):
+        rows = slice(first, first + _BLOCK_ROWS)
+        x, y = u[rows, None], v
+        d0, d1, one = along[0][:, rows], along[1][:, rows], a[:, rows]
+        columns = [d0, d0 * x, d0 * y, d1, d1 * x, d1 * y, 1j * one * x, 1j * one * y, one, 1j * one]
+        part = torch.stack([column.flatten(1) for column in columns], -1)
+        normal = normal + (part.mH @ part).real
+        right = right + (part.mH @ left[:, rows].flatten(1)[..., None]).real
+    assert isinstance(normal, Tensor) and isinstance(right, Tensor)
+    level = normal.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None]
+    # an image of one point does not determine all of them
+    ridge = torch.eye(normal.shape[-1], dtype=torch.float64, device=a.device) * torch.where(level > 0, 1e-9 * level, 1)
+    step = torch.linalg.solve(normal + ridge, right)[..., 0]
+    scale = step.new_tensor([1, n, m])
+    return step[:, :6].reshape(-1, 2, 3) / scale, step[:, 6:8] / (2 * math.pi * scale[1:])
+
+
+def _ramp(turns: list[Tensor], at: list[Tensor]) -> Tensor:
+    """exp(2j pi (turns . at)), shape (..., n, m)."""
+    return torch.exp(2j * math.pi * (turns[0] * at[0] + turns[1] * at[1]))
+
+
+def _peak(z: Tensor, turns: list[Tensor], start: list[Tensor] | None = None) -> list[Tensor]:
+    """Arguments d of the largest |sum z exp(2j pi turns . d)| for turns in steps of 1/n.
+
+    The start, if none is given, is found by an inverse FFT, and refined by Newton steps.
+    """
+    size = z.shape[-2:]
+    if start is None:
+        at = torch.fft.ifft2(z).abs().flatten(-2).argmax(-1)[..., None, None]
+        start = [
+            torch.where(i > n // 2, i - n, i).to(torch.float64)
+            for i, n in zip((at // size[1], at % size[1]), size, strict=True)
+        ]
+    found = list(start)
+    for _ in range(_REFINED):
+        for dim, t in enumerate(turns):  # along one axis after the other
+            turned, w = z * _ramp(turns, found), 2 * math.pi * t
+            s0, s1, s2 = (x.sum((-2, -1), keepdim=True) for x in (turned, 1j * w * turned, -w.square() * turned))
+            rise = 2 * (s1 * s0.conj()).real
+            bend = 2 * (s1.abs().square() + (s2 * s0.conj()).real)
+            step = torch.where(bend < 0, -rise / torch.where(bend < 0, bend, -1), 0)
+            found[dim] = found[dim] + step.clamp(-0.5, 0.5)
+    return found
+
+
+def _turns(spectrum: Tensor, dim: int) -> Tensor:
+    """Frequencies of a spectrum in turns per sample, within half a turn of its circular middle."""
+    n, other = spectrum.shape[dim], -3 - dim
+    f = torch.fft.fftfreq(n, dtype=torch.float64, device=spectrum.device)
+    power = spectrum.abs().square().sum(other)
+    middle = torch.angle((power * torch.exp(2j * math.pi * f)).sum(-1, keepdim=True)) / (2 * math.pi)
+    off = f - middle
+    return (off - torch.round(off)).unsqueeze(other)
