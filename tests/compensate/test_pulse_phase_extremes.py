@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tests.compensate.scenes import DOUBLE, METHODS, noise, noisy, still, turned, white
-from torchsar.compensate import autofocus, correct_pulse_phase, entropy_fixed_point, pga, sca
+from torchsar.compensate import autofocus, correct_pulse_phase, entropy_fixed_point, link_phases, pga, phase_polish, sca
 from torchsar.compensate.pulse_phase.verdict import occupied_band, sharpness_of_noise
 from torchsar.metrics import phase_rmse, residual_phase
 
@@ -100,6 +100,12 @@ def test_zero_trials_give_an_empty_estimate(name):
         3,
         16,
     ) and found.ok.shape == found.quality.shape == (0, 3)
+
+
+@pytest.mark.parametrize("method", [link_phases, phase_polish])
+def test_zero_trials_give_an_empty_estimate_of_the_other_phases(method):
+    found = method(torch.zeros(0, 3, 16, 8, dtype=torch.complex64))
+    assert found["phase_rad"].shape == (0, 3, 16) and found.ok.shape == found.quality.shape == (0, 3)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -183,8 +183,8 @@ class Recording:
         Raises:
             ValueError: If `dtype` or the samples are not complex, there are no samples, a sample is
                 not finite or becomes infinite by the conversion, side data are not numbers,
-                `agc_db` or `line_number` does not have one entry per line, or `agc_db` exceeds
-                +-200 dB.
+                `agc_db` or `line_number` does not have one entry per line, a line number is not
+                whole, or `agc_db` exceeds +-200 dB.
         """
         if not dtype.is_complex:
             raise ValueError(f"{what}: dtype must be complex64 or complex128, got {dtype}")
@@ -200,6 +200,8 @@ class Recording:
         for name in ("agc_db", "line_number"):
             if name in side:
                 _check_side_data(side[name], x, f"{what}: {name}")
+        if "line_number" in side and not bool((side["line_number"] == side["line_number"].round()).all()):
+            raise ValueError(f"{what}: line_number must hold whole numbers, got fractions or NaN")
         x = x.to(dtype)
         if "agc_db" in side:
             level = side["agc_db"].to(torch.float64)

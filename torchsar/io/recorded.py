@@ -69,6 +69,8 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
     with naming(path):
         _refuse_implausible(numbers, c)
         radar = _radar(numbers, c, _first_cell(fields))
+        if "pilot" in fields:
+            _refuse_other_length(fields["pilot"], iq)
         aux: dict[str, Any] = {name: _side(fields[name], iq) for name in _AUX if name in fields}
         return Recording.from_arrays(_complex(iq.load()), radar, dtype=dtype, what=str(path), **aux)
 
@@ -136,6 +138,12 @@ def _side(field: StoredArray, iq: StoredArray) -> np.ndarray:
             f"{field.what} must have one entry per line or per sample of {iq.described}, got {field.described}"
         )
     return field.load()
+
+
+def _refuse_other_length(pilot: StoredArray, iq: StoredArray) -> None:
+    """Raise ValueError unless a pilot tone has an entry per sample."""
+    if pilot.shape != iq.shape[1:2]:
+        raise ValueError(f"{pilot.what} must have one entry per sample of {iq.described}, got {pilot.described}")
 
 
 def _complex(iq: np.ndarray) -> np.ndarray:

@@ -88,9 +88,9 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
     Reference:
         Guarnieri and Tebaldini, IEEE Trans. Geosci. Remote Sens. 46(11), 2008 (phase linking).
     """
-    pulses = prepare(data, "link_phases", empty=False)
+    pulses = prepare(data, "link_phases")
     found = linked(pulses, starting_phase(start, pulses, "link_phases"))
-    if pulses.n < 3:
+    if pulses.n < 3 or not len(pulses.rows):
         return found
     with torch.no_grad():
         sharp = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
@@ -110,8 +110,11 @@ def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
         The `Estimate` that `link_phases` returns.
     """
     rows, n = pulses.rows, pulses.n
+    if not len(rows):
+        none = torch.zeros(0, n, dtype=torch.float64, device=rows.device)
+        return _estimate(pulses, none, none, none[:, 0], Displacement(none[:, 0], none[:, 0]))
     size = max(1, _BLOCK_BYTES // (16 * n * (6 * n + 2 * rows.shape[1])))
-    parts = [slice(first, first + size) for first in range(0, max(1, len(rows)), size)]
+    parts = [slice(first, first + size) for first in range(0, len(rows), size)]
     done: dict[int, tuple[Tensor, ...]] = {}
 
     def work(part: slice) -> None:

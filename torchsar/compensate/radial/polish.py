@@ -76,7 +76,7 @@ def phase_polish(
         ValueError: If the data are empty or not finite, the start does not have one phase per
             pulse, or the number of iterations is not a whole number of 1 or more.
     """
-    pulses = prepare(data, "phase_polish", empty=False)
+    pulses = prepare(data, "phase_polish")
     refuse_odd_counts("phase_polish", 1, iterations=iterations)
     begin = starting_phase(start, pulses, "phase_polish")
 
