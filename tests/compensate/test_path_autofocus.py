@@ -177,7 +177,11 @@ def test_fringes_of_a_smooth_line_of_sight_are_found() -> None:
     rough = roughness(carrier, fringe)
     assert bool((rough < 0.5).all()) and bool((roughness(100 * carrier, fringe) > 0.8).all())
     near = true + fringe * torch.randn(2, 200, dtype=F64, generator=made)
-    found = smooth_near(carrier, near, fringe, 2 * fringe, rough * fringe / math.sqrt(12))
+    bend_std = rough * fringe / math.sqrt(12)
+    found = smooth_near(carrier, near, 0.9 * true, fringe, 2 * fringe, bend_std)
+    assert float((found - true).abs().max()) < fringe / 4
+    near[:, [1, 10, 11, 150]] += torch.tensor([[0.8, -0.5, 0.9, -0.6]], dtype=F64)  # envelopes of other scatterers
+    found = smooth_near(carrier, near, 0.9 * true, fringe, 2 * fringe, bend_std)
     assert float((found - true).abs().max()) < fringe / 4
     line = (smoothest(carrier, fringe) - true).diff(n=2, dim=-1)
     assert float(line.abs().max()) < fringe / 2

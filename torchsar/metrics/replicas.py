@@ -116,13 +116,13 @@ def replica_level(profile: Tensor, step_m: float, zones_m: Tensor, *, centre_tur
         centre_turns: Centre of the spectrum in turns per sample.
 
     Returns:
-        A dict with `mfta_db` (maximum false target amplitude relative to the peak, -300 for
-        all-zero profiles), its offset from the peak in metres, `offset_m`, and the share of zones
-        that lie on the axis, `covered`, shape (...,) each.
+        A dict with `mfta_db` (maximum false target amplitude relative to the peak; -300 for
+        all-zero profiles and where no zone lies on the axis), its offset from the peak in metres,
+        `offset_m`, and the share of zones that lie on the axis, `covered`, shape (...,) each.
 
     Raises:
-        ValueError: If profiles are real, empty or not finite, or if no zone of any trial lies on
-            the axis.
+        ValueError: If profiles are real, empty or not finite, or if all zones are farther from
+            the peak than the profile is long.
     """
     _check_profile(profile, "replica_level")
     fine, step = _oversampled(profile.to(torch.complex128), centre_turns), step_m / _OVERSAMPLED
@@ -131,8 +131,8 @@ def replica_level(profile: Tensor, step_m: float, zones_m: Tensor, *, centre_tur
     offset = (torch.arange(power.shape[-1], device=power.device) - at[..., None]) * step
     inside = [(offset >= zone[..., :1]) & (offset <= zone[..., 1:]) for zone in zones_m.unbind(-2)]
     covered = torch.stack([one.any(-1) for one in inside], -1).to(torch.float64).mean(-1)
-    if not bool((covered > 0).any()):
-        reach = float(zones_m.abs().amin(-1).min())
+    reach = float(zones_m.abs().amin(-1).min())
+    if reach > profile.shape[-1] * step_m:
         raise ValueError(
             f"replica_level needs a profile that contains a replica, but the nearest lies {reach:.4g} m from "
             f"the peak, outside the profile of {profile.shape[-1] * step_m:.4g} m; record longer"

@@ -7,6 +7,10 @@ import math
 import torch
 from torch import Tensor
 
+# pulses whose median starts the search for fringes, and the most standard deviations by which a
+# measurement counts, by choice: few wrong envelopes in a row, anywhere, then change nothing
+_NEIGHBOURS, _MOST_STD = 15, 3.0
+
 
 def fringe_error(x_m: Tensor, fringe_m: float) -> Tensor:
     """Reduce lengths to the nearest fringe, to -fringe_m / 2..fringe_m / 2.
@@ -53,27 +57,37 @@ def smoothest(carrier_m: Tensor, fringe_m: float) -> Tensor:
 
 
 def smooth_near(
-    carrier_m: Tensor, near_m: Tensor, fringe_m: float, near_std_m: float, bend_std_m: Tensor, reach: int = 6
+    carrier_m: Tensor,
+    near_m: Tensor,
+    before_m: Tensor,
+    fringe_m: float,
+    near_std_m: float,
+    bend_std_m: Tensor,
+    reach: int = 6,
 ) -> Tensor:
     """Choose fringes of a smooth line of sight, given a rough measurement of it.
 
     The Viterbi algorithm minimises the sum of the squared differences from the measurement and of
-    the squared second differences, each over its variance.
+    the squared second differences, each over its variance. A measurement of one pulse may be wrong
+    by any amount: fringes are sought about the median of what it and its neighbours add to the line
+    of sight that was known before, and a difference counts by at most three standard deviations.
 
     Args:
         carrier_m: Line of sight in metres, known modulo fringes, shape (trial, pulse).
         near_m: Measured line of sight in metres, shape (trial, pulse).
+        before_m: Line of sight known before the measurement in metres, shape (trial, pulse).
         fringe_m: Half a wavelength in metres.
         near_std_m: Standard deviation of the measurement in metres.
         bend_std_m: Standard deviation of the second differences in metres, shape (trial,).
-        reach: Largest number of fringes from the measurement.
+        reach: Largest number of fringes from the median.
 
     Returns:
         Line of sight in metres, shape (trial, pulse).
     """
     n = fringe_m * torch.arange(-reach, reach + 1, dtype=carrier_m.dtype, device=carrier_m.device)
-    places = (carrier_m + fringe_m * torch.round((near_m - carrier_m) / fringe_m))[..., None] + n
-    far = ((places - near_m[..., None]) / near_std_m).square()
+    about = before_m + _local_median(near_m - before_m)
+    places = (carrier_m + fringe_m * torch.round((about - carrier_m) / fringe_m))[..., None] + n
+    far = ((places - near_m[..., None]) / near_std_m).square().clamp_max(_MOST_STD**2)
     weight = bend_std_m.clamp_min(1e-3 * fringe_m)[:, None, None, None].square().reciprocal()
     cost, back = far[:, 0, :, None] + far[:, 1, None, :], []  # (trial, last but one, last)
     for p in range(2, places.shape[1]):
@@ -89,3 +103,12 @@ def smooth_near(
     for chosen in reversed(back):
         path.append(chosen[rows, path[-1], path[-2]])
     return places.gather(-1, torch.stack(path[::-1], -1)[..., None])[..., 0]
+
+
+def _local_median(x: Tensor) -> Tensor:
+    """Median of each value (trial, pulse) and its neighbours; at the ends of the nearest ones."""
+    pulses = x.shape[-1]
+    width = min(_NEIGHBOURS, pulses)
+    medians = x.unfold(-1, width, 1).median(-1).values
+    at = torch.arange(pulses, device=x.device) - width // 2
+    return medians[..., at.clamp(0, pulses - width)]

@@ -154,4 +154,4 @@ class Search:
         carrier = range_m + self.metres(phase)
         bends = rough * (self.fringe_m / math.sqrt(12))
         near_std = _NEAR_FRINGES * self.fringe_m
-        return smooth_near(carrier[None], near[None], self.fringe_m, near_std, bends[None])[0]
+        return smooth_near(carrier[None], near[None], range_m[None], self.fringe_m, near_std, bends[None])[0]

@@ -45,6 +45,9 @@ _ONE_CELL, _MODULATION, _SURE = 1.5, 0.1, 4.0
 # least entropy, as in `autofocus`: a second estimate for the verdict; twice its rms difference was
 # 0.11 to 0.15 rad where both were right, and 0.43 and more where both were wrong at -10 dB
 _SHARPEN, _ENOUGH_APART_RAD = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01), 0.35
+# fewer periods have so few Doppler cells that sharpness hardly depends on the phases: of three to
+# five periods the iterations often do not converge, of eight they do
+_LEAST_PERIODS = 8
 _FEW_PERIODS = 32  # fewer periods are not started from PGA, whose first window is as wide
 # windows of PGA in Doppler cells, found by trial: a random walk blurs by few cells
 _WINDOWS = Listed((31.0, 21.0, 15.0, 9.0, 9.0, 9.0))
@@ -92,7 +95,7 @@ def radial_motion(
         deviations. The phase is to be removed after `compensate_motion` with the velocities.
         `range_error` combines both to a range error. `quality` is that of the velocities. `ok` is
         False where `ok` of `mirror_product` is False, the phase has a standard deviation of 0.5 rad
-        or more, or fewer than three periods have an echo; the phase is then zero. From 32 periods
+        or more, or fewer than eight periods have an echo; the phase is then zero. From 32 periods
         on, it is also False where linked phases of a dense scene are not confirmed; where the power
         of the pulses is modulated or the phases exceed the random walk that noise explains by far,
         and least entropy leads to other phases; and where a single range cell has a modulated
@@ -135,7 +138,7 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
     phase, taken = sharpened(pulses.rows, start, iterations, tolerance_rad)
     found = scene_cells(rotate(pulses.rows.detach(), phase.detach()))
     image_cells, range_cells = (count.reshape(pulses.trials) for count in found)
-    enough = pulses.present.sum(-1) > 2  # two cannot distinguish a phase error from a shift of the image
+    enough = pulses.present.sum(-1) >= _LEAST_PERIODS
     phase = torch.where(enough[:, None], phase, 0).to(torch.float64).reshape(*pulses.trials, pulses.n)
     phase = _unwrapped(phase, coarse.info["lit"])
     std = (1 / torch.sqrt(2 * 10 ** (coarse.info["snr_db"] / 10))).clamp_max(math.pi)
