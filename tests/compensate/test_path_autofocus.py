@@ -10,7 +10,7 @@ import torch
 
 from torchsar.compensate import CorrectPath, PathAutofocus, PathPhase, path_autofocus, path_phase
 from torchsar.compensate.path.envelopes import drift_m, moved
-from torchsar.compensate.path.fringes import roughness, smooth_near, smoothest
+from torchsar.compensate.path.fringes import rough_near, roughness, smooth_near, smoothest
 from torchsar.compensate.path.ground import ground_image
 from torchsar.core import Draws, Recording, unit_phasor
 from torchsar.echo import simulate_path
@@ -183,6 +183,12 @@ def test_fringes_of_a_smooth_line_of_sight_are_found() -> None:
     near[:, [1, 10, 11, 150]] += torch.tensor([[0.8, -0.5, 0.9, -0.6]], dtype=F64)  # envelopes of other scatterers
     found = smooth_near(carrier, near, 0.9 * true, fringe, 2 * fringe, bend_std)
     assert float((found - true).abs().max()) < fringe / 4
+    walk = (0.3 * fringe * torch.randn(2, 200, dtype=F64, generator=made)).cumsum(-1)
+    near = walk + fringe * torch.round(0.6 * torch.randn(2, 200, dtype=F64, generator=made))
+    torch.testing.assert_close(rough_near(walk, near, fringe), near)
+    wrong = near.clone()
+    wrong[:, [0, 1, 2, 5, 100, 197, 199]] += 0.4
+    assert float((rough_near(walk, wrong, fringe) - walk).abs().max()) < 8 * fringe
     line = (smoothest(carrier, fringe) - true).diff(n=2, dim=-1)
     assert float(line.abs().max()) < fringe / 2
 

@@ -22,6 +22,9 @@ _PER_FRINGE = 12
 _REACH_CELLS, _STEP_CELLS = 6.0, 0.6
 # highest degree of the polynomials of a drift, and steps of their search, found by trial
 _DEGREE, _STEPS = 6, 8
+# share of the record outside of which polynomials of degree 2 and more are held, because a Hann
+# window leaves less than a tenth there, so that the ends would run away
+_HELD = 0.8
 # unit of a drift in range cells, in which the search takes its first step
 _UNIT_CELLS = 0.4
 
@@ -86,7 +89,8 @@ def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging, slopes: bo
     cell = LIGHT_M_S / (2 * float(frequency_hz[-1] - frequency_hz[0]))
     rate = (frequency_hz - frequency_hz.mean()) * (-2 / LIGHT_M_S)  # turns per metre
     time = torch.linspace(-1, 1, pulses, dtype=torch.float64, device=samples.device)
-    basis = legendre(time, _DEGREE)[:, 1:].mT * (_UNIT_CELLS * cell)
+    bent = legendre(time.clamp(-_HELD, _HELD), _DEGREE)[:, 2:]
+    basis = torch.cat([time[:, None], bent], 1).mT * (_UNIT_CELLS * cell)
 
     def shifted(x: Tensor) -> Tensor:
         return samples * unit_phasor((x @ basis)[..., None] * rate, samples.dtype)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.path.envelopes import drift_m, matched_m, moved
-from torchsar.compensate.path.fringes import roughness, smooth_near, smoothest
+from torchsar.compensate.path.fringes import rough_near, roughness, smooth_near, smoothest
 from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
@@ -149,9 +149,9 @@ class Search:
         model = self.imaging.adjoint(weighted(self.imaging.image(turned[None]), _surprise))[0]
         whole = moved(self.rows, self.frequency_hz, range_m)
         near = range_m + matched_m(whole, model, self.frequency_hz, reach_m)
-        if rough >= _ROUGH:
-            return near
         carrier = range_m + self.metres(phase)
+        if rough >= _ROUGH:
+            return rough_near(carrier[None], near[None], self.fringe_m)[0]
         bends = rough * (self.fringe_m / math.sqrt(12))
         near_std = _NEAR_FRINGES * self.fringe_m
         return smooth_near(carrier[None], near[None], range_m[None], self.fringe_m, near_std, bends[None])[0]
