@@ -12,9 +12,9 @@ from torch.nn.functional import pad
 
 from torchsar.core import outer_phasor, phasor_tables, real_dtype, unit_phasor
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.tiles.choice import CHUNK, Choice, even_length, profile_length
+from torchsar.focus.tiles.choice import CHUNK, Choice, profile_length
 from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
-from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, node_values, spread_kernel, window_slope
+from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, node_values, spread_kernel, window_length, window_slope
 
 # pulses to which the polynomials of a part are fitted, and samples of s for each node
 _FIT_PULSES, _FIT_DENSITY = 64, 2
@@ -123,7 +123,7 @@ class Part:
         self.low = extent[0] - taps / 2 * self.node_step
         self.nodes = math.ceil((extent[1] - extent[0]) / self.node_step) + taps + 1
         self.extent = extent
-        self.length = even_length(2 * self._reach(every) + 1 + choice.rise)
+        self.length = window_length(self._reach(every), choice.rise)
         self.slope = window_slope(choice.rise, choice.guard).to(centre.device)
         self.samples = self.length + choice.rise
 

@@ -89,8 +89,8 @@ class TilePlan:
     Raises:
         TypeError: If frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
-            equal steps, `lit` returns other shapes, no pulse lights the corners and the middle of
-            the image, or tiles do not reach the error in this geometry.
+            equal steps, `lit` returns other shapes, no pulse lights any of 64 x 64 pixels that are
+            spread over the image, or tiles do not reach the error in this geometry.
     """
 
     def __init__(
@@ -135,13 +135,13 @@ class TilePlan:
         self._numbers: list[Tensor] = []
         self._zones: list[list[Part]] = []
         mean, relief = scene.relief(*size)
-        for block in scene.zones(*size):
+        for block, pulses in scene.zones(*size):
             i, j = (torch.arange(s.start, s.stop, device=grid.origin_m.device) for s in block)
             self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
             centre = tile_centres(grid, *size, i, j, mean)
-            bounds = part_bounds(*scene.pulses_of(block, *size), choice.parts)
+            bounds = part_bounds(*pulses, choice.parts)
             given = nominal, every, centre, grid, relief
-            self._zones.append([Part(self._band, choice, pulses, *given) for pulses in bounds])
+            self._zones.append([Part(self._band, choice, ends, *given) for ends in bounds])
         parts = [part for zone in self._zones for part in zone]
         self._table_count = sum(part.table_count for part in parts)
         self._tables = _Kept(len(every[0]) * self._table_count)
@@ -361,7 +361,7 @@ def image_tiles(
     Raises:
         TypeError: If the history is not complex, or frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
-            equal steps, `lit` returns other shapes, no pulse lights the corners and the middle of
-            the image, or tiles do not reach the error in this geometry.
+            equal steps, `lit` returns other shapes, no pulse lights any of 64 x 64 pixels that are
+            spread over the image, or tiles do not reach the error in this geometry.
     """
     return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit).image(history)
