@@ -15,6 +15,7 @@ from torch import Tensor
 
 from tests.focus.geometries import C128, F64, C, Case, case
 from torchsar.focus import ImageGrid, TilePlan, image_tiles
+from torchsar.focus.tiles.choice import _pixel_rule
 
 
 @pytest.mark.parametrize("seed", range(1000, 1016))
@@ -28,6 +29,27 @@ def test_the_promised_error_holds_in_any_geometry(seed: int) -> None:
     assert plan.choice.error_db <= wanted
     assert drawn.error_db(plan.image(drawn.history)) < wanted + 3
     assert drawn.error_db(plan.image(drawn.history.to(torch.complex64))) < wanted + 3
+
+
+@pytest.mark.parametrize(
+    ("seed", "wanted"),
+    [(3084, -50.3), (3112, -61.5), (3120, -58.1), (3158, -53.7), (3010, -85.9)],
+)
+def test_the_prediction_is_close_to_the_error(seed: int, wanted: float) -> None:
+    drawn = case(seed)
+    plan = drawn.plan(wanted)
+    history = torch.stack([drawn.history, drawn.history.flip(0, 1)])
+    errors = [replace(drawn, history=h).error_db(image) for h, image in zip(history, plan.image(history), strict=True)]
+    assert plan.choice.error_db - 6 < sum(errors) / 2 < plan.choice.error_db + 3
+
+
+@pytest.mark.parametrize(("pixels", "size"), [(5, 8), (16, 16), (21, 16), (300, 32), (3, 8)])
+def test_the_quadrature_over_pixels_is_exact(pixels: int, size: int) -> None:
+    """The mean of polynomials of degree 7 over all pixels, by their positions in the tiles."""
+    at = (torch.arange(pixels) % size - (size - 1) / 2).to(F64) / size
+    nodes, weight = _pixel_rule(pixels, size)
+    for power in range(8):
+        torch.testing.assert_close((weight * (nodes / size) ** power).sum(), (at**power).mean())
 
 
 def test_most_geometries_are_accepted() -> None:
@@ -271,6 +293,22 @@ def test_pixels_that_no_pulse_lights_are_zero() -> None:
         TilePlan(*given, drawn.grid, -60.0, lambda points: points)
     with pytest.raises(ValueError, match="no pulse lights"):
         TilePlan(*given, drawn.grid, -60.0, lambda points: torch.zeros(len(points), 2, dtype=torch.int64))
+
+
+def test_a_small_lit_part_between_the_corners_and_the_middle_is_found() -> None:
+    drawn, _ = strip(pulses=100)
+    inside = (drawn.grid.pixels_m() - torch.tensor([20.0, -3.0, 0.0], dtype=F64)).abs()[..., :2].amax(-1) < 1.5
+
+    def lit(points: Tensor) -> Tensor:
+        seen = (points - torch.tensor([20.0, -3.0, 0.0], dtype=F64)).abs()[:, :2].amax(-1) < 1.5
+        return seen[:, None] * torch.tensor([10, 90])
+
+    plan = TilePlan(drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m, drawn.grid, -60.0, lit)
+    history = drawn.history.clone()
+    history[:10], history[90:] = 0, 0
+    found = plan.image(history)[inside]
+    truth = replace(drawn, history=history).direct(drawn.grid.pixels_m()[inside])
+    assert len(truth) > 50 and float((found - truth).norm() / truth.norm()) < 10 ** (-57 / 20)
 
 
 def test_an_error_that_tiles_do_not_reach_is_refused_with_the_figure() -> None:

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-# powers of s whose sums over the pulses are formed
+# powers of s whose sums over the pulses are formed: 1, s and s^2, to the order of the expansion
 MOMENTS = 3
 
 

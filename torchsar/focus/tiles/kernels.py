@@ -10,9 +10,11 @@ from torch import Tensor
 
 from torchsar.focus.nufft import smooth_length
 
-# fineness of the nodes over cross range relative to the band of a tile, by choice
+# fineness of the nodes over cross range relative to the band of a tile, by choice: between 2, which
+# has a third more nodes, and 1.25, which needs wider kernels
 CROSS_OVERSAMPLING = 1.5
-# width and guard of the windows, and taps of the kernels, that are offered
+# slopes of the windows in samples, and taps of the kernels, that are offered: up to the errors that
+# double precision and the fit of the nodes allow
 _RISES = range(4, 65, 2)
 _TAPS = range(3, 13)
 # turns at which the errors of kernels and windows are tabulated: dense enough for the steep rise of
@@ -21,8 +23,9 @@ _ENTRIES = 97
 # distances from the last flat sample of a window at which its error is tabulated, in samples; a pixel
 # may lie up to one sample beyond it
 _DISTANCES = 0.5 * torch.arange(50, dtype=torch.float64) - 0.75
-# ridge of the fit of the nodes; beta relative to that of a kernel whose band just ends at the
-# oversampling, found by trial; 1 - u^2 below which the slope of the kernel is cut
+# ridge of the fit of the nodes, above the rounding of double precision; beta relative to that of a
+# kernel whose band just ends at the oversampling, found by trial; 1 - u^2
+# below which the slope of the kernel, which is infinite at its end, is cut for gradients
 _RIDGE, _SHARPNESS, _EDGE = 1e-13, 0.96, 1e-12
 
 

@@ -21,11 +21,13 @@ from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S
 
-# tables of the pulses, and weights of the tiles, up to this size each are kept for the next image
+# tables of the pulses, and weights of the tiles, up to this size each (384 MB) are kept for the next
+# image, by choice: what a small machine spares
 _KEPT_BYTES = 3 << 27
-# tiles and trials whose pixels are formed at once
+# tiles and trials whose pixels are formed at once, by choice: enough for the products, and few
+# enough that what is kept for gradients and by each thread is small
 _GROUP = 16
-# profiles that are formed at once
+# bytes of profiles that are formed at once, by choice: it limits the memory of the padded spectra
 _PROFILE_BYTES = 1 << 25
 
 
