@@ -214,6 +214,26 @@ def test_gradients_in_heights_are_those_of_the_direct_sum() -> None:
     assert float((found[0] - found[1]).norm() / found[1].norm()) < 1e-3
 
 
+@pytest.mark.parametrize("error_db", [-60.0, -110.0])
+def test_gradcheck_in_heights(error_db: float) -> None:
+    """Each image has a plan of its own, and yet its error is a smooth function of the heights."""
+    drawn = hilly(case(1008), 0.02)
+    grid = replace(drawn.grid, counts=(2, 3), height_m=drawn.grid.height_m[:2, :3])
+    few = replace(
+        drawn,
+        transmitter_m=drawn.transmitter_m[:6],
+        receiver_m=None,
+        reference_m=2 * torch.linalg.vector_norm(drawn.transmitter_m[:6], dim=-1),
+        frequency_hz=drawn.frequency_hz[:7],
+        history=drawn.history[:6, :7],
+    )
+
+    def image(height: Tensor) -> Tensor:
+        return replace(few, grid=replace(grid, height_m=height)).plan(error_db).image(few.history)
+
+    assert torch.autograd.gradcheck(image, grid.height_m.clone().requires_grad_())
+
+
 def strip(pulses: int = 400, pixels: int = 400) -> tuple[Case, Callable[[Tensor], Tensor]]:
     """A straight path beside a strip of which each pulse lights a sixth."""
     spacing, frequencies = 0.3, 64

@@ -59,9 +59,11 @@ _MARGIN = 1.1
 # pulses of which the extent of s is found for the cost, and least pulses of a sub-aperture, both by
 # choice: with fewer, the nodes that the kernel adds at either end outnumber the pulses
 _SPAN_PULSES, _LEAST_PULSES = 512, 8
-# nodes of the quadrature over the pixels of a tile along either axis: exact for errors whose squares
-# have degree 7
+# nodes of the quadrature over the pixels of a tile along either axis: exact for errors whose
+# squares have degree 7
 _NODES = 4
+# steps of the heights of tiles, relative to the pixel spacing, by choice: small beside a tile
+_HEIGHT_STEP = 1 / 16
 # zones, and sub-apertures of a dense sample, over which the error of an expansion is averaged, by
 # choice. Errors change slowly from zone to zone, but those of one sub-aperture of a rough path were
 # found 13 dB above those of 15 others
@@ -69,8 +71,8 @@ _ZONES, _PARTS = 3, 32
 # values of eps, frequencies, and positions along either axis of a tile over which the error of a
 # window is averaged: means of more values differ by less than 1 dB
 _STRETCHES, _TURNS, _AWAY = 33, 33, 8
-# pixels along either axis at which the pulses that light them are asked for: the lit part of an image
-# is found if it is wider than the image over this, by choice
+# pixels along either axis at which the pulses that light them are asked for: the lit part of an
+# image is found if it is wider than the image over this, by choice
 _PROBES = 64
 # extent of a zone relative to that which a pulse lights, by choice: its tiles sum at most a quarter
 # more pulses than light a pixel
@@ -258,9 +260,7 @@ class Scene:
         the pixels, first pulse of each and the pulse after the last, int64 (i, j, 2).
         """
         most = 2 if self.lit is None else _PROBES
-        rows, columns = (
-            torch.linspace(0, n - 1, min(n, most), dtype=torch.float64).round().long() for n in self.grid.counts
-        )
+        rows, columns = (_sampled(0, n, most) for n in self.grid.counts)
         return rows, columns, self.lit_pulses(self._points(rows, columns))
 
     @functools.cached_property
@@ -274,7 +274,8 @@ class Scene:
         seen = pulses[..., 1] > pulses[..., 0]
         if not bool(seen.any()):
             raise ValueError(
-                f"no pulse lights any of {len(at[0])} x {len(at[1])} pixels across the image; image the part that is lit"
+                f"no pulse lights any of {len(at[0])} x {len(at[1])} pixels across the image; image the part "
+                "that is lit"
             )
         ends = (v[seen.any(dim)][[0, -1]].tolist() for dim, v in zip((1, 0), at, strict=True))
         return self._points(*(torch.linspace(*pair, 3, dtype=torch.float64) for pair in ends))
@@ -318,12 +319,18 @@ class Scene:
         return extent(rows, seen, middle), extent(columns, seen.mT, middle.mT)
 
     def relief(self, width: int, depth: int) -> tuple[Tensor | None, float]:
-        """Mean height of each tile in metres, (tile, tile), and the largest difference from it."""
+        """Height of the centre of each tile in metres, (tile, tile), and the largest difference of
+        a pixel from it.
+
+        Centres have about the mean height of their pixels, in steps: a small change of the heights
+        does not move them, so that the error of the tiles does not jump with it.
+        """
         heights = tile_heights(self.grid, width, depth)
         if heights is None:
             return None, 0.0
-        mean = heights.mean((-2, -1))
-        return mean, float((heights - mean[..., None, None]).abs().max())
+        step = self.grid.step_m * _HEIGHT_STEP
+        centre = (heights.mean((-2, -1)) / step).round() * step
+        return centre, float((heights - centre[..., None, None]).abs().max())
 
     def zones(self, width: int, depth: int) -> list[tuple[tuple[slice, slice], tuple[int, int]]]:
         """Zones of the tiles, see `zones`, each with the first pulse that lights it and the pulse
@@ -388,7 +395,7 @@ class Scene:
         return float(curvatures([v[:1] for v in self.places], points, self.grid.axes).abs().max())
 
     def sampled(self, width: int, depth: int, parts: int, order: int, *, dense: bool = False) -> Sampled:
-        """Error of the expansion, and what the window needs, over a sample of zones and sub-apertures.
+        """Error of the expansion, and what the window needs, from a sample of zones and pulses.
 
         In a dense sample each sub-aperture, if they are not too many, occurs in one of the zones.
         """

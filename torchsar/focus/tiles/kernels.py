@@ -20,8 +20,8 @@ _TAPS = range(3, 13)
 # turns at which the errors of kernels and windows are tabulated: dense enough for the steep rise of
 # the errors at the edge of a band, where most of their power is
 _ENTRIES = 97
-# distances from the last flat sample of a window at which its error is tabulated, in samples; a pixel
-# may lie up to one sample beyond it
+# distances from the last flat sample of a window at which its error is tabulated, in samples; a
+# pixel may lie up to one sample beyond it
 _DISTANCES = 0.5 * torch.arange(50, dtype=torch.float64) - 0.75
 # ridge of the fit of the nodes, above the rounding of double precision; beta relative to that of a
 # kernel whose band just ends at the oversampling, found by trial; 1 - u^2
@@ -147,9 +147,9 @@ def window_slope(rise: int, guard: float) -> Tensor:
 def _window_squares(rise: int, guard: float) -> Tensor:
     """Square errors of a signal between the samples of a window near the end of its flat part.
 
-    They are tabulated at `_ENTRIES` equally spaced turns per sample over the band outside the guard,
-    and at `_DISTANCES` from the last flat sample, (turn, distance). Signals with whole turns in a
-    spectrum have no error, so that two lengths are averaged.
+    They are tabulated at `_ENTRIES` equally spaced turns per sample over the band outside the
+    guard, and at `_DISTANCES` from the last flat sample, (turn, distance). Signals at a wave number
+    of the spectrum have no error, so that two lengths are averaged.
     """
     turns = torch.linspace(-0.5, 0.5, _ENTRIES, dtype=torch.float64)[:, None] * (1 - guard)
     slope, found = window_slope(rise, guard), torch.zeros(_ENTRIES, len(_DISTANCES), dtype=torch.float64)

@@ -21,8 +21,8 @@ from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S
 
-# tables of the pulses, and weights of the tiles, up to this size each (384 MB) are kept for the next
-# image, by choice: what a small machine spares
+# tables of the pulses, and weights of the tiles, up to this size each (384 MB) are kept for the
+# next image, by choice: what a small machine spares
 _KEPT_BYTES = 3 << 27
 # tiles and trials whose pixels are formed at once, by choice: enough for the products, and few
 # enough that what is kept for gradients and by each thread is small
@@ -136,11 +136,11 @@ class TilePlan:
         self._tiles = tuple(-(-n // m) for n, m in zip(grid.counts, size, strict=True))
         self._numbers: list[Tensor] = []
         self._zones: list[list[Part]] = []
-        mean, relief = scene.relief(*size)
+        self._height_m, relief = scene.relief(*size)
         for block, pulses in scene.zones(*size):
             i, j = (torch.arange(s.start, s.stop, device=grid.origin_m.device) for s in block)
             self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
-            centre = tile_centres(grid, *size, i, j, mean)
+            centre = tile_centres(grid, *size, i, j, self._height_m)
             bounds = part_bounds(*pulses, choice.parts)
             given = nominal, every, centre, grid, relief
             self._zones.append([Part(self._band, choice, ends, *given) for ends in bounds])
@@ -252,7 +252,8 @@ class TilePlan:
             kept.begin(data.dtype, step)
         heights = tile_heights(self.grid.transposed() if self._swapped else self.grid, *self._size)
         if heights is not None:
-            heights = (heights - heights.detach().mean((-2, -1), keepdim=True)).flatten(0, 1)
+            assert self._height_m is not None
+            heights = (heights - self._height_m[..., None, None]).flatten(0, 1)
         found: list[Tensor] = []
         given = [data, *self._places, self._reference_m, *([] if heights is None else [heights])]
         grad = torch.is_grad_enabled() and any(v.requires_grad for v in given)
