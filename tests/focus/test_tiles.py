@@ -203,10 +203,12 @@ def test_the_promised_error_holds_on_hills(seed: int) -> None:
 
 def test_gradients_in_heights_are_those_of_the_direct_sum() -> None:
     drawn = hilly(case(1006), 0.02)
-    grid = replace(drawn.grid, counts=(8, 6), height_m=drawn.grid.height_m[:8, :6])
+    assert drawn.grid.height_m is not None
+    start = drawn.grid.height_m[:8, :6]
+    grid = replace(drawn.grid, counts=(8, 6), height_m=start)
     weight, found = torch.randn(8, 6, dtype=C128), []
     for tiles in (True, False):
-        height = grid.height_m.clone().requires_grad_()
+        height = start.clone().requires_grad_()
         tried = replace(drawn, grid=replace(grid, height_m=height))
         image = tried.plan().image(drawn.history) if tiles else tried.direct(tried.grid.pixels_m().reshape(-1, 3))
         image = image.view(8, 6)
@@ -218,7 +220,9 @@ def test_gradients_in_heights_are_those_of_the_direct_sum() -> None:
 def test_gradcheck_in_heights(error_db: float) -> None:
     """Each image has a plan of its own, and yet its error is a smooth function of the heights."""
     drawn = hilly(case(1008), 0.02)
-    grid = replace(drawn.grid, counts=(2, 3), height_m=drawn.grid.height_m[:2, :3])
+    assert drawn.grid.height_m is not None
+    start = drawn.grid.height_m[:2, :3]
+    grid = replace(drawn.grid, counts=(2, 3), height_m=start)
     few = replace(
         drawn,
         transmitter_m=drawn.transmitter_m[:6],
@@ -231,7 +235,7 @@ def test_gradcheck_in_heights(error_db: float) -> None:
     def image(height: Tensor) -> Tensor:
         return replace(few, grid=replace(grid, height_m=height)).plan(error_db).image(few.history)
 
-    assert torch.autograd.gradcheck(image, grid.height_m.clone().requires_grad_())
+    assert torch.autograd.gradcheck(image, start.clone().requires_grad_())
 
 
 def strip(pulses: int = 400, pixels: int = 400) -> tuple[Case, Callable[[Tensor], Tensor]]:

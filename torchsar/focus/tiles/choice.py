@@ -74,7 +74,7 @@ _STRETCHES, _TURNS, _AWAY = 33, 33, 8
 # pixels along either axis at which the pulses that light them are asked for: the lit part of an
 # image is found if it is wider than the image over this, by choice
 _PROBES = 64
-# extent of a zone relative to that which a pulse lights, by choice: its tiles sum at most a quarter
+# extent of a zone relative to that which a pulse lights, by choice: its tiles sum about a quarter
 # more pulses than light a pixel
 _ZONE_SHARE = 0.25
 # longest window that is tried, in samples, by choice: it limits the memory of a plan
@@ -271,14 +271,14 @@ class Scene:
             ValueError: If no pulse lights a pixel of the lattice.
         """
         *at, pulses = self.probed
-        seen = pulses[..., 1] > pulses[..., 0]
+        seen = pulses[..., 1] > pulses[..., 0]  # (i, j)
         if not bool(seen.any()):
             raise ValueError(
                 f"no pulse lights any of {len(at[0])} x {len(at[1])} pixels across the image; image the part "
                 "that is lit"
             )
-        ends = (v[seen.any(dim)][[0, -1]].tolist() for dim, v in zip((1, 0), at, strict=True))
-        return self._points(*(torch.linspace(*pair, 3, dtype=torch.float64) for pair in ends))
+        rows, columns = (v[seen.any(dim)] for dim, v in zip((1, 0), at, strict=True))
+        return self._points(*(torch.linspace(int(v[0]), int(v[-1]), 3, dtype=torch.float64) for v in (rows, columns)))
 
     def _points(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Points at rows (..., i) and columns (..., j) of pixels, float64 (..., i, j, 3)."""
@@ -439,11 +439,11 @@ class Scene:
         lit = [(zone, pulses) for zone, pulses in self.zones(width, depth) if pulses[1] > pulses[0]]
         some = _between(0, len(lit), _ZONES).unique().tolist()
         for turn, number in enumerate(some):
-            zone, pulses = lit[number]
+            zone, (first, last) = lit[int(number)]
             (rows, of_row), (columns, of_column) = (_gauss_numbers(s.start, s.stop) for s in zone)
             centre = tile_centres(self.grid, width, depth, rows.to(device), columns.to(device), heights)
             of_tile = (of_row[:, None] * of_column).flatten().to(device)
-            bounds = part_bounds(*pulses, parts)
+            bounds = part_bounds(first, last, parts)
             if dense:
                 chosen = _sampled(0, len(bounds), _PARTS)[turn :: len(some)]
                 of_part = torch.ones(len(chosen))
