@@ -562,6 +562,8 @@ def _choose_slope(scene: Scene, sampled: Sampled, error: float) -> tuple[tuple[i
     found = []
     most = float(sampled.stretch.abs().max()) * _MARGIN
     for oversampling in _RANGE_OVERSAMPLING:
+        if found and oversampling * _CELLS > min(found)[0]:
+            break  # no slope is short enough
         guard, turns = _guard_of(scene, oversampling, most), scene.sample_turns(oversampling, sampled.stretch)
         per_metre = scene.samples_per_metre(oversampling)
         away, reach = sampled.away_m * per_metre, sampled.reach_m * per_metre
