@@ -37,7 +37,7 @@ class Case:
         turns = (path - self.reference_m)[..., None] * self.frequency_hz / C
         return (self.history.to(C128) * torch.exp(2j * math.pi * (turns - turns.detach().round()))).sum((-2, -1))
 
-    def error_db(self, image: Tensor, pixels: int = 60) -> float:
+    def error_db(self, image: Tensor, pixels: int = 200) -> float:
         """Rms error of an image at random pixels, relative to their rms, in dB."""
         source = torch.Generator().manual_seed(1)
         i, j = (torch.randint(0, n, (pixels,), generator=source) for n in self.grid.counts)

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchsar.radar.antenna_path import refuse_unusable
 
-# two axes count as perpendicular unit vectors within this deviation of their products
+# two axes count as perpendicular unit vectors within this difference of their products, by choice:
+# axes that were computed in single precision pass
 _UNIT = 1e-6
 
 

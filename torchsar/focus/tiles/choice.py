@@ -15,43 +15,72 @@ from torch.nn.functional import pad
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.nufft import smooth_length
 from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
-from torchsar.focus.tiles.kernels import CROSS_OVERSAMPLING, kernel_error, rise_for, taps_for, window_error
+from torchsar.focus.tiles.kernels import (
+    CROSS_OVERSAMPLING,
+    kernel_error,
+    rise_for,
+    taps_for,
+    window_error,
+    window_length,
+)
 
 # first pulse that lights each point (point, 3), and the pulse after the last, (point, 2)
 Lit = Callable[[Tensor], Tensor]
 
-# sizes that are tried
+# sizes that are tried, by choice: powers of 2, and few oversamplings, so that few are judged
 _WIDTHS = (8, 16, 32, 64, 128)
 _DEPTHS = (4, 8, 16, 32, 64, 128)
 _RANGE_OVERSAMPLING = (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-# windows are tabulated at multiples of this share of the band
+# windows are tabulated at multiples of this share of the band, by choice: finer steps would make
+# windows shorter by less than a sample, and fewer plans share a table
 _GUARD_STEP = 1 / 64
-# tiles that share one expansion
+# tiles that share one expansion, by choice: enough that its matrices, which do not depend on the
+# tile, take a small part of the time, and few enough that the zone is small
 TILES_OF_ZONE = 256
-# pulses that one product of the spreading joins
+# pulses that one product of the spreading joins, by choice: products of fewer are slow, those of
+# more have more zeros
 CHUNK = 64
 # most error of the kernel, as a share of what the expansion leaves; those of kernel and window that
-# the cost assumes, as shares of the whole
+# the cost assumes, as shares of the whole; both by choice. The rest is left to the window
 _KERNEL_SHARE, _USUAL_SHARE = 0.8, 0.5
-# errors that are offered: the kernels reach the least
+# errors that are offered: the kernels reach the least, and the expansion to second order is not
+# meant for more than the most
 _LEAST_DB, _MOST_DB = -130.0, -20.0
 # most that an expansion gains from halving a size or doubling the sub-apertures, found by trial
 _MOST_GAIN_DB = 24.0
-# pulses of a sub-aperture to which an expansion is fitted, and others on which it is judged
+# pulses of a sub-aperture to which an expansion is fitted, and others on which it is judged: in 11
+# geometries more pulses changed the error by 0.8 dB at most
 _FIT_PULSES, _JUDGED_PULSES = 24, 16
 # time of the operations in ns, fitted to 13 plans on one core within 7 %: per sample of a window or
 # of its spectrum, per flop of a product, per element of the expansion, and per tile
 _NS_SAMPLE, _NS_FLOP, _NS_ELEMENT, _NS_TILE = 4.4, 0.0142, 2.1, 3000.0
-# |eps| of all pulses over the largest that is sampled
+# |eps| of all pulses over the largest that is sampled, by choice: what the sample may miss
 _MARGIN = 1.1
-# pulses of which the extent of s is found, and least pulses of a sub-aperture
+# pulses of which the extent of s is found for the cost, and least pulses of a sub-aperture, both by
+# choice: with fewer, the nodes that the kernel adds at either end outnumber the pulses
 _SPAN_PULSES, _LEAST_PULSES = 512, 8
-# extent of a zone relative to that which a pulse lights
+# nodes of the quadrature over the pixels of a tile along either axis: exact for errors whose
+# squares have degree 7
+_NODES = 4
+# steps of the heights of tiles, relative to the pixel spacing, by choice: small beside a tile
+_HEIGHT_STEP = 1 / 16
+# zones, and sub-apertures of a dense sample, over which the error of an expansion is averaged, by
+# choice. Errors change slowly from zone to zone, but those of one sub-aperture of a rough path were
+# found 13 dB above those of 15 others
+_ZONES, _PARTS = 3, 32
+# values of eps, frequencies, and positions along either axis of a tile over which the error of a
+# window is averaged: means of ten times as many differed by 1 dB at most in 14 geometries
+_STRETCHES, _TURNS, _AWAY = 33, 33, 8
+# pixels along either axis at which the pulses that light them are asked for: the lit part of an
+# image is found if it is wider than the image over this, by choice
+_PROBES = 64
+# extent of a zone relative to that which a pulse lights, by choice: its tiles sum about a quarter
+# more pulses than light a pixel
 _ZONE_SHARE = 0.25
-# longest window that is tried, in samples
+# longest window that is tried, in samples, by choice: it limits the memory of a plan
 _LONGEST = 4096
 # what the cost assumes: oversampling of the profiles with the guard that is left, and depth of a
-# tile in resolution cells
+# tile in resolution cells; by choice, to put the sizes in order before windows are known
 _USUAL_OVERSAMPLING, _USUAL_GUARD, _CELLS = 1.5, 20 / 64, 24
 
 
@@ -80,18 +109,6 @@ class Choice:
     guard: float
     oversampling: float
     error_db: float
-
-
-def even_length(n: float) -> int:
-    """Return the least even FFT length of at least n without prime factors above 5.
-
-    Args:
-        n: Least length, at least 1.
-
-    Returns:
-        Length.
-    """
-    return 2 * smooth_length(math.ceil(n / 2))
 
 
 def profile_length(n: int, oversampling: float) -> int:
@@ -194,6 +211,29 @@ def tile_centres(
 
 
 @dataclass(frozen=True, eq=False)
+class Sampled:
+    """What the errors of sizes depend on, from a sample of tiles and pulses.
+
+    Args:
+        error: Rms error of the expansion relative to 1.
+        stretch: Values of eps, from the least to the greatest, float64 (value,).
+        span_m: Mean path differences between the middle and the edge of a tile along either axis.
+        reach_m: Largest path difference between the middle of a tile and a pixel.
+    """
+
+    error: float
+    stretch: Tensor
+    span_m: tuple[float, float]
+    reach_m: float
+
+    @property
+    def away_m(self) -> Tensor:
+        """Path differences of pixels from the middle of their tiles in metres, float64 (pixel,)."""
+        at = (torch.arange(_AWAY, dtype=torch.float64) + 0.5) * (2 / _AWAY) - 1
+        return (self.span_m[0] * at[:, None] + self.span_m[1] * at).flatten()
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """Geometry for which sizes are chosen.
 
@@ -214,16 +254,36 @@ class Scene:
     grid: ImageGrid
     lit: Lit | None = None
 
-    @property
-    def spread(self) -> Tensor:
-        """Nine points from edge to edge of the image, float64 (3, 3, 3)."""
-        return self._points(*((0, n - 1) for n in self.grid.counts))
+    @functools.cached_property
+    def probed(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Pulses that light a lattice of pixels over the whole image: rows (i,) and columns (j,) of
+        the pixels, first pulse of each and the pulse after the last, int64 (i, j, 2).
+        """
+        most = 2 if self.lit is None else _PROBES
+        rows, columns = (_sampled(0, n, most) for n in self.grid.counts)
+        return rows, columns, self.lit_pulses(self._points(rows, columns))
 
-    def _points(self, rows: tuple[int, int], columns: tuple[int, int]) -> Tensor:
-        """Nine points between two rows and two columns of pixels, float64 (3, 3, 3)."""
-        i, j = (torch.linspace(*ends, 3, dtype=torch.float64).to(self.grid.origin_m) for ends in (rows, columns))
-        axes = self.grid.axes * self.grid.step_m
-        return self.grid.origin_m + i[:, None, None] * axes[0] + j[:, None] * axes[1]
+    @functools.cached_property
+    def spread(self) -> Tensor:
+        """Nine points from edge to edge of the part of the image that is lit, float64 (3, 3, 3).
+
+        Raises:
+            ValueError: If no pulse lights a pixel of the lattice.
+        """
+        *at, pulses = self.probed
+        seen = pulses[..., 1] > pulses[..., 0]  # (i, j)
+        if not bool(seen.any()):
+            raise ValueError(
+                f"no pulse lights any of {len(at[0])} x {len(at[1])} pixels across the image; image the part "
+                "that is lit"
+            )
+        rows, columns = (v[seen.any(dim)] for dim, v in zip((1, 0), at, strict=True))
+        return self._points(*(torch.linspace(int(v[0]), int(v[-1]), 3, dtype=torch.float64) for v in (rows, columns)))
+
+    def _points(self, rows: Tensor, columns: Tensor) -> Tensor:
+        """Points at rows (..., i) and columns (..., j) of pixels, float64 (..., i, j, 3)."""
+        axes, (i, j) = self.grid.axes * self.grid.step_m, (v.to(self.grid.origin_m) for v in (rows, columns))
+        return self.grid.origin_m + i[..., :, None, None] * axes[0] + j[..., None, :, None] * axes[1]
 
     def lit_pulses(self, points: Tensor) -> Tensor:
         """First pulse that lights each point (..., 3), and the pulse after the last, (..., 2)."""
@@ -237,41 +297,66 @@ class Scene:
                 f"lit must return int64 pulses of shape {(len(flat), 2)} for {len(flat)} points, got {found.dtype} of "
                 f"shape {tuple(found.shape)}"
             )
-        return found.clamp(0, pulses).view(*points.shape[:-1], 2)
+        return found.cpu().clamp(0, pulses).view(*points.shape[:-1], 2)
 
     @functools.cached_property
     def most(self) -> tuple[float, float]:
         """Largest extent of a zone in pixels, so that it is lit by few more pulses than a pixel."""
-        first, last = self.lit_pulses(self.spread).to(torch.float64).unbind(-1)
-        pulses, middle = float((last - first).max()), (first + last) / 2
-        moves = (float((v[-1] - v[0]).abs().max()) for v in (middle, middle.mT))
-        rows, columns = (
-            _ZONE_SHARE * pulses * n / move if move else math.inf
-            for n, move in zip(self.grid.counts, moves, strict=True)
-        )
-        return rows, columns
+        rows, columns, lit = self.probed
+        first, last = lit.to(torch.float64).unbind(-1)
+        seen, middle, pulses = last > first, (first + last) / 2, float((last - first).max())
+
+        def extent(at: Tensor, seen: Tensor, middle: Tensor) -> float:
+            # pulses per pixel by which the middle of those that light a pixel moves
+            span, moved = (
+                torch.where(seen, v, -math.inf).amax(0) - torch.where(seen, v, math.inf).amin(0)
+                for v in (at[:, None].to(middle).expand_as(middle), middle)
+            )
+            some = span > 0
+            speed = float((moved[some] / span[some]).max()) if bool(some.any()) else 0.0
+            return _ZONE_SHARE * pulses / speed if speed else math.inf
+
+        return extent(rows, seen, middle), extent(columns, seen.mT, middle.mT)
 
     def relief(self, width: int, depth: int) -> tuple[Tensor | None, float]:
-        """Mean height of each tile in metres, (tile, tile), and the largest difference from it."""
+        """Height of the centre of each tile in metres, (tile, tile), and the largest difference of
+        a pixel from it.
+
+        Centres have about the mean height of their pixels, in steps: a small change of the heights
+        does not move them, so that the error of the tiles does not jump with it.
+        """
         heights = tile_heights(self.grid, width, depth)
         if heights is None:
             return None, 0.0
-        mean = heights.mean((-2, -1))
-        return mean, float((heights - mean[..., None, None]).abs().max())
+        step = self.grid.step_m * _HEIGHT_STEP
+        centre = (heights.mean((-2, -1)) / step).round() * step
+        return centre, float((heights - centre[..., None, None]).abs().max())
 
-    def zones(self, width: int, depth: int) -> list[tuple[slice, slice]]:
-        """Zones of the tiles, see `zones`."""
-        return zones(self.grid.counts, width, depth, self.most)
-
-    def pulses_of(self, zone: tuple[slice, slice], width: int, depth: int) -> tuple[int, int]:
-        """First pulse that lights a zone, and the pulse after the last."""
-        rows, columns = (
-            (s.start * size, min(s.stop * size, n) - 1)
-            for s, size, n in zip(zone, (width, depth), self.grid.counts, strict=True)
+    def zones(self, width: int, depth: int) -> list[tuple[tuple[slice, slice], tuple[int, int]]]:
+        """Zones of the tiles, see `zones`, each with the first pulse that lights it and the pulse
+        after the last; they are equal if none does.
+        """
+        found = zones(self.grid.counts, width, depth, self.most)
+        if self.lit is None:
+            return [(zone, (0, len(self.places[0]))) for zone in found]
+        # nine points of each zone, and those of the lattice that it contains
+        ends = [
+            torch.tensor([(zone[axis].start * size, min(zone[axis].stop * size, n) - 1) for zone in found])
+            for axis, (size, n) in enumerate(zip((width, depth), self.grid.counts, strict=True))
+        ]
+        share = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
+        own = self.lit_pulses(self._points(*(v[:, :1] + (v[:, 1:] - v[:, :1]) * share for v in ends))).flatten(1, 2)
+        *at, probed = self.probed
+        inner = (
+            torch.stack([(v < end[:, :1]).sum(-1), (v <= end[:, 1:]).sum(-1)], -1).tolist()
+            for v, end in zip(at, ends, strict=True)
         )
-        first, last = self.lit_pulses(self._points(rows, columns)).unbind(-1)
-        seen = last > first
-        return (int(first[seen].min()), int(last[seen].max())) if bool(seen.any()) else (0, 0)
+        pulses = []
+        for (top, bottom), (left, right), nine in zip(*inner, own, strict=True):
+            every = torch.cat([nine, probed[top:bottom, left:right].reshape(-1, 2)])
+            every = every[every[:, 1] > every[:, 0]]
+            pulses.append((int(every[:, 0].min()), int(every[:, 1].max())) if len(every) else (0, 0))
+        return list(zip(found, pulses, strict=True))
 
     @property
     def waves(self) -> tuple[float, float, float]:
@@ -279,50 +364,131 @@ class Scene:
         f = self.frequency_hz * (2 * math.pi / self.speed_m_s)
         return float(f[0]), float(f[len(f) // 2]), float(f[-1])
 
-    def expansion_error(self, width: int, depth: int, parts: int, order: int) -> tuple[float, float]:
-        """Rms error of the expansion relative to 1, and the largest |eps|, over a sample of zones
-        and sub-apertures.
+    def node_turns(self, width: int) -> tuple[Tensor, Tensor]:
+        """Turns per node over cross range of the pixels of a tile at three wave numbers, with
+        weights, both (pixel, 3).
         """
-        lit = [(zone, self.pulses_of(zone, width, depth)) for zone in self.zones(width, depth)]
-        lit = [(zone, pulses) for zone, pulses in lit if pulses[1] > pulses[0]]
-        x, y = (_gauss(size, self.grid) for size in (width, depth))
+        low, _, high = self.waves
+        at, weight = _in_tile(self.grid.counts[0], width)
+        turns = at[:, None] / (width * CROSS_OVERSAMPLING) * (((low + high) / 2 + (high - low) / 2 * _GAUSS) / high)
+        return turns, weight[:, None] * _GAUSS_WEIGHT
+
+    def samples_per_metre(self, oversampling: float) -> float:
+        """Samples of the range profiles in a path difference of 1 m."""
+        low, _, high = self.waves
+        n = len(self.frequency_hz)
+        return profile_length(n, oversampling) * (high - low) / max(1, n - 1) / (2 * math.pi)
+
+    def sample_turns(self, oversampling: float, stretch: Tensor) -> Tensor:
+        """Turns per sample over range of the frequencies of pulses that have some values of eps."""
+        n = len(self.frequency_hz)
         low, carrier, high = self.waves
-        wave = (low + high) / 2 + (high - low) / 2 * _GAUSS.to(x)
-        squares, stretches = [], []
-        mean, relief = self.relief(width, depth)
-        ends = [(zone, part) for zone, (first, last) in _ends(lit) for part in _ends(part_bounds(first, last, parts))]
-        for zone, (first, last) in ends:
-            rows, columns = (_gauss_numbers(s.start, s.stop).to(x.device) for s in zone)
-            centre = tile_centres(self.grid, width, depth, rows, columns, mean)
-            middle, fitted = (first + last) // 2, _sampled(first, last, _FIT_PULSES)
-            expansion = Expansion.of(
-                [v[fitted] for v in self.places],
-                [v[middle, None] for v in self.places],
-                centre,
-                self.grid.axes,
-                carrier,
-            )
-            judged = _between(first, last, _JUDGED_PULSES)
-            places = [v[:: max(1, len(v) // 2)][:, judged].flatten(0, 1) for v in self.judged]
-            for height in sorted(set((relief * _GAUSS).tolist())):
-                error = expansion.error(places, wave, x, y, order, height)
-                squares.append(float(error.abs().square().mean()))
-            stretches.append(float((slopes(places, centre, self.grid.axes)[2] / expansion.b - 1).abs().max()))
-        return math.sqrt(sum(squares) / len(squares)), max(stretches)
+        some = min(n, _TURNS)
+        number = ((torch.arange(some, dtype=torch.float64) + 0.5) * (n / some)).floor()
+        wave = low + (high - low) / max(1, n - 1) * number
+        return (wave[:, None] - carrier / (1 + stretch)) / (2 * math.pi * self.samples_per_metre(oversampling))
+
+    @functools.cached_property
+    def bend(self) -> float:
+        """Largest second derivative of the path along the axes of the image in 1/m."""
+        points = self.spread.reshape(-1, 3)
+        return float(curvatures([v[:1] for v in self.places], points, self.grid.axes).abs().max())
+
+    def sampled(self, width: int, depth: int, parts: int, order: int, *, dense: bool = False) -> Sampled:
+        """Error of the expansion, and what the window needs, from a sample of zones and pulses.
+
+        In a dense sample each sub-aperture, if they are not too many, occurs in one of the zones.
+        """
+        device, step = self.grid.origin_m.device, self.grid.step_m
+        (x, of_x), (y, of_y) = (
+            (nodes.to(device) * step, weight.to(device))
+            for nodes, weight in map(_pixel_rule, self.grid.counts, (width, depth))
+        )
+        low, _, high = self.waves
+        wave = ((low + high) / 2 + (high - low) / 2 * _GAUSS).to(device)
+        within = (_GAUSS_WEIGHT.to(device)[:, None, None] * of_x[:, None] * of_y).flatten()
+        relief = self.relief(width, depth)[1]
+        heights = list(zip((relief * _GAUSS).tolist(), _GAUSS_WEIGHT.tolist(), strict=True)) if relief else [(0.0, 1.0)]
+        half = torch.tensor([width - 1, depth - 1], dtype=torch.float64, device=device) * (step / 2)
+        total, whole, stretches, spans = 0.0, 0.0, [], []
+        for centre, of_tile, pulses, weight in self._blocks(width, depth, parts, dense):
+            expansion, places = self._fitted(centre, *pulses)
+            whole += weight
+            for height, of_height in heights:
+                squares = expansion.error(places, wave, x, y, order, height).abs().square()
+                total += weight * of_height * float((squares.mean(1).flatten(1) @ within) @ of_tile)
+            _, a, b = slopes(places, centre, self.grid.axes)
+            stretches.append((b / expansion.b - 1).flatten())
+            spans.append((torch.stack([a, b], -1).abs() * half).flatten(0, -2))
+        stretch, span = torch.cat(stretches).sort().values.cpu(), torch.cat(spans)
+        across, along = span.mean(0).tolist()
+        return Sampled(
+            math.sqrt(total / whole),
+            stretch[_sampled(0, len(stretch), _STRETCHES)],
+            (across, along + 2 * relief),
+            float(span.sum(-1).max()) + self.bend * float(half.sum()) ** 2 / 2 + 2 * relief,
+        )
+
+    def _blocks(
+        self, width: int, depth: int, parts: int, dense: bool
+    ) -> Iterator[tuple[Tensor, Tensor, tuple[int, int], float]]:
+        """Sample of blocks of tiles and pulses: centres of tiles (tile, 3) with weights (tile,),
+        first pulse and pulse after the last, and weight.
+        """
+        device, (heights, _) = self.grid.origin_m.device, self.relief(width, depth)
+        lit = [(zone, pulses) for zone, pulses in self.zones(width, depth) if pulses[1] > pulses[0]]
+        some = _between(0, len(lit), _ZONES).unique().tolist()
+        for turn, number in enumerate(some):
+            zone, (first, last) = lit[int(number)]
+            (rows, of_row), (columns, of_column) = (_gauss_numbers(s.start, s.stop) for s in zone)
+            centre = tile_centres(self.grid, width, depth, rows.to(device), columns.to(device), heights)
+            of_tile = (of_row[:, None] * of_column).flatten().to(device)
+            bounds = part_bounds(first, last, parts)
+            if dense:
+                chosen = _sampled(0, len(bounds), _PARTS)[turn :: len(some)]
+                of_part = torch.ones(len(chosen))
+            else:
+                chosen, of_part = _gauss_numbers(0, len(bounds))
+            for part, weight in zip(chosen.tolist(), of_part.tolist(), strict=True):
+                first, last = bounds[part]
+                yield centre, of_tile, (first, last), weight * (last - first)
+
+    def _fitted(self, centre: Tensor, first: int, last: int) -> tuple[Expansion, list[Tensor]]:
+        """Expansion of tiles for some of the pulses, and positions on which it is judged."""
+        middle, fitted = (first + last) // 2, _sampled(first, last, _FIT_PULSES)
+        places, reference = [v[fitted] for v in self.places], [v[middle, None] for v in self.places]
+        judged = _between(first, last, _JUDGED_PULSES)
+        others = [v[:: max(1, len(v) // 2)][:, judged].flatten(0, 1) for v in self.judged]
+        return Expansion.of(places, reference, centre, self.grid.axes, self.waves[1]), others
 
 
-# nodes of the Gauss-Legendre rule of three points
+# Gauss-Legendre rule of three points for the mean from -1 to 1
 _GAUSS = torch.tensor([-math.sqrt(0.6), 0.0, math.sqrt(0.6)], dtype=torch.float64)
+_GAUSS_WEIGHT = torch.tensor([5 / 18, 8 / 18, 5 / 18], dtype=torch.float64)
 
 
-def _gauss(size: int, grid: ImageGrid) -> Tensor:
-    """Three positions in a tile, whose mean square is close to that of all."""
-    return (_GAUSS * (size * grid.step_m / 2)).to(grid.origin_m.device)
+def _in_tile(n: int, size: int) -> tuple[Tensor, Tensor]:
+    """Positions in a tile of `size` pixels relative to its middle, in pixels, and the shares of n
+    pixels that lie there; the last tile may be filled in part.
+    """
+    number = torch.arange(size, dtype=torch.float64)
+    return number - (size - 1) / 2, (n // size + (number < n % size).to(number)) / n
 
 
-def _ends(items: Sequence) -> list:
-    """First, middle and last item, each once."""
-    return [items[i] for i in sorted({0, len(items) // 2, len(items) - 1})]
+@functools.cache
+def _pixel_rule(n: int, size: int) -> tuple[Tensor, Tensor]:
+    """Gauss quadrature for the mean over the pixels of `_in_tile`, from the eigenvalues of its
+    Jacobi matrix: nodes in pixels from the middle and weights, (`_NODES`,) or fewer.
+
+    Reference:
+        Golub and Welsch 1969.
+    """
+    at, weight = _in_tile(n, size)
+    at, root = at[weight > 0], weight[weight > 0].sqrt()
+    powers = (at / size)[:, None] ** torch.arange(min(_NODES, len(at)))
+    q = torch.linalg.qr(root[:, None] * powers).Q
+    nodes, vectors = torch.linalg.eigh(q.mT @ (at[:, None] * q))
+    return nodes, (root @ q @ vectors).square()
 
 
 def _sampled(first: int, last: int, n: int) -> Tensor:
@@ -330,10 +496,12 @@ def _sampled(first: int, last: int, n: int) -> Tensor:
     return torch.linspace(first, last - 1, min(n, last - first), dtype=torch.float64).round().long()
 
 
-def _gauss_numbers(first: int, last: int) -> Tensor:
-    """Up to three whole numbers of first..last - 1, whose mean square is close to that of all."""
-    at = (first + last - 1) / 2 + _GAUSS * ((last - first) / 2)
-    return at.round().long().clamp(first, last - 1).unique()
+def _gauss_numbers(first: int, last: int) -> tuple[Tensor, Tensor]:
+    """Up to three whole numbers of first..last - 1, with weights for the mean over all."""
+    n = last - first
+    if n <= 3:
+        return torch.arange(first, last), torch.full((n,), 1 / n, dtype=torch.float64)
+    return ((first + last - 1) / 2 + _GAUSS * (n / 2)).round().long().clamp(first, last - 1), _GAUSS_WEIGHT
 
 
 def _between(first: int, last: int, n: int) -> Tensor:
@@ -363,16 +531,22 @@ def choose(scene: Scene, error_db: float) -> Choice:
     for sizes, _ in sorted(_costs(scene, wanted), key=lambda pair: pair[1]):
         if any(_hopeless(sizes, *other, wanted) for other in failed):
             continue
-        error, stretch = scene.expansion_error(*sizes)
+        sampled = scene.sampled(*sizes)
+        if sampled.error < wanted and sizes[2] > 3:
+            # the errors of a rough path differ from one sub-aperture to the next
+            sampled = scene.sampled(*sizes, dense=True)
+        error = sampled.error
         left = math.sqrt(max(0.0, wanted**2 - error**2))
-        taps = taps_for(_KERNEL_SHARE * left)
+        turns = scene.node_turns(sizes[0])
+        taps = taps_for(_KERNEL_SHARE * left, *turns)
         if taps is None:
             best = min(best, error)
         else:
-            slope = _choose_slope(scene, stretch, math.sqrt(left**2 - kernel_error(taps) ** 2))
-            if slope is not None:
-                total = math.hypot(error, kernel_error(taps), window_error(*slope[:2]))
-                return Choice(*sizes, taps, *slope, 20 * math.log10(total))
+            kernel = kernel_error(taps, *turns)
+            found = _choose_slope(scene, sampled, math.sqrt(left**2 - kernel**2))
+            if found is not None:
+                slope, window = found
+                return Choice(*sizes, taps, *slope, 20 * math.log10(math.hypot(error, kernel, window)))
         failed.append((sizes, error))
     reach = f"{20 * math.log10(best):.0f} dB" if best < 1 else "no error below 0 dB"
     raise ValueError(
@@ -381,17 +555,23 @@ def choose(scene: Scene, error_db: float) -> Choice:
     )
 
 
-def _choose_slope(scene: Scene, stretch: float, error: float) -> tuple[int, float, float] | None:
+def _choose_slope(scene: Scene, sampled: Sampled, error: float) -> tuple[tuple[int, float, float], float] | None:
     """Slope of the window in samples, its share of the band, and oversampling of the profiles, for
-    an error of the window.
+    an error of the window, and the error that it has.
     """
     found = []
+    most = float(sampled.stretch.abs().max()) * _MARGIN
     for oversampling in _RANGE_OVERSAMPLING:
-        guard = _guard_of(scene, oversampling, stretch * _MARGIN)
-        rise = rise_for(error, guard)
+        if found and oversampling * _CELLS > min(found)[0]:
+            break  # no slope is short enough
+        guard, turns = _guard_of(scene, oversampling, most), scene.sample_turns(oversampling, sampled.stretch)
+        per_metre = scene.samples_per_metre(oversampling)
+        away, reach = sampled.away_m * per_metre, sampled.reach_m * per_metre
+        rise = rise_for(error, guard, turns, away, reach)
         if rise is not None:
-            found.append((oversampling * _CELLS + rise, (rise, guard, oversampling)))
-    return min(found)[1] if found else None
+            remaining = window_error(rise, guard, turns, away, reach)
+            found.append((oversampling * _CELLS + rise, (rise, guard, oversampling), remaining))
+    return min(found)[1:] if found else None
 
 
 def _guard_of(scene: Scene, oversampling: float, stretch: float) -> float:
@@ -399,8 +579,7 @@ def _guard_of(scene: Scene, oversampling: float, stretch: float) -> float:
     that few windows are tabulated.
     """
     low, carrier, high = scene.waves
-    n = len(scene.frequency_hz)
-    band = profile_length(n, oversampling) * (high - low) / max(1, n - 1)
+    band = 2 * math.pi * scene.samples_per_metre(oversampling)
     share = 1 - 2 * (max(high - carrier, carrier - low) + carrier * stretch) / band
     return math.floor(share / _GUARD_STEP) * _GUARD_STEP
 
@@ -419,10 +598,9 @@ def _costs(scene: Scene, wanted: float) -> Iterator[tuple[tuple[int, int, int, i
     grid = scene.grid
     low, _, high = scene.waves
     points = scene.spread.reshape(-1, 3)
-    ranges = sorted({(first, last) for first, last in scene.lit_pulses(points).tolist() if last > first})
-    if not ranges:
-        raise ValueError("no pulse lights the corners or the middle of the image; image the part that is lit")
-    pulses = max(last - first for first, last in ranges)
+    ranges = {(first, last) for first, last in scene.lit_pulses(points).tolist() if last > first}
+    longest = max(scene.probed[2].flatten(0, 1).tolist(), key=lambda ends: ends[1] - ends[0])
+    ranges, pulses = sorted({*ranges, tuple(longest)}), longest[1] - longest[0]
     number = [2**k for k in range(int(math.log2(max(1, pulses // _LEAST_PULSES))) + 1)]
     spans = dict.fromkeys(number, 0.0)
     steepest: list[tuple[Tensor, Tensor]] = []
@@ -435,24 +613,30 @@ def _costs(scene: Scene, wanted: float) -> Iterator[tuple[tuple[int, int, int, i
             blocks = [s[:, i:j] for i, j in part_bounds(0, n, parts)]
             spans[parts] = max(spans[parts], *(float((v.amax(-1) - v.amin(-1)).max()) for v in blocks))
         steepest.append((a.abs(), b.abs()))
-    bend = float(curvatures([v[:1] for v in scene.places], points, grid.axes).abs().max())
     per_metre = _USUAL_OVERSAMPLING * (high - low) / (2 * math.pi)
-    rise = rise_for(_USUAL_SHARE * wanted, _USUAL_GUARD) or _CELLS
-    taps = taps_for(_USUAL_SHARE * wanted)
-    assert taps is not None
+    usual = torch.linspace(-0.5, 0.5, _TURNS, dtype=torch.float64)
+    rise = (
+        rise_for(_USUAL_SHARE * wanted, _USUAL_GUARD, usual / _USUAL_OVERSAMPLING, usual * _CELLS, _CELLS / 2) or _CELLS
+    )
     widths, depths = (
         [size for size in sizes if size < 2 * n or size == sizes[0]]
         for sizes, n in zip((_WIDTHS, _DEPTHS), grid.counts, strict=True)
     )
+    taps_of = {width: taps_for(_USUAL_SHARE * wanted, *scene.node_turns(width)) for width in widths}
     relief = {size: scene.relief(*size)[1] for size in itertools.product(widths, depths)}
     for width, depth, parts, order in itertools.product(widths, depths, number, (1, 2)):
         half = width * grid.step_m / 2, depth * grid.step_m / 2
-        reach = max(float((a * half[0] + b * half[1]).max()) for a, b in steepest) + bend * (half[0] + half[1]) ** 2 / 2
+        reach = (
+            max(float((a * half[0] + b * half[1]).max()) for a, b in steepest)
+            + scene.bend * (half[0] + half[1]) ** 2 / 2
+        )
         reach += 2 * relief[width, depth]
-        flat = 2 * reach * per_metre + 1
-        if not flat <= _LONGEST:
+        taps = taps_of[width]
+        assert taps is not None
+        reach *= per_metre
+        if not 2 * reach + 1 <= _LONGEST:
             continue
-        length, samples = even_length(flat + rise), flat + 2 * rise
+        length, samples = window_length(reach, rise), 2 * reach + 1 + 2 * rise
         nodes = spans[parts] * high * width * grid.step_m * CROSS_OVERSAMPLING / (2 * math.pi) + taps + 1
         joined = taps + CHUNK * nodes / max(1, pulses / parts)
         tiles = -(-grid.counts[0] // width) * -(-grid.counts[1] // depth)

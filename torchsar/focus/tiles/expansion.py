@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-# powers of s whose sums over the pulses are formed
+# powers of s whose sums over the pulses are formed: 1, s and s^2, to the order of the expansion
 MOMENTS = 3
 
 
@@ -133,17 +133,24 @@ class Expansion:
             axes: Axes of the image, float64 (2, 3).
             carrier: Wave number k_c in rad/m.
         """
-        path, a0, b0 = slopes(reference, centre, axes)
-        h0 = curvatures(reference, centre, axes)[:, 0]
-        _, a, b = slopes(places, centre, axes)
-        stretch = b / b0
-        s = a / stretch - a0
+        # the reference comes first
+        every = [torch.cat(pair) for pair in zip(reference, places, strict=True)]
+        path, a, b = slopes(every, centre, axes)
+        bends, climbs = curvatures(every, centre, axes), climb(every, centre, axes)
+        path, a0, b0, c0 = (v[:, :1] for v in (path, a, b, climbs))
+        h0 = bends[:, 0]
+        stretch = b[:, 1:] / b0
+        s = a[:, 1:] / stretch - a0
         scale = s.abs().amax(-1, keepdim=True).clamp_min(1e-30)
         t = s / scale
-        c0 = climb(reference, centre, axes)
-        bends = curvatures(places, centre, axes) / stretch[..., None] - h0[:, None]
-        climbs = climb(places, centre, axes) / stretch - c0
-        wanted = torch.cat([bends, (stretch - 1)[..., None], climbs[..., None]], -1)
+        wanted = torch.cat(
+            [
+                bends[:, 1:] / stretch[..., None] - h0[:, None],
+                (stretch - 1)[..., None],
+                (climbs[:, 1:] / stretch - c0)[..., None],
+            ],
+            -1,
+        )
         powers = torch.stack([t, t * t], -1)
         fit = torch.linalg.pinv(powers, rtol=1e-8) @ wanted
         fit = fit / torch.stack([scale, scale * scale], -2)
@@ -249,14 +256,12 @@ class Expansion:
         """
         path, a, b = slopes(places, self.centre, self.axes)
         stretch = b / self.b
-        pixels = (self.centre[:, None, None] + x[:, None, None] * self.axes[0] + y[:, None] * self.axes[1]).flatten(
-            0, 2
-        )
-        shape = (len(self.centre), len(x), len(y))
+        shape, raised = (len(self.centre), len(x), len(y)), height_m != 0
+        plane = self.centre[:, None, None] + x[:, None, None] * self.axes[0] + y[:, None] * self.axes[1]
+        plane = plane.flatten(0, 2)
+        pixels = plane + height_m * torch.linalg.cross(*self.axes) if raised else plane
 
-        above = pixels + height_m * torch.linalg.cross(*self.axes)
-
-        def excess(of: Sequence[Tensor], centre_m: Tensor, pixels: Tensor = above) -> Tensor:
+        def excess(of: Sequence[Tensor], centre_m: Tensor, pixels: Tensor) -> Tensor:
             far = slopes(of, pixels, self.axes)[0].unflatten(0, shape).movedim(-1, 1)
             return (far - centre_m[..., None, None])[:, :, None]
 
@@ -265,14 +270,15 @@ class Expansion:
         q = wave[:, None, None] - (self.carrier / stretch)[..., None, None, None]
         xx0, _, yy0 = (v.reshape(-1, 1, 1, 1, 1) for v in self.curvature.unbind(-1))
         constant, per_wave = self.common_phase(s, x)
-        exact = excess(self.reference, self.path_m)
+        exact = excess(self.reference, self.path_m, pixels)
         phase = constant + q * per_wave + self.carrier * exact
-        phase = phase + q * (exact - excess(self.reference, self.path_m, pixels))
+        if raised:
+            phase = phase + q * (exact - excess(self.reference, self.path_m, plane))
         phase = phase + q * (a0 * x + 0.5 * xx0 * x * x + b0 * y + 0.5 * yy0 * y * y)
-        phase = phase - wave[:, None, None] * excess(places, path)
-        factors = self.factors(y, order, torch.full_like(y, height_m))
+        phase = phase - wave[:, None, None] * excess(places, path, pixels)
+        factors = self.factors(y, order, torch.full_like(y, height_m) if raised else None)
         parts = (
             factor * sum(weight * s**moment for moment, weight in enumerate(weights))
-            for factor, weights in zip(factors, self.remainders(q, x, order, 4, heights=True), strict=True)
+            for factor, weights in zip(factors, self.remainders(q, x, order, 4, heights=raised), strict=True)
         )
         return torch.exp(1j * phase) * sum(parts) - 1

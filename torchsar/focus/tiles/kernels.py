@@ -8,13 +8,24 @@ import math
 import torch
 from torch import Tensor
 
-# fineness of the nodes over cross range relative to the band of a tile, by choice
+from torchsar.focus.nufft import smooth_length
+
+# fineness of the nodes over cross range relative to the band of a tile, by choice: between 2, which
+# has a third more nodes, and 1.25, which needs wider kernels
 CROSS_OVERSAMPLING = 1.5
-# width and guard of the windows, and taps of the kernels, that are offered
+# slopes of the windows in samples, and taps of the kernels, that are offered: up to the errors that
+# double precision and the fit of the nodes allow
 _RISES = range(4, 65, 2)
 _TAPS = range(3, 13)
-# ridge of the fit of the nodes; beta relative to that of a kernel whose band just ends at the
-# oversampling, found by trial; 1 - u^2 below which the slope of the kernel is cut
+# turns at which the errors of kernels and windows are tabulated: dense enough for the steep rise of
+# the errors at the edge of a band, where most of their power is
+_ENTRIES = 97
+# distances from the last flat sample of a window at which its error is tabulated, in samples; a
+# pixel may lie up to one sample beyond it
+_DISTANCES = 0.5 * torch.arange(50, dtype=torch.float64) - 0.75
+# ridge of the fit of the nodes, above the rounding of double precision; beta relative to that of a
+# kernel whose band just ends at the oversampling, found by trial; 1 - u^2
+# below which the slope of the kernel, which is infinite at its end, is cut for gradients
 _RIDGE, _SHARPNESS, _EDGE = 1e-13, 0.96, 1e-12
 
 
@@ -58,16 +69,11 @@ def node_values(at: Tensor, nodes: int, taps: int) -> Tensor:
 
 
 @functools.cache
-def kernel_error(taps: int) -> float:
-    """Compute the error of phasors between nodes, over all frequencies of the band of a tile.
-
-    Args:
-        taps: Width of the kernel in nodes.
-
-    Returns:
-        Rms error relative to 1.
+def _kernel_squares(taps: int) -> Tensor:
+    """Mean square errors of phasors between nodes, at `_ENTRIES` equally spaced turns per node over
+    the band of a tile, (turn,).
     """
-    nodes, turns = 32, torch.linspace(-0.5, 0.5, 41, dtype=torch.float64) / CROSS_OVERSAMPLING
+    nodes, turns = 32, torch.linspace(-0.5, 0.5, _ENTRIES, dtype=torch.float64) / CROSS_OVERSAMPLING
     low, high = taps / 2, nodes - 1 - taps / 2
 
     def phasors(count: int) -> tuple[Tensor, Tensor]:
@@ -78,7 +84,43 @@ def kernel_error(taps: int) -> float:
     found = node_values(at, nodes, taps).to(values.dtype) @ values
     between, truth = phasors(7 * nodes + 1)
     kernel = spread_kernel(between[:, None] - torch.arange(nodes, dtype=torch.float64), taps)
-    return float((kernel.to(values.dtype) @ found - truth).abs().square().mean().sqrt())
+    return (kernel.to(values.dtype) @ found - truth).abs().square().mean(0)
+
+
+def _shares(at: Tensor, first: float, last: float, entries: int, weight: Tensor | None = None) -> Tensor:
+    """Shares of positions that are nearest to each of some equally spaced entries of a table."""
+    entry = ((at.flatten() - first) * ((entries - 1) / (last - first))).round().long().clamp(0, entries - 1)
+    count = torch.bincount(entry, None if weight is None else weight.flatten(), minlength=entries)
+    return count.to(torch.float64) / count.sum()
+
+
+def kernel_error(taps: int, turns: Tensor, weight: Tensor) -> float:
+    """Compute the error of phasors between nodes.
+
+    Args:
+        taps: Width of the kernel in nodes.
+        turns: Turns per node of a sample of phasors, at most 0.5 / `CROSS_OVERSAMPLING` in size,
+            any shape.
+        weight: Their weights, whose sum is 1, same shape.
+
+    Returns:
+        Rms error relative to 1.
+    """
+    edge = 0.5 / CROSS_OVERSAMPLING
+    return math.sqrt(float(_kernel_squares(taps) @ _shares(turns, -edge, edge, _ENTRIES, weight)))
+
+
+def window_length(reach: float, rise: int) -> int:
+    """Return the length of the spectrum of a window, an even number without prime factors above 5.
+
+    Args:
+        reach: Largest distance of a pixel from the middle of the window in samples.
+        rise: Samples of either slope.
+
+    Returns:
+        Number of samples from the middle of one slope to that of the other.
+    """
+    return 2 * smooth_length(math.ceil((2 * reach + 1 + rise) / 2))
 
 
 def window_slope(rise: int, guard: float) -> Tensor:
@@ -102,52 +144,78 @@ def window_slope(rise: int, guard: float) -> Tensor:
 
 
 @functools.cache
-def window_error(rise: int, guard: float) -> float:
+def _window_squares(rise: int, guard: float) -> Tensor:
+    """Square errors of a signal between the samples of a window near the end of its flat part.
+
+    They are tabulated at `_ENTRIES` equally spaced turns per sample over the band outside the
+    guard, and at `_DISTANCES` from the last flat sample, (turn, distance). Signals at a wave number
+    of the spectrum have no error, so that two lengths are averaged.
+    """
+    turns = torch.linspace(-0.5, 0.5, _ENTRIES, dtype=torch.float64)[:, None] * (1 - guard)
+    slope, found = window_slope(rise, guard), torch.zeros(_ENTRIES, len(_DISTANCES), dtype=torch.float64)
+    for flat in (len(_DISTANCES), len(_DISTANCES) + 2):  # the farthest is the middle
+        length = flat + rise
+        weights = torch.cat([slope, slope.new_ones(flat), slope.flip(0)])
+        m = torch.arange(flat + 2 * rise, dtype=torch.float64) - flat / 2 - rise
+        j = torch.arange(length, dtype=torch.float64) - length // 2
+        at = flat / 2 - 1 - _DISTANCES
+        between = weights[:, None] * torch.exp(-2j * math.pi / length * m[:, None] * j)
+        between = between @ torch.exp(2j * math.pi / length * j[:, None] * at) / length
+        error = torch.exp(2j * math.pi * turns * m) @ between - torch.exp(2j * math.pi * turns * at)
+        found += error.abs().square() / 2
+    return found
+
+
+def window_error(rise: int, guard: float, turns: Tensor, away: Tensor, reach: float) -> float:
     """Compute the error of a signal between the samples in the flat part of a window.
 
     Args:
         rise: Samples of either slope.
         guard: Share of the band without signal, 0 to 1.
+        turns: Turns per sample of a sample of signals, at most (1 - guard) / 2 in size, any shape.
+        away: Distances from the middle of the window in samples, of a sample of pixels, any shape.
+        reach: Largest distance in samples.
 
     Returns:
         Rms error relative to 1.
     """
-    flat = 24
-    slope = window_slope(rise, guard)
-    weights = torch.cat([slope, slope.new_ones(flat), slope.flip(0)])
-    m = torch.arange(flat + 2 * rise, dtype=torch.float64) - flat / 2 - rise
-    turns = torch.linspace(-(1 - guard) / 2, (1 - guard) / 2, 41, dtype=torch.float64)
-    at = torch.linspace(-flat / 2 + 0.5, flat / 2 - 0.5, 53, dtype=torch.float64)
-    length = flat + rise
-    j = torch.arange(length, dtype=torch.float64) - length // 2
-    signal = torch.exp(2j * math.pi * turns[:, None] * m) * weights
-    spectrum = signal @ torch.exp(-2j * math.pi * m[:, None] * j / length) / length
-    found = spectrum @ torch.exp(2j * math.pi * j[:, None] * at / length)
-    return float((found - torch.exp(2j * math.pi * turns[:, None] * at)).abs().square().mean().sqrt())
+    edge = (1 - guard) / 2
+    flat = window_length(reach, rise) - rise
+    # windows begin at whole samples
+    at = away.flatten()[:, None] + torch.tensor([-0.375, -0.125, 0.125, 0.375], dtype=torch.float64)
+    # either end has its error
+    far = torch.cat([flat / 2 - 1 - at, flat / 2 + at])
+    by_turns = _window_squares(rise, guard) @ _shares(far, float(_DISTANCES[0]), float(_DISTANCES[-1]), len(_DISTANCES))
+    return math.sqrt(2 * float(_shares(turns, -edge, edge, _ENTRIES) @ by_turns))
 
 
-def taps_for(error: float) -> int | None:
+def taps_for(error: float, turns: Tensor, weight: Tensor) -> int | None:
     """Find the narrowest kernel for an error.
 
     Args:
         error: Largest rms error relative to 1.
+        turns: Turns per node, see `kernel_error`.
+        weight: Their weights.
 
     Returns:
         Width in nodes, None if no kernel meets the error.
     """
-    return next((taps for taps in _TAPS if kernel_error(taps) <= error), None)
+    return next((taps for taps in _TAPS if kernel_error(taps, turns, weight) <= error), None)
 
 
-def rise_for(error: float, guard: float) -> int | None:
+def rise_for(error: float, guard: float, turns: Tensor, away: Tensor, reach: float) -> int | None:
     """Find the shortest slope of a window for an error.
 
     Args:
         error: Largest rms error relative to 1.
         guard: Share of the band without signal, 0 to 1.
+        turns: Turns per sample, see `window_error`.
+        away: Distances from the middle of the window in samples.
+        reach: Largest distance in samples.
 
     Returns:
         Samples of either slope, None if no window meets the error.
     """
     if guard <= 0:
         return None
-    return next((rise for rise in _RISES if window_error(rise, guard) <= error), None)
+    return next((rise for rise in _RISES if window_error(rise, guard, turns, away, reach) <= error), None)

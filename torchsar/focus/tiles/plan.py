@@ -21,11 +21,13 @@ from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 from torchsar.radar.stripmap import LIGHT_M_S
 
-# tables of the pulses, and weights of the tiles, up to this size each are kept for the next image
+# tables of the pulses, and weights of the tiles, up to this size each (384 MB) are kept for the
+# next image, by choice: what a small machine spares
 _KEPT_BYTES = 3 << 27
-# tiles and trials whose pixels are formed at once
+# tiles and trials whose pixels are formed at once, by choice: enough for the products, and few
+# enough that what is kept for gradients and by each thread is small
 _GROUP = 16
-# profiles that are formed at once
+# bytes of profiles that are formed at once, by choice: it limits the memory of the padded spectra
 _PROFILE_BYTES = 1 << 25
 
 
@@ -89,8 +91,8 @@ class TilePlan:
     Raises:
         TypeError: If frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
-            equal steps, `lit` returns other shapes, no pulse lights the corners and the middle of
-            the image, or tiles do not reach the error in this geometry.
+            equal steps, `lit` returns other shapes, no pulse lights any of 64 x 64 pixels that are
+            spread over the image, or tiles do not reach the error in this geometry.
     """
 
     def __init__(
@@ -134,14 +136,14 @@ class TilePlan:
         self._tiles = tuple(-(-n // m) for n, m in zip(grid.counts, size, strict=True))
         self._numbers: list[Tensor] = []
         self._zones: list[list[Part]] = []
-        mean, relief = scene.relief(*size)
-        for block in scene.zones(*size):
+        self._height_m, relief = scene.relief(*size)
+        for block, pulses in scene.zones(*size):
             i, j = (torch.arange(s.start, s.stop, device=grid.origin_m.device) for s in block)
             self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
-            centre = tile_centres(grid, *size, i, j, mean)
-            bounds = part_bounds(*scene.pulses_of(block, *size), choice.parts)
+            centre = tile_centres(grid, *size, i, j, self._height_m)
+            bounds = part_bounds(*pulses, choice.parts)
             given = nominal, every, centre, grid, relief
-            self._zones.append([Part(self._band, choice, pulses, *given) for pulses in bounds])
+            self._zones.append([Part(self._band, choice, ends, *given) for ends in bounds])
         parts = [part for zone in self._zones for part in zone]
         self._table_count = sum(part.table_count for part in parts)
         self._tables = _Kept(len(every[0]) * self._table_count)
@@ -250,7 +252,8 @@ class TilePlan:
             kept.begin(data.dtype, step)
         heights = tile_heights(self.grid.transposed() if self._swapped else self.grid, *self._size)
         if heights is not None:
-            heights = (heights - heights.detach().mean((-2, -1), keepdim=True)).flatten(0, 1)
+            assert self._height_m is not None
+            heights = (heights - self._height_m[..., None, None]).flatten(0, 1)
         found: list[Tensor] = []
         given = [data, *self._places, self._reference_m, *([] if heights is None else [heights])]
         grad = torch.is_grad_enabled() and any(v.requires_grad for v in given)
@@ -361,7 +364,7 @@ def image_tiles(
     Raises:
         TypeError: If the history is not complex, or frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
-            equal steps, `lit` returns other shapes, no pulse lights the corners and the middle of
-            the image, or tiles do not reach the error in this geometry.
+            equal steps, `lit` returns other shapes, no pulse lights any of 64 x 64 pixels that are
+            spread over the image, or tiles do not reach the error in this geometry.
     """
     return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit).image(history)
