@@ -16,6 +16,9 @@ from torchsar.radar.spotlight import frequency_step_hz
 
 # pixel spacing in resolution cells, by choice: images are sampled above their bandwidth
 STEP = 0.7
+# the same where the scene is fitted to the samples: with 0.7 the line of sight was up to 2.6 times
+# its bound at 10 dB and with 0.5 1.2 times
+FINE_STEP = 0.5
 # error of the images in dB, by choice: far below what noise and side lobes leave
 _ERROR_DB = -40.0
 
@@ -91,17 +94,18 @@ def sights(antennas: AntennaPath, height_m: float = 0.0) -> Tensor:
 
 
 def ground_image(
-    frequency_hz: Tensor, antennas: AntennaPath, height_m: float, extent_m: float | None = None
+    frequency_hz: Tensor, antennas: AntennaPath, height_m: float, extent_m: float | None = None, step: float = STEP
 ) -> TileOperator:
     """Return the image of the ground about the origin, for one path.
 
-    Its second axis is that of the range. Pixels are 0.7 of a resolution cell apart.
+    Its second axis is that of the range.
 
     Args:
         frequency_hz: Frequencies in Hz, float64 (range,).
         antennas: Path of one trial.
         height_m: Height z of the ground in metres.
         extent_m: Side of the imaged square in metres; None for all of the unambiguous ground.
+        step: Spacing of the pixels in resolution cells.
 
     Returns:
         Image formation of range profiles, with its adjoint.
@@ -117,15 +121,15 @@ def ground_image(
         steep = float(torch.linalg.vector_norm(away))
         across = torch.stack([-away[1], away[0]]) / max(steep, 1e-300)
         turn = slope @ across
-        span, step = float(turn.max() - turn.min()), float(turn.diff().abs().mean())
+        span, per_pulse = float(turn.max() - turn.min()), float(turn.diff().abs().mean())
     band = float(frequency_hz[-1] - frequency_hz[0])
     wavelength = LIGHT_M_S / float(frequency_hz.mean())
     if not (span > 0 and steep > 0):
         raise ValueError("autofocus of a path needs a line of sight that turns over the ground; the path has none")
-    extent = wavelength / step, LIGHT_M_S / (frequency_step_hz(frequency_hz) * steep)
+    extent = wavelength / per_pulse, LIGHT_M_S / (frequency_step_hz(frequency_hz) * steep)
     if extent_m is not None:
         extent = min(extent[0], extent_m), min(extent[1], extent_m)
-    spacing = STEP * min(wavelength / span, LIGHT_M_S / (band * steep))
+    spacing = step * min(wavelength / span, LIGHT_M_S / (band * steep))
     counts = tuple(max(2, math.ceil(x / spacing)) for x in extent)
     axes = torch.zeros(2, 3, dtype=torch.float64, device=frequency_hz.device)
     axes[0, :2], axes[1, :2] = across, away / steep

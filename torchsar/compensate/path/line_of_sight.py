@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.path.axes import Found, three_axes
-from torchsar.compensate.path.ground import STEP, for_each, ground_image, trials_of
+from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, trials_of
 from torchsar.compensate.path.search import Search
 from torchsar.compensate.pulse_phase.verdict import (
     LEAST_ROWS,
@@ -17,6 +17,7 @@ from torchsar.compensate.pulse_phase.verdict import (
     sharpness_of_noise,
 )
 from torchsar.core import Estimate, checked_samples
+from torchsar.focus import TileOperator
 from torchsar.metrics import entropy, residual_phase
 from torchsar.radar import AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
@@ -114,17 +115,16 @@ def path_autofocus(
 
     @torch.no_grad()
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
-        operator = ground_image(frequency_hz, one, height_m, extent_m)
-        found = _nothing(rows)
         present = (rows.real.square() + rows.imag.square()).sum(-1) > 0
-        if int(present.sum()) >= _LEAST_PULSES:
-            if not bool(present.all()):
-                operator = ground_image(frequency_hz, _only(one, present), height_m, extent_m)
-            some = rows[present]
-            some = some / some.abs().amax()
-            found = _judged(Search(some, frequency_hz, operator), rounds)
-            found = _spread(found, present)
-        return found
+        few = int(present.sum()) < _LEAST_PULSES
+        seen = one if few or bool(present.all()) else _only(one, present)
+        coarse = ground_image(frequency_hz, seen, height_m, extent_m)
+        if few:
+            return _nothing(rows)
+        fine = ground_image(frequency_hz, seen, height_m, extent_m, FINE_STEP)
+        some = rows[present]
+        some = some / some.abs().amax()
+        return _spread(_judged(Search(some, frequency_hz, coarse), fine, rounds), present)
 
     return for_each(find, profiles, antennas, trials)
 
@@ -159,11 +159,14 @@ def _spread(found: Estimate, present: Tensor) -> Estimate:
     return Estimate(value, found.quality, found.ok, {name: of(x) for name, x in found.std.items()}, found.info)
 
 
-def _judged(search: Search, rounds: int) -> Estimate:
-    """The estimate of the sharpest image from two or three starts, and its verdict."""
+def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
+    """The estimate of the sharpest image from two or three starts, and its verdict.
+
+    fine: Image formation of the last step.
+    """
 
     def refined(range_m: Tensor) -> Found:
-        return three_axes(search.rows, search.imaging, range_m, rounds)
+        return three_axes(search.rows, fine, range_m, rounds)
 
     def strehl(std_m: Tensor) -> Tensor:
         return torch.exp(-(std_m * (2 * math.pi / search.fringe_m)).square().mean())
@@ -175,7 +178,7 @@ def _judged(search: Search, rounds: int) -> Estimate:
         results.append(refined(search.by_envelopes(_OTHER_BAND)[0]))
         found, std_m = _sharpest(results, search.fringe_m)
     sharp, effective, telling = sharpness_beyond_speckle(found.image.mT)
-    noise = sharpness_of_noise((effective * STEP).clamp_min(1))
+    noise = sharpness_of_noise((effective * FINE_STEP).clamp_min(1))
     quality = strehl(std_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
     ok = (sharp > _MARGIN * noise) & (telling > LEAST_ROWS) & (strehl(_SPREAD * std_m) > LEAST_STREHL)
     value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
