@@ -60,9 +60,10 @@ def path_autofocus(
        of the band, in which the envelopes are corrected too.
     3. Envelopes may still drift slowly against the phases. The drift is the polynomial of time of
        least image entropy at unchanged phases of the carrier; it is added in whole fringes.
-    4. The phases of each pulse in nine blocks of the image, without windows and relative to an
-       estimate of the scene, refine the line of sight. Errors across it, which act differently over
-       the scene, are fitted with a ridge, for which they are supposed to have the spectrum of the
+    4. The phase of each pulse is compared with a Wiener estimate of the scene, without windows,
+       until it no longer changes. Then the phases in nine blocks of the image, relative to a scene
+       that is fitted to the samples, refine the line of sight. Errors across it, which act
+       differently over the scene, are fitted with a ridge, for which they are supposed to have the spectrum of the
        motion along the line of sight.
     5. Step 4 is repeated from another start: phases of the whole band, with envelopes at rest; and
        from a third one, half of the band in step 1, if the results differ. The sharpest image
@@ -166,7 +167,7 @@ def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
     """
 
     def refined(range_m: Tensor) -> Found:
-        return three_axes(search.rows, fine, range_m, rounds)
+        return three_axes(search.rows, fine, search.polished(range_m, fine), rounds)
 
     def strehl(std_m: Tensor) -> Tensor:
         return torch.exp(-(std_m * (2 * math.pi / search.fringe_m)).square().mean())
