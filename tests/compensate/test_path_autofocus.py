@@ -185,10 +185,12 @@ def test_fringes_of_a_smooth_line_of_sight_are_found() -> None:
     assert float((found - true).abs().max()) < fringe / 4
     walk = (0.3 * fringe * torch.randn(2, 200, dtype=F64, generator=made)).cumsum(-1)
     near = walk + fringe * torch.round(0.6 * torch.randn(2, 200, dtype=F64, generator=made))
-    torch.testing.assert_close(rough_near(walk, near, fringe), near)
+    torch.testing.assert_close(rough_near(walk, near, 0 * walk, fringe), near)
+    curved = walk + 50 * fringe * torch.linspace(-1, 1, 200, dtype=F64) ** 2
+    torch.testing.assert_close(rough_near(curved, curved, curved - walk, fringe), curved)
     wrong = near.clone()
     wrong[:, [0, 1, 2, 5, 100, 197, 199]] += 0.4
-    assert float((rough_near(walk, wrong, fringe) - walk).abs().max()) < 8 * fringe
+    assert float((rough_near(walk, wrong, 0 * walk, fringe) - walk).abs().max()) < 8 * fringe
     line = (smoothest(carrier, fringe) - true).diff(n=2, dim=-1)
     assert float(line.abs().max()) < fringe / 2
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from tests.focus.geometries import C128, F64, C, Case, case
-from torchsar.focus import ImageGrid, TilePlan, image_tiles
+from torchsar.focus import ImageGrid, TilePlan, backproject, image_tiles
 from torchsar.focus.tiles.choice import _pixel_rule
 
 
@@ -405,3 +405,22 @@ def test_pixels_of_a_grid() -> None:
     assert pixels.shape == (3, 4, 3) and pixels.dtype == F64
     assert pixels[2, 3].tolist() == [2.5, 3.0, 3.0]
     assert torch.equal(grid.pixels_m(slice(1, 2), slice(0, 2)), pixels[1:2, 0:2])
+
+
+def test_the_error_is_that_of_the_trial_farthest_from_the_others() -> None:
+    """Of five paths the second sways: its error counts, wherever it stands."""
+    pulses = 128
+    angle = torch.linspace(-0.03, 0.03, pulses, dtype=torch.float64)
+    path = 3000.0 * torch.stack([torch.sin(angle), -torch.cos(angle), torch.ones_like(angle)], -1)
+    paths = path.repeat(5, 1, 1)
+    paths[1, :, 1] += 2.0 * torch.sin(300 * angle)
+    frequency = 9.5e9 + 2e6 * torch.arange(64, dtype=torch.float64)
+    grid = ImageGrid(torch.tensor([-20.0, -20.0, 0.0]), torch.eye(3)[:2], (48, 48), 0.8)
+    reference = 2 * torch.linalg.vector_norm(paths, dim=-1)
+    plan = TilePlan(frequency, paths, None, reference, grid, -70.0)
+    made = torch.Generator().manual_seed(1)
+    history = torch.randn(5, pulses, 64, dtype=torch.complex128, generator=made)
+    at = torch.randint(48 * 48, (200,), generator=made)
+    exact = backproject(history, frequency, paths, None, reference, grid.pixels_m().reshape(-1, 3)[at])
+    error = (plan.image(history).flatten(-2)[:, at] - exact).abs().square().mean(-1).sqrt()
+    assert bool((20 * torch.log10(error / exact.abs().square().mean(-1).sqrt()) < -67).all())

@@ -71,7 +71,9 @@ def test_axes_chirp_and_gain_come_from_the_file(tmp_path):
         ({"agc_db": np.array(["loud"] * 6)}, "raw.npz: agc_db: expected numbers in an array or a tensor, got <U4"),
         ({"agc_db": np.full(6, np.nan)}, "agc_db must be finite and within"),
         ({"line_number": np.arange(6) + 0.5}, "line_number must hold whole numbers"),
-        ({"pilot": np.ones(7)}, r"pilot must have one entry per sample of int8 of shape \(6, 80, 2\), got float64"),
+        ({"line_number": np.full(6, np.inf)}, "line_number must hold whole numbers"),
+        ({"line_number": np.ones(6, bool)}, "line_number must hold whole numbers, got torch.bool"),
+        ({"pilot": np.ones((2, 7))}, "pilot must be one row of samples, got float64"),
         (
             {"line_number": np.zeros((2, 6), int)},
             r"line_number must hold real numbers, .* got torch.int64 of shape \(2, 6\)",

@@ -59,3 +59,16 @@ def test_images_that_have_nothing_in_common_keep_their_error() -> None:
     made = torch.randn(2, 2, 40, 30, dtype=torch.complex128, generator=torch.Generator().manual_seed(5))
     found = registered_error_db(made[0], made[1])
     assert bool((found < 1e-9).all()) and bool((found > -0.3).all())
+
+
+def test_registration_never_hides_what_does_not_agree() -> None:
+    """Few points at unrelated places, and thin images: what is compared leaves no small error."""
+    made = torch.Generator().manual_seed(6)
+    for size, count in (((32, 32), 5), ((32, 32), 10), ((2, 40), 0)):
+        images = torch.zeros(2, 40, *size, dtype=torch.complex128)
+        if count:
+            at = torch.randint(size[0] * size[1], (2, 40, count), generator=made)
+            images.flatten(-2).scatter_(-1, at, torch.randn(2, 40, count, dtype=torch.complex128, generator=made))
+        else:
+            images = torch.randn(images.shape, dtype=torch.complex128, generator=made)
+        assert float(registered_error_db(*images).min()) > -20

@@ -175,7 +175,7 @@ class Recording:
             what: Name of the data for messages.
             **aux: Side data by name. `agc_db` (..., line) is the attenuation of the receiver in dB,
                 which is compensated here: each line is multiplied by 10**(agc_db / 20).
-                `line_number` (..., line) has one number per line.
+                `line_number` (..., line) has one whole number per line.
 
         Returns:
             Recording with the axes that `radar.raw_axes` gives, and the side data in `aux`.
@@ -200,8 +200,8 @@ class Recording:
         for name in ("agc_db", "line_number"):
             if name in side:
                 _check_side_data(side[name], x, f"{what}: {name}")
-        if "line_number" in side and not bool((side["line_number"] == side["line_number"].round()).all()):
-            raise ValueError(f"{what}: line_number must hold whole numbers, got fractions or NaN")
+        if "line_number" in side:
+            side["line_number"] = _whole(side["line_number"], f"{what}: line_number")
         x = x.to(dtype)
         if "agc_db" in side:
             level = side["agc_db"].to(torch.float64)
@@ -232,6 +232,18 @@ def _as_tensor(value: Any, what: str) -> Tensor:
     except (TypeError, ValueError, RuntimeError):
         kind = getattr(value, "dtype", type(value).__name__)
         raise ValueError(f"{what}: expected numbers in an array or a tensor, got {kind}") from None
+
+
+def _whole(numbers: Tensor, what: str) -> Tensor:
+    """The numbers as integers; raises ValueError for others than whole numbers."""
+    if numbers.dtype == torch.bool:
+        raise ValueError(f"{what} must hold whole numbers, got {numbers.dtype}")
+    if not numbers.is_floating_point():
+        return numbers
+    wide = numbers.to(torch.float64)
+    if not bool(((wide == wide.round()) & (wide.abs() < 2.0**53)).all()):
+        raise ValueError(f"{what} must hold whole numbers, got fractions, NaN or numbers beyond 2**53")
+    return wide.to(torch.int64)
 
 
 def _warn_of_empty_lines(samples: Tensor, what: str) -> None:

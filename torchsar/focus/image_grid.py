@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchsar.radar.antenna_path import refuse_unusable
 
-# two axes count as perpendicular unit vectors within this difference of their products, by choice:
-# axes that were computed in single precision pass
+# largest accepted difference of the products of the axes from 1 and 0, by choice: axes computed in
+# single precision pass
 _UNIT = 1e-6
 
 

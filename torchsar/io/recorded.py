@@ -70,7 +70,7 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
         _refuse_implausible(numbers, c)
         radar = _radar(numbers, c, _first_cell(fields))
         if "pilot" in fields:
-            _refuse_other_length(fields["pilot"], iq)
+            _refuse_other_than_tone(fields["pilot"])
         aux: dict[str, Any] = {name: _side(fields[name], iq) for name in _AUX if name in fields}
         return Recording.from_arrays(_complex(iq.load()), radar, dtype=dtype, what=str(path), **aux)
 
@@ -140,10 +140,10 @@ def _side(field: StoredArray, iq: StoredArray) -> np.ndarray:
     return field.load()
 
 
-def _refuse_other_length(pilot: StoredArray, iq: StoredArray) -> None:
-    """Raise ValueError unless a pilot tone has an entry per sample."""
-    if pilot.shape != iq.shape[1:2]:
-        raise ValueError(f"{pilot.what} must have one entry per sample of {iq.described}, got {pilot.described}")
+def _refuse_other_than_tone(pilot: StoredArray) -> None:
+    """Raise ValueError unless a pilot tone is a single row of samples."""
+    if len(pilot.shape) != 1 or 0 in pilot.shape:
+        raise ValueError(f"{pilot.what} must be one row of samples, got {pilot.described}")
 
 
 def _complex(iq: np.ndarray) -> np.ndarray:

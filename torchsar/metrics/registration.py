@@ -14,25 +14,30 @@ from torchsar.metrics.image import error_db, pair_of
 _REFINED, _ROUNDS = 4, 3
 # chosen: steps of the affine registration, and rows of the image whose derivatives are held at once
 _STEPS, _BLOCK_ROWS = 4, 256
+# chosen: largest rotation, stretch and shear; largest change of the shift with them in samples; and
+# share of the energy of either image that must be compared
+_MOST_LINEAR, _MOST_SHIFT, _LEAST_SHOWN = 0.02, 1.0, 0.8
 
 
 def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
     """Compute the relative error of an image, registered to its reference, of each trial.
 
     Registration removes what autofocus cannot observe of a path. Constant and linear errors of the
-    path shift the image, rotate and stretch it slightly about its middle (by as much as points at
-    its edges move less or more than others), turn the phase linearly over it, and give it a complex
-    gain. The shift is that of the largest correlation of the intensities, refined with the phases
-    of the images; rotation, stretch and shear are a linear displacement that is fitted to the
-    difference of the images. The pixels that both images show after the registration are compared.
+    path shift the image, rotate, stretch and shear it slightly, add a linear phase over it, and
+    give it a complex gain. The shift is that of the largest correlation of the intensities, refined
+    with the phases of the images; rotation, stretch and shear, of up to 2 %, are fitted to the
+    difference of the images. The pixels that both images
+    show after the registration are compared. Memory and time are those of some twenty images and of
+    two matrix products of the size of the image.
 
     Args:
         image: Image I, shape (..., azimuth, range), complex, or a Signal.
         reference: Image I0, same size.
 
     Returns:
-        Error |registered(I) - I0|^2 / |I0|^2 in dB, shape (...,), float64; 0 dB where the images
-        have nothing in common.
+        Error |registered(I) - I0|^2 / |I0|^2 over the compared pixels in dB, shape (...,), float64;
+        0 dB where the images have nothing in common, or the compared pixels hold less than 80 % of
+        the energy of either image.
 
     Raises:
         TypeError: If one of them is not a tensor of numbers.
@@ -41,24 +46,32 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
     a, b = (unit_level(x).to(torch.complex128) for x in pair_of(image, reference))
     lead = torch.broadcast_shapes(a.shape[:-2], b.shape[:-2])
     a, b = (x.expand(*lead, *x.shape[-2:]).reshape(-1, *x.shape[-2:]) for x in (a, b))
+    whole = b.abs().square().sum((-2, -1))
     spectrum = torch.fft.fft2(a)
     turns = [_turns(torch.fft.fft2(b), dim) for dim in (-2, -1)]
     map_, slope = _shifted(a, b, spectrum, turns)
+    first, most = map_, map_.new_tensor([_MOST_SHIFT, _MOST_LINEAR, _MOST_LINEAR])
     moved, seen = _displaced(spectrum, turns, map_)
+    energy = a.abs().square().sum((-2, -1))
+    # what is compared is decided once, so that no step gains by moving pixels out of sight
+    b = torch.where(seen, b, 0)
+    shown = torch.where(seen, moved, 0).abs().square().sum((-2, -1)) >= _LEAST_SHOWN * energy
+    shown = shown & (b.abs().square().sum((-2, -1)) >= _LEAST_SHOWN * whole)
     best = _error(moved, b, seen, slope)
     for _ in range(_STEPS):
         step_map, step_slope = _step(moved, b, seen, slope, turns)
         trial_map, trial_slope = map_ + step_map, slope + step_slope
         trial_moved, trial_seen = _displaced(spectrum, turns, trial_map)
         error = _error(trial_moved, b, trial_seen, trial_slope)
-        better = error < best
+        small = ((trial_map - first).abs() <= most).flatten(1).all(-1)
+        better = (error < best) & small
 
         def chosen(new: Tensor, old: Tensor, better: Tensor = better) -> Tensor:
             return torch.where(better.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
 
         map_, slope, best = chosen(trial_map, map_), chosen(trial_slope, slope), chosen(error, best)
         moved, seen = chosen(trial_moved, moved), chosen(trial_seen, seen)
-    return best.reshape(lead)
+    return torch.where(shown, best, 0.0).reshape(lead)
 
 
 def _from_middle(n: int, like: Tensor) -> Tensor:
@@ -132,7 +145,7 @@ def _sloped(image: Tensor, slope: Tensor) -> Tensor:
 
 def _error(moved: Tensor, b: Tensor, seen: Tensor, slope: Tensor) -> Tensor:
     """Error in dB of the pixels that are seen, after the best gain, (trial,)."""
-    a, b = torch.where(seen, _sloped(moved, slope), 0), torch.where(seen, b, 0)
+    a = torch.where(seen, _sloped(moved, slope), 0)
     energy = a.abs().square().sum((-2, -1), keepdim=True)
     gain = (a.conj() * b).sum((-2, -1), keepdim=True) / torch.where(energy == 0, 1, energy)
     return error_db(gain * a, b)
@@ -141,7 +154,6 @@ def _error(moved: Tensor, b: Tensor, seen: Tensor, slope: Tensor) -> Tensor:
 def _step(moved: Tensor, b: Tensor, seen: Tensor, slope: Tensor, turns: list[Tensor]) -> tuple[Tensor, Tensor]:
     """Gauss-Newton step of the displacement (trial, axis, 3) and of the slope (trial, axis)."""
     a = torch.where(seen, _sloped(moved, slope), 0)
-    b = torch.where(seen, b, 0)
     energy = a.abs().square().sum((-2, -1), keepdim=True)
     gain = (a.conj() * b).sum((-2, -1), keepdim=True) / torch.where(energy == 0, 1, energy)
     spectrum = torch.fft.fft2(moved)

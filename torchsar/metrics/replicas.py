@@ -117,8 +117,9 @@ def replica_level(profile: Tensor, step_m: float, zones_m: Tensor, *, centre_tur
 
     Returns:
         A dict with `mfta_db` (maximum false target amplitude relative to the peak; -300 for
-        all-zero profiles and where no zone lies on the axis), its offset from the peak in metres,
-        `offset_m`, and the share of zones that lie on the axis, `covered`, shape (...,) each.
+        all-zero profiles, and 0 where no zone lies on the axis, so that nothing is known), its
+        offset from the peak in metres, `offset_m`, and the share of zones that lie on the axis,
+        `covered`, shape (...,) each.
 
     Raises:
         ValueError: If profiles are real, empty or not finite, or if all zones are farther from
@@ -139,7 +140,8 @@ def replica_level(profile: Tensor, step_m: float, zones_m: Tensor, *, centre_tur
         )
     level, index = torch.where(torch.stack(inside).any(0), power, 0).max(-1)
     ratio = level / peak.clamp_min(torch.finfo(torch.float64).tiny)
-    return {"mfta_db": 10 * torch.log10(ratio.clamp_min(1e-30)), "offset_m": (index - at) * step, "covered": covered}
+    level_db = torch.where(covered > 0, 10 * torch.log10(ratio.clamp_min(1e-30)), 0.0)
+    return {"mfta_db": level_db, "offset_m": (index - at) * step, "covered": covered}
 
 
 def _oversampled(data: Tensor, centre_turns: float) -> Tensor:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.path.ground import sights
-from torchsar.compensate.pulse_phase.data import or_one, safe_angle, without_line
+from torchsar.compensate.path.ground import line_free, sights
+from torchsar.compensate.pulse_phase.data import or_one, safe_angle
 from torchsar.compensate.pulse_phase.sharpen import Wiener
 from torchsar.core import cis
 from torchsar.focus import TileOperator
@@ -65,7 +65,7 @@ class Found:
     image: Tensor
 
 
-def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, rounds: int = 4) -> Found:
+def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, present: Tensor, rounds: int = 4) -> Found:
     """Refine the line of sight, and find the errors across it, by phases of blocks of the image.
 
     An error across the line of sight acts with opposite signs on the two sides of a scene. In each
@@ -78,6 +78,7 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, rou
         rows: Range profiles, shape (pulse, range), complex.
         imaging: Image formation along the recorded path.
         line_of_sight_m: Recorded minus true half path in metres as found so far, float64 (pulse,).
+        present: True for the pulses of the profiles among all pulses.
         rounds: Rounds of measurement and correction, at least 1.
 
     Returns:
@@ -98,7 +99,7 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, rou
         lever = _levers(operator.plan.antennas, places, axes).movedim(0, 1)
         step, std = _fitted(angles / radians, information * radians**2, lever, motion)
         motion = motion + step
-        motion[:, 0] = without_line(motion[:, 0], torch.ones_like(motion[:, 0], dtype=torch.bool))
+        motion[:, 0] = line_free(motion[:, 0], present)
     offset = (motion[:, None] @ axes)[:, 0]
     return Found(motion[:, 0], offset, std, _along(imaging, offset).image(rows[None])[0])
 

@@ -9,8 +9,9 @@ from torch import Tensor
 
 # pulses whose median replaces wrong envelopes: at the ends of recordings ten in a row were wrong
 _NEIGHBOURS = 25
-# most standard deviations by which a measurement of a smooth line of sight counts; least distance
-# from the median at which one of a rough line is wrong, in usual distances and in fringes; chosen
+# by choice: most standard deviations by which a measurement of a smooth line of sight counts; one
+# of a rough line is wrong if its distance from the median exceeds 6 times the median distance and 2
+# fringes
 _MOST_STD, _FAR, _FAR_FRINGES = 3.0, 6.0, 2.0
 
 
@@ -107,19 +108,21 @@ def smooth_near(
     return places.gather(-1, torch.stack(path[::-1], -1)[..., None])[..., 0]
 
 
-def rough_near(carrier_m: Tensor, near_m: Tensor, fringe_m: float) -> Tensor:
+def rough_near(carrier_m: Tensor, near_m: Tensor, before_m: Tensor, fringe_m: float) -> Tensor:
     """Replace measurements of a rough line of sight that lie far from those of their neighbours.
 
     Args:
         carrier_m: Line of sight in metres, known modulo fringes, shape (trial, pulse).
         near_m: Measured line of sight in metres, shape (trial, pulse).
+        before_m: Line of sight known before the measurement in metres, shape (trial, pulse). What
+            a measurement adds to it is compared.
         fringe_m: Half a wavelength in metres.
 
     Returns:
         The measurements; where they lie six times as far from the median of their neighbours as
         usual, and two fringes or more, the place of the carrier that is nearest to that median.
     """
-    median = _local_median(near_m)
+    median = before_m + _local_median(near_m - before_m)
     apart = (near_m - median).abs()
     limit = (_FAR * apart.median(-1, keepdim=True).values).clamp_min(_FAR_FRINGES * fringe_m)
     return torch.where(apart > limit, median + fringe_error(carrier_m - median, fringe_m), near_m)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.core import Estimate
 from torchsar.focus import ImageGrid, TileOperator, TilePlan
 from torchsar.radar import LIGHT_M_S, AntennaPath
@@ -74,6 +75,32 @@ def for_each(
         {key: joined([one.std[key] for one in found]) for key in found[0].std},
         {key: joined([one.info[key] for one in found]) for key in found[0].info},
     )
+
+
+def line_free(range_m: Tensor, present: Tensor) -> Tensor:
+    """Subtract the line in time that fits ranges of the pulses that are present best.
+
+    Args:
+        range_m: Ranges of these pulses in metres, float64 (n,).
+        present: True for the pulses that are present, (pulse,), of which n are.
+
+    Returns:
+        Ranges without constant and linear terms, (n,).
+    """
+    return without_line(placed(range_m, present), present)[present]
+
+
+def placed(x: Tensor, present: Tensor) -> Tensor:
+    """Put values of the pulses that are present at their places among all, with zeros elsewhere.
+
+    Args:
+        x: Values, (n,).
+        present: True for the pulses that are present, (pulse,), of which n are.
+
+    Returns:
+        Values of all pulses, (pulse,).
+    """
+    return x.new_zeros(len(present)).masked_scatter(present, x)
 
 
 def sights(antennas: AntennaPath, height_m: float = 0.0) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.path.axes import Found, three_axes
-from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, trials_of
+from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, placed, trials_of
 from torchsar.compensate.path.search import Search
 from torchsar.compensate.pulse_phase.verdict import (
     LEAST_ROWS,
@@ -63,16 +63,16 @@ def path_autofocus(
     4. The phase of each pulse is compared with a Wiener estimate of the scene, without windows,
        until it no longer changes. Then the phases in nine blocks of the image, relative to a scene
        that is fitted to the samples, refine the line of sight. Errors across it, which act
-       differently over the scene, are fitted with a ridge, for which they are supposed to have the spectrum of the
-       motion along the line of sight.
+       differently over the scene, are fitted with a ridge, for which they are supposed to have the
+       spectrum of the motion along the line of sight.
     5. Step 4 is repeated from another start: phases of the whole band, with envelopes at rest; and
        from a third one, half of the band in step 1, if the results differ. The sharpest image
        counts.
 
-    Not observable are a constant and a linear term, which move the image; they are zero in the
-    result. Where the errors are rough from pulse to pulse, fringes follow from single envelopes and
-    are partly wrong; the result then holds modulo half a wavelength. Trials have image plans of
-    their own and are processed one after another.
+    Not observable are a constant and a linear term, which shift the image, and rotate and stretch
+    it slightly; they are zero in the result. Where the errors are rough from pulse to pulse,
+    fringes follow from single envelopes and are partly wrong; the result then holds modulo half a
+    wavelength. Trials have image plans of their own and are processed one after another.
 
     Args:
         profiles: Range profiles, the unitary centred inverse FFT of a phase history, shape (...,
@@ -116,7 +116,7 @@ def path_autofocus(
 
     @torch.no_grad()
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
-        present = (rows.real.square() + rows.imag.square()).sum(-1) > 0
+        present = (rows != 0).any(-1)
         few = int(present.sum()) < _LEAST_PULSES
         seen = one if few or bool(present.all()) else _only(one, present)
         coarse = ground_image(frequency_hz, seen, height_m, extent_m)
@@ -125,7 +125,7 @@ def path_autofocus(
         fine = ground_image(frequency_hz, seen, height_m, extent_m, FINE_STEP)
         some = rows[present]
         some = some / some.abs().amax()
-        return _spread(_judged(Search(some, frequency_hz, coarse), fine, rounds), present)
+        return _spread(_judged(Search(some, frequency_hz, coarse, present), fine, rounds), present)
 
     return for_each(find, profiles, antennas, trials)
 
@@ -167,17 +167,17 @@ def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
     """
 
     def refined(range_m: Tensor) -> Found:
-        return three_axes(search.rows, fine, search.polished(range_m, fine), rounds)
+        return three_axes(search.rows, fine, search.polished(range_m, fine), search.present, rounds)
 
     def strehl(std_m: Tensor) -> Tensor:
         return torch.exp(-(std_m * (2 * math.pi / search.fringe_m)).square().mean())
 
     range_m, rough = search.by_envelopes(_FIRST_BAND)
     results = [refined(range_m), refined(search.by_phases())]
-    found, std_m = _sharpest(results, search.fringe_m)
+    found, std_m = _sharpest(results, search)
     if strehl(_SPREAD * std_m) <= LEAST_STREHL:
         results.append(refined(search.by_envelopes(_OTHER_BAND)[0]))
-        found, std_m = _sharpest(results, search.fringe_m)
+        found, std_m = _sharpest(results, search)
     sharp, effective, telling = sharpness_beyond_speckle(found.image.mT)
     noise = sharpness_of_noise((effective * FINE_STEP).clamp_min(1))
     quality = strehl(std_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
@@ -187,14 +187,15 @@ def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
     return Estimate(value, quality, ok, {"line_of_sight_m": std_m}, info)
 
 
-def _sharpest(found: list[Found], fringe_m: float) -> tuple[Found, Tensor]:
+def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor]:
     """The result of the sharpest image, and the standard deviation of its line of sight (m).
 
     The latter contains the difference from the nearest other result. All have the errors by noise
     in common; what differs comes from the search.
     """
     best, *others = sorted(found, key=lambda one: float(entropy(one.image)))
-    radians = 2 * math.pi / fringe_m
-    apart = [residual_phase(radians * best.line_of_sight_m, radians * one.line_of_sight_m) for one in others]
+    radians, present = 2 * math.pi / search.fringe_m, search.present
+    phase, *others = (radians * placed(one.line_of_sight_m, present) for one in (best, *others))
+    apart = [residual_phase(phase, other, present)[present] for other in others]
     least = torch.stack([x.square().mean() for x in apart]).amin() / radians**2
     return best, (best.std_m.square() + least / 2).sqrt()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsar.compensate.path.envelopes import drift_m, matched_m, moved
 from torchsar.compensate.path.fringes import rough_near, roughness, smooth_near, smoothest
-from torchsar.compensate.pulse_phase.data import without_line
+from torchsar.compensate.path.ground import line_free
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import Run, Weights, Wiener, fixed_point, weighted
@@ -27,16 +27,16 @@ _ROUNDS, _SETTLED_FRINGES = 6, 1.0
 _REACH_CELLS = (4.0, 2.0, 0.5)
 # share of the band in the first, the second and the later rounds of the search
 _BANDS = (0.5, 1.0, 1.0)
-# roughness below which fringes are those of a smooth line of sight, and standard deviation in
-# fringes of a measurement by envelopes: 0.3 to 0.6 for smooth errors, 1.0 for random walks
+# roughness below which a line of sight is smooth: it was 0.3 to 0.6 for smooth errors, and 1.0 for
+# random walks; and assumed standard deviation of a measurement by envelopes in fringes
 _ROUGH, _NEAR_FRINGES = 0.75, 2.0
 # least weight of the window over pulses
 _LEAST_WEIGHT = 0.1
 # iterations of the fixed points, by trial, and phase step at which they end
 _COARSE, _FINE, _TOLERANCE_RAD = 30, 12, 0.03
-# the same of the last ones, which stop after 4 to 12 iterations as a rule; without them errors at
-# 20 dB were 10 to 40 bounds in half of the trials, with them 1.2 to 5
-_POLISH, _POLISHED_RAD = 40, 1e-3
+# the same of the last ones, by trial: more drift off where errors across the line of sight are not
+# known yet
+_POLISH, _POLISHED_RAD = 10, 1e-3
 
 
 def _intensity(power: Tensor, mean: Tensor) -> Tensor:
@@ -66,11 +66,13 @@ class Search:
         rows: Range profiles of the pulses that are present, (pulse, range).
         frequency_hz: Frequencies.
         imaging: Image formation along their recorded path.
+        present: True for these among all pulses.
     """
 
     rows: Tensor
     frequency_hz: Tensor
     imaging: TileOperator
+    present: Tensor
 
     @property
     def fringe_m(self) -> float:
@@ -82,8 +84,8 @@ class Search:
         return phase_rad.double() * (self.fringe_m / (2 * math.pi))
 
     def line_free(self, range_m: Tensor) -> Tensor:
-        """Ranges without constant and linear terms."""
-        return without_line(range_m, torch.ones_like(range_m, dtype=torch.bool))
+        """Ranges without constant and linear terms of time."""
+        return line_free(range_m, self.present)
 
     def windowed(self, share: float) -> Tensor:
         """Profiles with Hann windows over pulses and over a share of the band."""
@@ -164,7 +166,7 @@ class Search:
         near = range_m + matched_m(whole, model, self.frequency_hz, reach_m)
         carrier = range_m + self.metres(phase)
         if rough >= _ROUGH:
-            return rough_near(carrier[None], near[None], self.fringe_m)[0]
+            return rough_near(carrier[None], near[None], range_m[None], self.fringe_m)[0]
         bends = rough * (self.fringe_m / math.sqrt(12))
         near_std = _NEAR_FRINGES * self.fringe_m
         return smooth_near(carrier[None], near[None], range_m[None], self.fringe_m, near_std, bends[None])[0]

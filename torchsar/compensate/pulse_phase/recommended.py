@@ -161,8 +161,8 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
 def halves_of_image(imaging: Imaging, rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
     """Divide pulses into those of two halves of their image.
 
-    Range cells do not divide scatterers that migrate through them. The strips of four range lines
-    of the image, sorted by energy, are taken alternately.
+    Range cells do not divide scatterers that migrate through them. Strips of four range lines of
+    the image (fewer if there are less than eight), sorted by energy, are taken alternately.
 
     Args:
         imaging: Image formation of pulses (trial, range, pulse), with the range as last dimension
@@ -174,7 +174,8 @@ def halves_of_image(imaging: Imaging, rows: Tensor, phase: Tensor) -> tuple[Tens
         Pulses of both halves, of the shape of the rows.
     """
     image = imaging.image(rotate(rows, phase))
-    strip = torch.arange(image.shape[-1], device=image.device) // _STRIP
+    lines = image.shape[-1]
+    strip = torch.arange(lines, device=image.device) // max(1, min(_STRIP, lines // 2))
     energy = (image.real.square() + image.imag.square()).sum(-2)
     strips = energy.new_zeros(len(energy), int(strip[-1]) + 1).index_add_(1, strip, energy)
     place = strips.argsort(-1, descending=True).argsort(-1)[:, strip]

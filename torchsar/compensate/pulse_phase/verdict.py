@@ -1,7 +1,7 @@
 """Reliability of the phases that autofocus estimates.
 
 It follows from the sharpness of the image, compared with that of noise, and from the agreement of
-estimates from two halves of the range cells.
+estimates from two halves of the range cells or of the image.
 """
 
 from __future__ import annotations
@@ -207,7 +207,9 @@ def _assessed(
         scatter, rest = _of_point(focused, present)
         lone = (sharpness_rows <= LEAST_ROWS) & (scatter < _STEADY) & (present.sum(-1) >= _LEAST_PULSES)
         lone = lone & (imaging is None) & (rows.shape[-2] > 1)
-        apart = _half_difference(rows, present, phase, again, halves or halves_of_rows) / occupied.sqrt()
+        apart = _half_difference(rows, present, phase, again, halves or halves_of_rows)
+        if halves is None:
+            apart = apart / occupied.sqrt()
         std = torch.where(lone, torch.hypot(scatter, rest), apart)
         if not at_rest:
             std = torch.maximum(std, _drift(rows, present, phase, again))
@@ -301,14 +303,17 @@ def halves_of_rows(rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
 def _half_difference(rows: Tensor, present: Tensor, phase: Tensor, again: Again, halves: Halves) -> Tensor:
     """Std of the phase (rad) from the differences between two halves of the pulses, (trial,).
 
-    It is pi / sqrt(3), as for a random phase, if there is only one row.
+    It is pi / sqrt(3), as for a random phase, if there is only one row or a half is empty.
     """
+    unknown = torch.full(rows.shape[:1], math.pi / math.sqrt(3), dtype=torch.float64, device=rows.device)
     if rows.shape[-2] < 2:
-        return torch.full(rows.shape[:1], math.pi / math.sqrt(3), dtype=torch.float64, device=rows.device)
-    one, other = (again(half, present, phase) for half in halves(rows, phase))
+        return unknown
+    parts = halves(rows, phase)
+    filled = torch.stack([(part != 0).flatten(1).any(-1) for part in parts]).all(0)
+    one, other = (again(part, present, phase) for part in parts)
     apart = residual_phase(one, other, present)
     apart = torch.where(apart.abs() > _APART_RAD, apart, apart / 2)
-    return (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
+    return torch.where(filled, (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt(), unknown)
 
 
 def _drift(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:

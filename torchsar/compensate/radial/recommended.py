@@ -45,8 +45,8 @@ _ONE_CELL, _MODULATION, _SURE = 1.5, 0.1, 4.0
 # least entropy, as in `autofocus`: a second estimate for the verdict; twice its rms difference was
 # 0.11 to 0.15 rad where both were right, and 0.43 and more where both were wrong at -10 dB
 _SHARPEN, _ENOUGH_APART_RAD = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01), 0.35
-# fewer periods have so few Doppler cells that sharpness hardly depends on the phases: of three to
-# five periods the iterations often do not converge, of eight they do
+# fewer periods have so few Doppler cells that sharpness hardly depends on the phases: with three to
+# five periods the iterations often do not converge, with eight they do
 _LEAST_PERIODS = 8
 _FEW_PERIODS = 32  # fewer periods are not started from PGA, whose first window is as wide
 # windows of PGA in Doppler cells, found by trial: a random walk blurs by few cells

@@ -24,7 +24,7 @@ from torchsar.focus.tiles.kernels import (
     window_length,
 )
 
-# first pulse that lights each point (point, 3), and the pulse after the last, (point, 2)
+# function of positions (point, 3): first pulse that lights each, pulse after the last, (point, 2)
 Lit = Callable[[Tensor], Tensor]
 
 # sizes that are tried, by choice: powers of 2, and few oversamplings, so that few are judged
@@ -255,6 +255,14 @@ class Scene:
     lit: Lit | None = None
 
     @functools.cached_property
+    def farthest(self) -> list[Tensor]:
+        """Positions of the trial that is farthest from the nominal path, (pulse, 3) each."""
+        pairs = zip(self.judged, self.places, strict=True)
+        apart = [torch.linalg.vector_norm(v - nominal, dim=-1).amax(-1) for v, nominal in pairs]
+        trial = int(torch.stack(torch.broadcast_tensors(*apart)).sum(0).argmax())
+        return [v[min(trial, len(v) - 1)] for v in self.judged]
+
+    @functools.cached_property
     def probed(self) -> tuple[Tensor, Tensor, Tensor]:
         """Pulses that light a lattice of pixels over the whole image: rows (i,) and columns (j,) of
         the pixels, first pulse of each and the pulse after the last, int64 (i, j, 2).
@@ -458,7 +466,7 @@ class Scene:
         middle, fitted = (first + last) // 2, _sampled(first, last, _FIT_PULSES)
         places, reference = [v[fitted] for v in self.places], [v[middle, None] for v in self.places]
         judged = _between(first, last, _JUDGED_PULSES)
-        others = [v[:: max(1, len(v) // 2)][:, judged].flatten(0, 1) for v in self.judged]
+        others = [v[judged] for v in self.farthest]
         return Expansion.of(places, reference, centre, self.grid.axes, self.waves[1]), others
 
 

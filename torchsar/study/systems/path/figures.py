@@ -38,7 +38,7 @@ def paths(case: str, result: Result) -> Drawn:
     parts.append(_panel("error of the line of sight that is left", "error (mm)", series))
     caption = (
         "The first trial. The error of the line of sight is that of half the path over the middle of the scene, "
-        "recorded and corrected minus true, without constant and linear terms, which only shift the image."
+        "recorded and corrected minus true, without constant and linear terms, which hardly change the focus."
     )
     yield f"paths_{word_of(case)}", titled("Paths", case), caption, plot.panels(parts)
 

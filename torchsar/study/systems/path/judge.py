@@ -49,8 +49,8 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -
 def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, clean: bool) -> Tensor:
     """Return the error of the line of sight (m) that a chain leaves, (trial, pulse).
 
-    It has no constant and linear terms, which only shift the image. Where the chain estimates it or
-    phases of pulses it is known modulo half a wavelength.
+    It has no constant and linear terms, which shift the image, and rotate and stretch it slightly.
+    Where the chain estimates it or phases of pulses it is known modulo half a wavelength.
     """
     data = trials.recording.signal.data
     pulses = (trials.count, data.shape[-2])
@@ -94,8 +94,8 @@ def _positions(off: Tensor, at: Tensor) -> dict[str, Tensor]:
     image. off: displacements (trial, point, 2); at: places (trial, point, 2).
     """
     basis = torch.cat([torch.ones_like(at[..., :1]), at[..., : 2 * (at.shape[1] > 3)]], -1)
-    left = (off - basis @ (torch.linalg.pinv(basis) @ off)).square().sum((1, 2)) / (off.shape[1] - basis.shape[-1] + 1)
-    return {"image_shift_m": off.mean(1).square().sum(-1).sqrt(), "position_error_rms_m": left.sqrt()}
+    left = (off - basis @ (torch.linalg.pinv(basis) @ off)).square().sum(-1).mean(-1).sqrt()
+    return {"image_shift_m": off.mean(1).square().sum(-1).sqrt(), "position_error_rms_m": left}
 
 
 def _points(
