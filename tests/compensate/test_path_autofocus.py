@@ -139,14 +139,14 @@ def test_paths_that_err_by_a_wavelength_give_the_image_of_the_true_path() -> Non
     assert bool((after < -10).all()) and bool((before > -3).all()), (before, after)
 
 
-def test_a_search_that_ends_in_a_wrong_minimum_is_noticed() -> None:
-    """Envelopes in motion find a wrong minimum in this trial, 2.3 mm off."""
+def test_a_start_that_ends_in_a_wrong_minimum_does_no_harm() -> None:
+    """Envelopes in motion find a wrong minimum in this trial, 2.3 mm off; the sharpest image counts."""
     recording, _, true_m = with_navigation(range(2, 3), 0.05, 20.0, seed=1000)
     found = path_autofocus(recording.signal.data, recording.aux["frequency_hz"], path_of(recording))
     radians = 4 * math.pi / RADAR.wavelength_m
     error = float(phase_rmse(radians * found["line_of_sight_m"], radians * true_m))
     std = radians * float(found.std["line_of_sight_m"].square().mean().sqrt())
-    assert 0.4 < error < 2 * std and not found.ok.any()
+    assert error < 0.1 and error < 2 * std, (error, std)
 
 
 def test_noise_and_too_few_pulses_are_not_ok() -> None:

@@ -16,7 +16,7 @@ _REFINED, _ROUNDS = 4, 3
 _STEPS, _BLOCK_ROWS = 4, 256
 # chosen: largest rotation, stretch and shear; largest change of the shift with them in samples; and
 # share of the energy of either image that must be compared
-_MOST_LINEAR, _MOST_SHIFT, _LEAST_SHOWN = 0.02, 1.0, 0.8
+_MOST_LINEAR, _MOST_SHIFT, _LEAST_SHOWN = 0.02, 1.0, 0.5
 
 
 def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
@@ -36,7 +36,7 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
 
     Returns:
         Error |registered(I) - I0|^2 / |I0|^2 over the compared pixels in dB, shape (...,), float64;
-        0 dB where the images have nothing in common, or the compared pixels hold less than 80 % of
+        0 dB where the images have nothing in common, or the compared pixels hold less than half of
         the energy of either image.
 
     Raises:
