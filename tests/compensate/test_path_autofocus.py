@@ -140,7 +140,7 @@ def test_paths_that_err_by_a_wavelength_give_the_image_of_the_true_path() -> Non
 
 
 def test_a_start_that_ends_in_a_wrong_minimum_does_no_harm() -> None:
-    """Envelopes in motion find a wrong minimum in this trial, 2.3 mm off; the sharpest image counts."""
+    """With envelopes in motion this trial ends 2.3 mm off; the sharpest image counts."""
     recording, _, true_m = with_navigation(range(2, 3), 0.05, 20.0, seed=1000)
     found = path_autofocus(recording.signal.data, recording.aux["frequency_hz"], path_of(recording))
     radians = 4 * math.pi / RADAR.wavelength_m
