@@ -56,15 +56,16 @@ def path_autofocus(
        the image formation and its adjoint then sharpen the image.
     2. Phases become ranges. If their second differences show a smooth motion, its fringes follow
        from the phases; otherwise each pulse takes the range at which its envelope and its phase
-       match the sharpened image best. This is repeated in up to six rounds with half and then all
-       of the band, in which the envelopes are corrected too.
+       match the sharpened image best. Envelopes that lie far from those of their neighbours are
+       replaced. This is repeated in up to six rounds with half and then all of the band, in which
+       the envelopes are corrected too.
     3. Envelopes may still drift slowly against the phases. The drift is the polynomial of time of
        least image entropy at unchanged phases of the carrier; it is added in whole fringes.
-    4. The phase of each pulse is compared with a Wiener estimate of the scene, without windows,
-       until it no longer changes. Then the phases in nine blocks of the image, relative to a scene
-       that is fitted to the samples, refine the line of sight. Errors across it, which act
-       differently over the scene, are fitted with a ridge, for which they are supposed to have the
-       spectrum of the motion along the line of sight.
+    4. The phase of each pulse is compared with a Wiener estimate of the scene, without windows, in
+       up to ten iterations. Then the phases in nine blocks of the image, relative to a scene that
+       is fitted to the samples, refine the line of sight. Errors across it, which act differently
+       over the scene, are fitted with a ridge, for which they are supposed to have the spectrum of
+       the motion along the line of sight.
     5. Step 4 is repeated from another start: phases of the whole band, with envelopes at rest; and
        from a third one, half of the band in step 1, if the results differ. The sharpest image
        counts.
