@@ -55,8 +55,8 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
     energy = a.abs().square().sum((-2, -1))
     # what is compared is decided once, so that no step gains by moving pixels out of sight
     b = torch.where(seen, b, 0)
-    shown = torch.where(seen, moved, 0).abs().square().sum((-2, -1)) >= _LEAST_SHOWN * energy
-    shown = shown & (b.abs().square().sum((-2, -1)) >= _LEAST_SHOWN * whole)
+    hidden = torch.where(seen, moved, 0).abs().square().sum((-2, -1)) < _LEAST_SHOWN * energy
+    hidden = hidden | (b.abs().square().sum((-2, -1)) < _LEAST_SHOWN * whole)
     best = _error(moved, b, seen, slope)
     for _ in range(_STEPS):
         step_map, step_slope = _step(moved, b, seen, slope, turns)
@@ -71,7 +71,7 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
 
         map_, slope, best = chosen(trial_map, map_), chosen(trial_slope, slope), chosen(error, best)
         moved, seen = chosen(trial_moved, moved), chosen(trial_seen, seen)
-    return torch.where(shown, best, 0.0).reshape(lead)
+    return torch.where(hidden, 0.0, best).reshape(lead)
 
 
 def _from_middle(n: int, like: Tensor) -> Tensor:

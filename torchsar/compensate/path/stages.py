@@ -10,7 +10,7 @@ from torchsar.core import Estimate, Signal, Stage
 from torchsar.radar import AntennaPath
 
 
-class PathEstimator(Stage):
+class _PathEstimator(Stage):
     """Base class of the stages that estimate errors of pulses through the image along a path."""
 
     def estimate(self, profiles: Tensor, frequency_hz: Tensor, antennas: AntennaPath) -> Estimate:
@@ -49,7 +49,7 @@ class PathEstimator(Stage):
         return self.estimate(signal.data, frequency_hz, AntennaPath(transmitter_m, receiver_m, path_reference_m))
 
 
-class PathPhase(PathEstimator):
+class PathPhase(_PathEstimator):
     """Phase per pulse that sharpens the image along any path; see `path_phase`.
 
     Args:
@@ -81,7 +81,7 @@ class PathPhase(PathEstimator):
         return path_phase(profiles, frequency_hz, antennas, **how)
 
 
-class PathAutofocus(PathEstimator):
+class PathAutofocus(_PathEstimator):
     """Error of the recorded path at every pulse, along and across the line of sight.
 
     See `path_autofocus`.
