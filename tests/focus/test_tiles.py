@@ -138,17 +138,21 @@ def test_gradients_are_those_of_the_direct_sum() -> None:
         assert float((ours - truth).norm() / truth.norm()) < 1e-3
 
 
-def test_gradcheck_in_history_and_positions() -> None:
-    drawn = case(1008)
-    few = replace(
+def small(drawn: Case) -> Case:
+    """The same with six pulses and seven frequencies, by one antenna."""
+    return replace(
         drawn,
         transmitter_m=drawn.transmitter_m[:6],
         receiver_m=None,
         reference_m=2 * torch.linalg.vector_norm(drawn.transmitter_m[:6], dim=-1),
         frequency_hz=drawn.frequency_hz[:7],
         history=drawn.history[:6, :7],
-        grid=replace(drawn.grid, counts=(4, 3)),
     )
+
+
+def test_gradcheck_in_history_and_positions() -> None:
+    drawn = case(1008)
+    few = replace(small(drawn), grid=replace(drawn.grid, counts=(4, 3)))
     k = 2 * math.pi * float(few.frequency_hz.mean()) / C  # positions in radians
 
     def image(history: Tensor, shift: Tensor) -> Tensor:
@@ -223,14 +227,7 @@ def test_gradcheck_in_heights(error_db: float) -> None:
     assert drawn.grid.height_m is not None
     start = drawn.grid.height_m[:2, :3]
     grid = replace(drawn.grid, counts=(2, 3), height_m=start)
-    few = replace(
-        drawn,
-        transmitter_m=drawn.transmitter_m[:6],
-        receiver_m=None,
-        reference_m=2 * torch.linalg.vector_norm(drawn.transmitter_m[:6], dim=-1),
-        frequency_hz=drawn.frequency_hz[:7],
-        history=drawn.history[:6, :7],
-    )
+    few = small(drawn)
 
     def image(height: Tensor) -> Tensor:
         return replace(few, grid=replace(grid, height_m=height)).plan(error_db).image(few.history)

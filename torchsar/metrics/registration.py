@@ -26,9 +26,8 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
     path shift the image, rotate, stretch and shear it slightly, add a linear phase over it, and
     give it a complex gain. The shift is that of the largest correlation of the intensities, refined
     with the phases of the images; rotation, stretch and shear, of up to 2 %, are fitted to the
-    difference of the images. The pixels that both images
-    show after the registration are compared. Memory and time are those of some twenty images and of
-    two matrix products of the size of the image.
+    difference of the images. The pixels that both images show after the shift are compared. Memory
+    and time are those of some twenty images, and of ten matrix products of the size of the image.
 
     Args:
         image: Image I, shape (..., azimuth, range), complex, or a Signal.

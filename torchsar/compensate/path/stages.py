@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from torch import Tensor
 
 from torchsar.compensate.path.line_of_sight import path_autofocus
@@ -13,18 +15,12 @@ from torchsar.radar import AntennaPath
 class _PathEstimator(Stage):
     """Base class of the stages that estimate errors of pulses through the image along a path."""
 
-    def estimate(self, profiles: Tensor, frequency_hz: Tensor, antennas: AntennaPath) -> Estimate:
-        """Estimate the errors; subclasses implement this method.
+    # function of profiles, frequencies and antennas, and its further settings
+    find: Callable[..., Estimate]
 
-        Args:
-            profiles: Range profiles, shape (..., pulse, range), complex.
-            frequency_hz: Frequencies in Hz, float64 (range,).
-            antennas: Recorded path of the antennas.
-
-        Returns:
-            The estimate.
-        """
-        raise NotImplementedError
+    def __init__(self, **settings: float | None) -> None:
+        super().__init__()
+        self.settings = settings
 
     def forward(
         self,
@@ -46,7 +42,8 @@ class _PathEstimator(Stage):
         Returns:
             `Estimate` with the values that the stage provides, by pulse.
         """
-        return self.estimate(signal.data, frequency_hz, AntennaPath(transmitter_m, receiver_m, path_reference_m))
+        antennas = AntennaPath(transmitter_m, receiver_m, path_reference_m)
+        return type(self).find(signal.data, frequency_hz, antennas, **self.settings)
 
 
 class PathPhase(_PathEstimator):
@@ -61,24 +58,10 @@ class PathPhase(_PathEstimator):
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
+    find = staticmethod(path_phase)
 
     def __init__(self, height_m: float = 0.0, search: int = 120, polish: int = 20) -> None:
-        super().__init__()
-        self.height_m, self.search, self.polish = height_m, search, polish
-
-    def estimate(self, profiles: Tensor, frequency_hz: Tensor, antennas: AntennaPath) -> Estimate:
-        """Estimate the phase error of every pulse, see `path_phase`.
-
-        Args:
-            profiles: Range profiles, shape (..., pulse, range), complex.
-            frequency_hz: Frequencies in Hz, float64 (range,).
-            antennas: Recorded path of the antennas.
-
-        Returns:
-            `phase_rad` of shape (..., pulse), to be removed.
-        """
-        how = {"height_m": self.height_m, "search": self.search, "polish": self.polish}
-        return path_phase(profiles, frequency_hz, antennas, **how)
+        super().__init__(height_m=height_m, search=search, polish=polish)
 
 
 class PathAutofocus(_PathEstimator):
@@ -95,24 +78,10 @@ class PathAutofocus(_PathEstimator):
 
     provides = ("line_of_sight_m", "offset_m")
     neutral = {"line_of_sight_m": 0.0, "offset_m": 0.0}
+    find = staticmethod(path_autofocus)
 
     def __init__(self, extent_m: float | None = None, height_m: float = 0.0, rounds: int = 4) -> None:
-        super().__init__()
-        self.extent_m, self.height_m, self.rounds = extent_m, height_m, rounds
-
-    def estimate(self, profiles: Tensor, frequency_hz: Tensor, antennas: AntennaPath) -> Estimate:
-        """Estimate the error of the recorded path, see `path_autofocus`.
-
-        Args:
-            profiles: Range profiles, shape (..., pulse, range), complex.
-            frequency_hz: Frequencies in Hz, float64 (range,).
-            antennas: Recorded path of the antennas.
-
-        Returns:
-            `line_of_sight_m` of shape (..., pulse) and `offset_m` of shape (..., pulse, 3).
-        """
-        how = {"extent_m": self.extent_m, "height_m": self.height_m, "rounds": self.rounds}
-        return path_autofocus(profiles, frequency_hz, antennas, **how)
+        super().__init__(extent_m=extent_m, height_m=height_m, rounds=rounds)
 
 
 class CorrectPath(Stage):
