@@ -9,42 +9,22 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.path.ground import line_free, sights
-from torchsar.compensate.pulse_phase.data import or_one, safe_angle
-from torchsar.compensate.pulse_phase.sharpen import Wiener
+from torchsar.compensate.path.motion import Motion
+from torchsar.compensate.path.scene import seen_scene
+from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.core import cis
 from torchsar.focus import TileOperator
 from torchsar.radar import LIGHT_M_S, AntennaPath
+from torchsar.radar.spotlight import frequency_samples
 
 # blocks of the image along either axis, by choice: several scatterers in each, yet blocks so far
 # apart that errors across the line of sight act differently on them
 _BLOCKS = 3
-# steps that fit the scene to the samples, and share of the residual energy that a step may leave
-# to be kept, by trial: begun at the true path, errors at 20 dB were 7 times the bound with 6 and
-# 0.8, and 1.4 times with these, and no larger at -5 dB
-_FITS, _WORTH = 20, 0.97
-# share of the mean power of the blocks that is added as a ridge, so that empty blocks get no gain
-_RIDGE = 1e-3
-# neighbourhood over which the spectrum of the motion is averaged: share of the number of the
-# coefficient, plus a number of coefficients
-_WIDE, _LEAST_WIDE = 0.25, 2
-# lowest coefficients, of the constant and the linear term, which are not observable
-_UNSEEN = 2
-
-
-def wiener(power: Tensor, mean: Tensor) -> Tensor:
-    """Weigh the cells of an image (..., azimuth, range) by a Wiener estimate, see `Wiener`.
-
-    Args:
-        power: Power of the cells.
-        mean: Its mean over the image.
-
-    Returns:
-        Weights 0..1, without the subtracted mean of `Wiener`.
-    """
-    pairs = power + power.roll(1, -1)
-    local = pairs + pairs.roll(-1, -1)
-    share = local / (local + 4 * Wiener().level * mean)
-    return share * share
+# share of the standard deviation of the phases by which the last round may change them, by trial
+_SETTLED = 0.3
+# whole fringes that a round may add to the line of sight of a pulse, and logarithm of the
+# likelihood that they must gain: by noise alone one in some thousand pulses gains it
+_FRINGES, _GAIN = 4, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,42 +46,51 @@ class Found:
 
 
 def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, present: Tensor, rounds: int = 4) -> Found:
-    """Refine the line of sight, and find the errors across it, by phases of blocks of the image.
+    """Refine the line of sight, and find the errors across it, together with the scene.
 
-    An error across the line of sight acts with opposite signs on the two sides of a scene. In each
-    round the phase of every pulse is measured in each of nine blocks, against a Wiener estimate of
-    the scene; least squares fit three axes to the phases of each pulse, with a ridge for the two
-    across: their expected spectrum is that of the motion along the line of sight. What the Wiener
-    estimate leaves of the samples is taken as noise, from which the standard deviation follows.
+    An error across the line of sight acts with opposite signs on the two sides of a scene. Each
+    round estimates the scene and the motion in three axes jointly, linear about the motion found so
+    far: a scene alone would adapt itself to the errors, and they would vanish slowly. The scene has
+    independent cells, whose variances follow from a first fit to the samples; the motion acts on
+    the phases of nine blocks of the image. Then whole fringes are added to the line of sight of
+    pulses whose envelopes match the scene so much better. The rounds end when the phases change by
+    less than a share of their standard deviation.
 
     Args:
         rows: Range profiles, shape (pulse, range), complex.
         imaging: Image formation along the recorded path.
         line_of_sight_m: Recorded minus true half path in metres as found so far, float64 (pulse,).
         present: True for the pulses of the profiles among all pulses.
-        rounds: Rounds of measurement and correction, at least 1.
+        rounds: Largest number of rounds, at least 1.
 
     Returns:
         The errors.
     """
     plan = imaging.plan
-    antennas = plan.antennas
-    height = float(plan.grid.origin_m[2])
-    axes = _axes(antennas, height)
-    motion = torch.nn.functional.pad(line_of_sight_m[:, None], (0, 2))
+    axes = _axes(plan.antennas, float(plan.grid.origin_m[2]))
+    found = torch.nn.functional.pad(line_of_sight_m[:, None], (0, 2))
     masks = _masks(plan.grid.counts, rows.device)
-    radians = 4 * math.pi * float(plan.frequency_hz.mean()) / LIGHT_M_S
-    std = torch.zeros_like(line_of_sight_m)
+    middle = float(plan.frequency_hz.mean())
+    radians = 4j * math.pi * middle / LIGHT_M_S
+    noise, std = None, torch.zeros_like(line_of_sight_m)
     for _ in range(rounds):
-        offset = (motion[:, None] @ axes)[:, 0]
-        operator = _along(imaging, offset)
-        angles, information, places = _measured(rows, operator, masks)
-        lever = _levers(operator.plan.antennas, places, axes).movedim(0, 1)
-        step, std = _fitted(angles / radians, information * radians**2, lever, motion)
-        motion = motion + step
-        motion[:, 0] = line_free(motion[:, 0], present)
-    offset = (motion[:, None] @ axes)[:, 0]
-    return Found(motion[:, 0], offset, std, _along(imaging, offset).image(rows[None])[0])
+        scene = seen_scene(rows, _along(imaging, (found[:, None] @ axes)[:, 0]), noise)
+        cells, _ = scene.fitted()
+        scene = scene.narrowed(cells)
+        unit, lever = _units(scene.imaging, cells * masks, axes)
+        motion = Motion(unit * radians, found, scene.noise)
+        cells, left = scene.fitted(motion.without)
+        step = motion.step_m(left)
+        noise = scene.noise_of(left - motion.echo(step))
+        std = motion.std_m() * (noise / scene.noise).sqrt()
+        fringes = _fringes(rows, rows - left, plan.frequency_hz, noise)
+        found = found + step
+        found[:, 0] = line_free(found[:, 0] + fringes * (LIGHT_M_S / (2 * middle)), present)
+        change = (lever @ step[..., None]).square().mean()
+        if change <= _SETTLED**2 * std.square().mean() and not bool(fringes.any()):
+            break
+    offset = (found[:, None] @ axes)[:, 0]
+    return Found(found[:, 0], offset, std, _along(imaging, offset).image(rows[None])[0])
 
 
 def _along(imaging: TileOperator, offset_m: Tensor) -> TileOperator:
@@ -132,59 +121,29 @@ def _masks(counts: tuple[int, int], device: torch.device) -> Tensor:
     return torch.stack([block == i for i in range(_BLOCKS**2)])
 
 
-def _scene(rows: Tensor, operator: TileOperator) -> tuple[Tensor, Tensor]:
-    """Scene (azimuth, range) whose echo fits the samples, and the variance of the samples that a
-    Wiener estimate of it leaves.
+def _units(operator: TileOperator, parts: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """Change of the samples by the phase of a unit of each axis, (pulse, range, axis), and of half
+    the path of the blocks, (pulse, block, axis).
 
-    Each step adds the image of the residual samples, weighted by the Wiener estimate, with the
-    factor that leaves the least residual.
+    parts: blocks of the scene, (block, azimuth, range).
     """
-    left, noise = rows[None], torch.zeros_like(rows.real[0, 0]).double()
-    image = operator.image(left)
-    power = image.real.square() + image.imag.square()
-    weight = wiener(power, or_one(power.mean((-2, -1), keepdim=True)))
-    scene = torch.zeros_like(image)
-    for step in range(_FITS):
-        # without its mean the first weight leaves out what each pulse adds to its own model
-        part = operator.image(left) * weight if step else image * (weight - weight.mean(-2, keepdim=True))
-        echo = operator.adjoint(part)
-        size = (echo.conj() * left).sum().real / or_one(echo.abs().square().sum())
-        rest = left - echo * size
-        if step == 0:
-            noise = rest.abs().square().double().mean() / (1 - weight.double().mean()) ** 2
-        elif rest.abs().square().sum() > _WORTH * left.abs().square().sum():
-            break  # what is left is noise
-        scene, left = scene + part * size, rest
-    return scene[0], noise
-
-
-def _measured(rows: Tensor, operator: TileOperator, masks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Phases in rad of each pulse in the blocks (pulse, block), their Fisher information (pulse,
-    block, block), and the centroids of the power of the blocks in metres (block, 3).
-
-    Blocks at the same range overlap in a pulse; least squares fit all blocks at once, each with a
-    complex gain.
-    """
-    scene, noise = _scene(rows, operator)
-    parts = scene * masks
     power = (parts.real.square() + parts.imag.square()).flatten(1).double()
-    pixels = operator.plan.grid.pixels_m().reshape(-1, 3)
-    places = (power @ pixels) / or_one(power.sum(-1, keepdim=True))
-    model = operator.adjoint(parts).movedim(0, -1)  # (pulse, range, block)
-    # phases that are far off are common to all blocks; what is left of them is small
-    common = safe_angle((rows * model.sum(-1).conj()).sum(-1))
-    rows = rows * cis(-common)[:, None]
-    # the model holds some noise too
-    excess = model.sum(-1).abs().square().double().mean() / or_one(rows.abs().square().double().mean() - noise)
-    gram = (model.mH @ model).to(torch.complex128)
-    ridge = _RIDGE * or_one(gram.diagonal(dim1=-2, dim2=-1).real.mean())
-    inverse = torch.linalg.inv(gram + ridge * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device))
-    gain = (inverse @ (model.mH @ rows[..., None]).to(inverse.dtype))[..., 0]
-    return (
-        gain.imag + common[:, None],
-        torch.linalg.inv(inverse.real) * (2 / or_one(noise * excess.clamp_min(1))),
-        places,
-    )
+    places = (power @ operator.plan.grid.pixels_m().reshape(-1, 3)) / or_one(power.sum(-1, keepdim=True))
+    lever = _levers(operator.plan.antennas, places, axes).movedim(0, 1)
+    return operator.adjoint(parts).movedim(0, -1) @ lever.to(parts.dtype), lever
+
+
+def _fringes(rows: Tensor, model: Tensor, frequency_hz: Tensor, noise: Tensor) -> Tensor:
+    """Whole fringes by which the envelopes of range profiles lie behind those of their model, of
+    pulses where these are likelier by far, float64 (pulse,).
+    """
+    number = torch.arange(-_FRINGES, _FRINGES + 1, dtype=torch.float64, device=rows.device)
+    middle = frequency_hz.mean()
+    shift = cis(torch.outer((middle - frequency_hz) * (2 * math.pi / middle), number)).to(rows.dtype)
+    match = ((frequency_samples(rows) * frequency_samples(model).conj()) @ shift).abs().square().double()
+    score = match / or_one(model.abs().square().double().sum(-1, keepdim=True) * noise)
+    best, at = score.max(-1)
+    return torch.where(best - score[:, _FRINGES] > _GAIN, number[at], 0.0)
 
 
 def _levers(antennas: AntennaPath, places_m: Tensor, axes: Tensor) -> Tensor:
@@ -192,45 +151,3 @@ def _levers(antennas: AntennaPath, places_m: Tensor, axes: Tensor) -> Tensor:
     ways = [place - places_m[:, None] for place in antennas.places]
     units = [way / torch.linalg.vector_norm(way, dim=-1, keepdim=True) for way in ways]
     return (torch.stack(torch.broadcast_tensors(*units)).mean(0)[..., None, :] * axes).sum(-1)
-
-
-def _fitted(range_m: Tensor, information: Tensor, lever: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Least-squares step of the motion (pulse, 3), and standard deviation of the line of sight.
-
-    range_m: errors of half the path in the blocks, (pulse, block), with their Fisher information
-    (pulse, block, block); lever: change of half the path by a unit of each axis, (pulse, block,
-    axis).
-    """
-    pull = (lever.mT @ (information @ range_m[..., None]))[..., 0]  # (pulse, axis)
-    normal = lever.mT @ information @ lever
-    whole = or_one(normal[:, 0, 0])
-    step, variance = torch.zeros_like(motion), 1 / whole
-    share = normal[:, 0, 1:] / whole[:, None]
-    basis, prior = _spectrum(motion[:, 0])
-    rest = pull[:, 1:] - share * pull[:, :1]
-    seen = normal[:, 1:, 1:] - normal[:, 1:, :1] * share[:, None]
-    parts = [[basis.mT @ (seen[:, i, k, None] * basis) for k in range(2)] for i in range(2)]
-    ridge = torch.cat([prior, prior]).reciprocal()
-    spread = torch.linalg.inv(torch.cat([torch.cat(row, 1) for row in parts]) + torch.diag(ridge))
-    now = (basis.mT @ motion[:, 1:]).mT.reshape(-1)
-    found = spread @ ((basis.mT @ rest).mT.reshape(-1) - ridge * now)
-    step[:, 1:] = basis @ found.reshape(2, -1).mT
-    blocks = spread.reshape(2, len(prior), 2, len(prior))
-    of_pulse = torch.einsum("pa,iakb,pb->pik", basis, blocks, basis)
-    variance = variance + (share[:, None] @ of_pulse @ share[..., None])[:, 0, 0]
-    step[:, 0] = pull[:, 0] / whole - (share * step[:, 1:]).sum(-1)
-    return step, variance.clamp_min(0).sqrt()
-
-
-def _spectrum(motion_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine basis over the pulses, (pulse, coefficient), and the expected power of its
-    coefficients: that of a motion, averaged over neighbours. The lowest are not observable.
-    """
-    pulses = len(motion_m)
-    order = torch.arange(_UNSEEN, pulses, dtype=torch.float64, device=motion_m.device)
-    time = torch.arange(pulses, dtype=torch.float64, device=motion_m.device) + 0.5
-    basis = torch.cos(torch.outer(time, order) * (math.pi / pulses)) * math.sqrt(2 / pulses)
-    power = (basis.mT @ motion_m).square()
-    near = (order[:, None] - order).abs() <= order[:, None] * _WIDE + _LEAST_WIDE
-    mean = (near * power).sum(-1) / near.sum(-1)
-    return basis, mean.clamp_min(1e-9 * float(mean.max()) + 1e-18)

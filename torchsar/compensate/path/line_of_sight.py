@@ -62,10 +62,11 @@ def path_autofocus(
     3. Envelopes may still drift slowly against the phases. The drift is the polynomial of time of
        least image entropy at unchanged phases of the carrier; it is added in whole fringes.
     4. The phase of each pulse is compared with a Wiener estimate of the scene, without windows, in
-       up to ten iterations. Then the phases in nine blocks of the image, relative to a scene that
-       is fitted to the samples, refine the line of sight. Errors across it, which act differently
-       over the scene, are fitted with a ridge, for which they are supposed to have the spectrum of
-       the motion along the line of sight.
+       up to ten iterations. Then the scene and the motion in three axes are estimated jointly from
+       the samples: the scene with a Gaussian prior whose variance follows from the image, the
+       motion by its phases in nine blocks of the image. Errors across the line of sight, which act
+       differently over the scene, are supposed to have the spectrum of those along it. Whole
+       fringes are added to pulses whose envelopes match the scene so much better.
     5. Step 4 is repeated from another start: phases of the whole band, with envelopes at rest; and
        from a third one, half of the band in step 1, if the results differ. The sharpest image
        counts.
@@ -85,15 +86,15 @@ def path_autofocus(
         extent_m: Side of the imaged square about the origin in metres, which should hold most of
             the scatterers; by default that of the whole unambiguous ground, which takes longer.
         height_m: Height z of the imaged plane in metres.
-        rounds: Rounds of step 4, at least 1.
+        rounds: Largest number of rounds of the joint estimate in step 4, at least 1.
 
     Returns:
         `line_of_sight_m` of shape (..., pulse), float64: half the path over the middle of the scene
         in metres, recorded minus true; and `offset_m` of shape (..., pulse, 3): the error of the
         positions in metres, recorded minus true, of both antennas alike, for `CorrectPath`. The
         standard deviation, of `line_of_sight_m` only, is that modulo half a wavelength; it follows
-        from what a Wiener estimate of the scene leaves of the samples, and from the difference
-        from the nearest result of another start. `quality` is the Strehl ratio predicted from it,
+        from what the estimated scene and motion leave of the samples, and from the difference from
+        the nearest result of another start. `quality` is the Strehl ratio predicted from it,
         times the share of the sharpness that noise does not explain. Sharpness is the amount by
         which the image entropy lies below that of speckle. `ok` is False unless the image is twice
         as sharp as autofocus can make pure noise, more than one range cell contributes to the

@@ -1,0 +1,112 @@
+"""Least squares of the motion in three axes, of given samples."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.pulse_phase.data import or_one
+
+# neighbourhood over which the spectrum of the motion is averaged: share of the number of the
+# coefficient, plus a number of coefficients
+_WIDE, _LEAST_WIDE = 0.25, 2
+# lowest coefficients, of the constant and the linear term, which are not observable
+_UNSEEN = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Small motions of the antennas, which change the samples linearly.
+
+    The motion along the line of sight is free at each pulse. The two axes across have a Gaussian
+    prior: the spectrum of the motion along the line of sight, as found so far.
+
+    Args:
+        unit: Change of the samples by a unit of each axis, shape (pulse, range, axis), complex.
+        found_m: Motion found so far in metres, float64 (pulse, axis).
+        noise: Variance of the noise of a sample.
+    """
+
+    unit: Tensor
+    found_m: Tensor
+    noise: Tensor
+
+    @cached_property
+    def _normal(self) -> Tensor:
+        """Normal equations of each pulse, (pulse, axis, axis)."""
+        return (self.unit.mH @ self.unit).real.double()
+
+    @cached_property
+    def _whole(self) -> Tensor:
+        """Those of the line of sight, (pulse,)."""
+        return or_one(self._normal[:, 0, 0])
+
+    @cached_property
+    def _share(self) -> Tensor:
+        """Change of the line of sight by a unit of the axes across, (pulse, 2)."""
+        return self._normal[:, 0, 1:] / self._whole[:, None]
+
+    @cached_property
+    def _prior(self) -> tuple[Tensor, Tensor]:
+        """Basis (pulse, coefficient), and the ridge of its coefficients for both axes across."""
+        basis, power = _spectrum(self.found_m[:, 0])
+        return basis, self.noise / torch.cat([power, power])
+
+    @cached_property
+    def _factor(self) -> Tensor:
+        """Cholesky factor of the equations of the coefficients across."""
+        basis, ridge = self._prior
+        seen = self._normal[:, 1:, 1:] - self._normal[:, 1:, :1] * self._share[:, None]
+        parts = [torch.cat([basis.mT @ (seen[:, i, k, None] * basis) for k in range(2)], 1) for i in range(2)]
+        return torch.linalg.cholesky(torch.cat(parts) + torch.diag(ridge))
+
+    def _solved(self, rows: Tensor, known: Tensor) -> Tensor:
+        """Motion that explains samples best, (pulse, axis).
+
+        known: motion that the prior counts besides, (pulse, axis).
+        """
+        basis, ridge = self._prior
+        pull = (self.unit.mH @ rows[..., None])[..., 0].real.double()
+        rest = torch.cat([basis.mT @ (pull[:, i] - self._share[:, i - 1] * pull[:, 0]) for i in (1, 2)])
+        rest = rest - ridge * torch.cat([basis.mT @ known[:, i] for i in (1, 2)])
+        across = basis @ torch.cholesky_solve(rest[:, None], self._factor).reshape(2, -1).mT
+        return torch.cat([(pull[:, 0] / self._whole - (self._share * across).sum(-1))[:, None], across], 1)
+
+    def echo(self, motion_m: Tensor) -> Tensor:
+        """Change of the samples by a motion."""
+        return (self.unit @ motion_m[..., None].to(self.unit.dtype))[..., 0]
+
+    def without(self, rows: Tensor) -> Tensor:
+        """Samples less what a motion explains of them."""
+        return rows - self.echo(self._solved(rows, torch.zeros_like(self.found_m)))
+
+    def step_m(self, rows: Tensor) -> Tensor:
+        """Most probable motion besides that found so far, from what the scene leaves."""
+        return self._solved(rows, self.found_m)
+
+    def std_m(self) -> Tensor:
+        """Standard deviation of the line of sight for a known scene, float64 (pulse,)."""
+        basis, _ = self._prior
+        count = basis.shape[-1]
+        spread = torch.cholesky_inverse(self._factor).reshape(2, count, 2, count)
+        across = torch.einsum("pa,iakb,pb->pik", basis, spread, basis)
+        added = (self._share[:, None] @ across @ self._share[..., None])[:, 0, 0]
+        return ((1 / self._whole + added) * self.noise).sqrt()
+
+
+def _spectrum(motion_m: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine basis over the pulses, (pulse, coefficient), and the expected power of its
+    coefficients: that of a motion, averaged over neighbours. The lowest are not observable.
+    """
+    pulses = len(motion_m)
+    order = torch.arange(_UNSEEN, pulses, dtype=torch.float64, device=motion_m.device)
+    time = torch.arange(pulses, dtype=torch.float64, device=motion_m.device) + 0.5
+    basis = torch.cos(torch.outer(time, order) * (math.pi / pulses)) * math.sqrt(2 / pulses)
+    power = (basis.mT @ motion_m).square()
+    near = (order[:, None] - order).abs() <= order[:, None] * _WIDE + _LEAST_WIDE
+    mean = (near * power).sum(-1) / near.sum(-1)
+    return basis, mean.clamp_min(1e-9 * float(mean.max()) + 1e-18)
