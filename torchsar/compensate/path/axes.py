@@ -20,6 +20,8 @@ from torchsar.radar.spotlight import frequency_samples
 # blocks of the image along either axis, by choice: several scatterers in each, yet blocks so far
 # apart that errors across the line of sight act differently on them
 _BLOCKS = 3
+# factor by which the variance of the line of sight exceeds that for a known scene, by trial
+_UNKNOWN = 1.4
 # share of the standard deviation of the phases by which the last round may change them, by trial
 _SETTLED = 0.3
 # whole fringes that a round may add to the line of sight of a pulse, and logarithm of the
@@ -82,7 +84,7 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, pre
         cells, left = scene.fitted(motion.without)
         step = motion.step_m(left)
         noise = scene.noise_of(left - motion.echo(step))
-        std = motion.std_m() * (noise / scene.noise).sqrt()
+        std = motion.std_m() * (_UNKNOWN * noise / scene.noise).sqrt()
         fringes = _fringes(rows, rows - left, plan.frequency_hz, noise)
         found = found + step
         found[:, 0] = line_free(found[:, 0] + fringes * (LIGHT_M_S / (2 * middle)), present)

@@ -54,7 +54,7 @@ class Motion:
     def _prior(self) -> tuple[Tensor, Tensor]:
         """Basis (pulse, coefficient), and the ridge of its coefficients for both axes across."""
         basis, power = _spectrum(self.found_m[:, 0])
-        return basis, self.noise / torch.cat([power, power])
+        return basis, self.noise / (2 * torch.cat([power, power]))
 
     @cached_property
     def _factor(self) -> Tensor:
@@ -95,7 +95,7 @@ class Motion:
         spread = torch.cholesky_inverse(self._factor).reshape(2, count, 2, count)
         across = torch.einsum("pa,iakb,pb->pik", basis, spread, basis)
         added = (self._share[:, None] @ across @ self._share[..., None])[:, 0, 0]
-        return ((1 / self._whole + added) * self.noise).sqrt()
+        return ((1 / self._whole + added) * self.noise / 2).sqrt()
 
 
 def _spectrum(motion_m: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -50,8 +51,12 @@ class _Kept(dict):
 
     def keep(self, key: tuple, value: Any, dtype: torch.dtype) -> None:
         """Keep a value unless those of an image of the precision are too large together."""
-        if self.count * dtype.itemsize <= _KEPT_BYTES:
+        if self.fits(dtype):
             self[key] = value
+
+    def fits(self, dtype: torch.dtype) -> bool:
+        """True if the values of an image of the precision are kept."""
+        return self.count * dtype.itemsize <= _KEPT_BYTES
 
 
 class TilePlan:
@@ -257,6 +262,10 @@ class TilePlan:
         found: list[Tensor] = []
         given = [data, *self._places, self._reference_m, *([] if heights is None else [heights])]
         grad = torch.is_grad_enabled() and any(v.requires_grad for v in given)
+        # in the history alone the image is linear: its graph holds no more than what is kept anyway
+        linear = not any(v.requires_grad for v in given[1:])
+        linear = linear and self._tables.fits(data.dtype) and self._weights.fits(data.dtype)
+        pixels = self._pixels if linear else partial(checkpoint, self._pixels, use_reentrant=False)
         count = 0 if grad else math.prod(self._tiles)
         tiles = data.new_empty(count, paths * trials, *self._size)
         for zone, numbers in zip(self._zones, self._numbers, strict=True):
@@ -265,7 +274,7 @@ class TilePlan:
             rows = [slice(i, min(i + step, len(numbers))) for i in range(0, len(numbers), step)]
             if grad:
                 fixed = across, profiles, above
-                found += [checkpoint(self._pixels, zone, some, *fixed, use_reentrant=False) for some in rows]
+                found += [pixels(zone, some, *fixed) for some in rows]
                 continue
 
             def work(some: slice) -> None:
