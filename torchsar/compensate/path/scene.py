@@ -107,6 +107,9 @@ def seen_scene(rows: Tensor, imaging: TileOperator, noise: Tensor | None = None)
         rows: Range profiles, shape (pulse, range), complex.
         imaging: Image formation along the assumed path.
         noise: Variance of the noise of a sample; by default of what the Wiener estimate leaves.
+
+    Returns:
+        The scene.
     """
     image = imaging.image(rows[None])[0]
     power = image.abs().square()
