@@ -1,16 +1,16 @@
-"""Three axes of the position error, from the phases of the parts of an image."""
+"""Joint estimate of a scene and of the position errors in three axes."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.path.ground import line_free, sights
 from torchsar.compensate.path.motion import Motion
-from torchsar.compensate.path.scene import seen_scene
+from torchsar.compensate.path.scene import scene_of
 from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.core import cis
 from torchsar.focus import TileOperator
@@ -25,7 +25,7 @@ _UNKNOWN = 1.4
 # share of the standard deviation of the phases by which the last round may change them, by trial
 _SETTLED = 0.3
 # whole fringes that a round may add to the line of sight of a pulse, and logarithm of the
-# likelihood that they must gain: by noise alone one in some thousand pulses gains it
+# likelihood that they must gain, by choice: noise alone gains it in one of ten thousand pulses
 _FRINGES, _GAIN = 4, 10.0
 
 
@@ -72,22 +72,24 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, pre
     axes = _axes(plan.antennas, float(plan.grid.origin_m[2]))
     found = torch.nn.functional.pad(line_of_sight_m[:, None], (0, 2))
     masks = _masks(plan.grid.counts, rows.device)
-    middle = float(plan.frequency_hz.mean())
-    radians = 4j * math.pi * middle / LIGHT_M_S
+    fringe = LIGHT_M_S / (2 * float(plan.frequency_hz.mean()))
     noise, std = None, torch.zeros_like(line_of_sight_m)
     for _ in range(rounds):
-        scene = seen_scene(rows, _along(imaging, (found[:, None] @ axes)[:, 0]), noise)
+        scene = scene_of(rows, _along(imaging, (found[:, None] @ axes)[:, 0]), noise)
         cells, _ = scene.fitted()
         scene = scene.narrowed(cells)
         unit, lever = _units(scene.imaging, cells * masks, axes)
-        motion = Motion(unit * radians, found, scene.noise)
-        cells, left = scene.fitted(motion.without)
-        step = motion.step_m(left)
-        noise = scene.noise_of(left - motion.echo(step))
+        motion = Motion(unit, found[:, 0], scene.noise)
+        # the prior is that of the whole motion across; that along the line of sight has none
+        across = torch.nn.functional.pad(found[:, 1:], (1, 0))
+        _, left = replace(scene, rows=rows + motion.echo(across)).fitted(motion.without)
+        whole = motion.of(left)
+        left, step = left - motion.echo(whole), whole - across
+        noise = scene.noise_of(left)
         std = motion.std_m() * (_UNKNOWN * noise / scene.noise).sqrt()
         fringes = _fringes(rows, rows - left, plan.frequency_hz, noise)
         found = found + step
-        found[:, 0] = line_free(found[:, 0] + fringes * (LIGHT_M_S / (2 * middle)), present)
+        found[:, 0] = line_free(found[:, 0] + fringes * fringe, present)
         change = (lever @ step[..., None]).square().mean()
         if change <= _SETTLED**2 * std.square().mean() and not bool(fringes.any()):
             break
@@ -124,20 +126,23 @@ def _masks(counts: tuple[int, int], device: torch.device) -> Tensor:
 
 
 def _units(operator: TileOperator, parts: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
-    """Change of the samples by the phase of a unit of each axis, (pulse, range, axis), and of half
-    the path of the blocks, (pulse, block, axis).
+    """Derivative of the samples by the motion along each axis, per metre, (pulse, range, axis), and
+    derivative of half the path over each block, (pulse, block, axis).
 
     parts: blocks of the scene, (block, azimuth, range).
     """
     power = (parts.real.square() + parts.imag.square()).flatten(1).double()
     places = (power @ operator.plan.grid.pixels_m().reshape(-1, 3)) / or_one(power.sum(-1, keepdim=True))
     lever = _levers(operator.plan.antennas, places, axes).movedim(0, 1)
-    return operator.adjoint(parts).movedim(0, -1) @ lever.to(parts.dtype), lever
+    radians = 4j * math.pi * float(operator.plan.frequency_hz.mean()) / LIGHT_M_S
+    # one after another, with the tables of the other images
+    echo = torch.stack([operator.adjoint(part[None])[0] for part in parts], -1)
+    return echo @ (radians * lever).to(parts.dtype), lever
 
 
 def _fringes(rows: Tensor, model: Tensor, frequency_hz: Tensor, noise: Tensor) -> Tensor:
-    """Whole fringes by which the envelopes of range profiles lie behind those of their model, of
-    pulses where these are likelier by far, float64 (pulse,).
+    """Whole fringes by which recorded ranges exceed true ones, float64 (pulse,): the envelopes of
+    range profiles then lie nearer than those of the model. 0 unless they are likelier by far.
     """
     number = torch.arange(-_FRINGES, _FRINGES + 1, dtype=torch.float64, device=rows.device)
     middle = frequency_hz.mean()

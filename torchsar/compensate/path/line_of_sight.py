@@ -65,7 +65,7 @@ def path_autofocus(
        up to ten iterations. Then the scene and the motion in three axes are estimated jointly from
        the samples: the scene with a Gaussian prior whose variance follows from the image, the
        motion by its phases in nine blocks of the image. Errors across the line of sight, which act
-       differently over the scene, are supposed to have the spectrum of those along it. Whole
+       differently over the scene, are assumed to have the spectrum of those along it. Whole
        fringes are added to pulses whose envelopes match the scene so much better.
     5. Step 4 is repeated from another start: phases of the whole band, with envelopes at rest; and
        from a third one, half of the band in step 1, if the results differ. The sharpest image

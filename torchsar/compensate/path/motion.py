@@ -23,22 +23,24 @@ class Motion:
     """Small motions of the antennas, which change the samples linearly.
 
     The motion along the line of sight is free at each pulse. The two axes across have a Gaussian
-    prior: the spectrum of the motion along the line of sight, as found so far.
+    prior of mean zero, with the spectrum of the motion along the line of sight.
 
     Args:
-        unit: Change of the samples by a unit of each axis, shape (pulse, range, axis), complex.
-        found_m: Motion found so far in metres, float64 (pulse, axis).
+        unit: Derivative of the samples by the motion along each axis, per metre, shape (pulse,
+            range, axis), complex.
+        line_of_sight_m: Motion along the line of sight as found so far in metres, float64 (pulse,).
         noise: Variance of the noise of a sample.
     """
 
     unit: Tensor
-    found_m: Tensor
+    line_of_sight_m: Tensor
     noise: Tensor
 
     @cached_property
     def _normal(self) -> Tensor:
         """Normal equations of each pulse, (pulse, axis, axis)."""
-        return (self.unit.mH @ self.unit).real.double()
+        unit = self.unit.to(torch.complex128)
+        return (unit.mH @ unit).real
 
     @cached_property
     def _whole(self) -> Tensor:
@@ -53,26 +55,22 @@ class Motion:
     @cached_property
     def _prior(self) -> tuple[Tensor, Tensor]:
         """Basis (pulse, coefficient), and the ridge of its coefficients for both axes across."""
-        basis, power = _spectrum(self.found_m[:, 0])
+        basis, power = _spectrum(self.line_of_sight_m)
         return basis, self.noise / (2 * torch.cat([power, power]))
 
     @cached_property
     def _factor(self) -> Tensor:
         """Cholesky factor of the equations of the coefficients across."""
         basis, ridge = self._prior
-        seen = self._normal[:, 1:, 1:] - self._normal[:, 1:, :1] * self._share[:, None]
-        parts = [torch.cat([basis.mT @ (seen[:, i, k, None] * basis) for k in range(2)], 1) for i in range(2)]
+        rest = self._normal[:, 1:, 1:] - self._normal[:, 1:, :1] * self._share[:, None]
+        parts = [torch.cat([basis.mT @ (rest[:, i, k, None] * basis) for k in range(2)], 1) for i in range(2)]
         return torch.linalg.cholesky(torch.cat(parts) + torch.diag(ridge))
 
-    def _solved(self, rows: Tensor, known: Tensor) -> Tensor:
-        """Motion that explains samples best, (pulse, axis).
-
-        known: motion that the prior counts besides, (pulse, axis).
-        """
-        basis, ridge = self._prior
+    def of(self, rows: Tensor) -> Tensor:
+        """Most probable motion in metres, float64 (pulse, axis), that made samples."""
+        basis, _ = self._prior
         pull = (self.unit.mH @ rows[..., None])[..., 0].real.double()
         rest = torch.cat([basis.mT @ (pull[:, i] - self._share[:, i - 1] * pull[:, 0]) for i in (1, 2)])
-        rest = rest - ridge * torch.cat([basis.mT @ known[:, i] for i in (1, 2)])
         across = basis @ torch.cholesky_solve(rest[:, None], self._factor).reshape(2, -1).mT
         return torch.cat([(pull[:, 0] / self._whole - (self._share * across).sum(-1))[:, None], across], 1)
 
@@ -82,11 +80,7 @@ class Motion:
 
     def without(self, rows: Tensor) -> Tensor:
         """Samples less what a motion explains of them."""
-        return rows - self.echo(self._solved(rows, torch.zeros_like(self.found_m)))
-
-    def step_m(self, rows: Tensor) -> Tensor:
-        """Most probable motion besides that found so far, from what the scene leaves."""
-        return self._solved(rows, self.found_m)
+        return rows - self.echo(self.of(rows))
 
     def std_m(self) -> Tensor:
         """Standard deviation of the line of sight for a known scene, float64 (pulse,)."""

@@ -17,8 +17,8 @@ from torchsar.focus import TileOperator
 _STEPS, _LEFT = 12, 1e-4
 # weight of noise, in mean powers of the image, in the Wiener estimate: see `Wiener`
 _LEVEL = Wiener().level
-# share of the mean variance that every cell of a scene keeps, and least share of the energy that is
-# no noise, by choice
+# share of the mean variance that every cell of a scene keeps, and least share of the energy of the
+# samples that is taken as echo, by choice
 _FLOOR, _LEAST_ENERGY = 1e-4, 1e-3
 # least noise, as a share of the mean power of the samples, by choice: below it float32 rounds
 _LEAST_NOISE = 1e-8
@@ -28,7 +28,7 @@ _MOST_EXPLAINED = 0.9
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Independent Gaussian reflectivities of known standard deviations, and what they explain.
+    """Prior of a scene, independent Gaussian cells of known standard deviations, and its fit.
 
     Args:
         rows: Range profiles, shape (pulse, range), complex.
@@ -48,7 +48,7 @@ class Scene:
         """Range profiles of a scene, given in units of its standard deviations."""
         return self.imaging.adjoint((self.size * cells)[None])[0]
 
-    def seen(self, rows: Tensor) -> Tensor:
+    def image_of(self, rows: Tensor) -> Tensor:
         """The adjoint of `echo`."""
         return self.size * self.imaging.image(rows[None])[0]
 
@@ -65,7 +65,7 @@ class Scene:
         """
         without = without or (lambda rows: rows)
         left, cells = self.rows, torch.zeros_like(self.size, dtype=self.rows.dtype)
-        gradient = self.seen(without(left))
+        gradient = self.image_of(without(left))
         toward, power = gradient, _energy(gradient)
         enough = power * _LEFT
         for _ in range(_STEPS):
@@ -73,7 +73,7 @@ class Scene:
             bend = (echo.conj() * without(echo)).sum().real + self.noise * _energy(toward)
             length = (power / or_one(bend)).to(self.size.dtype)
             cells, left = cells + length * toward, left - length * echo
-            gradient = self.seen(without(left)) - self.noise.to(self.size.dtype) * cells
+            gradient = self.image_of(without(left)) - self.noise.to(self.size.dtype) * cells
             now = _energy(gradient)
             if now <= enough:
                 break
@@ -83,14 +83,14 @@ class Scene:
     def noise_of(self, left: Tensor) -> Tensor:
         """Variance of the noise from the samples that a fit leaves.
 
-        A fit explains some of the noise. Where a cell is explained to a share w, a fixed size would
-        take w of the noise of a sample, but the size follows the noise of the cell, too. For w = (p
-        / (p + c))^2 of the power p the divergence (Stein 1981, Annals of Statistics 9) is w (3 - 2
-        sqrt(w)).
+        A fit explains some of the noise. A cell of fixed size would take the share w of the noise
+        of its samples. The size follows the noise too: with w = (p / (p + c))^2, where p is the
+        power of the cell, the divergence of the fit (Stein 1981, Annals of Statistics 9) is
+        w (3 - 2 sqrt(w)).
         """
         samples = self.rows.numel()
         gain = self.size.double().square() * (samples * self.pixels)
-        share = gain / or_one(gain + self.noise)
+        share = gain / (gain + self.noise)
         explained = (share * (3 - 2 * share.sqrt())).sum() / (samples * self.pixels)
         return _floored(_energy(left) / (left.numel() * (1 - explained.clamp_max(_MOST_EXPLAINED))), self.rows)
 
@@ -100,7 +100,7 @@ class Scene:
         return _scaled(power + _FLOOR * power.mean(), self)
 
 
-def seen_scene(rows: Tensor, imaging: TileOperator, noise: Tensor | None = None) -> Scene:
+def scene_of(rows: Tensor, imaging: TileOperator, noise: Tensor | None = None) -> Scene:
     """The scene whose sizes follow from a Wiener estimate of the image of range profiles.
 
     Args:
@@ -142,7 +142,7 @@ def _pixels(imaging: TileOperator, rows: Tensor) -> Tensor:
 
 
 def _smoothed(power: Tensor, dims: tuple[int, ...]) -> Tensor:
-    """Averages over neighbours."""
+    """Averages over three neighbours with the weights 1/4, 1/2 and 1/4, circular."""
     for dim in dims:
         power = (power.roll(1, dim) + 2 * power + power.roll(-1, dim)) / 4
     return power

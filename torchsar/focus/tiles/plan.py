@@ -76,7 +76,7 @@ class TilePlan:
     Leading dimensions of the positions are trials with paths of their own. Their mean is the
     nominal path, from which they may differ as motion errors do. The image is differentiable in
     the history, the positions, the reference and the heights of the pixels; memory for gradients is
-    limited to that of some tiles at a time.
+    limited to that of the kept tables, or of some tiles at a time.
 
     Args:
         frequency_hz: Frequencies in Hz, rising in equal steps, float64 (frequency,).
@@ -262,8 +262,8 @@ class TilePlan:
         found: list[Tensor] = []
         given = [data, *self._places, self._reference_m, *([] if heights is None else [heights])]
         grad = torch.is_grad_enabled() and any(v.requires_grad for v in given)
-        # in the history alone the image is linear: its graph holds no more than what is kept anyway
-        linear = not any(v.requires_grad for v in given[1:])
+        # linear in the history alone, the graph holds what is kept anyway and the places of windows
+        linear = trials <= _GROUP and not any(v.requires_grad for v in given[1:])
         linear = linear and self._tables.fits(data.dtype) and self._weights.fits(data.dtype)
         pixels = self._pixels if linear else partial(checkpoint, self._pixels, use_reentrant=False)
         count = 0 if grad else math.prod(self._tiles)
@@ -337,10 +337,12 @@ class TilePlan:
     def _tables_of(self, part: Part, rows: slice, dtype: torch.dtype) -> Tables:
         """Tables of some tiles, from the last image if they are kept."""
         key = part, rows.start, rows.stop, dtype
-        if key in self._tables:
+        places = *self._places, self._reference_m
+        fixed = not (torch.is_grad_enabled() and any(v.requires_grad for v in places))
+        if fixed and key in self._tables:
             return self._tables[key]
         tables = part.tables(rows, self._places, self._reference_m, dtype)
-        if not tables.before.requires_grad:
+        if fixed:
             self._tables.keep(key, tables, dtype)
         return tables
 
