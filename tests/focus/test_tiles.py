@@ -15,6 +15,7 @@ from torch import Tensor
 
 from tests.focus.geometries import C128, F64, C, Case, case
 from torchsar.focus import ImageGrid, TilePlan, backproject, image_tiles
+from torchsar.focus.tiles import plan as of_plan
 from torchsar.focus.tiles.choice import _pixel_rule
 
 
@@ -161,6 +162,32 @@ def test_gradcheck_in_history_and_positions() -> None:
     plan = few.plan(-60.0)
     inputs = few.history.clone().requires_grad_(), torch.zeros(6, 3, dtype=F64, requires_grad=True)
     assert torch.autograd.gradcheck(image, inputs, eps=1e-3, rtol=1e-4, atol=1e-4)
+
+
+def test_an_image_without_gradients_does_not_hide_those_of_the_positions() -> None:
+    drawn = case(1008)
+    few = replace(small(drawn), grid=replace(drawn.grid, counts=(4, 3)))
+    few = replace(few, transmitter_m=few.transmitter_m.clone().requires_grad_())
+    fresh, used, history = few.plan(-60.0), few.plan(-60.0), few.history.clone().requires_grad_()
+    with torch.no_grad():
+        used.image(few.history)
+    found = [
+        torch.autograd.grad(plan.image(history).abs().square().sum(), [few.transmitter_m, history])
+        for plan in (fresh, used)
+    ]
+    torch.testing.assert_close(found[1], found[0])
+
+
+def test_the_adjoint_of_several_trials_and_of_large_tables_is_that_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = case(1003)
+    history = torch.randn(3, *drawn.history.shape, dtype=C128)
+    found = []
+    for kept in (1 << 27, 0):  # tables are kept, or computed again
+        monkeypatch.setattr(of_plan, "_KEPT_BYTES", kept)
+        given = history.clone().requires_grad_()
+        image = drawn.plan().image(given)
+        found.append(torch.autograd.grad(image.abs().square().sum(), given)[0])
+    torch.testing.assert_close(found[0], found[1])
 
 
 def test_a_plan_moves_with_its_path() -> None:
