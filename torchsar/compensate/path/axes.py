@@ -39,12 +39,16 @@ class Found:
         offset_m: Error of the positions in metres, recorded minus true, float64 (pulse, 3).
         std_m: Standard deviation of the line of sight in metres, float64 (pulse,).
         image: Image with the errors removed, complex (azimuth, range).
+        noise: Variance of the samples that scene and motion leave.
+        restless: Share of the pulses to which the last round still added fringes.
     """
 
     line_of_sight_m: Tensor
     offset_m: Tensor
     std_m: Tensor
     image: Tensor
+    noise: Tensor
+    restless: Tensor
 
 
 def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, present: Tensor, rounds: int = 4) -> Found:
@@ -73,7 +77,8 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, pre
     found = torch.nn.functional.pad(line_of_sight_m[:, None], (0, 2))
     masks = _masks(plan.grid.counts, rows.device)
     fringe = LIGHT_M_S / (2 * float(plan.frequency_hz.mean()))
-    noise, std = None, torch.zeros_like(line_of_sight_m)
+    noise = None
+    std = fringes = torch.zeros_like(line_of_sight_m)
     for _ in range(rounds):
         scene = scene_of(rows, _along(imaging, (found[:, None] @ axes)[:, 0]), noise)
         cells, _ = scene.fitted()
@@ -94,7 +99,9 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, pre
         if change <= _SETTLED**2 * std.square().mean() and not bool(fringes.any()):
             break
     offset = (found[:, None] @ axes)[:, 0]
-    return Found(found[:, 0], offset, std, _along(imaging, offset).image(rows[None])[0])
+    image = _along(imaging, offset).image(rows[None])[0]
+    assert noise is not None
+    return Found(found[:, 0], offset, std, image, noise, (fringes != 0).double().mean())
 
 
 def _along(imaging: TileOperator, offset_m: Tensor) -> TileOperator:

@@ -17,8 +17,7 @@ from torchsar.radar.spotlight import frequency_step_hz
 
 # pixel spacing in resolution cells, by choice: images are sampled above their bandwidth
 STEP = 0.7
-# the same where the scene is fitted to the samples: with 0.7 the line of sight was up to 2.6 times
-# its bound at 10 dB and with 0.5 1.2 times
+# the same where the scene is fitted to the samples, by choice: two in a resolution cell
 FINE_STEP = 0.5
 # error of the images in dB, by choice: far below what noise and side lobes leave
 _ERROR_DB = -40.0
