@@ -502,3 +502,13 @@ def test_refusals():
         Search(u_r_m_s=-1)
     with pytest.raises(ValueError, match="finite duration_s, got 0"):
         Dwell(0.0)
+
+
+def test_noise_of_fewer_samples_than_channels_is_taken_as_equal() -> None:
+    """One pulse would leave no noise in two of three directions, and a false deviation of 2 um."""
+    left = torch.randn(4, 3, 1, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
+    noise = noise_beside(left, torch.ones(4, 1, 1, dtype=torch.float64), torch.ones(4, 1, 1) + 0j, 4)
+    level = noise.diagonal(dim1=-2, dim2=-1)
+    torch.testing.assert_close(noise, torch.diag_embed(level))
+    torch.testing.assert_close(level, level.mean(-1, keepdim=True).expand_as(level))
+    assert bool((level > 0).all())

@@ -21,7 +21,7 @@ from torchsar.radar.spotlight import frequency_samples
 # apart that errors across the line of sight act differently on them
 _BLOCKS = 3
 # factor by which the variance of the line of sight exceeds that for a known scene, by trial
-_UNKNOWN = 1.4
+_UNKNOWN = 1.1
 # share of the standard deviation of the phases by which the last round may change them, by trial
 _SETTLED = 0.3
 # whole fringes that a round may add to the line of sight of a pulse, and logarithm of the
@@ -51,7 +51,7 @@ class Found:
     restless: Tensor
 
 
-def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, present: Tensor, rounds: int = 4) -> Found:
+def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, present: Tensor, rounds: int = 6) -> Found:
     """Refine the line of sight, and find the errors across it, together with the scene.
 
     An error across the line of sight acts with opposite signs on the two sides of a scene. Each

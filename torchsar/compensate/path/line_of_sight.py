@@ -47,7 +47,7 @@ def path_autofocus(
     *,
     extent_m: float | None = None,
     height_m: float = 0.0,
-    rounds: int = 4,
+    rounds: int = 6,
 ) -> Estimate:
     """Estimate the error of the recorded path at each pulse, along and across the line of sight.
 

@@ -73,14 +73,14 @@ class PathAutofocus(_PathEstimator):
         extent_m: Side of the imaged square about the origin in metres; None for the whole
             unambiguous ground.
         height_m: Height z of the imaged plane in metres.
-        rounds: Rounds of the last step, at least 1.
+        rounds: Largest number of rounds of the last step, at least 1.
     """
 
     provides = ("line_of_sight_m", "offset_m")
     neutral = {"line_of_sight_m": 0.0, "offset_m": 0.0}
     find = staticmethod(path_autofocus)
 
-    def __init__(self, extent_m: float | None = None, height_m: float = 0.0, rounds: int = 4) -> None:
+    def __init__(self, extent_m: float | None = None, height_m: float = 0.0, rounds: int = 6) -> None:
         super().__init__(extent_m=extent_m, height_m=height_m, rounds=rounds)
 
 

@@ -147,7 +147,8 @@ def noise_beside(left: Tensor, weight: Tensor, amplitude: Tensor, fitted: int) -
 
     It is taken from what the fit leaves over within sixteen Doppler cells of the point, in
     quadrature to it. Targets and clutter at other Doppler frequencies, and differences from the
-    expected amplitude, do not act on the phase of the point and are excluded.
+    expected amplitude, do not act on the phase of the point and are excluded. Fewer samples than
+    channels do not show how the noise is shared; it is taken as independent and equal then.
 
     Args:
         left: Deramped data without the fitted point, shape (..., channel, pulse), complex.
@@ -165,7 +166,12 @@ def noise_beside(left: Tensor, weight: Tensor, amplitude: Tensor, fitted: int) -
     turned = (left * torch.polar(torch.ones_like(amplitude.abs()), -amplitude.angle())).imag
     spectrum = torch.fft.fft(weight * turned) * inside[..., None, :]
     samples = inside.sum(-1) * energy / n - fitted / left.shape[-2]
-    return 2 * (spectrum @ spectrum.mH).real / (n * samples.clamp_min(1.0))[..., None, None]
+    found = 2 * (spectrum @ spectrum.mH).real / (n * samples.clamp_min(1.0))[..., None, None]
+    channels = left.shape[-2]
+    equal = found.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(
+        channels, dtype=found.dtype, device=found.device
+    )
+    return torch.where((samples < channels)[..., None, None], equal, found)
 
 
 def covariance_in(noise: Tensor, slopes: Tensor, amplitude: Tensor) -> Tensor:
