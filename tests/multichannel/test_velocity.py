@@ -30,7 +30,7 @@ from torchsar.multichannel import (
 from torchsar.multichannel.velocity.bank import bank_search
 from torchsar.multichannel.velocity.illumination import SeenAperture
 from torchsar.multichannel.velocity.likelihood import PointLikelihood
-from torchsar.multichannel.velocity.model import UNKNOWNS, moved, phase_slopes, point_phasor
+from torchsar.multichannel.velocity.model import UNKNOWNS, moved, noise_beside, phase_slopes, point_phasor
 from torchsar.scene import KSea, Pattern
 
 F64, C128 = torch.float64, torch.complex128
