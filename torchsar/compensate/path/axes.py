@@ -22,7 +22,7 @@ from torchsar.radar.spotlight import frequency_samples
 _BLOCKS = 3
 # factor by which the variance of the line of sight exceeds that for a known scene, by trial
 _UNKNOWN = 1.1
-# share of the standard deviation of the phases by which the last round may change them, by trial
+# share of the standard deviation of the phases by which the last round may change them, by choice
 _SETTLED = 0.3
 # whole fringes that a round may add to the line of sight of a pulse, and logarithm of the
 # likelihood that they must gain, by choice: noise alone gains it in one of ten thousand pulses

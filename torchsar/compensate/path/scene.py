@@ -22,7 +22,7 @@ _LEVEL = Wiener().level
 _FLOOR, _LEAST_ENERGY = 1e-4, 1e-3
 # least noise, as a share of the mean power of the samples, by choice: below it float32 rounds
 _LEAST_NOISE = 1e-8
-# largest share of the samples that a scene may explain by noise
+# largest share of the samples that a scene may explain of noise, by choice
 _MOST_EXPLAINED = 0.9
 
 
