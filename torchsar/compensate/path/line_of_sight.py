@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.path.axes import Found, three_axes
+from torchsar.compensate.path.envelopes import moved
 from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, placed, trials_of
 from torchsar.compensate.path.search import Search
 from torchsar.compensate.pulse_phase.verdict import (
@@ -31,6 +32,10 @@ _LEAST_PULSES = 8
 # factor by which the sharpness must exceed that of noise: more than for the phases of pulses, 1.5,
 # because envelopes and three axes are free too
 _MARGIN = 2.0
+# factor by which the sharpness of a start must exceed that of noise to be refined in more than one
+# round: it was 0.5 to 1.3 times that of noise, of noise and at -10 dB, and 3 to 11 times where the
+# errors were found
+_HOPE = 1.25
 # number of standard deviations that may not lower the Strehl ratio below its limit, by choice: the
 # difference of two starts is itself uncertain
 _SPREAD = 1.5
@@ -91,7 +96,8 @@ def path_autofocus(
         extent_m: Side of the imaged square about the origin in metres, which should hold most of
             the scatterers; by default that of the whole unambiguous ground, which takes longer.
         height_m: Height z of the imaged plane in metres.
-        rounds: Largest number of rounds of the joint estimate in step 4, at least 1.
+        rounds: Largest number of rounds of the joint estimate in step 4, at least 1; there is only
+            one where the image before is no sharper than that of noise.
 
     Returns:
         `line_of_sight_m` of shape (..., pulse), float64: half the path over the middle of the scene
@@ -175,7 +181,9 @@ def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
     """
 
     def refined(range_m: Tensor) -> Found:
-        return three_axes(search.rows, fine, search.polished(range_m, fine), search.present, rounds)
+        range_m = search.polished(range_m, fine)
+        sharp, noise, _ = _sharpness(fine.image(moved(search.rows, search.frequency_hz, range_m)[None])[0])
+        return three_axes(search.rows, fine, range_m, search.present, rounds if sharp > _HOPE * noise else 1)
 
     def strehl(std_m: Tensor) -> Tensor:
         return torch.exp(-(std_m * (2 * math.pi / search.fringe_m)).square().mean())
@@ -186,8 +194,7 @@ def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
     if strehl(_SPREAD * std_m) <= LEAST_STREHL:
         results.append(refined(search.by_envelopes(_OTHER_BAND)[0]))
         found, std_m = _sharpest(results, search)
-    sharp, effective, telling = sharpness_beyond_speckle(found.image.mT)
-    noise = sharpness_of_noise((effective * FINE_STEP).clamp_min(1))
+    sharp, noise, telling = _sharpness(found.image)
     quality = strehl(std_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
     least = torch.stack([one.noise for one in results]).amin()
     least = _WORSE * least + _UNFIT * search.rows.abs().square().double().mean()
@@ -196,6 +203,14 @@ def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
     value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
     info = {"roughness": rough, "entropy_nats": entropy(found.image).double()}
     return Estimate(value, quality, ok, {"line_of_sight_m": std_m}, info)
+
+
+def _sharpness(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sharpness of an image (azimuth, range), that of noise, and the number of range cells that
+    contribute to it.
+    """
+    sharp, effective, telling = sharpness_beyond_speckle(image.mT)
+    return sharp, sharpness_of_noise((effective * FINE_STEP).clamp_min(1)), telling
 
 
 def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor]:
