@@ -198,11 +198,16 @@ def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
     quality = strehl(std_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
     least = torch.stack([one.noise for one in results]).amin()
     least = _WORSE * least + _UNFIT * search.rows.abs().square().double().mean()
-    sure = (found.restless <= _RESTLESS) & (found.noise <= least)
-    ok = (sharp > _MARGIN * noise) & (telling > LEAST_ROWS) & (strehl(_SPREAD * std_m) > LEAST_STREHL) & sure
+    sure = [
+        sharp > _MARGIN * noise,
+        telling > LEAST_ROWS,
+        strehl(_SPREAD * std_m) > LEAST_STREHL,
+        found.restless <= _RESTLESS,
+        found.noise <= least,
+    ]
     value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
     info = {"roughness": rough, "entropy_nats": entropy(found.image).double()}
-    return Estimate(value, quality, ok, {"line_of_sight_m": std_m}, info)
+    return Estimate(value, quality, torch.stack(sure).all(), {"line_of_sight_m": std_m}, info)
 
 
 def _sharpness(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:

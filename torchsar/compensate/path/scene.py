@@ -15,8 +15,6 @@ from torchsar.focus import TileOperator
 # iterations of conjugate gradients, and share of the squared gradient at which they end, by trial:
 # with 20 the line of sight was no better, of points and of a recording, and with 8 it was worse
 _STEPS, _LEFT = 12, 1e-4
-# weight of noise, in mean powers of the image, in the Wiener estimate: see `Wiener`
-_LEVEL = Wiener().level
 # share of the mean variance that every cell of a scene keeps, and least share of the energy of the
 # samples that is taken as echo, by choice
 _FLOOR, _LEAST_ENERGY = 1e-4, 1e-3
@@ -113,16 +111,14 @@ def scene_of(rows: Tensor, imaging: TileOperator, noise: Tensor | None = None) -
     """
     image = imaging.image(rows[None])[0]
     power = image.abs().square()
-    local = _smoothed(power, (-1,))
-    share = local / or_one(local + _LEVEL * power.mean())
-    weight = share * share
+    weight = Wiener().filter(power, or_one(power.mean()), -1)
     if noise is None:
         # without its mean the weight leaves out what each pulse adds to its own model
         echo = imaging.adjoint((image * (weight - weight.mean(-2, keepdim=True)))[None])[0]
         left = rows - echo * ((echo.conj() * rows).sum().real / or_one(_energy(echo)).to(power.dtype))
         noise = _floored(_energy(left) / (left.numel() * (1 - weight.double().mean()).square()), rows)
     size = torch.zeros_like(power)
-    return _scaled(_smoothed(power, (-1, -2)) * weight, Scene(rows, imaging, size, noise, _pixels(imaging, rows)))
+    return _scaled(_smoothed(power) * weight, Scene(rows, imaging, size, noise, _pixels(imaging, rows)))
 
 
 def _scaled(power: Tensor, scene: Scene) -> Scene:
@@ -141,9 +137,9 @@ def _pixels(imaging: TileOperator, rows: Tensor) -> Tensor:
     return _energy(imaging.image(imaging.adjoint(point))) / rows.numel() ** 2
 
 
-def _smoothed(power: Tensor, dims: tuple[int, ...]) -> Tensor:
-    """Averages over three neighbours with the weights 1/4, 1/2 and 1/4, circular."""
-    for dim in dims:
+def _smoothed(power: Tensor) -> Tensor:
+    """Averages over three neighbours along either axis, weights 1/4, 1/2 and 1/4, circular."""
+    for dim in (-1, -2):
         power = (power.roll(1, dim) + 2 * power + power.roll(-1, dim)) / 4
     return power
 

@@ -143,11 +143,21 @@ class Wiener:
     level: float = 2.0
 
     def __call__(self, power: Tensor, mean: Tensor) -> Tensor:
-        pairs = power + power.roll(1, -2)
-        local = pairs + pairs.roll(-1, -2)
-        share = local / (local + 4 * self.level * mean)
-        weight = share * share
+        weight = self.filter(power, mean, -2)
         return weight - weight.mean(-1, keepdim=True)
+
+    def filter(self, power: Tensor, mean: Tensor, range_dim: int) -> Tensor:
+        """Return the first term, 0 to 1.
+
+        Args:
+            power: Power of the cells of an image, any shape.
+            mean: Mean power of the image, broadcastable.
+            range_dim: Dimension of the range, along which the power is averaged.
+        """
+        pairs = power + power.roll(1, range_dim)
+        local = pairs + pairs.roll(-1, range_dim)
+        share = local / (local + 4 * self.level * mean)
+        return share * share
 
 
 def entropy_fixed_point(
