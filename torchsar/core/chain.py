@@ -368,7 +368,7 @@ class Chain(nn.Module):
             stage = self.stages[name]
             provided = {f"{name}.{key}" for key in _provided(stage)}
             held = name in known.stages or bool(provided and provided <= known.held)
-            entered, began = signal, time.perf_counter()
+            entered, began = signal, 0.0 if log is None else time.perf_counter()
             arguments, neutral = self._arguments(name, known, required=not held)
             if not held:
                 signal = self._step(name, stage, signal, arguments, known, neutral)
