@@ -636,7 +636,12 @@ def test_gradients(case: Case) -> None:
 
     data = signal.data / signal.data.abs().flatten(1).amax(1)[(slice(None),) + (None,) * (signal.data.ndim - 1)]
     assert torch.autograd.gradcheck(
-        outputs, (data.requires_grad_(), *floating.values()), fast_mode=True, atol=1e-4, rtol=1e-3
+        outputs,
+        (data.requires_grad_(), *floating.values()),
+        fast_mode=True,
+        check_forward_ad=True,
+        atol=1e-4,
+        rtol=1e-3,
     )
 
 

@@ -60,7 +60,7 @@ def test_gradcheck_in_history_positions_and_pixels() -> None:
         torch.zeros(5, 3, dtype=F64, requires_grad=True),
         (radian * drawn.grid.pixels_m()[:2, 4]).requires_grad_(),
     )
-    assert torch.autograd.gradcheck(at, inputs, eps=1e-3, rtol=1e-4, atol=1e-4)
+    assert torch.autograd.gradcheck(at, inputs, eps=1e-3, rtol=1e-4, atol=1e-4, check_forward_ad=True)
 
 
 @pytest.mark.parametrize(

@@ -161,7 +161,7 @@ def test_gradcheck_in_history_and_positions() -> None:
 
     plan = few.plan(-60.0)
     inputs = few.history.clone().requires_grad_(), torch.zeros(6, 3, dtype=F64, requires_grad=True)
-    assert torch.autograd.gradcheck(image, inputs, eps=1e-3, rtol=1e-4, atol=1e-4)
+    assert torch.autograd.gradcheck(image, inputs, eps=1e-3, rtol=1e-4, atol=1e-4, check_forward_ad=True)
 
 
 def test_an_image_without_gradients_does_not_hide_those_of_the_positions() -> None:

@@ -98,8 +98,9 @@ class _Trilinear(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        ctx.wanted, _, first, a, b = inputs
+        ctx.wanted, ctx.size, first, a, b = inputs
         ctx.save_for_backward(first, a, b)
+        ctx.save_for_forward(first, a, b)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -108,6 +109,13 @@ class _Trilinear(torch.autograd.Function):
         parts = dict(zip(names, (a, b))) | {ctx.wanted: gradient}
         slopes = [_partial(name, parts, first) if ctx.needs_input_grad[3 + i] else None for i, name in enumerate(names)]
         return None, None, None, *slopes
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        first, a, b = ctx.saved_tensors
+        of_a, of_b = (torch.zeros_like(x) if slope is None else slope for slope, x in zip(tangents[3:], (a, b)))
+        terms = [_Trilinear.apply(ctx.wanted, ctx.size, first, *pair) for pair in ((of_a, b), (a, of_b))]
+        return terms[0] + terms[1]
 
     @staticmethod
     def vmap(
@@ -321,12 +329,17 @@ class _Lines(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
         x, factor, length, rows = inputs
-        ctx.length, ctx.rows = length, 0 if rows else x.shape[-2]
+        ctx.length, ctx.rows, ctx.same = length, 0 if rows else x.shape[-2], rows
         ctx.save_for_backward(factor)
+        ctx.save_for_forward(factor)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         return _Lines.apply(gradient, *ctx.saved_tensors, ctx.length, ctx.rows), None, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return _Lines.apply(tangent, *ctx.saved_tensors, ctx.length, ctx.same)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, x: Tensor, factor: Tensor, length: int, rows: int) -> tuple[Tensor, int]:

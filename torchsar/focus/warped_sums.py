@@ -384,10 +384,14 @@ class _CompiledSum(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:
-        ctx.save_for_backward(x, points)
-        ctx.eps, ctx.lines = eps, lines
+    def forward(x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:
         return _compiled(x, points, lines, eps)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        x, points, ctx.lines, ctx.eps = inputs
+        ctx.save_for_backward(x, points)
+        ctx.save_for_forward(x, points)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -395,9 +399,26 @@ class _CompiledSum(torch.autograd.Function):
         x, points = ctx.saved_tensors
         back = _compiled(gradient, points, 0 if ctx.lines else x.shape[-2], ctx.eps)
         image, pulses = (gradient, x) if ctx.lines else (x, gradient)
-        line = torch.arange(image.shape[-2], dtype=torch.float64, device=x.device) - image.shape[-2] // 2
-        slope = _compiled(-2j * math.pi * line[:, None] * image, points, 0, ctx.eps)
+        slope = _compiled(_slope(image), points, 0, ctx.eps)
         return back, (pulses * slope.conj()).real.sum(-1), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, of_x: Tensor | None, of_points: Tensor | None, *_: None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        x, points = ctx.saved_tensors
+        out = 0 if of_x is None else _compiled(of_x, points, ctx.lines, ctx.eps)
+        if of_points is None:
+            return out  # pyright: ignore[reportReturnType]
+        rate = of_points[..., None]
+        if ctx.lines:
+            return out - _slope(_compiled(rate * x, points, ctx.lines, ctx.eps))
+        return out + rate * _compiled(_slope(x), points, 0, ctx.eps)
+
+
+def _slope(lines: Tensor) -> Tensor:
+    """Lines times the derivative of the exponent of the adjoint by the point."""
+    n = lines.shape[-2]
+    line = torch.arange(n, dtype=torch.float64, device=lines.device) - n // 2
+    return -2j * math.pi * line[:, None] * lines
 
 
 def _compiled(x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:

@@ -433,12 +433,17 @@ class _Cut(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: Tensor, index: Tensor, n: int) -> Tensor:
         ctx.save_for_backward(index)
+        ctx.save_for_forward(index)
         ctx.size, ctx.n = len(x), n
         return x.as_strided((len(x) - n + 1, n), (1, 1)).index_select(0, index)
 
     @staticmethod
     def backward(ctx, gradient: Tensor):
         return _Lay.apply(gradient, ctx.saved_tensors[0], ctx.size), None, None
+
+    @staticmethod
+    def jvp(ctx, tangent: Tensor, *_: None):
+        return _Cut.apply(tangent.contiguous(), ctx.saved_tensors[0], ctx.n)
 
 
 class _Lay(torch.autograd.Function):
@@ -447,10 +452,15 @@ class _Lay(torch.autograd.Function):
     @staticmethod
     def forward(ctx, windows: Tensor, index: Tensor, size: int) -> Tensor:
         ctx.save_for_backward(index)
-        ctx.n = windows.shape[-1]
+        ctx.save_for_forward(index)
+        ctx.size, ctx.n = size, windows.shape[-1]
         at = index[:, None] + torch.arange(ctx.n, device=index.device)
         return windows.new_zeros(size).index_add_(0, at.reshape(-1), windows.reshape(-1))
 
     @staticmethod
     def backward(ctx, gradient: Tensor):
         return _Cut.apply(gradient.contiguous(), ctx.saved_tensors[0], ctx.n), None, None
+
+    @staticmethod
+    def jvp(ctx, tangent: Tensor, *_: None):
+        return _Lay.apply(tangent, ctx.saved_tensors[0], ctx.size)
