@@ -442,7 +442,7 @@ FUNCTIONS = [
             parabola_minimum,
             0.1,
         ),
-        {"1": None},  # a standard deviation by differences of entropies, rounded in single precision
+        {"most_m_s": None},  # a width by differences of entropies, rounded in single precision
     ),
     _entry(
         "compensate.velocity_objective",
