@@ -15,7 +15,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, checked_samples, fft_lines, linear_phasor
+from torchsar.core import Axis, Signal, Stage, checked_samples, fft_lines, host_largest, host_value, linear_phasor
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.response import (
     POOR,
@@ -251,14 +251,14 @@ def check_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild,
         return
     found = condition_number(radar, motion, rebuild.bands)
     limit = SINGULAR if dtype == torch.complex128 else SINGULAR_SINGLE
-    if bool((found > limit).all()):
+    if host_value((found > limit).all(), False):
         then = (
             f"so that {rebuild.bands} bands cannot be separated; rebuild fewer bands, use "
             "MinimumMeanSquare, or change the pulse rate"
         )
         raise ValueError(_condition_message(radar, motion, rebuild.bands, float(found.min()), then))
-    if bool((found > POOR).any()):
-        worst = float(found.max())
+    worst = host_largest(found, 0.0)
+    if worst > POOR:
         warnings.warn(
             _condition_message(
                 radar,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -428,39 +429,65 @@ def _spreading(below: Tensor, weights: Tensor, nodes: int) -> tuple[Tensor, Tens
 
 
 class _Cut(torch.autograd.Function):
-    """Windows of adjacent samples; the adjoint of `_Lay`."""
+    """Windows of n adjacent samples; the adjoint of `_Lay`."""
 
     @staticmethod
-    def forward(ctx, x: Tensor, index: Tensor, n: int) -> Tensor:
-        ctx.save_for_backward(index)
-        ctx.save_for_forward(index)
-        ctx.size, ctx.n = len(x), n
+    def forward(x: Tensor, index: Tensor, n: int) -> Tensor:
         return x.as_strided((len(x) - n + 1, n), (1, 1)).index_select(0, index)
 
     @staticmethod
-    def backward(ctx, gradient: Tensor):
-        return _Lay.apply(gradient, ctx.saved_tensors[0], ctx.size), None, None
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        x, index, ctx.n = inputs
+        ctx.size = len(x)
+        ctx.save_for_backward(index)
+        ctx.save_for_forward(index)
 
     @staticmethod
-    def jvp(ctx, tangent: Tensor, *_: None):
-        return _Cut.apply(tangent.contiguous(), ctx.saved_tensors[0], ctx.n)
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return _Lay.apply(gradient, *ctx.saved_tensors, ctx.size), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return _Cut.apply(tangent.contiguous(), *ctx.saved_tensors, ctx.n)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, x: Tensor, index: Tensor, n: int) -> tuple[Tensor, int]:
+        count, size = info.batch_size, x.shape[1 - in_dims[0]]
+        windows = _Cut.apply(x.movedim(in_dims[0], 0).reshape(-1), _each(index, count, size), n)
+        return windows.unflatten(0, (count, -1)), 0
 
 
 class _Lay(torch.autograd.Function):
-    """Sum of windows at their places; the adjoint of `_Cut`."""
+    """Sum of windows at their places among so many samples; the adjoint of `_Cut`."""
 
     @staticmethod
-    def forward(ctx, windows: Tensor, index: Tensor, size: int) -> Tensor:
-        ctx.save_for_backward(index)
-        ctx.save_for_forward(index)
-        ctx.size, ctx.n = size, windows.shape[-1]
-        at = index[:, None] + torch.arange(ctx.n, device=index.device)
+    def forward(windows: Tensor, index: Tensor, size: int) -> Tensor:
+        at = index[:, None] + torch.arange(windows.shape[-1], device=index.device)
         return windows.new_zeros(size).index_add_(0, at.reshape(-1), windows.reshape(-1))
 
     @staticmethod
-    def backward(ctx, gradient: Tensor):
-        return _Cut.apply(gradient.contiguous(), ctx.saved_tensors[0], ctx.n), None, None
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        windows, index, ctx.size = inputs
+        ctx.n = windows.shape[-1]
+        ctx.save_for_backward(index)
+        ctx.save_for_forward(index)
 
     @staticmethod
-    def jvp(ctx, tangent: Tensor, *_: None):
-        return _Lay.apply(tangent, ctx.saved_tensors[0], ctx.size)
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return _Cut.apply(gradient.contiguous(), *ctx.saved_tensors, ctx.n), None, None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return _Lay.apply(tangent, *ctx.saved_tensors, ctx.size)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, windows: Tensor, index: Tensor, size: int) -> tuple[Tensor, int]:
+        joined = windows.movedim(in_dims[0], 0).flatten(0, 1)
+        return _Lay.apply(joined, _each(index, info.batch_size, size), info.batch_size * size).unflatten(
+            0, (info.batch_size, size)
+        ), 0
+
+
+def _each(index: Tensor, count: int, size: int) -> Tensor:
+    """Places in each of so many rows of that size, which stand one after another."""
+    return (torch.arange(count, device=index.device)[:, None] * size + index).reshape(-1)
