@@ -649,12 +649,7 @@ def test_gradients(case: Case) -> None:
 def test_vmap_equals_batch(case: Case) -> None:
     stage, signal = case.build(), entering(case, raw(3, n_range=case.n_range))
     values = case.values(signal)
-    names = list(values)
-
-    def one(data: Tensor, *tensors: Tensor) -> dict[str, Tensor]:
-        return results(stage(signal.with_data(data), **dict(zip(names, tensors, strict=True))))
-
-    mapped = torch.vmap(one)(signal.data, *values.values())
+    mapped = results(torch.vmap(lambda one, given: stage(one, **given))(signal, values))
     for name, value in results(stage(signal, **values)).items():
         scale = float(value.abs().max()) if value.dtype != torch.bool and value.numel() else 1.0
         torch.testing.assert_close(mapped[name], value, atol=case.tolerance * max(scale, 1e-30), rtol=0)

@@ -178,10 +178,8 @@ def test_stages_keep_trials_apart(stage) -> None:
     out = stage(Signal(data, axes), **velocity).data
     for i in range(3):
         assert torch.equal(stage(Signal(data[i], axes), **{k: v[i] for k, v in velocity.items()}).data, out[i])
-    mapped = torch.vmap(lambda x, *v: stage(Signal(x, axes), **dict(zip(velocity, v, strict=True))).data)(
-        data, *velocity.values()
-    )
-    torch.testing.assert_close(mapped, out, atol=1e-12, rtol=1e-12)
+    mapped = torch.vmap(lambda one, given: stage(one, **given))(Signal(data, axes), velocity)
+    torch.testing.assert_close(mapped.data, out, atol=1e-12, rtol=1e-12)
     assert stage(Signal(data.to(torch.complex64), axes), **velocity).data.dtype == torch.complex64
 
 

@@ -1,5 +1,6 @@
 """Foundation of the package: axes, signals, chains, estimates, random draws and transforms."""
 
+from torchsar.core import trees as trees  # registers signals and estimates with torch
 from torchsar.core.alternate import Alternate, Turn
 from torchsar.core.axis import Axis
 from torchsar.core.chain import Chain, Trace, Use, use

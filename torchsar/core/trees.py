@@ -1,0 +1,126 @@
+"""Signals, recordings, truths and estimates as trees of tensors for torch.func and data loaders.
+
+Importing this module registers them with torch.utils._pytree, so that `torch.func.vmap`, `grad` and
+the other transforms accept and return them, and with torch.utils.data.default_collate, so that a
+DataLoader stacks them into a batch with a new leading trial dimension. The tensors are the leaves
+of the tree. All else (axes, radar, names, neutral values that are numbers) is part of its
+structure and stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+from torch.utils import _pytree as pytree
+from torch.utils.data._utils.collate import collate, default_collate_fn_map
+
+from torchsar.core.estimate import Estimate
+from torchsar.core.signal import Recording, Signal, Truth
+
+_NODES = (Tensor, Signal, Recording)
+# attribute of an object whose leaves are not tensors: its nodes and its structure
+_BARE = "_tree"
+
+
+@dataclass(frozen=True)
+class _Structure:
+    """What the tree of an object holds beside its tensors.
+
+    Args:
+        names: Fields that hold tensors, in order.
+        static: Other fields, and the entries of mappings that are not tensors.
+    """
+
+    names: tuple[str, ...]
+    static: Mapping[str, Any]
+
+
+def _parts(x: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Fields of an object with tensors, and the others; a mapping is divided between both."""
+    nodes, static = {}, {}
+    for name in (field.name for field in fields(x)):
+        value = getattr(x, name)
+        if isinstance(value, Mapping):
+            nodes[name] = {key: entry for key, entry in value.items() if isinstance(entry, _NODES)}
+            static[name] = {key: entry for key, entry in value.items() if not isinstance(entry, _NODES)}
+        else:
+            (nodes if isinstance(value, _NODES) else static)[name] = value
+    return nodes, static
+
+
+def _flatten(x: Any) -> tuple[list[Any], _Structure]:
+    if _BARE in vars(x):
+        return vars(x)[_BARE]
+    nodes, static = _parts(x)
+    return list(nodes.values()), _Structure(tuple(nodes), static)
+
+
+def _flatten_with_keys(x: Any) -> tuple[list[tuple[Any, Any]], _Structure]:
+    nodes, structure = _flatten(x)
+    return [(pytree.GetAttrKey(name), node) for name, node in zip(structure.names, nodes)], structure
+
+
+def _unflatten(kind: type, nodes: Iterable[Any], structure: _Structure) -> Any:
+    """The object with these tensors. torch also builds trees of other things, such as the numbers
+    of `in_dims`; the constructor would reject them, and the object keeps its structure instead.
+    """
+    whole, nodes = dict(structure.static), list(nodes)
+    for name, value in zip(structure.names, nodes):
+        whole[name] = {**value, **whole[name]} if name in whole else value
+    if all(map(_holds_tensors, nodes)):
+        return kind(**whole)
+    bare = object.__new__(kind)
+    vars(bare).update(whole, **{_BARE: (nodes, structure)})
+    return bare
+
+
+def _holds_tensors(node: Any) -> bool:
+    """Whether all leaves of a tree are tensors."""
+    if isinstance(node, dict):
+        return all(map(_holds_tensors, node.values()))
+    return isinstance(node, Tensor) or (isinstance(node, _NODES) and _BARE not in vars(node))
+
+
+def _collate(batch: Sequence[Any], *, collate_fn_map: dict[Any, Callable[..., Any]] | None = None) -> Any:
+    """Stack the tensors of several samples, with a new leading trial dimension."""
+    leaves, structures = zip(*(pytree.tree_flatten(sample) for sample in batch))
+    odd = next((i for i, one in enumerate(structures) if one != structures[0]), None)
+    if odd is not None:
+        raise ValueError(
+            f"a batch needs {type(batch[0]).__name__}s of equal axes, radar and names, but the samples 0 and {odd} "
+            f"differ in {_difference(batch[0], batch[odd])}; crop or pad the samples to one shape, or pass a "
+            "collate_fn to the DataLoader"
+        )
+    stacked = [collate(tensors, collate_fn_map=collate_fn_map) for tensors in zip(*leaves)]
+    return pytree.tree_unflatten(stacked, structures[0])
+
+
+def _difference(one: Any, other: Any) -> str:
+    """The first part of the structure in which two objects differ, with both values."""
+    (nodes, static), (others, other_static) = _parts(one), _parts(other)
+    for name, value in static.items():
+        if value != other_static.get(name):
+            return f"{name}: {value} and {other_static.get(name)}"
+    for name, value in nodes.items():
+        if isinstance(value, dict) and list(value) != list(others[name]):
+            return f"the names in {name}: {list(value)} and {list(others[name])}"
+        if isinstance(value, (Signal, Recording)) and pytree.tree_structure(value) != pytree.tree_structure(
+            others[name]
+        ):
+            return f"{name}.{_difference(value, others[name])}"
+    return "the fields that hold tensors"
+
+
+for _kind in (Signal, Recording, Truth, Estimate):
+    pytree.register_pytree_node(
+        _kind,
+        _flatten,
+        partial(_unflatten, _kind),
+        serialized_type_name=f"torchsar.{_kind.__name__}",
+        flatten_with_keys_fn=_flatten_with_keys,
+    )
+    default_collate_fn_map[_kind] = _collate
