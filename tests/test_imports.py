@@ -72,7 +72,7 @@ MOST_STATEMENTS = {
 
 
 def test_core_and_stages_need_only_torch_and_numpy() -> None:
-    modules = ["torchsar", *(_module(path) for path in CORE)]
+    modules = ["torchsar", "torchsar.data", *(_module(path) for path in CORE)]
     done = subprocess.run(
         [sys.executable, "-c", _ONLY_TORCH_AND_NUMPY, *modules], capture_output=True, text=True, timeout=120
     )

@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from torchsar.study.settings.errors import ConfigError
 
@@ -155,7 +154,7 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
         find_config(options.config)
     import torch
 
-    from torchsar.core import keep_freed_memory
+    from torchsar.core import device_fault, keep_freed_memory
     from torchsar.study.table import load, systems
 
     if options.command == "list":
@@ -166,7 +165,9 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
     keep_freed_memory()
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    _refuse_device(options.device, torch)
+    reason = device_fault(options.device)
+    if reason:
+        raise ConfigError(f"--device {options.device} cannot be used here: {reason}; leave it out to use the CPU")
     loaded = load(options.config, options.overrides)
     out = options.out or _folder(options.command, loaded.name)
     if options.command == "run":
@@ -185,15 +186,6 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
         print((requires if options.command == "requires" else trade)(loaded, out, options.device))
         print(out)
     return 0
-
-
-def _refuse_device(name: str, torch: Any) -> None:
-    """Raise ConfigError if a device cannot compute; allocation alone succeeds on any device."""
-    try:
-        torch.zeros(1, dtype=torch.complex128, device=name).abs().item()
-    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
-        reason = str(error).splitlines()[0].rstrip(".")
-        raise ConfigError(f"--device {name} cannot be used here: {reason}; leave it out to use the CPU") from None
 
 
 def _fail(sentence: str) -> int:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.core import cis, host_largest, host_value
+from torchsar.core import cis, device_fault, host_largest, host_value
 
 
 def test_values_are_read_with_their_type() -> None:
@@ -41,3 +41,9 @@ def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched, pytest.raises(torch.OutOfMemoryError):
         patched.setattr(torch, "cos", full)
         cis(torch.ones(3))
+
+
+@pytest.mark.parametrize("device", ["meta", "best", "cuda:99", ""])
+def test_a_device_that_cannot_compute_says_why(device: str) -> None:
+    assert device_fault("cpu") == device_fault(torch.device("cpu")) == ""
+    assert device_fault(device) and "\n" not in device_fault(device)

@@ -726,6 +726,7 @@ REASONS = {
     "core.is_out_of_memory": "takes an exception only",
     "core.take": "index arithmetic that callers inside the package have checked",
     "core.per_trial": "appends dimensions; no arithmetic",
+    "core.device_fault": "takes a device only; tests/core/test_host.py",
     "core.host_value": "reads one number",
     "core.host_largest": "reads one number",
     "core.outer_phasor": "a product of two tables that phasor_tables has made",

@@ -19,7 +19,7 @@ from torchsar.core.fft import (
     transform_in_blocks,
 )
 from torchsar.core.fingerprint import fingerprint
-from torchsar.core.host import host_largest, host_value
+from torchsar.core.host import device_fault, host_largest, host_value
 from torchsar.core.memory import LargestTensor, PeakMemory, is_out_of_memory, keep_freed_memory, machine_memory_bytes
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
@@ -64,6 +64,7 @@ __all__ = [
     "checked_samples",
     "checksum",
     "cis",
+    "device_fault",
     "document",
     "fault_of_name",
     "fft_lines",

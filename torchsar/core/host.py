@@ -1,9 +1,10 @@
-"""Values of tensors on the host, on which a program decides."""
+"""Values of tensors on the host, on which a program decides, and whether a device can compute."""
 
 from __future__ import annotations
 
 from typing import TypeVar
 
+import torch
 from torch import Tensor
 
 Number = TypeVar("Number", bool, int, float)
@@ -43,3 +44,19 @@ def host_largest(x: Tensor, otherwise: Number) -> Number:
         The largest value.
     """
     return host_value(x.max(), otherwise) if x.numel() else otherwise
+
+
+def device_fault(device: torch.device | str) -> str:
+    """Find out whether a device can compute; on some devices allocation alone succeeds.
+
+    Args:
+        device: The device, such as "cpu" or "cuda:1".
+
+    Returns:
+        Why it cannot compute, in one line; empty if it can.
+    """
+    try:
+        torch.zeros(1, dtype=torch.complex128, device=device).abs().item()
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
+        return str(error).splitlines()[0].rstrip(".")
+    return ""

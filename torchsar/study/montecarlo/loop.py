@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from torchsar.core import fingerprint
+from torchsar.core import device_fault, fingerprint
 from torchsar.metrics.intervals import half_width_ratio
 from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import Grid, make_grid
@@ -121,11 +121,9 @@ class Plan:
             raise ConfigError(
                 f"sweep: save must list numbers of trials, which are 0 to {self.trials - 1}, got {absent!r}"
             )
-        try:
-            torch.empty(0, device=torch.device(self.device))
-        except (RuntimeError, AssertionError, TypeError) as error:
-            text = str(error).splitlines()[0]
-            raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {text}") from None
+        reason = device_fault(self.device)
+        if reason:
+            raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {reason}")
 
     def work(self, trial: Trial) -> Work:
         """What a process needs to compute its chunks."""

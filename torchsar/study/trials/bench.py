@@ -120,11 +120,15 @@ class Bench:
         Args:
             draws: Random numbers of the trials.
             given: Tensors (trial,) that replace numbers of the world, by dotted key below `world`.
+
+        Raises:
+            ConfigError: If the simulation fails.
         """
-        if self.recording is None:
-            return self.system.simulate(self, self.world(given), draws)
-        impaired, truth = apply_impairments(self.recording, self.impairments, replace(draws, trials=None))
-        return Trials(impaired, self.recording, truth)
+        with self._named("world"):
+            if self.recording is None:
+                return self.system.simulate(self, self.world(given), draws)
+            impaired, truth = apply_impairments(self.recording, self.impairments, replace(draws, trials=None))
+            return Trials(impaired, self.recording, truth)
 
     @torch.no_grad()
     def batch(
@@ -153,8 +157,7 @@ class Bench:
                 failure of another method is part of its outcome.
         """
         self.announce("", "recording" if self.recording is not None else "simulation")
-        with self._named("world"):
-            trials = self.trials(draws, given)
+        trials = self.trials(draws, given)
         outcomes: dict[str, Outcome] = {}
         later = [method.rerun.method for method in self.config.processor.values() if method.rerun is not None]
         for name, method in self.config.processor.items():

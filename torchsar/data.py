@@ -1,0 +1,185 @@
+"""Simulated recordings with their true values, in batches for training and tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+from torch.utils.data import IterableDataset, get_worker_info
+
+from torchsar.core import Draws, Recording, Truth, device_fault
+
+Pair = tuple[Recording, Truth]
+
+
+class Simulated(IterableDataset[Pair]):
+    """Batches of simulated recordings and their true values, by the numbers of their trials.
+
+    All random numbers of a trial depend only on the seed and the case of `draws` and on the number
+    of the trial. Neither the batch size nor the number of workers of a DataLoader changes a trial.
+    With n workers, worker k computes the batches k, k + n, k + 2 n, ..., so that a DataLoader gives
+    the same batches in the same order as without workers. The batches are complete: give the
+    DataLoader `batch_size=None`.
+
+        data = Simulated("isal_snr", Draws(1, trials=range(1_000_000)), vary=lambda draws: {
+            "world.noise.snr_db": draws.uniform("snr_db", low=-10.0, high=20.0)})
+        for recording, truth in DataLoader(data, batch_size=None, num_workers=2):
+            ...
+
+    Each pass over the data gives the same trials. For other trials, for instance to test what was
+    trained, give other numbers of trials or another seed.
+
+    Args:
+        source: Name of a packaged config or path of a YAML file, which is simulated as by
+            `torchsar run`; or a function that is given Draws and returns a recording and its truth,
+            such as one that calls `torchsar.echo.simulate`. A config needs the extra `study`.
+        draws: Seed, case and numbers of the trials.
+        batch: Number of trials in a batch; the last one may be smaller.
+        overrides: Changes of the config, as "key=value" with dotted keys.
+        case: Name of the case, for a config with cases.
+        vary: Function that is given the Draws of a batch and returns numbers of the world that
+            differ between trials, by dotted key, shape (trial,), float64. Where workers are
+            spawned and not forked, it must be a function of a module.
+        device: Device on which the trials of a config are computed. The results of a function are
+            moved to it.
+
+    Raises:
+        TypeError: If `draws` are not Draws, the source is no config and no function, or a function
+            does not return a Recording and a Truth.
+        ValueError: If there are no numbers of trials, the batch has less than one trial, the device
+            cannot be used, the config or an override is invalid, the config processes a recording,
+            the case does not exist, a number that `vary` gives cannot differ between trials, or
+            arguments for a config are combined with a function.
+        ImportError: If a package of the extra `study`, which a config needs, is not installed.
+    """
+
+    def __init__(
+        self,
+        source: str | Path | Callable[[Draws], Pair],
+        draws: Draws,
+        *,
+        batch: int = 16,
+        overrides: Sequence[str] = (),
+        case: str | None = None,
+        vary: Callable[[Draws], Mapping[str, Tensor]] | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if not isinstance(draws, Draws):
+            raise TypeError(f"Simulated needs Draws, such as Draws(1, trials=range(100)), got {type(draws).__name__}")
+        if draws.trials is None or not len(draws.trials):
+            raise ValueError(
+                f"Simulated needs numbers of trials, got Draws with trials={draws.trials!r}; give Draws with "
+                "trials=range(100)"
+            )
+        if isinstance(batch, bool) or not isinstance(batch, int) or batch < 1:
+            raise ValueError(f"Simulated: batch must be a whole number of trials above 0, got {batch!r}")
+        reason = device_fault(device)
+        if reason:
+            raise ValueError(f"Simulated: the device {str(device)!r} cannot be used here: {reason}")
+        self.draws, self.trials, self.batch = draws, draws.trials, batch
+        if isinstance(source, str | Path):
+            self.simulate: Callable[[Draws], Pair] = _Config(str(source), tuple(overrides), case, vary, str(device))
+            self.simulate.given(self._part(0))
+        elif callable(source):
+            if overrides or case is not None or vary is not None:
+                raise ValueError("Simulated: overrides, case and vary are for a config, and the source is a function")
+            self.simulate = _Function(source, str(device))
+        else:
+            raise TypeError(
+                f"Simulated needs the name or path of a config, or a function of Draws, got {type(source).__name__}"
+            )
+
+    def __len__(self) -> int:
+        """Return the number of batches of one pass."""
+        return -(-len(self.trials) // self.batch)
+
+    def __iter__(self) -> Iterator[Pair]:
+        """Yield the batches of this worker, or all batches if there are no workers."""
+        worker = get_worker_info()
+        first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        for index in range(first, len(self), step):
+            with torch.no_grad():
+                pair = self.simulate(self._part(index))
+            yield pair
+
+    def _part(self, index: int) -> Draws:
+        """Draws of one batch."""
+        part, case = slice(index * self.batch, (index + 1) * self.batch), self.draws.case
+        return replace(self.draws, trials=self.trials[part], case=case[part] if isinstance(case, tuple) else case)
+
+
+@dataclass(frozen=True)
+class _Function:
+    """A function that simulates, with a check of its result."""
+
+    function: Callable[[Draws], Pair]
+    device: str
+
+    def __call__(self, draws: Draws) -> Pair:
+        pair = self.function(draws)
+        if not (isinstance(pair, tuple) and [type(part) for part in pair] == [Recording, Truth]):
+            raise TypeError(
+                f"Simulated: the function must return a Recording and a Truth, got {type(pair).__name__}"
+                f"{f' of {[type(part).__name__ for part in pair]}' if isinstance(pair, tuple) else ''}"
+            )
+        return pytree.tree_map(lambda x: x.to(self.device), pair)
+
+
+@dataclass(frozen=True)
+class _Config:
+    """The simulation of a config. Other processes get its name and build their own bench."""
+
+    source: str
+    overrides: tuple[str, ...]
+    case: str | None
+    vary: Callable[[Draws], Mapping[str, Tensor]] | None
+    device: str
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def __call__(self, draws: Draws) -> Pair:
+        trials = self.bench.trials(draws, self.given(draws))
+        return trials.recording, Truth(trials.truth, trials.clean)
+
+    @cached_property
+    def bench(self) -> Any:
+        """Radar and world."""
+        try:
+            from torchsar.study.settings.cases import cases_of
+            from torchsar.study.table import load
+            from torchsar.study.trials.bench import Bench
+        except ImportError as error:
+            raise ImportError(
+                f"Simulated needs {error.name} to read a config: pip install 'torchsar-lab[study]'"
+            ) from error
+        loaded = load(self.source, self.overrides)
+        if loaded.config.data.file is not None:
+            raise ValueError(f"{loaded.file}: the config processes the recording data.file; Simulated needs a world")
+        cases = cases_of(loaded)
+        name = next(iter(cases)) if self.case is None and not loaded.config.cases else self.case
+        if name not in cases:
+            raise ValueError(
+                f"{loaded.file}: Simulated needs one case of the config, got case={self.case!r}; its cases are "
+                f"{', '.join(map(repr, loaded.config.cases)) or 'none'}"
+            )
+        return Bench(cases[name], self.device)
+
+    def given(self, draws: Draws) -> dict[str, Tensor]:
+        """Numbers of the world that differ between trials, by dotted key below `world`."""
+        bench, count, found = self.bench, len(draws.trials or ()), {}
+        for key, value in ({} if self.vary is None else self.vary(draws)).items():
+            section, _, rest = key.partition(".")
+            if section != "world" or not bench.system.may_differ(rest, bench.config.world):
+                raise ValueError(f"{bench.file}: vary gives {key!r}, which cannot differ between trials of a batch")
+            if not isinstance(value, Tensor) or value.shape != (count,):
+                got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+                raise ValueError(f"{bench.file}: vary must give one number per trial as {key!r}, ({count},), got {got}")
+            found[rest] = value.to(self.device)
+        return found
