@@ -1,0 +1,320 @@
+"""An autofocus whose image weights come from a small trained network, beside the library's own.
+
+    python scripts/learned_autofocus.py [--small] [--trials 6] [--out learned_autofocus]
+
+The estimator repeats one step: it forms the image, weights its cells, transforms the weighted image
+back to pulses, and takes the phase of each pulse relative to the result. It starts from SCA.
+Therefore, a phase that is added to a pulse is added to its estimate, whatever its size, and a
+constant or linear phase over the pulses changes nothing. `entropy_fixed_point` and `autofocus`
+repeat the same step with weights that follow from a formula. Here a network of 98 parameters
+computes the weight of each cell from the power of the cell, of its surroundings, of its range cell
+and of the noise.
+
+The network is trained on small simulated scenes of the config `isal_snr` and tested on scenes of
+the full size of that config with other seeds. `torchsar.data.Simulated` makes both. All random
+numbers are drawn by address, so that a second run prints the same losses.
+
+The script prints the loss during the training, its time, and the median over trials of the rms
+phase error (rad) over SNR, with the Cramer-Rao bound for a scene of unknown amplitudes. The picture
+shows these errors and the loss. If the folder TORCHSAR_DATA (by default shared/data beside the
+repository) holds recordings of aircraft, random phases are added to their pulses, and the script
+prints how far the entropy of the image lies above that of the recording as it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, conv2d, pad, silu, softplus
+
+from torchsar import plot
+from torchsar.compensate import autofocus, correct_pulse_phase, entropy_fixed_point, pga, pga_sca, sca
+from torchsar.core import Draws, Recording, Truth, cis, unit_level
+from torchsar.data import Simulated
+from torchsar.io import read_inverse
+from torchsar.metrics import entropy, phase_rmse
+from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad, turntable_responses
+
+CONFIG = "isal_snr"
+TRAIN_SEED, TEST_SEED = 11, 12
+DATA = Path(os.environ.get("TORCHSAR_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+RECORDINGS = ("isar_thz_airplane_even.npz", "isar_yak42_a.npz")
+# training scenes, and smaller ones: pulses, range cells, length and width of the aircraft (m)
+TRAINED, TINY = (128, 64, 0.08, 0.045), (64, 40, 0.04, 0.025)
+Method = Callable[[Tensor], Tensor]
+
+
+class CellWeights(nn.Module):
+    """Weight of each image cell, computed from its power and that of its surroundings.
+
+    A shift of the image in Doppler shifts the weights, and a factor on the image changes nothing.
+
+    Args:
+        draws: Source of the initial parameters.
+        hidden: Number of hidden units.
+    """
+
+    def __init__(self, draws: Draws, hidden: int = 12) -> None:
+        super().__init__()
+
+        def drawn(name: str, scale: float, *shape: int) -> nn.Parameter:
+            return nn.Parameter(scale * draws.normal(name, shape, torch.float32))
+
+        self.of_cell, self.of_row = drawn("of_cell", 0.5, hidden, 3), drawn("of_row", 0.5, hidden, 3)
+        self.offset, self.out = nn.Parameter(torch.zeros(hidden)), drawn("out", 0.05, hidden)
+
+    def forward(self, power: Tensor) -> Tensor:
+        """Power (trial, range, Doppler) of an image to weights of the same shape.
+
+        The network adds a term to that of ln(1 + p / 2), a weight that lowers the entropy.
+        """
+        row = power.mean(-1, keepdim=True)
+        mean = row.mean(-2, keepdim=True)
+        noise = row.quantile(0.25, -2, keepdim=True)  # if the target leaves some range cells free
+        sharpness = power.square().mean((-2, -1), keepdim=True) / mean.square()
+        cell = [power, beside(power), around(power)]
+        x = torch.stack([(part / mean + 1e-4).log() for part in cell], 1)
+        context = [(row / mean).log(), (noise / mean).log().expand_as(row), sharpness.log().expand_as(row)]
+        y = torch.stack(context, 1).clamp(-8, 8)
+        hidden = conv2d(x, self.of_cell[..., None, None], self.offset) + conv2d(y, self.of_row[..., None, None])
+        change = conv2d(silu(hidden), self.out[None, :, None, None])
+        return softplus(x[:, 0] - 0.7) * change[:, 0].exp()
+
+
+def beside(power: Tensor) -> Tensor:
+    """Mean power of a cell and its neighbours in range."""
+    return avg_pool2d(pad(power, (0, 0, 1, 1))[:, None], (3, 1), 1)[:, 0]
+
+
+def around(power: Tensor) -> Tensor:
+    """Mean power of 5 range cells and 9 Doppler cells; the image is circular in Doppler."""
+    wide = pad(pad(power, (4, 4), mode="circular"), (0, 0, 2, 2))
+    return avg_pool2d(wide[:, None], (5, 9), 1)[:, 0]
+
+
+class LearnedAutofocus(nn.Module):
+    """Phase of each pulse, (trial, pulse), from range-compressed data, (trial, pulse, range).
+
+    Args:
+        draws: Source of the initial parameters.
+    """
+
+    def __init__(self, draws: Draws) -> None:
+        super().__init__()
+        self.weights, self.relaxation = CellWeights(draws), nn.Parameter(torch.tensor(1.5))
+
+    def forward(self, data: Tensor, rounds: int = 20) -> Tensor:
+        phase = sca(data)["phase_rad"]
+        rows = unit_level(data).mT
+        for _ in range(rounds):
+            phase = phase + self.step(rows, phase)
+        return phase
+
+    def step(self, rows: Tensor, phase: Tensor) -> Tensor:
+        """Phase of each pulse relative to the weighted image.
+
+        The image has two samples per Doppler cell, so that pulses at both ends of the aperture are
+        no neighbours. Without the mean of the weights, a pulse is not compared with itself.
+        """
+        n = rows.shape[-1]
+        x = rows * cis(-phase)[:, None]
+        image = torch.fft.fft(x, 2 * n)
+        weights = self.weights(image.real.square() + image.imag.square())
+        weights = weights - weights.mean(-1, keepdim=True)
+        model = torch.fft.ifft(image * weights)[..., :n]
+        return self.relaxation * (x * model.conj()).sum(-2).angle()
+
+
+def strehl_of(phase: Tensor, truth: Tensor) -> Tensor:
+    """|sum over pulses of exp(j error)| / n at the best linear phase, (trial,): 1 for no error.
+
+    Constant and linear phases are no errors. Differentiable.
+    """
+    error = cis((phase - truth).float())
+    return torch.fft.fft(error, 8 * error.shape[-1]).abs().amax(-1) / error.shape[-1]
+
+
+def sized(pulses: int, samples: int, length_m: float, width_m: float) -> list[str]:
+    """Overrides of the config for scenes of another size."""
+    plane = {"length_m": length_m, "width_m": width_m}
+    return [f"world.pulses={pulses}", f"world.samples={samples}"] + [
+        f"world.scene.aircraft.{name}={value}" for name, value in plane.items()
+    ]
+
+
+def any_snr(draws: Draws) -> dict[str, Tensor]:
+    """SNR and heading of training scenes."""
+    return {
+        "world.noise.snr_db": draws.uniform("snr", low=-10.0, high=20.0),
+        "world.scene.aircraft.heading_deg": draws.uniform("heading", low=-10.0, high=10.0),
+    }
+
+
+def strehl_amplitude(phase: Tensor, truth: Tensor) -> Tensor:
+    """Largest |mean over pulses of exp(j error)| of any linear phase, (trial,); 1 without error.
+
+    Constant and linear phases are no errors. Differentiable.
+    """
+    error = cis((phase - truth).to(phase.dtype))
+    return torch.fft.fft(error, 8 * error.shape[-1]).abs().amax(-1) / error.shape[-1]
+
+
+def train(network: LearnedAutofocus, batches: Simulated, learned_rounds: int = 3) -> list[float]:
+    """Loss of each step; a step takes one batch.
+
+    The loss is the mean over trials of ln(1 - Strehl amplitude), where 1 - Strehl amplitude is
+    about half the mean square error. Each step begins after up to 14 rounds, a number that is
+    drawn, so that the network learns the first rounds and the last, and has gradients through a
+    few rounds.
+    """
+    adam = torch.optim.Adam(network.parameters(), lr=0.03)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, len(batches))
+    drawn = Draws(batches.draws.seed).uniform("rounds before", (len(batches),), high=15.0)
+    losses: list[float] = []
+    for before, (recording, truth) in zip(drawn.long().tolist(), batches, strict=True):
+        data = recording.signal.data
+        rows = unit_level(data).mT
+        with torch.no_grad():
+            phase = network(data, before)
+        loss = torch.zeros(())
+        for _ in range(learned_rounds):
+            phase = phase + network.step(rows, phase)
+            loss = loss + (1 - strehl_amplitude(phase, truth.values["phase_rad"]) + 1e-4).log().mean()
+        adam.zero_grad()
+        (loss / learned_rounds).backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        adam.step()
+        schedule.step()
+        losses.append(float(loss.detach()) / learned_rounds)
+    return losses
+
+
+def methods(network: LearnedAutofocus) -> dict[str, Method]:
+    """Estimators of the phase by name."""
+    own = {f.__name__: lambda data, f=f: f(data)["phase_rad"] for f in (sca, pga, pga_sca, entropy_fixed_point)}
+    return {
+        **own,
+        "autofocus": lambda data: autofocus(data)["phase_rad"],
+        "learned": network,
+        "autofocus, started from learned": lambda data: autofocus(data, start=network(data))["phase_rad"],
+    }
+
+
+@torch.no_grad()
+def errors(found: Mapping[str, Method], snr_db: Sequence[float], trials: int, size: Sequence[str]) -> dict[str, Tensor]:
+    """Rms phase errors in rad by method, (SNR, trial), and their bound, (SNR, 1)."""
+    table: dict[str, list[Tensor]] = {name: [] for name in ("bound", *found)}
+    ratio = None
+    for i, snr in enumerate(snr_db):
+        draws = Draws(TEST_SEED, f"SNR {i}", range(trials))
+        recording, truth = next(
+            iter(Simulated(CONFIG, draws, batch=trials, overrides=[*size, f"world.noise.snr_db={snr}"]))
+        )
+        data = recording.signal.data
+        ratio = ratio or bound_ratio(recording, truth)
+        table["bound"].append(ratio * pulse_phase_bound_rad(10 ** (snr / 10), data.shape[-1])[None])
+        for name, method in found.items():
+            table[name].append(phase_rmse(method(data), truth.values["phase_rad"]))
+    return {name: torch.stack(rows) for name, rows in table.items()}
+
+
+def bound_ratio(recording: Recording, truth: Truth) -> float:
+    """Bound for a scene of unknown amplitudes over that for a known scene.
+
+    It hardly differs between scenes of one kind.
+    """
+    cross, down, amplitude = (truth.values[name][0] for name in ("cross_range_m", "range_m", "amplitude"))
+    pulses, samples = recording.signal.data.shape[-2:]
+    rate = float(truth.values["rotation_rad_s"])
+    azimuth, response = turntable_responses(recording.radar, rate, cross, down, pulses, samples)
+    power = float(((azimuth * amplitude) @ response).abs().square().mean())
+    bound = pulse_phase_bound_of_scene_rad(azimuth, response, amplitude, 1.0)
+    return float(bound / pulse_phase_bound_rad(power, samples))
+
+
+@torch.no_grad()
+def recorded(found: Mapping[str, Method], files: Sequence[Path]) -> dict[str, list[float]]:
+    """Entropy of the image of recordings with added phases minus that without, in nats."""
+    table: dict[str, list[float]] = {"no compensation": [], **{name: [] for name in found}}
+    for path in files:
+        data = read_inverse(path).signal.data[None]
+        added = Draws(TEST_SEED).uniform("added", data.shape[:2], -math.pi, math.pi, torch.float32)
+        turned = correct_pulse_phase(data, -added)
+        estimates = {"no compensation": torch.zeros_like(added), **{name: f(turned) for name, f in found.items()}}
+        for name, phase in estimates.items():
+            table[name].append(image_entropy(correct_pulse_phase(turned, phase)) - image_entropy(data))
+    return table
+
+
+def image_entropy(data: Tensor) -> float:
+    return float(entropy(torch.fft.fft(data, dim=-2)))
+
+
+def show(title: str, heads: Sequence[str], rows: Mapping[str, Sequence[float]]) -> None:
+    """Print a table."""
+    print(f"{title:34}" + "".join(f"{head:>9}" for head in heads))
+    for name, values in rows.items():
+        print(f"{name:34}" + "".join(f"{value:9.3f}" for value in values))
+
+
+def pictures(snr_db: Sequence[float], table: Mapping[str, Tensor], losses: Sequence[float]) -> list[Any]:
+    """Medians and quartiles of the errors, and the loss."""
+    share = torch.tensor([0.5, 0.25, 0.75], dtype=torch.float64)
+    levels = {name: plot.array(values.double().quantile(share, -1)) for name, values in table.items()}
+    errors = {
+        "title": "Phase error on unseen scenes",
+        "x": plot.array(torch.tensor(snr_db)),
+        "series": {name: (level[0], level[1:].T) for name, level in levels.items() if name != "bound"},
+        "bounds": {"Cramer-Rao bound": levels["bound"][0]},
+    }
+    steps = plot.array(torch.arange(len(losses)))
+    return [
+        *plot.error_curves([errors], "SNR (dB)", "rms phase error (rad)", log_y=True),
+        plot.curves(
+            {"loss": (steps, plot.array(torch.tensor(losses)))}, "step", "loss, ln(1 - Strehl amplitude)", "Training"
+        ),
+    ]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--small", action="store_true", help="few steps and tests on small scenes, in seconds")
+    parser.add_argument("--trials", type=int, default=6, help="test scenes at each SNR")
+    parser.add_argument("--out", default="learned_autofocus", help="folder of the picture")
+    options = parser.parse_args(arguments)
+    steps, batch, size = (24, 4, TINY) if options.small else (240, 6, TRAINED)
+    snr_db = [0.0, 10.0] if options.small else [-10.0, -5.0, 0.0, 5.0, 10.0, 20.0]
+
+    began = time.perf_counter()
+    network = LearnedAutofocus(Draws(TRAIN_SEED))
+    draws = Draws(TRAIN_SEED, trials=range(steps * batch))
+    losses = train(network, Simulated(CONFIG, draws, batch=batch, overrides=sized(*size), vary=any_snr))
+    for first in range(0, steps, steps // 6):
+        part = losses[first : first + steps // 6]
+        print(f"steps {first:3} to {first + len(part) - 1:3}: mean loss {sum(part) / len(part):.6f}")
+    print(f"training: {steps} steps of {batch} scenes, {time.perf_counter() - began:.0f} s")
+
+    found = methods(network)
+    table = errors(found, snr_db, options.trials, sized(*TINY) if options.small else [])
+    medians = {name: values.double().quantile(0.5, -1).tolist() for name, values in table.items()}
+    show("median rms phase error (rad), SNR:", [f"{snr:g} dB" for snr in snr_db], medians)
+    files = [DATA / name for name in RECORDINGS if (DATA / name).is_file()]
+    if files and not options.small:
+        show("recording: entropy above (nats)", [path.stem[5:13] for path in files], recorded(found, files))
+    else:
+        print("recordings: skipped")
+    folder = Path(options.out)
+    folder.mkdir(parents=True, exist_ok=True)
+    plot.save(pictures(snr_db, table, losses), folder / "learned_autofocus.png")
+
+
+if __name__ == "__main__":
+    main()
