@@ -1,12 +1,12 @@
 """An autofocus whose image weights come from a small trained network, beside the library's own.
 
-    python scripts/learned_autofocus.py [--small] [--trials 6] [--out learned_autofocus]
+    python scripts/learned_autofocus.py [--small] [--trials 12] [--out learned_autofocus]
 
 The estimator repeats one step: it forms the image, weights its cells, transforms the weighted image
 back to pulses, and takes the phase of each pulse relative to the result. It starts from SCA.
 Therefore, a phase that is added to a pulse is added to its estimate, whatever its size, and a
 constant or linear phase over the pulses changes nothing. `entropy_fixed_point` and `autofocus`
-repeat the same step with weights that follow from a formula. Here a network of 98 parameters
+repeat the same step with weights that follow from a formula. Here a network of 97 parameters
 computes the weight of each cell from the power of the cell, of its surroundings, of its range cell
 and of the noise.
 
@@ -16,9 +16,10 @@ numbers are drawn by address, so that a second run prints the same losses.
 
 The script prints the loss during the training, its time, and the median over trials of the rms
 phase error (rad) over SNR, with the Cramer-Rao bound for a scene of unknown amplitudes. The picture
-shows these errors and the loss. If the folder TORCHSAR_DATA (by default shared/data beside the
-repository) holds recordings of aircraft, random phases are added to their pulses, and the script
-prints how far the entropy of the image lies above that of the recording as it is.
+shows these errors, and how far they exceed the bound. If the folder TORCHSAR_DATA (by default
+shared/data beside the repository) holds recordings of aircraft, random phases are added to their
+pulses, and the script prints how far the entropy of the image lies above that of the recording as
+it is.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ DATA = Path(os.environ.get("TORCHSAR_DATA", Path(__file__).resolve().parents[2] 
 RECORDINGS = ("isar_thz_airplane_even.npz", "isar_yak42_a.npz")
 # training scenes, and smaller ones: pulses, range cells, length and width of the aircraft (m)
 TRAINED, TINY = (128, 64, 0.08, 0.045), (64, 40, 0.04, 0.025)
+LIBRARY = {f.__name__: f for f in (sca, pga, pga_sca, entropy_fixed_point, autofocus)}
+X = "SNR (dB)"
 Method = Callable[[Tensor], Tensor]
 
 
@@ -77,7 +80,7 @@ class CellWeights(nn.Module):
         The network adds a term to that of ln(1 + p / 2), a weight that lowers the entropy.
         """
         row = power.mean(-1, keepdim=True)
-        mean = row.mean(-2, keepdim=True)
+        mean = row.mean(-2, keepdim=True).clamp_min(1e-12)
         noise = row.quantile(0.25, -2, keepdim=True)  # if the target leaves some range cells free
         sharpness = power.square().mean((-2, -1), keepdim=True) / mean.square()
         cell = [power, beside(power), around(power)]
@@ -131,15 +134,6 @@ class LearnedAutofocus(nn.Module):
         weights = weights - weights.mean(-1, keepdim=True)
         model = torch.fft.ifft(image * weights)[..., :n]
         return self.relaxation * (x * model.conj()).sum(-2).angle()
-
-
-def strehl_of(phase: Tensor, truth: Tensor) -> Tensor:
-    """|sum over pulses of exp(j error)| / n at the best linear phase, (trial,): 1 for no error.
-
-    Constant and linear phases are no errors. Differentiable.
-    """
-    error = cis((phase - truth).float())
-    return torch.fft.fft(error, 8 * error.shape[-1]).abs().amax(-1) / error.shape[-1]
 
 
 def sized(pulses: int, samples: int, length_m: float, width_m: float) -> list[str]:
@@ -199,10 +193,8 @@ def train(network: LearnedAutofocus, batches: Simulated, learned_rounds: int = 3
 
 def methods(network: LearnedAutofocus) -> dict[str, Method]:
     """Estimators of the phase by name."""
-    own = {f.__name__: lambda data, f=f: f(data)["phase_rad"] for f in (sca, pga, pga_sca, entropy_fixed_point)}
     return {
-        **own,
-        "autofocus": lambda data: autofocus(data)["phase_rad"],
+        **{name: lambda data, function=function: function(data)["phase_rad"] for name, function in LIBRARY.items()},
         "learned": network,
         "autofocus, started from learned": lambda data: autofocus(data, start=network(data))["phase_rad"],
     }
@@ -265,32 +257,39 @@ def show(title: str, heads: Sequence[str], rows: Mapping[str, Sequence[float]]) 
         print(f"{name:34}" + "".join(f"{value:9.3f}" for value in values))
 
 
-def pictures(snr_db: Sequence[float], table: Mapping[str, Tensor], losses: Sequence[float]) -> list[Any]:
-    """Medians and quartiles of the errors, and the loss."""
-    share = torch.tensor([0.5, 0.25, 0.75], dtype=torch.float64)
-    levels = {name: plot.array(values.double().quantile(share, -1)) for name, values in table.items()}
-    errors = {
-        "title": "Phase error on unseen scenes",
-        "x": plot.array(torch.tensor(snr_db)),
-        "series": {name: (level[0], level[1:].T) for name, level in levels.items() if name != "bound"},
-        "bounds": {"Cramer-Rao bound": levels["bound"][0]},
-    }
-    steps = plot.array(torch.arange(len(losses)))
+def pictures(snr_db: Sequence[float], table: Mapping[str, Tensor]) -> list[Any]:
+    """Errors over SNR, and their ratio to the bound for the methods that come near it."""
+    bound = table["bound"]
+    near = {name: table[name] / bound for name in ("entropy_fixed_point", "autofocus", "learned")}
+    whole = {name: values for name, values in table.items() if name in (*LIBRARY, "learned")}
     return [
-        *plot.error_curves([errors], "SNR (dB)", "rms phase error (rad)", log_y=True),
-        plot.curves(
-            {"loss": (steps, plot.array(torch.tensor(losses)))}, "step", "loss, ln(1 - Strehl amplitude)", "Training"
+        *plot.error_curves([panel("Phase error on unseen scenes", snr_db, whole, bound)], X, "rms (rad)", log_y=True),
+        *plot.error_curves(
+            [panel("Relative to the bound", snr_db, near, bound / bound)], X, "rms over bound", log_y=True
         ),
     ]
+
+
+def panel(title: str, snr_db: Sequence[float], table: Mapping[str, Tensor], bound: Tensor) -> dict[str, Any]:
+    """Medians over trials with their quartiles."""
+    share = torch.tensor([0.5, 0.25, 0.75], dtype=torch.float64)
+    levels = {name: plot.array(values.double().quantile(share, -1)) for name, values in table.items()}
+    return {
+        "title": title,
+        "x": plot.array(torch.tensor(snr_db)),
+        "series": {name: (level[0], level[1:].T) for name, level in levels.items()},
+        "bounds": {"Cramer-Rao bound": plot.array(bound[:, 0])},
+    }
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--small", action="store_true", help="few steps and tests on small scenes, in seconds")
-    parser.add_argument("--trials", type=int, default=6, help="test scenes at each SNR")
+    parser.add_argument("--trials", type=int, help="test scenes at each SNR (default 12, or 3 with --small)")
     parser.add_argument("--out", default="learned_autofocus", help="folder of the picture")
     options = parser.parse_args(arguments)
-    steps, batch, size = (24, 4, TINY) if options.small else (240, 6, TRAINED)
+    steps, batch, size = (12, 4, TINY) if options.small else (240, 6, TRAINED)
+    trials = options.trials or (3 if options.small else 12)
     snr_db = [0.0, 10.0] if options.small else [-10.0, -5.0, 0.0, 5.0, 10.0, 20.0]
 
     began = time.perf_counter()
@@ -303,7 +302,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"training: {steps} steps of {batch} scenes, {time.perf_counter() - began:.0f} s")
 
     found = methods(network)
-    table = errors(found, snr_db, options.trials, sized(*TINY) if options.small else [])
+    table = errors(found, snr_db, trials, sized(*TINY) if options.small else [])
     medians = {name: values.double().quantile(0.5, -1).tolist() for name, values in table.items()}
     show("median rms phase error (rad), SNR:", [f"{snr:g} dB" for snr in snr_db], medians)
     files = [DATA / name for name in RECORDINGS if (DATA / name).is_file()]
@@ -313,7 +312,7 @@ def main(arguments: list[str] | None = None) -> None:
         print("recordings: skipped")
     folder = Path(options.out)
     folder.mkdir(parents=True, exist_ok=True)
-    plot.save(pictures(snr_db, table, losses), folder / "learned_autofocus.png")
+    plot.save(pictures(snr_db, table), folder / "learned_autofocus.png")
 
 
 if __name__ == "__main__":

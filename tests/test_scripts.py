@@ -11,6 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests import scripting
+from torchsar.compensate import correct_pulse_phase
+from torchsar.core import Draws
+from torchsar.metrics import phase_rmse
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
@@ -90,6 +94,37 @@ def test_autofocus_is_composed(printed: Printed, tmp_path: Path) -> None:
     middle = {name: sorted(row)[2] for name, row in rows.items()}
     assert middle["polynomial, region"] < 0.1 < middle["polynomial, whole image"]
     assert (tmp_path / "compose_autofocus.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_network_learns_to_focus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = scripting.run("learned_autofocus", tmp_path, {"learned_autofocus"}, capsys)
+    rows = scripting.rows(text, 34)
+    for i in range(2):
+        bound, learned, known = (rows[name][i] for name in ("bound", "learned", "pga_sca"))
+        assert 0.8 * bound < learned < known, text
+    assert "recordings: skipped" in text
+
+
+def test_the_training_of_a_network_repeats_to_the_bit() -> None:
+    script = scripting.script("learned_autofocus")
+
+    def losses() -> list[float]:
+        scenes = script.Simulated("isal_snr", Draws(1, trials=range(6)), batch=2, overrides=script.sized(*script.TINY))
+        return script.train(script.LearnedAutofocus(Draws(2)), scenes)
+
+    first = losses()
+    assert len(set(first)) == 3 and first == losses()
+
+
+def test_a_learned_autofocus_moves_with_the_phases_and_stays_finite() -> None:
+    script = scripting.script("learned_autofocus")
+    network, draws = script.LearnedAutofocus(Draws(2)), Draws(3, trials=range(2))
+    data = draws.normal("data", (32, 24), torch.complex128).to(torch.complex64)
+    phase = draws.uniform("phase", (32,), -100.0, 100.0, torch.float32)
+    with torch.no_grad():
+        still, turned = network(data, 2), network(correct_pulse_phase(data, -phase), 2)
+        assert bool(torch.isfinite(network(torch.zeros_like(data), 2)).all())
+    assert float(phase_rmse(turned - phase, still).max()) < 1e-3
 
 
 def test_the_benchmark_of_ladar_estimators_runs(printed: Printed) -> None:
