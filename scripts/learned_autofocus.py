@@ -14,6 +14,9 @@ The network is trained on small simulated scenes of the config `isal_snr` and te
 the full size of that config with other seeds. `torchsar.data.Simulated` makes both. All random
 numbers are drawn by address, so that a second run prints the same losses.
 
+In the same way, but with less effect, it learns the two thresholds (floors) of the stage
+`EntropyFixedPoint`, by gradients through its iterations.
+
 The script prints the loss during the training, its time, and the median over trials of the rms
 phase error (rad) over SNR, with the Cramer-Rao bound for a scene of unknown amplitudes. The picture
 shows these errors, and how far they exceed the bound. If the folder TORCHSAR_DATA (by default
@@ -28,7 +31,7 @@ import argparse
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +40,16 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, conv2d, pad, silu, softplus
 
 from torchsar import plot
-from torchsar.compensate import autofocus, correct_pulse_phase, entropy_fixed_point, pga, pga_sca, sca
-from torchsar.core import Draws, Recording, Truth, cis, unit_level
+from torchsar.compensate import (
+    EntropyFixedPoint,
+    autofocus,
+    correct_pulse_phase,
+    entropy_fixed_point,
+    pga,
+    pga_sca,
+    sca,
+)
+from torchsar.core import Axis, Draws, Recording, Signal, Truth, cis, unit_level
 from torchsar.data import Simulated
 from torchsar.io import read_inverse
 from torchsar.metrics import entropy, phase_rmse
@@ -136,12 +147,18 @@ class LearnedAutofocus(nn.Module):
         return self.relaxation * (x * model.conj()).sum(-2).angle()
 
 
-def sized(pulses: int, samples: int, length_m: float, width_m: float) -> list[str]:
+def sized(pulses: float, samples: float, length_m: float, width_m: float) -> list[str]:
     """Overrides of the config for scenes of another size."""
     plane = {"length_m": length_m, "width_m": width_m}
     return [f"world.pulses={pulses}", f"world.samples={samples}"] + [
         f"world.scene.aircraft.{name}={value}" for name, value in plane.items()
     ]
+
+
+def scenes(trials: int, batch: int, size: Sequence[float]) -> Simulated:
+    """Training scenes."""
+    draws = Draws(TRAIN_SEED, trials=range(trials))
+    return Simulated(CONFIG, draws, batch=batch, overrides=sized(*size), vary=any_snr)
 
 
 def any_snr(draws: Draws) -> dict[str, Tensor]:
@@ -152,49 +169,74 @@ def any_snr(draws: Draws) -> dict[str, Tensor]:
     }
 
 
-def strehl_amplitude(phase: Tensor, truth: Tensor) -> Tensor:
-    """Largest |mean over pulses of exp(j error)| of any linear phase, (trial,); 1 without error.
+Loss = Callable[[Tensor, Tensor, int], Tensor]
 
-    Constant and linear phases are no errors. Differentiable.
+
+def train(parameters: Iterable[nn.Parameter], batches: Simulated, loss_of: Loss, rate: float) -> list[float]:
+    """Loss of each step of Adam; a step takes one batch.
+
+    Args:
+        parameters: What is trained.
+        batches: Data and true phases.
+        loss_of: Loss of data (trial, pulse, range), phases (trial, pulse) and a drawn number.
+        rate: Step size at the beginning; it falls to zero.
     """
-    error = cis((phase - truth).to(phase.dtype))
-    return torch.fft.fft(error, 8 * error.shape[-1]).abs().amax(-1) / error.shape[-1]
-
-
-def train(network: LearnedAutofocus, batches: Simulated, learned_rounds: int = 3) -> list[float]:
-    """Loss of each step; a step takes one batch.
-
-    The loss is the mean over trials of ln(1 - Strehl amplitude), where 1 - Strehl amplitude is
-    about half the mean square error. Each step begins after up to 14 rounds, a number that is
-    drawn, so that the network learns the first rounds and the last, and has gradients through a
-    few rounds.
-    """
-    adam = torch.optim.Adam(network.parameters(), lr=0.03)
+    trained = list(parameters)
+    adam = torch.optim.Adam(trained, lr=rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, len(batches))
     drawn = Draws(batches.draws.seed).uniform("rounds before", (len(batches),), high=15.0)
     losses: list[float] = []
     for before, (recording, truth) in zip(drawn.long().tolist(), batches, strict=True):
-        data = recording.signal.data
-        rows = unit_level(data).mT
-        with torch.no_grad():
-            phase = network(data, before)
-        loss = torch.zeros(())
-        for _ in range(learned_rounds):
-            phase = phase + network.step(rows, phase)
-            loss = loss + (1 - strehl_amplitude(phase, truth.values["phase_rad"]) + 1e-4).log().mean()
         adam.zero_grad()
-        (loss / learned_rounds).backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        loss = loss_of(recording.signal.data, truth.values["phase_rad"], before)
+        loss.backward()
+        nn.utils.clip_grad_norm_(trained, 1.0)
         adam.step()
         schedule.step()
-        losses.append(float(loss.detach()) / learned_rounds)
+        losses.append(float(loss.detach()))
     return losses
 
 
-def methods(network: LearnedAutofocus) -> dict[str, Method]:
+def phase_loss(phase: Tensor, truth: Tensor) -> Tensor:
+    """Mean over trials of ln(1 - Strehl amplitude), which is about half the mean square error.
+
+    The Strehl amplitude is the largest |mean over pulses of exp(j error)| of any linear phase:
+    constant and linear phases are no errors. Differentiable.
+    """
+    error = cis((phase - truth).to(phase.dtype))
+    amplitude = torch.fft.fft(error, 8 * error.shape[-1]).abs().amax(-1) / error.shape[-1]
+    return (1 - amplitude + 1e-4).log().mean()
+
+
+def loss_of_network(network: LearnedAutofocus, rounds: int = 3) -> Loss:
+    """Mean loss of a few rounds. Others precede them without gradients, so that the network learns
+    the first rounds and the last.
+    """
+
+    def loss(data: Tensor, truth: Tensor, before: int) -> Tensor:
+        rows, total = unit_level(data).mT, torch.zeros(())
+        with torch.no_grad():
+            phase = network(data, before)
+        for _ in range(rounds):
+            phase = phase + network.step(rows, phase)
+            total = total + phase_loss(phase, truth)
+        return total / rounds
+
+    return loss
+
+
+def loss_of_stage(stage: EntropyFixedPoint, axes: tuple[Axis, ...]) -> Loss:
+    """Loss of the phases that a stage estimates."""
+    return lambda data, truth, _: phase_loss(stage(Signal(data, axes))["phase_rad"], truth)
+
+
+def methods(network: LearnedAutofocus, floors: Sequence[float]) -> dict[str, Method]:
     """Estimators of the phase by name."""
     return {
         **{name: lambda data, function=function: function(data)["phase_rad"] for name, function in LIBRARY.items()},
+        "entropy, learned floors": lambda data: entropy_fixed_point(data, floors=[(f, 12) for f in floors])[
+            "phase_rad"
+        ],
         "learned": network,
         "autofocus, started from learned": lambda data: autofocus(data, start=network(data))["phase_rad"],
     }
@@ -294,14 +336,20 @@ def main(arguments: list[str] | None = None) -> None:
 
     began = time.perf_counter()
     network = LearnedAutofocus(Draws(TRAIN_SEED))
-    draws = Draws(TRAIN_SEED, trials=range(steps * batch))
-    losses = train(network, Simulated(CONFIG, draws, batch=batch, overrides=sized(*size), vary=any_snr))
+    losses = train(network.parameters(), scenes(steps * batch, batch, size), loss_of_network(network), rate=0.03)
     for first in range(0, steps, steps // 6):
         part = losses[first : first + steps // 6]
         print(f"steps {first:3} to {first + len(part) - 1:3}: mean loss {sum(part) / len(part):.6f}")
     print(f"training: {steps} steps of {batch} scenes, {time.perf_counter() - began:.0f} s")
 
-    found = methods(network)
+    stage = EntropyFixedPoint(nn.Parameter(torch.tensor([5.0, 2.0])))
+    few = scenes(steps * batch // 8, batch, size)
+    axes = next(iter(few))[0].signal.axes
+    tuned = train(stage.parameters(), few, loss_of_stage(stage, axes), rate=0.1)
+    learned = torch.as_tensor(stage.floors).tolist()
+    print(f"floors of entropy_fixed_point: 5 and 2, learned {learned[0]:.2f} and {learned[1]:.2f}; {len(tuned)} steps")
+
+    found = methods(network, learned)
     table = errors(found, snr_db, trials, sized(*TINY) if options.small else [])
     medians = {name: values.double().quantile(0.5, -1).tolist() for name, values in table.items()}
     show("median rms phase error (rad), SNR:", [f"{snr:g} dB" for snr in snr_db], medians)

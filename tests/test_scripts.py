@@ -109,8 +109,10 @@ def test_the_training_of_a_network_repeats_to_the_bit() -> None:
     script = scripting.script("learned_autofocus")
 
     def losses() -> list[float]:
-        scenes = script.Simulated("isal_snr", Draws(1, trials=range(6)), batch=2, overrides=script.sized(*script.TINY))
-        return script.train(script.LearnedAutofocus(Draws(2)), scenes)
+        network = script.LearnedAutofocus(Draws(2))
+        return script.train(
+            network.parameters(), script.scenes(6, 2, script.TINY), script.loss_of_network(network), rate=0.03
+        )
 
     first = losses()
     assert len(set(first)) == 3 and first == losses()

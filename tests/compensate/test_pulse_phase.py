@@ -407,3 +407,23 @@ def test_a_start_connects_to_pga():
 def test_invalid_arguments_are_rejected(call, message):
     with pytest.raises(ValueError, match=message):
         call(still(1, 16, 4))
+
+
+def test_gradients_by_settings_and_start_in_a_batch() -> None:
+    """Also if the data require none."""
+    x = torch.randn(2, 12, 6, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
+
+    def phases(floors: Tensor, relaxation: Tensor, start: Tensor) -> Tensor:
+        schedule = [(floor, 2) for floor in floors]
+        return entropy_fixed_point(x, start=start, floors=schedule, relaxation=relaxation, tolerance_rad=0.0)[
+            "phase_rad"
+        ]
+
+    settings = torch.tensor([1.4, 0.8], dtype=torch.float64), torch.tensor(1.5, dtype=torch.float64)
+    start = torch.linspace(0, 1, 24, dtype=torch.float64).reshape(2, 12)
+    assert torch.autograd.gradcheck(phases, [y.requires_grad_() for y in (*settings, start)])
+    stage = EntropyFixedPoint(
+        torch.nn.Parameter(torch.tensor([1.4, 0.8])), relaxation=torch.nn.Parameter(torch.tensor(1.5))
+    )
+    stage(Signal(x, InverseRadar(3.2e9, 50e6, 400.0, 0.01).raw_axes(12, 6)))["phase_rad"][:, 3].sum().backward()
+    assert all(float(p.grad.abs().max()) > 0 for p in stage.parameters()) and len(list(stage.parameters())) == 2

@@ -42,7 +42,7 @@ class Run:
     weights: Weights
     imaging: Imaging
     iterations: int
-    relaxation: float
+    relaxation: Tensor | float
     tolerance_rad: float
 
 
@@ -164,8 +164,8 @@ def entropy_fixed_point(
     data: Tensor,
     *,
     start: Tensor | None = None,
-    floors: Sequence[tuple[float, int]] = ((5.0, 12), (2.0, 12)),
-    relaxation: float = 1.8,
+    floors: Sequence[tuple[Tensor | float, int]] = ((5.0, 12), (2.0, 12)),
+    relaxation: Tensor | float = 1.8,
     tolerance_rad: float = 1e-3,
     imaging: Imaging | None = None,
 ) -> Estimate:
@@ -174,7 +174,8 @@ def entropy_fixed_point(
     Each iteration forms the image and weights its cells with ln(max(p, floor) / floor), where p is
     the power of a cell over the mean power. It transforms the weighted image back to pulses and
     takes the phase of each pulse relative to the result. An iteration takes two transforms and,
-    unlike PGA, needs no peaks and no windows. Differentiable.
+    unlike PGA, needs no peaks and no windows. Differentiable, also in the floors and the
+    relaxation, which may be tensors of one number.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
@@ -218,7 +219,8 @@ def entropy_fixed_point(
         return phase, taken, settled
 
     begin = starting_phase(start, pulses, "entropy_fixed_point")
-    return estimated(pulses, begin, find, at_rest=True, compare=imaging is None)
+    tuned = (relaxation, *(floor for floor, _ in floors))
+    return estimated(pulses, begin, find, at_rest=True, compare=imaging is None, tuned=tuned)
 
 
 def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, Tensor]:

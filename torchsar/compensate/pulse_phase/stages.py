@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchsar.compensate.pulse_phase.data import on_the_circle, rotate
 from torchsar.compensate.pulse_phase.descent import sharpest_phase
@@ -208,9 +208,9 @@ class EntropyFixedPoint(Stage):
 
     Args:
         floors: Power floors as multiples of the mean power of the image, used one after another;
-            cells below the floor get no weight.
+            cells below the floor get no weight. An nn.Parameter, shape (floor,), stays tunable.
         iterations: Largest number of iterations for each floor.
-        relaxation: Factor applied to the phase step.
+        relaxation: Factor applied to the phase step. An nn.Parameter stays tunable.
         imaging: Image formation whose image is sharpened; by default a Fourier transform along
             pulses.
 
@@ -223,9 +223,9 @@ class EntropyFixedPoint(Stage):
 
     def __init__(
         self,
-        floors: list[float] | tuple[float, ...] = (5.0, 2.0),
+        floors: list[float] | tuple[float, ...] | nn.Parameter = (5.0, 2.0),
         iterations: list[int] | tuple[int, ...] = (12, 12),
-        relaxation: float = 1.8,
+        relaxation: float | nn.Parameter = 1.8,
         imaging: Imaging | None = None,
     ) -> None:
         super().__init__()
@@ -234,7 +234,7 @@ class EntropyFixedPoint(Stage):
                 "EntropyFixedPoint: iterations must hold a number of iterations for each floor, got floors "
                 f"{list(floors)} and iterations {list(iterations)}"
             )
-        self.schedule, self.relaxation, self.imaging = tuple(zip(floors, iterations)), relaxation, imaging
+        self.floors, self.iterations, self.relaxation, self.imaging = floors, iterations, relaxation, imaging
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -248,8 +248,9 @@ class EntropyFixedPoint(Stage):
             `Estimate` by the function `entropy_fixed_point` with `phase_rad` of shape (...,
             pulse), to be removed.
         """
+        floors = tuple(zip(self.floors, self.iterations))
         return entropy_fixed_point(
-            signal.data, start=start, floors=self.schedule, relaxation=self.relaxation, imaging=self.imaging
+            signal.data, start=start, floors=floors, relaxation=self.relaxation, imaging=self.imaging
         )
 
 

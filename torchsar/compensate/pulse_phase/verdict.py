@@ -115,6 +115,7 @@ def estimated(
     compare: bool = True,
     imaging: Imaging | None = None,
     halves: Halves | None = None,
+    tuned: Sequence[Tensor | float] = (),
 ) -> Estimate:
     """Run an autofocus method on all trials and predict the accuracy of its phases.
 
@@ -146,6 +147,8 @@ def estimated(
             trials are then processed at once.
         halves: Function of (rows, phase) that divides the pulses into two, whose noise is
             independent and which both determine all phases; by default the rows are divided.
+        tuned: Settings of the method; where one of them, the start or the rows require a gradient,
+            all trials are processed at once.
 
     Returns:
         `phase_rad` of shape (..., pulse) with its standard deviation. Sharpness is the amount by
@@ -168,7 +171,8 @@ def estimated(
     rows, present = pulses.rows, pulses.present
     if not len(rows) or pulses.n < 3:
         return _gathered(pulses, [_no_estimate(rows)])
-    if imaging is not None or len(rows) == 1 or (rows.requires_grad and torch.is_grad_enabled()):
+    of_gradients = any(isinstance(x, Tensor) and x.requires_grad for x in (rows, start, *tuned))
+    if imaging is not None or len(rows) == 1 or (of_gradients and torch.is_grad_enabled()):
         return _gathered(pulses, [_assessed(rows, present, start, find, at_rest, compare, imaging, halves)])
     height = max(1, block_bytes_of(rows.device) // (rows[0].numel() * rows.element_size()))
     parts = [slice(first, first + height) for first in range(0, len(rows), height)]
