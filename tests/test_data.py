@@ -11,7 +11,6 @@ import pytest
 import torch
 import yaml
 from torch import Tensor
-from torch.utils import _pytree as pytree
 from torch.utils.data import DataLoader
 
 from tests.study.tiny import write_tiny
@@ -50,7 +49,7 @@ def of_config(**changes: Any) -> Simulated:
 
 def joined(batches: Any) -> tuple[Tensor, dict[str, Tensor]]:
     """Samples and true values of all trials, in order."""
-    pairs = [pytree.tree_map(lambda x: x, pair) for pair in batches]
+    pairs = list(batches)
     names = [name for name, value in pairs[0][1].values.items() if value.ndim]
     return torch.cat([r.signal.data for r, _ in pairs]), {n: torch.cat([t.values[n] for _, t in pairs]) for n in names}
 

@@ -22,7 +22,8 @@ class Simulated(IterableDataset[Pair]):
     """Batches of simulated recordings and their true values, by the numbers of their trials.
 
     All random numbers of a trial depend only on the seed and the case of `draws` and on the number
-    of the trial. Neither the batch size nor the number of workers of a DataLoader changes a trial.
+    of the trial. Neither the batch size nor the number of workers of a DataLoader changes a trial:
+    on a CPU to the last bit, on a GPU to the rounding of sums in batches of another size.
     With n workers, worker k computes the batches k, k + n, k + 2 n, ..., so that a DataLoader gives
     the same batches in the same order as without workers. The batches are complete: give the
     DataLoader `batch_size=None`.
