@@ -223,7 +223,7 @@ def _wrapped(x: Tensor, originals: Mapping[int, Pretended], packet: Any) -> Pret
     if originals and id(x) in originals:
         return originals[id(x)]
     if x.is_conj() or x.is_neg():
-        # the wrapper has no bit for a lazy conjugate, which torch would resolve before it comes here
+        # the wrapper has no bit for a lazy conjugate, which torch would resolve earlier
         x = x.resolve_conj().resolve_neg()
     made = Pretended(x)
     if packet is _aten.scalar_tensor:

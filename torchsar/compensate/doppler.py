@@ -19,7 +19,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, fft_lines, legendre, settle, unit_level
+from torchsar.core import (
+    Estimate,
+    Signal,
+    Stage,
+    checked_samples,
+    cis,
+    fft_lines,
+    legendre,
+    linear_solve,
+    matrix_inverse,
+    settle,
+    unit_level,
+)
 from torchsar.radar import StripmapRadar
 
 OVER = ("mean", "median")  # how `combine_blocks` combines the blocks
@@ -569,7 +581,7 @@ def _influence(basis: Tensor, weight: Tensor) -> Tensor:
     normal = (basis * weight[..., None]).mT @ basis
     size = normal.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None] + 1e-30
     eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
-    return basis @ torch.linalg.inv(normal / size + 1e-12 * eye) * weight[..., None] / size
+    return basis @ matrix_inverse(normal / size + 1e-12 * eye) * weight[..., None] / size
 
 
 def _weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -578,7 +590,7 @@ def _weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Ten
     normal = weighted.mT @ basis
     ridge = 1e-12 * (normal.diagonal(dim1=-2, dim2=-1).amax(-1) + 1e-30)
     eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
-    coefficients = torch.linalg.solve(normal + ridge[..., None, None] * eye, (weighted * y[..., None]).sum(-2))
+    coefficients = linear_solve(normal + ridge[..., None, None] * eye, (weighted * y[..., None]).sum(-2))
     return coefficients, y - coefficients @ basis.mT
 
 

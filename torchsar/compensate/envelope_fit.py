@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import legendre, linear_phasor, unit_level
+from torchsar.core import legendre, linear_phasor, linear_solve, unit_level
 
 Match = Literal["likelihood", "amplitude"]
 
@@ -485,7 +485,7 @@ def weighted_fit(values: Tensor, basis: Tensor, weight: Tensor) -> Tensor:
     share = weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)
     normal = (basis.mT * share[:, None]) @ basis
     eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
-    return torch.linalg.solve(normal + 1e-9 * eye, (basis.mT * share[:, None]) @ values[..., None]).squeeze(-1)
+    return linear_solve(normal + 1e-9 * eye, (basis.mT * share[:, None]) @ values[..., None]).squeeze(-1)
 
 
 @dataclass(frozen=True)

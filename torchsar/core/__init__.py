@@ -19,13 +19,14 @@ from torchsar.core.fft import (
     transform_in_blocks,
 )
 from torchsar.core.fingerprint import fingerprint
-from torchsar.core.host import device_fault, host_largest, host_value
+from torchsar.core.host import check_value, device_fault, gathered_checks, host_largest, host_value
+from torchsar.core.linear import cholesky_factor, linear_solve, matrix_inverse
 from torchsar.core.memory import LargestTensor, PeakMemory, is_out_of_memory, keep_freed_memory, machine_memory_bytes
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
 from torchsar.core.replace import OwnFiles, remove_empty
 from torchsar.core.seal import SEAL, address, canonical, checksum, is_sealed, sealed
-from torchsar.core.select import best_of, per_trial, take
+from torchsar.core.select import best_of, numbers_on, per_trial, take
 from torchsar.core.signal import Recording, Signal, Truth
 from torchsar.core.spline import UniformSpline
 from torchsar.core.stage import Stage
@@ -61,8 +62,10 @@ __all__ = [
     "canonical",
     "centred_fft",
     "centred_ifft",
+    "check_value",
     "checked_samples",
     "checksum",
+    "cholesky_factor",
     "cis",
     "device_fault",
     "document",
@@ -70,6 +73,7 @@ __all__ = [
     "fft_lines",
     "fingerprint",
     "from_frequency",
+    "gathered_checks",
     "group_attributes",
     "host_largest",
     "host_value",
@@ -79,7 +83,10 @@ __all__ = [
     "legendre",
     "level_of",
     "linear_phasor",
+    "linear_solve",
     "machine_memory_bytes",
+    "matrix_inverse",
+    "numbers_on",
     "outer_phasor",
     "over_blocks",
     "per_trial",

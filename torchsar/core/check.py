@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core.host import host_value
+from torchsar.core.host import check_value
 
 _COMPLEX = (torch.complex64, torch.complex128)
 _REAL = (torch.float32, torch.float64)
@@ -35,13 +35,19 @@ def refuse_non_finite(
     # a lazily conjugated tensor has no real view; signs do not matter here
     x = x.detach().resolve_conj()
     total = torch.view_as_real(x).sum() if x.is_complex() else x.sum()
-    if host_value(torch.isfinite(total), True):
-        return
-    bad = ~torch.isfinite(x)
-    count = int(bad.sum())
-    if count:
-        first = tuple(int(i) for i in bad.nonzero()[0])
-        raise ValueError(f"{what}: {count} of {x.numel()} {noun} are NaN or Inf, the first at index {first}; {advice}")
+
+    def check(finite: float) -> None:
+        if finite:
+            return
+        bad = ~torch.isfinite(x)
+        count = int(bad.sum())
+        if count:
+            first = tuple(int(i) for i in bad.nonzero()[0])
+            raise ValueError(
+                f"{what}: {count} of {x.numel()} {noun} are NaN or Inf, the first at index {first}; {advice}"
+            )
+
+    check_value(torch.isfinite(total), check)
 
 
 def refuse_non_finite_values(what: str, **values: Tensor | float | None) -> None:

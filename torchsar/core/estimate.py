@@ -72,7 +72,10 @@ class Estimate:
         value = self[name]
         if name not in self.neutral:
             return value
-        neutral = torch.as_tensor(self.neutral[name], dtype=value.dtype, device=value.device)
+        neutral = self.neutral[name]
+        if isinstance(neutral, (int, float)):
+            neutral = torch.full((), neutral, dtype=value.dtype, device=value.device)
+        neutral = torch.as_tensor(neutral, dtype=value.dtype, device=value.device)
         return torch.where(self.ok[(...,) + (None,) * (value.ndim - self.ok.ndim)], value, neutral)
 
     @staticmethod

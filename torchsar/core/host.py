@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from torchsar.core.memory import is_out_of_memory
+
 Number = TypeVar("Number", bool, int, float)
+# raises an error if a value is not acceptable
+Check = Callable[[float], None]
+
+
+class _Gathered(threading.local):
+    """The checks that wait for their values, of this thread."""
+
+    def __init__(self) -> None:
+        self.blocks = 0
+        self.waiting: list[tuple[Tensor, Check]] = []
+
+
+_gathered = _Gathered()
 
 
 def host_value(x: Tensor, otherwise: Number) -> Number:
     """Read a number from a tensor, which waits for its device.
 
+    Checks that wait for values of this device (see `gathered_checks`) are made in the same wait.
     Inside `torch.func.vmap` a tensor stands for many trials, and its value cannot be read.
 
     Args:
@@ -25,6 +44,10 @@ def host_value(x: Tensor, otherwise: Number) -> Number:
     Raises:
         RuntimeError: If the tensor has more than one element, or the device fails.
     """
+    if _gathered.waiting and x.numel() == 1 and not _is_mapped(x):
+        read: list[float] = []
+        _make([*_taken(), (x.detach(), read.append)])
+        return type(otherwise)(read[0])
     try:
         return type(otherwise)(x.item())
     except RuntimeError as error:
@@ -60,3 +83,79 @@ def device_fault(device: torch.device | str) -> str:
     except (RuntimeError, AssertionError, TypeError, ImportError) as error:
         return str(error).splitlines()[0].rstrip(".")
     return ""
+
+
+def check_value(x: Tensor, check: Check) -> None:
+    """Check a number in a tensor: at once, or in a block of `gathered_checks` perhaps later.
+
+    Inside `torch.func.vmap` a tensor stands for many trials, and nothing is checked.
+
+    Args:
+        x: Tensor of one real number, float, int or bool; it may require a gradient.
+        check: Function of the number that raises an error if it is not acceptable. It is kept for
+            as long as the check waits.
+
+    Raises:
+        Exception: What `check` raises.
+    """
+    if _gathered.blocks and x.device.type != "cpu" and not _is_mapped(x):
+        _gathered.waiting.append((x.detach(), check))
+        return
+    try:
+        value = x.item()
+    except RuntimeError as error:
+        if "vmap" not in str(error):
+            raise
+        return
+    check(value)
+
+
+@contextmanager
+def gathered_checks() -> Iterator[None]:
+    """Within the block, let the checks of `check_value` wait until a value is read from the device.
+
+    On an accelerator every value that the host reads makes it wait for the device. Waiting checks
+    are made, in their order, with the next number that `host_value` reads, and at the end of the
+    block with one reading; also if the block ends with an error, of which a value that is not
+    acceptable may be the reason. On the CPU every check is made at once. Blocks may be nested; at
+    the end of each no check waits any longer.
+
+    Raises:
+        Exception: What a check raises.
+    """
+    _gathered.blocks += 1
+    try:
+        yield
+    except Exception as error:
+        waiting = _taken()
+        if not is_out_of_memory(error):
+            _make(waiting)
+        raise
+    else:
+        _make(_taken())
+    finally:
+        _gathered.blocks -= 1
+        if not _gathered.blocks:
+            _gathered.waiting = []
+
+
+def _is_mapped(x: Tensor) -> bool:
+    """Whether a tensor belongs to a transform of torch.func, outside which it must not be kept."""
+    return torch._C._functorch.is_functorch_wrapped_tensor(x)
+
+
+def _taken() -> list[tuple[Tensor, Check]]:
+    """The checks that wait, which then no longer do."""
+    waiting, _gathered.waiting = _gathered.waiting, []
+    return waiting
+
+
+def _make(checks: list[tuple[Tensor, Check]]) -> None:
+    """Make checks, with one reading for each device."""
+    values: dict[int, float] = {}
+    for device in dict.fromkeys(x.device for x, _ in checks):
+        here = {i: x for i, (x, _) in enumerate(checks) if x.device == device}
+        read = torch.stack([x.reshape(()).to(torch.float64) for x in here.values()]).tolist()
+        values |= dict(zip(here, read, strict=True))
+    for i, (_, check) in enumerate(checks):
+        check(values[i])

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core.host import host_largest
+from torchsar.core.host import check_value
 from torchsar.core.memory import is_out_of_memory
 
 # the distance of float64 numbers of this size is 6e-5 turn
@@ -104,9 +104,11 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
 
 def _check_resolution(turns: Tensor) -> None:
     """Raise ValueError for phases beyond the precision of float64."""
-    if turns.numel() == 0:
-        return
-    worst = host_largest(turns.detach().abs(), 0.0)
+    if turns.numel():
+        check_value(turns.detach().abs().max(), _check_worst)
+
+
+def _check_worst(worst: float) -> None:
     if not worst <= MAX_TURNS:
         raise ValueError(
             f"the phase must be at most {MAX_TURNS:.0e} turns, beyond which float64 resolves only 1e-4 turn, "

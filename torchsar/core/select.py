@@ -6,6 +6,21 @@ import torch
 from torch import Tensor
 
 
+def numbers_on(device: torch.device | str | None, *numbers: float) -> Tensor:
+    """Return a tensor of a few numbers without a copy from the host, which waits for the device.
+
+    Args:
+        device: Device of the result.
+        *numbers: The numbers.
+
+    Returns:
+        The numbers, shape (number,), float64.
+    """
+    if torch.device(device or "cpu").type == "cpu" or not numbers:
+        return torch.tensor(numbers, dtype=torch.float64, device=device)
+    return torch.stack([torch.full((), number, dtype=torch.float64, device=device) for number in numbers])
+
+
 def per_trial(value: Tensor | float, trailing: int, like: Tensor) -> Tensor:
     """Append dimensions of length one to values per trial, so that they broadcast against data.
 
@@ -18,6 +33,8 @@ def per_trial(value: Tensor | float, trailing: int, like: Tensor) -> Tensor:
         The values in float64, shape (..., 1, ..., 1) with `trailing` dimensions of length one at
         the end.
     """
+    if isinstance(value, (int, float)):
+        return torch.full((1,) * trailing, value, dtype=torch.float64, device=like.device)
     value = torch.as_tensor(value, dtype=torch.float64, device=like.device)
     return value[(...,) + (None,) * trailing]
 

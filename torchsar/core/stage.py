@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torchsar.core.check import checked_samples, refuse_non_finite_values
 from torchsar.core.estimate import Estimate
+from torchsar.core.host import gathered_checks
 from torchsar.core.signal import Signal
 
 
@@ -51,6 +52,11 @@ class Stage(nn.Module):
     takes_empty: bool = True
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
+        with gathered_checks():
+            return self._called(signal, *args, **values)
+
+    def _called(self, signal: Signal, *args: Any, **values: Any) -> Any:
+        """The result of a call, after the checks of its arguments."""
         name = type(self).__name__
         if not isinstance(signal, Signal):
             raise TypeError(

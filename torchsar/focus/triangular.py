@@ -232,7 +232,7 @@ def azimuth_matched_filter(
             "move across the line of sight has no such image"
         )
     n = data.shape[-2]
-    half = _half_aperture(radar, pulse, range_, beam_rad)
+    half = _half_aperture(radar, pulse, range_, beam_rad, data.device)
     turns = azimuth_turns(pulse, range_, radar, data.device)
     lag = torch.arange(-(n - 1), n, device=data.device)
     across = (radar.speed_m_s * pulse.step * lag.to(torch.float64))[:, None].square()
@@ -263,12 +263,14 @@ def _cosine(share: Tensor, weighting: float) -> Tensor:
     return 1 - weighting + weighting * torch.cos(2 * math.pi * share)
 
 
-def _half_aperture(radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: float | None) -> Tensor:
+def _half_aperture(
+    radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: float | None, device: torch.device
+) -> Tensor:
     """Pulses to either side of the middle of the aperture, (range,) int64."""
     beam = radar.beam_rad if beam_rad is None else beam_rad
-    r = radar.reference_range_m + range_.values()
+    r = radar.reference_range_m + range_.values(device)
     if beam is None:
-        return torch.full((range_.n,), pulse.n, dtype=torch.int64)
+        return torch.full((range_.n,), pulse.n, dtype=torch.int64, device=device)
     if not beam > 0:
         raise ValueError(f"beam_rad must be a positive angle or None, got {beam}")
     return torch.floor(beam * r / (2 * radar.speed_m_s * pulse.step)).to(torch.int64).clamp_min(0)

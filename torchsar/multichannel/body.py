@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_phasor, unit_level, unit_phasor
+from torchsar.core import linear_phasor, matrix_inverse, unit_level, unit_phasor
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.migration import Frame, StaticBulk, correct_migration
@@ -404,7 +404,7 @@ def _inverse_covariance(chip: Chip) -> Tensor:
     covariance = covariance + _LOADING * level[:, None, None] * torch.eye(
         covariance.shape[-1], dtype=covariance.dtype, device=covariance.device
     )
-    return turn[..., :, None] * torch.linalg.inv(covariance)[:, None] * turn.conj()[..., None, :]
+    return turn[..., :, None] * matrix_inverse(covariance)[:, None] * turn.conj()[..., None, :]
 
 
 def find_body(

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchsar.core import matrix_inverse
 from torchsar.multichannel.clutter_fit import HANN_LOOKS, Fit
 
 # Blocks of range cells and of Doppler bins, by choice: 32 give a standard deviation to 13 %.
@@ -73,7 +74,7 @@ def deviations(
         The standard deviations.
     """
     channels, bins, count = lines.shape[-3:]
-    inverse = torch.linalg.inv(model)
+    inverse = matrix_inverse(model)
     inner = _through(inverse, lines)
     twice = _through(inverse, inner)
     trace = noise[..., None] * inverse.diagonal(dim1=-2, dim2=-1).real.sum(-1) / 2

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import take
+from torchsar.core import linear_solve, matrix_inverse, take
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.response import Prior, band_matrix, doppler_offsets, first_bin, shared_response
 from torchsar.radar import BistaticRadar
@@ -128,7 +128,7 @@ class ClutterModel:
         balanced = self._smoothed(weights[..., :, None] * products * weights[..., None, :].conj())
         inside, model, power = slice(1, -1), self, self.power
         for _ in range(_POWER_ROUNDS):
-            seen = torch.linalg.inv(model.noisy(snr_db)) @ self.response[..., inside]
+            seen = matrix_inverse(model.noisy(snr_db)) @ self.response[..., inside]
             found = (seen.conj() * (balanced @ seen)).sum(-2).real
             expected = (seen.conj() * self.response[..., inside]).sum(-2).real
             ratio = found / expected.clamp_min(torch.finfo(torch.float64).tiny)
@@ -174,7 +174,7 @@ class ClutterModel:
             log-likelihood per look (...,).
         """
         model = self.noisy(snr_db)
-        matrix = (torch.linalg.inv(model) * products.mT).mean(-3)
+        matrix = (matrix_inverse(model) * products.mT).mean(-3)
         power = products.diagonal(dim1=-2, dim2=-1).real.mean(-2)
         found = solve(matrix[..., None, :, :], _start(matrix, power))
         return found.weights, 2 * found.cost + torch.linalg.slogdet(model)[1].mean(-1)
@@ -191,7 +191,7 @@ class ClutterModel:
             The fit.
         """
         start = self.weights(products.mean(-3), snr_db)[0]
-        inverse = torch.linalg.inv(self.noisy(snr_db))
+        inverse = matrix_inverse(self.noisy(snr_db))
         return solve((inverse[..., None, :, :] * products.mT).mean(-4), start, position)
 
     def lead(self, products: Tensor, weights: Tensor, snr_db: Tensor) -> Tensor:
@@ -208,7 +208,7 @@ class ClutterModel:
         Returns:
             Difference of the log-likelihoods per look, (...,).
         """
-        matrix = (torch.linalg.inv(self.noisy(snr_db)) * products.mT).mean(-3)
+        matrix = (matrix_inverse(self.noisy(snr_db)) * products.mT).mean(-3)
         apart = (self.response[0, :, 2:-1] / self.response[0, :, 1:2]).mT
         others = torch.cat([apart, apart.conj()])
         moved = weights[..., None, :] * torch.cat([torch.ones_like(others[:1]), others])
@@ -310,7 +310,7 @@ def solve(matrix: Tensor, start: Tensor, position: Tensor | None = None) -> Fit:
             hessian
             + (damping * hessian.diagonal(dim1=-2, dim2=-1).abs().amax(-1)).clamp_min(1e-12)[..., None, None] * identity
         )
-        new = logs - torch.linalg.solve(curved, gradient).clamp(-1, 1)
+        new = logs - linear_solve(curved, gradient).clamp(-1, 1)
         after = _expanded(matrix, new, position)
         better = after[0] < cost
         logs = torch.where(better[..., None], new, logs)

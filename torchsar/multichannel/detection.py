@@ -55,7 +55,8 @@ def contrast(image: Signal, extent_m: tuple[float, float] = (60.0, 10.0)) -> tup
     mean = mean[:, 0].unflatten(0, image.trials) if image.trials else mean[0, 0]
     typical = mean.flatten(-2).median(-1).values.clamp_min(torch.finfo(torch.float64).tiny)
     middles = [
-        axis.start + axis.step * ((n - 1) / 2 + max(1, n // 2) * torch.arange(count, dtype=torch.float64))
+        axis.start
+        + axis.step * ((n - 1) / 2 + max(1, n // 2) * torch.arange(count, dtype=torch.float64, device=mean.device))
         for axis, n, count in zip((azimuth, range_), size, mean.shape[-2:], strict=True)
     ]
     return mean / typical[..., None, None], (middles[0], middles[1])

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchsar.core import host_largest, host_value, per_trial
+from torchsar.core import check_value, per_trial
 from torchsar.radar import BistaticRadar
 
 Number = Tensor | float
+_VALUES = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
 
 
 @dataclass(frozen=True)
@@ -154,12 +154,15 @@ class PointMotion:
 
 def _check_motion(motion: PointMotion) -> None:
     """Raise ValueError for motions that are not finite, overtake the receiver or have no range."""
-    slowest, nearest = (-host_largest(-v.detach(), -math.inf) for v in (motion.along_m_s, motion.range_m))
-    not_finite = [
-        name
-        for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
-        if not host_value(torch.isfinite(getattr(motion, name)).all(), True)
-    ]
+    finite = [torch.isfinite(getattr(motion, name)).all() for name in _VALUES]
+    possible = [(value.detach() > 0).all() for value in (motion.along_m_s, motion.range_m)]
+    check_value(torch.stack(finite + possible).all(), lambda fine: None if fine else _refuse(motion))
+
+
+def _refuse(motion: PointMotion) -> None:
+    """Raise ValueError with the reason why a motion is impossible."""
+    not_finite = [name for name in _VALUES if not bool(torch.isfinite(getattr(motion, name)).all())]
+    slowest, nearest = (float(value.detach().min()) for value in (motion.along_m_s, motion.range_m))
     if not_finite:
         raise ValueError(
             f"velocity and position of a point must be finite, got NaN or Inf in {', '.join(not_finite)}; "

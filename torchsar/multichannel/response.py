@@ -20,7 +20,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_phasor, unit_phasor
+from torchsar.core import linear_phasor, linear_solve, unit_phasor
 from torchsar.multichannel.motion import PointMotion
 from torchsar.radar import BistaticRadar
 
@@ -273,9 +273,7 @@ class LeastSquares:
         matrix = band_matrix(radar, motion, self.bands)
         normal = matrix.mH @ matrix
         floor = _TINY * self.bands * radar.channels
-        return torch.linalg.solve(
-            normal + floor * torch.eye(self.bands, dtype=normal.dtype, device=normal.device), matrix.mH
-        )
+        return linear_solve(normal + floor * torch.eye(self.bands, dtype=normal.dtype, device=normal.device), matrix.mH)
 
     def refusal(self, channels: int) -> str | None:
         """Return why the method cannot work with this number of channels, or None if it can."""
@@ -325,7 +323,7 @@ class MinimumMeanSquare:
         matrix = band_matrix(radar, motion, self.bands)[..., None, :, :]
         weighted = matrix * self.prior.power(offset, radar, motion)[..., None, :].to(matrix.dtype)
         noise = 10 ** (-self.snr_db / 10) * torch.eye(radar.channels, dtype=matrix.dtype, device=matrix.device)
-        return torch.linalg.solve(weighted @ matrix.mH + noise, weighted).mH
+        return linear_solve(weighted @ matrix.mH + noise, weighted).mH
 
     def refusal(self, channels: int) -> str | None:
         """Return None, since a prior lets any number of channels separate the bands."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis
+from torchsar.core import Axis, numbers_on
 from torchsar.radar.stripmap import LIGHT_M_S
 from torchsar.radar.waveform import LinearFM
 
@@ -118,7 +118,7 @@ class BistaticRadar:
 
     def channels_at(self, device: torch.device | str | None = None) -> Tensor:
         """Return `channel_m` as a float64 tensor (channel,) on a device."""
-        return torch.tensor(self.channel_m, dtype=torch.float64, device=device)
+        return numbers_on(device, *self.channel_m)
 
     def pulse_axis(self, n_pulse: int) -> Axis:
         """Return the slow-time axis in seconds, zero at pulse n_pulse // 2."""

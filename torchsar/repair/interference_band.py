@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchsar.core import cholesky_factor
 from torchsar.repair.interference_detect import LEVEL_SHARE, THRESHOLD, Level, line_spectra, stands_out
 from torchsar.repair.interference_tone import anything, block_sums, window_sums
 
@@ -137,6 +138,6 @@ def _process(x: Tensor, first: Tensor, ratio: Tensor) -> Tensor:
         (lag[None, :] - lag[:, None]) % (2 * n)
     ]
     system = root[..., :, None] * overlap * root[..., None, :] + torch.eye(m, dtype=wide, device=x.device)
-    solved = torch.cholesky_solve(projected.mT, torch.linalg.cholesky(system)).mT * root[..., None, :]
+    solved = torch.cholesky_solve(projected.mT, cholesky_factor(system)).mT * root[..., None, :]
     spectrum = torch.zeros(*x.shape[:-1], 2 * n, dtype=x.dtype, device=x.device).scatter(-1, index, solved.to(x.dtype))
     return torch.fft.ifft(spectrum, norm="ortho")[..., :n]

@@ -26,6 +26,8 @@ from torchsar.core import (
     cis,
     host_largest,
     linear_phasor,
+    linear_solve,
+    matrix_inverse,
     real_dtype,
     refuse_non_finite_values,
 )
@@ -135,7 +137,7 @@ def band_limited_weights(instants: Tensor, band: float, floor: float = 1e-9) -> 
     """
     eye = torch.eye(instants.shape[-1], dtype=instants.dtype, device=instants.device)
     gram = torch.sinc(band * (instants[..., :, None] - instants[..., None, :])) + floor * eye
-    return torch.linalg.solve(gram, torch.sinc(band * instants)[..., None])[..., 0]
+    return linear_solve(gram, torch.sinc(band * instants)[..., None])[..., 0]
 
 
 def _combine(y: Tensor, weights: Tensor, first: Tensor) -> Tensor:
@@ -267,7 +269,7 @@ def _separate(y: Tensor, offsets: Tensor) -> Tensor:
     lines = lines * linear_phasor(-instant / n, start, q, y.dtype)[..., None, :, :]
     order = torch.arange(m, dtype=torch.float64, device=y.device)
     vandermonde = cis(2 * math.pi * (instant[..., :, None] * order / m)) / m
-    spectrum = torch.linalg.inv(vandermonde).to(y.dtype)[..., None, :, :] @ lines
+    spectrum = matrix_inverse(vandermonde).to(y.dtype)[..., None, :, :] @ lines
     return torch.fft.ifft(torch.fft.ifftshift(spectrum.flatten(-2), dim=-1))
 
 

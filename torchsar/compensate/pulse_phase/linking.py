@@ -28,7 +28,7 @@ from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 from torchsar.compensate.pulse_phase.verdict import LEAST_ROWS, LEAST_STREHL, occupied_band
-from torchsar.core import Estimate, cis, over_blocks
+from torchsar.core import Estimate, cholesky_factor, cis, linear_solve, matrix_inverse, over_blocks
 
 # Longest block whose phases are found by themselves, in pulses; bands of their first guesses as
 # shares of the pulse rate, and the share of the power in the band.
@@ -451,7 +451,7 @@ class _Scene:
 
     def _factor(self, covariance: Tensor) -> tuple[Tensor, Tensor]:
         """Cholesky factor and log determinant of covariances."""
-        lower = torch.linalg.cholesky(covariance)
+        lower = cholesky_factor(covariance)
         return lower, 2 * torch.diagonal(lower, dim1=-2, dim2=-1).real.log().sum(-1)
 
 
@@ -478,7 +478,7 @@ def _smallest(matrix: Tensor, start: Tensor) -> Tensor:
     """Phases, as exp(j phase), of the eigenvector of the smallest eigenvalue; inverse iteration."""
     n = start.shape[-1]
     ridge = 1e-6 * torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1)[:, None, None] + 1e-12
-    lower = torch.linalg.cholesky(matrix + ridge * torch.eye(n, dtype=matrix.dtype, device=matrix.device))
+    lower = cholesky_factor(matrix + ridge * torch.eye(n, dtype=matrix.dtype, device=matrix.device))
     vector = start
     for _ in range(4):
         vector = torch.cholesky_solve(vector[..., None], lower)[..., 0]
@@ -515,7 +515,7 @@ def _step(matrix: Tensor, u: Tensor) -> Tensor:
     # a constant phase has no curvature and no slope
     ridge = 1e-6 * torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1).detach()
     eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
-    return -torch.linalg.solve(bend + ridge[:, None, None] * eye, 2 * slope.imag)
+    return -linear_solve(bend + ridge[:, None, None] * eye, 2 * slope.imag)
 
 
 def _deviation(information: Tensor) -> Tensor:
@@ -525,5 +525,5 @@ def _deviation(information: Tensor) -> Tensor:
     line = torch.linalg.qr(torch.stack([torch.ones_like(pulse), pulse], -1)).Q
     eye = torch.eye(n, dtype=torch.float64, device=information.device)
     flat = eye - line @ line.mT
-    covariance = flat @ torch.linalg.inv(information + _PRIOR * eye) @ flat
+    covariance = flat @ matrix_inverse(information + _PRIOR * eye) @ flat
     return torch.diagonal(covariance, dim1=-2, dim2=-1).clamp_min(0).sqrt()

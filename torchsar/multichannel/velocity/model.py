@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, unit_phasor
+from torchsar.core import Estimate, cholesky_factor, linear_solve, matrix_inverse, unit_phasor
 from torchsar.multichannel.motion import PointMotion
 from torchsar.radar import BistaticRadar, receive_range
 
@@ -196,7 +196,7 @@ def covariance_in(noise: Tensor, slopes: Tensor, amplitude: Tensor) -> Tensor:
     spread = scale[..., :, None] * spread * scale[..., None, :] + _ROUNDING * level * torch.eye(
         unit.shape[-1], dtype=unit.dtype, device=unit.device
     )
-    inverse = scale[..., :, None] * torch.linalg.inv(unit)
+    inverse = scale[..., :, None] * matrix_inverse(unit)
     undetermined = torch.diag_embed((flat.square().sum(-1) * power[..., 0] <= 0).to(unit.dtype)) > 0
     return torch.where(undetermined, torch.inf, inverse @ spread @ inverse.mT)
 
@@ -216,7 +216,7 @@ def solved(normal: Tensor, right: Tensor) -> Tensor:
         Solutions, shape (..., n, k).
     """
     unit, scale = _of_unit_diagonal(normal)
-    return scale[..., :, None] * torch.linalg.solve(unit, scale[..., :, None] * right)
+    return scale[..., :, None] * linear_solve(unit, scale[..., :, None] * right)
 
 
 def round_units(normal: Tensor) -> Tensor:
@@ -232,7 +232,7 @@ def round_units(normal: Tensor) -> Tensor:
         Matrices U, shape (..., n, n), of Frobenius norm 1.
     """
     unit, scale = _of_unit_diagonal(normal)
-    units = scale[..., :, None] * torch.linalg.inv(torch.linalg.cholesky(unit)).mT
+    units = scale[..., :, None] * matrix_inverse(cholesky_factor(unit)).mT
     return units / torch.linalg.matrix_norm(units, keepdim=True)
 
 

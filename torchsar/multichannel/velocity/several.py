@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import take
+from torchsar.core import linear_solve, take
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.likelihood import PointFit, stepped
@@ -140,4 +140,4 @@ def _solved(gram: Tensor, right: Tensor) -> Tensor:
     scale = gram.diagonal(dim1=-2, dim2=-1).real.clamp_min(_TINY).rsqrt()
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     unit = scale[..., :, None] * gram * scale[..., None, :] + _ROUNDING * eye
-    return scale[..., :, None] * torch.linalg.solve(unit, scale[..., :, None] * right)
+    return scale[..., :, None] * linear_solve(unit, scale[..., :, None] * right)

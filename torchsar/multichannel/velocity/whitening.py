@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsar.core import cholesky_factor, matrix_inverse
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.response import shared_response
@@ -174,7 +175,7 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES)
     size = torch.bincount(group).to(torch.float64) * count
     covariance = (total / size).movedim(-1, -3)
     covariance, log_det, coloured = _or_white(covariance, size)
-    inverse = torch.linalg.inv(torch.linalg.cholesky(covariance))
+    inverse = matrix_inverse(cholesky_factor(covariance))
     return Whitening(inverse[..., group, :, :] * ramp.conj().mT[..., None, :], log_det, coloured)
 
 

@@ -138,7 +138,7 @@ class Ocean(World):
         remove, ships, still = RemoveTransmitRange(radar), dict[str, list[Ship]](), data.data
         clean = remove(data)
         for name, part in fleet.parts.items():
-            movers = part.movers(radar, scenes.part(name)).each(lambda x: x.expand(count, -1))
+            movers = part.movers(radar, scenes.part(name)).each(lambda x: x.to(real.device).expand(count, -1))
             vessel = self.targets[name]
             near = torch.as_tensor(vessel.range_m, dtype=torch.float64) + radar.reference_range_m
             motion = PointMotion.of(radar, real, vessel.u_r_m_s, vessel.u_a_m_s, vessel.azimuth_m, near)

@@ -121,7 +121,7 @@ def _points(
     if not places:
         return {}, outside, {}
     at = torch.stack([*places.values()], 1)  # (trial, point, 2)
-    apart = torch.cdist(at, at) + 2 * _SEARCH_M * torch.eye(len(places), dtype=torch.float64)
+    apart = torch.cdist(at, at) + 2 * _SEARCH_M * torch.eye(len(places), dtype=torch.float64, device=at.device)
     search_m = max(image.axes[0].step, min(_SEARCH_M, float(apart.min()) / 2))
     found = impulse_response(image, (at[..., 0], at[..., 1]), search_m=search_m)
     off = torch.stack([found[f"position_{axis}_m"] for axis in IMAGE], -1) - at
