@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Draws, Recording, Signal, Truth, per_trial, real_dtype, unit_phasor
+from torchsar.core import Axis, Draws, Recording, Signal, Truth, gathered_checks, per_trial, real_dtype, unit_phasor
 from torchsar.echo.pulsed import echo_spectrum
 from torchsar.echo.sea import sea_echo
 from torchsar.echo.stripmap import Impairment
@@ -166,6 +166,7 @@ def _pulse_blocks(n_pulse: int, bytes_per_pulse: int) -> Iterator[slice]:
         yield slice(first, min(first + height, n_pulse))
 
 
+@gathered_checks()
 def simulate_bistatic(
     radar: BistaticRadar,
     world: BistaticWorld,

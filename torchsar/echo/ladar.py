@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Truth, host_largest, linear_phasor, real_dtype, unit_phasor
+from torchsar.core import Draws, Recording, Truth, gathered_checks, host_largest, linear_phasor, real_dtype, unit_phasor
 from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over
 from torchsar.echo.stripmap import Impairment
 from torchsar.radar import TriangularLadar, sweep_middles
@@ -312,6 +312,7 @@ def _pulse_blocks(n_pulse: int, bytes_per_pulse: int) -> Iterator[slice]:
         yield slice(first, min(first + height, n_pulse))
 
 
+@gathered_checks()
 def simulate_ladar(
     radar: TriangularLadar,
     world: LadarWorld,

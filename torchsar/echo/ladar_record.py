@@ -10,7 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Truth, UniformSpline, cis, per_trial, real_dtype, reduced_turns
+from torchsar.core import (
+    Draws,
+    Recording,
+    Truth,
+    UniformSpline,
+    cis,
+    gathered_checks,
+    per_trial,
+    real_dtype,
+    reduced_turns,
+)
 from torchsar.echo.ladar import SweepLines, lit_by, refuse_beats, shared
 from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over, noise_std
 from torchsar.echo.stripmap import Impairment
@@ -325,6 +335,7 @@ def _refuse_folding(beat_hz: Tensor, contributing: Tensor) -> None:
         )
 
 
+@gathered_checks()
 def simulate_ladar_record(
     radar: TriangularLadar,
     world: LadarWorld,

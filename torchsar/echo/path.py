@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Signal, Truth, per_trial, unit_phasor
+from torchsar.core import Draws, Recording, Signal, Truth, gathered_checks, per_trial, unit_phasor
 from torchsar.echo.pulsed import echo_spectrum
 from torchsar.echo.stripmap import Impairment, apply_impairments
 from torchsar.radar import AntennaPath, InverseRadar, frequency_samples, range_profiles
@@ -68,6 +68,7 @@ def path_echo(
     return torch.cat(out, -2)
 
 
+@gathered_checks()
 def simulate_path(
     radar: InverseRadar,
     world: PathWorld,

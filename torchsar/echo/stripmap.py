@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Signal, Truth, per_trial
+from torchsar.core import Draws, Recording, Signal, Truth, gathered_checks, per_trial
 from torchsar.echo.pulsed import echo_spectrum
 from torchsar.radar import StripmapRadar
 from torchsar.scene import Scatterers, StripmapWorld
@@ -291,6 +291,7 @@ def lit_power(echo: Tensor) -> Tensor:
     return (power * lit).sum((-2, -1)) / lit.sum((-2, -1)).clamp_min(1)
 
 
+@gathered_checks()
 def simulate(
     radar: StripmapRadar,
     world: StripmapWorld,

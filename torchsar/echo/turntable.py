@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Draws, Recording, Signal, Truth, linear_phasor, per_trial, unit_phasor
+from torchsar.core import Axis, Draws, Recording, Signal, Truth, gathered_checks, linear_phasor, per_trial, unit_phasor
 from torchsar.echo.lines import lost_count
 from torchsar.echo.stripmap import Impairment, apply_impairments
 from torchsar.radar import InverseRadar
@@ -561,6 +561,7 @@ class LostPulses:
         return replace(recording, signal=recording.signal.with_data(data * present[..., None])), {"present": present}
 
 
+@gathered_checks()
 def simulate_turntable(
     radar: InverseRadar,
     world: TurntableWorld,

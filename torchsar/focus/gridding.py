@@ -173,8 +173,7 @@ def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tens
     b, m, taps = weights.shape
     rank, start = _ranks(first), _rows(first, 1, length).flatten()
     # how many points start at or before a row
-    below = torch.zeros(b * length, dtype=torch.int64, device=start.device)
-    below = below.index_add_(0, start, torch.ones_like(start)).cumsum(0)
+    below = _numbers_of(start, b * length).cumsum(0)
     before = torch.cat([below.new_zeros(taps), below[:-taps]])
     entries = below - before
     starts = entries.cumsum(0) - entries
@@ -186,6 +185,14 @@ def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tens
     return embedding_bag(source, values.flatten(0, 1), starts, mode="sum", per_sample_weights=ordered).unflatten(
         0, (b, length)
     )
+
+
+def _numbers_of(values: Tensor, length: int) -> Tensor:
+    """How often each of the numbers 0 to length - 1 occurs, (length,) int64."""
+    if values.device.type == "cpu":
+        return torch.bincount(values, minlength=length)
+    # on other devices `bincount` waits for the largest value
+    return torch.zeros(length, dtype=torch.int64, device=values.device).index_add_(0, values, torch.ones_like(values))
 
 
 def _ranks(first: Tensor) -> Tensor:

@@ -160,7 +160,7 @@ def course_of(chain: Chain, trace: Trace, truth: Mapping[str, Tensor], radar: Tr
     taken = _compensated(chain, trace)
     moved = torch.zeros_like(up)
     if taken is not None:
-        moved = integrated_range(taken, radar, pulse, sweep_middles(radar, pulse)[0])
+        moved = integrated_range(taken, radar, pulse, sweep_middles(radar, pulse, taken.device)[0])
     coarse = error = moved - up
     if phase is not None:
         per_m = 4 * math.pi / radar.wavelength_m

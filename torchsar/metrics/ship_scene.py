@@ -58,9 +58,9 @@ class ImagePosition:
         Returns:
             Indices of the rows, (row, 1), and of the columns, (column,).
         """
-        azimuth, range_ = (axis.values(image.data.device) for axis in image.axes)
-        rows = ((azimuth - self.azimuth_m).abs() < reach_m[0]).nonzero()
-        return rows, ((range_ - self.range_m).abs() < reach_m[1]).nonzero()[:, 0]
+        places = zip(image.axes, (self.azimuth_m, self.range_m), reach_m, strict=True)
+        rows, columns = (((axis.values() - at).abs() < reach).nonzero()[:, 0] for axis, at, reach in places)
+        return rows.to(image.data.device)[:, None], columns.to(image.data.device)
 
     def power(self, image: Signal, reach_m: tuple[float, float]) -> float:
         """Compute the mean power of an image near the position.

@@ -366,11 +366,12 @@ class Scene:
             pulses.append((int(every[:, 0].min()), int(every[:, 1].max())) if len(every) else (0, 0))
         return list(zip(found, pulses, strict=True))
 
-    @property
+    @functools.cached_property
     def waves(self) -> tuple[float, float, float]:
         """Wave numbers in rad/m: lowest, of the carrier (sample n // 2), highest."""
         f = self.frequency_hz * (2 * math.pi / self.speed_m_s)
-        return float(f[0]), float(f[len(f) // 2]), float(f[-1])
+        low, carrier, high = torch.stack([f[0], f[len(f) // 2], f[-1]]).tolist()
+        return low, carrier, high
 
     def node_turns(self, width: int) -> tuple[Tensor, Tensor]:
         """Turns per node over cross range of the pixels of a tile at three wave numbers, with
@@ -619,7 +620,7 @@ def _costs(scene: Scene, wanted: float) -> Iterator[tuple[tuple[int, int, int, i
         s = a / (b / b[:, n // 2, None]) - a[:, n // 2, None]
         for parts in number:
             blocks = [s[:, i:j] for i, j in part_bounds(0, n, parts)]
-            spans[parts] = max(spans[parts], *(float((v.amax(-1) - v.amin(-1)).max()) for v in blocks))
+            spans[parts] = max(spans[parts], float(torch.stack([v.amax(-1) - v.amin(-1) for v in blocks]).max()))
         steepest.append((a.abs(), b.abs()))
     per_metre = _USUAL_OVERSAMPLING * (high - low) / (2 * math.pi)
     usual = torch.linspace(-0.5, 0.5, _TURNS, dtype=torch.float64)
@@ -632,13 +633,14 @@ def _costs(scene: Scene, wanted: float) -> Iterator[tuple[tuple[int, int, int, i
     )
     taps_of = {width: taps_for(_USUAL_SHARE * wanted, *scene.node_turns(width)) for width in widths}
     relief = {size: scene.relief(*size)[1] for size in itertools.product(widths, depths)}
+    tiles_of = [(width, depth, width * grid.step_m / 2, depth * grid.step_m / 2) for width, depth in relief]
+    drifts = torch.stack([torch.stack([(a * x + b * y).max() for a, b in steepest]).max() for *_, x, y in tiles_of])
+    reach_of = {
+        (width, depth): drift + scene.bend * (x + y) ** 2 / 2
+        for (width, depth, x, y), drift in zip(tiles_of, drifts.tolist(), strict=True)
+    }
     for width, depth, parts, order in itertools.product(widths, depths, number, (1, 2)):
-        half = width * grid.step_m / 2, depth * grid.step_m / 2
-        reach = (
-            max(float((a * half[0] + b * half[1]).max()) for a, b in steepest)
-            + scene.bend * (half[0] + half[1]) ** 2 / 2
-        )
-        reach += 2 * relief[width, depth]
+        reach = reach_of[width, depth] + 2 * relief[width, depth]
         taps = taps_of[width]
         assert taps is not None
         reach *= per_metre

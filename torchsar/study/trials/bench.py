@@ -14,7 +14,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Chain, Draws, Estimate, Recording, Trace, is_out_of_memory, machine_memory_bytes
+from torchsar.core import (
+    Chain,
+    Draws,
+    Estimate,
+    Recording,
+    Trace,
+    gathered_checks,
+    is_out_of_memory,
+    machine_memory_bytes,
+)
 from torchsar.echo import apply_impairments
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded, Method
@@ -124,7 +133,7 @@ class Bench:
         Raises:
             ConfigError: If the simulation fails.
         """
-        with self._named("world"):
+        with self._named("world"), gathered_checks():
             if self.recording is None:
                 return self.system.simulate(self, self.world(given), draws)
             impaired, truth = apply_impairments(self.recording, self.impairments, replace(draws, trials=None))
@@ -178,7 +187,8 @@ class Bench:
             fault = fault_of_image(trace.signal, system.images, system.ending) if detail and system.ending else ""
             if fault:  # a chain that ends without an image is a mistake of the config
                 raise (ValueError if trace.signal.names in system.images else ConfigError)(f"processor.{name}, {fault}")
-            judged = self.system.judge(self, name, replace(trace, estimates=estimates), trials, detail)
+            with gathered_checks():
+                judged = self.system.judge(self, name, replace(trace, estimates=estimates), trials, detail)
         except ConfigError as error:
             raise ConfigError(str(error) if str(error).startswith(self.file) else f"{self.file}: {error}") from error
         except Exception as error:  # a stage of the user may raise any error

@@ -178,8 +178,9 @@ class Geo(System):
         whole = {key: value.double().nanmean(-1) for key, value in table.items()}
         each = {**table, **verdicts}
         targets = {t: {key: x[:, i] for key, x in each.items()} for i, t in enumerate(world.targets)}
-        missing = [t for t, row in targets.items() if not all(_seen(value) for value in row.values())]
-        shown = {t: {key: x for key, x in row.items() if _seen(x)} for t, row in targets.items()}
+        seen = {key: torch.isfinite(x.double()).all(0).tolist() for key, x in each.items()}
+        missing = [t for i, t in enumerate(targets) if not all(of[i] for of in seen.values())]
+        shown = {t: {key: x for key, x in row.items() if seen[key][i]} for i, (t, row) in enumerate(targets.items())}
         return Judged(whole, shown, missing, view)
 
     def found(self, bench: Bench, outcome: Outcome, trials: Trials) -> dict[str, Found]:
@@ -266,10 +267,6 @@ def _held(chain: Chain, trace: Trace) -> dict[str, Any]:
     """Values that a chain was given or has estimated."""
     sources = {source for uses in chain.uses.values() for source in uses.values() if source.startswith("given.")}
     return {**trace.estimates, **{source: trace.values[source] for source in sources}}
-
-
-def _seen(value: Tensor) -> bool:
-    return bool(torch.isfinite(value.double()).all())
 
 
 def _clutter(world: Points, radar: BistaticRadar) -> Tensor | None:
