@@ -89,6 +89,13 @@ class Pretended(Tensor):
         made.kept = kept
         return made
 
+    # torch would make index tensors of lists on `meta`, without values
+    def __getitem__(self, index: Any) -> Tensor:
+        return super().__getitem__(_index(index))
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        super().__setitem__(_index(index), value)
+
     def tolist(self) -> Any:
         return self.cpu().tolist()
 
@@ -103,6 +110,12 @@ class Pretended(Tensor):
 
     def __repr__(self) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
         return f"Pretended({self.kept!r})"
+
+
+def _index(index: Any) -> Any:
+    if isinstance(index, tuple):
+        return tuple(_index(each) for each in index)
+    return torch.tensor(index, device=DEVICE) if isinstance(index, list) else index
 
 
 class _Operations(TorchDispatchMode):

@@ -83,8 +83,9 @@ def _weights(mask: Tensor, image: Tensor, what: str) -> Tensor:
             f"{what}: a mask is a tensor of real weights or of bool, got "
             f"{mask.dtype if isinstance(mask, Tensor) else type(mask).__name__}"
         )
+    mask = mask.to(image.device)
     try:
-        weight = mask.to(image.device).expand(image.shape)
+        weight = mask.expand(image.shape)
     except RuntimeError:
         raise ValueError(
             f"{what}: a mask of shape {tuple(mask.shape)} does not broadcast to the image "

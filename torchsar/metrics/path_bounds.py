@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import refuse_non_finite
+from torchsar.core import gathered_checks, linear_solve, matrix_inverse, refuse_non_finite
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
 
@@ -17,6 +17,7 @@ from torchsar.radar.antenna_path import refuse_unusable
 _RIDGE = 1e-12
 
 
+@gathered_checks()
 def line_of_sight_bound_m(
     frequency_hz: Tensor, antennas: AntennaPath, points_m: Tensor, amplitude: Tensor, noise_std: Tensor | float
 ) -> Tensor:
@@ -86,9 +87,9 @@ def _unit_std_m(frequency_hz: Tensor, antennas: AntennaPath, points_m: Tensor, a
     scale = scene.diagonal().clamp_min(torch.finfo(torch.float64).tiny).rsqrt()
     scene, shared = scene * scale * scale[:, None], shared * scale
     scene.diagonal().add_(_RIDGE * float(len(scene)))
-    information = (torch.diag(own) - shared @ torch.linalg.solve(scene, shared.mT)) * 2
+    information = (torch.diag(own) - shared @ linear_solve(scene, shared.mT)) * 2
     time = torch.linspace(-1, 1, pulses, dtype=torch.float64, device=wave.device)
     line = torch.stack([torch.ones_like(time), time], -1)
     free = torch.linalg.qr(line, mode="complete").Q[:, 2:]  # orthogonal to constant and linear terms
-    variance = torch.linalg.inv(free.mT @ information @ free).diagonal().sum() / pulses
+    variance = matrix_inverse(free.mT @ information @ free).diagonal().sum() / pulses
     return variance.sqrt()

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from torchsar.core import Signal, Trace
 from torchsar.multichannel.body import Extraction, centred_motion, chip_about
@@ -48,7 +47,7 @@ class ImagePosition:
         """
         return ImagePosition(motion.speed_m_s * float(motion.image_s), float(motion.closest_m))
 
-    def window(self, image: Signal, reach_m: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    def window(self, image: Signal, reach_m: tuple[float, float]) -> tuple[slice, slice]:
         """Find the pixels of an image near the position.
 
         Args:
@@ -56,11 +55,12 @@ class ImagePosition:
             reach_m: Largest distances in azimuth and range in metres.
 
         Returns:
-            Indices of the rows, (row, 1), and of the columns, (column,).
+            The rows and the columns.
         """
         places = zip(image.axes, (self.azimuth_m, self.range_m), reach_m, strict=True)
-        rows, columns = (((axis.values() - at).abs() < reach).nonzero()[:, 0] for axis, at, reach in places)
-        return rows.to(image.data.device)[:, None], columns.to(image.data.device)
+        near = [((axis.values() - at).abs() < reach).nonzero()[:, 0].tolist() for axis, at, reach in places]
+        rows, columns = (slice(i[0], i[-1] + 1) if i else slice(0) for i in near)
+        return rows, columns
 
     def power(self, image: Signal, reach_m: tuple[float, float]) -> float:
         """Compute the mean power of an image near the position.
@@ -91,7 +91,7 @@ class ImagePosition:
         if not float(total) > 0:
             return self
         azimuth, range_ = (axis.values(image.data.device) for axis in image.axes)
-        along, across = (power.sum(1) * azimuth[rows[:, 0]]).sum(), (power.sum(0) * range_[columns]).sum()
+        along, across = (power.sum(1) * azimuth[rows]).sum(), (power.sum(0) * range_[columns]).sum()
         return ImagePosition(float(along / total), float(across / total))
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import outer_phasor, phasor_tables, real_dtype, unit_phasor
+from torchsar.core import linear_solve, outer_phasor, phasor_tables, real_dtype, unit_phasor
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import CHUNK, Choice, profile_length
 from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
@@ -395,7 +395,7 @@ def _interpolation(wanted: Tensor, degree: int) -> tuple[Tensor, Tensor]:
     half, middle = (wanted.max() - wanted.min()) / 2, (wanted.max() + wanted.min()) / 2
     t = (wanted - middle) / half.clamp_min(torch.finfo(half.dtype).tiny)
     powers = torch.arange(degree + 1, device=wanted.device)
-    matrix = torch.linalg.solve((at[:, None] ** powers).mT, (t[:, None] ** powers).mT).mT
+    matrix = linear_solve((at[:, None] ** powers).mT, (t[:, None] ** powers).mT).mT
     return middle + half * at, matrix
 
 

@@ -1,0 +1,216 @@
+"""Stages, systems and metrics on a pretended accelerator: no operation mixes devices, results equal
+those of the CPU, and the host does not wait more often for more trials.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.contract.pretended import DEVICE, Counts, Pretended, pretended_device, to_device, to_host
+from tests.contract.test_stages import CASES, Case, entering, raw, results
+from tests.extremes.table import FUNCTIONS, NUMBERS, Entry, named, samples
+from tests.study.scenes import loaded_as, world
+from torchsar.core import Draws
+from torchsar.study.trials.bench import Bench
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+
+# stages that cost seconds here, and where else they or their parts run
+ELSEWHERE = {
+    "alternate": "autofocus and rotation_coarse in turn",
+    "autofocus": "in the chain of the system isal",
+    "moving_point": "in the chain of the system geo",
+    "rotation": "in the chain of the system isal_rotation",
+    "rotation_evolution": "like rotation_genetic, with more steps",
+}
+# How many more waits and copies from the host four trials need than two, where it is not none. A
+# figure may only fall; then write the new one.
+GROWTH: dict[str, int] = {}
+
+SMALL = {
+    "stripmap": {},
+    "isal": {},
+    "isal_rotation": {"pulses": 400},
+    "sal": {},
+    "geo": {"pulses": 512},
+    "geo_ocean": {"pulses": 300, "samples": 64},
+    "path": {"pulses": 48, "samples": 48},
+}
+# these cost seconds a trial: one trial against two
+_COSTLY = ("geo_ocean", "path")
+
+
+def waits(counts: Counts) -> Counter[str]:
+    """What makes the host wait for the device: readings, and copies from pageable memory."""
+    return counts.waits + counts.uploads
+
+
+def compare(name: str, two: Counts, four: Counts) -> None:
+    """Waits for four trials against those for two, and the table."""
+    more = waits(four) - waits(two)
+    growth = waits(four).total() - waits(two).total()
+    assert growth == GROWTH.get(name, 0), f"{name}: {growth} more, at {dict(more.most_common(8))}"
+
+
+def equal(found: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float) -> None:
+    for name, value in expected.items():
+        scale = 0.0 if value.dtype == torch.bool or not value.numel() else float(value.abs().nan_to_num().max())
+        assert isinstance(found[name], Pretended), name
+        torch.testing.assert_close(
+            to_host(found[name]),
+            value,
+            atol=tolerance * scale,
+            rtol=0,
+            equal_nan=True,
+            msg=lambda m, n=name: f"{n}: {m}",
+        )
+
+
+def twice(x: Tensor) -> Tensor:
+    return torch.cat([x, x]) if x.ndim else x
+
+
+STAGES = [case for case in CASES if case.name not in ELSEWHERE]
+
+
+@pytest.mark.parametrize("case", STAGES, ids=[case.name for case in STAGES])
+def test_stages(case: Case) -> None:
+    """Two trials, and the same two twice."""
+    signal = entering(case, raw(2, n_range=case.n_range))
+    values = case.values(signal)
+    expected = results(case.build()(signal, **values))
+    counted = []
+    for repeated in (lambda x: x, twice):
+        with pretended_device() as counts:
+            stage = case.build().to(DEVICE)
+            given = to_device({name: repeated(value) for name, value in values.items()})
+            found = results(stage(signal.with_data(to_device(repeated(signal.data))), **given))
+        equal(found, {name: repeated(value) for name, value in expected.items()}, case.tolerance)
+        counted.append(counts)
+    compare(case.name, *counted)
+
+
+@pytest.mark.parametrize("system", SMALL)
+def test_systems(system: str, tmp_path: Path) -> None:
+    """Simulation, recommended chain, metrics and bounds, of few trials and of the same twice."""
+    few = [0] if system in _COSTLY else [0, 1]
+    loaded = loaded_as(tmp_path, system, world=world(system, **SMALL[system]))
+
+    def run(device: str, trials: list[int]) -> dict[str, Tensor]:
+        bench = Bench(loaded, device)
+        batch = bench.batch(Draws(3, "run", trials), methods=["recommended"])
+        bounds = {f"{key} {of}": x for key, each in bench.system.bounds(bench, batch).items() for of, x in each.items()}
+        metrics = batch.outcomes["recommended"].metrics
+        return {**bounds, **{key: x for key, x in metrics.items() if key != "seconds"}}
+
+    expected = run("cpu", few)
+    counted = []
+    for trials in (few, few * 2):
+        with pretended_device() as counts:
+            found = to_host(run(str(DEVICE), trials))
+        for name, value in expected.items():
+            there = value if value.shape == found[name].shape else torch.cat([value] * (len(trials) // len(few)))
+            torch.testing.assert_close(
+                found[name], there, rtol=1e-4, atol=1e-6, equal_nan=True, msg=lambda m, n=name: f"{n}: {m}"
+            )
+        counted.append(counts)
+    compare(system, *counted)
+
+
+# their entries hold tensors of the CPU
+_HELD = ("metrics.replica_level", "metrics.phase_rmse", "metrics.residual_phase", "metrics.rotation_bounds")
+METRICS = [entry for entry in FUNCTIONS if entry.name.startswith("metrics.") and entry.name not in _HELD]
+
+
+@pytest.mark.parametrize("entry", METRICS, ids=[entry.name for entry in METRICS])
+def test_metrics(entry: Entry) -> None:
+    x = samples(entry.kind, 2, torch.complex128)
+    with pretended_device():
+        found = named(entry.call(to_device(x)))
+    equal(found, named(entry.call(x)), 1e-9)
+
+
+# numbers of an instrument, the same for all trials
+_SHARED = ("wavelength_m", "prf_hz", "duration_s", "rate_hz_s")
+
+
+@pytest.mark.parametrize("name", [name for name in NUMBERS if name.startswith("metrics.") and name not in _HELD])
+def test_bounds(name: str) -> None:
+    function, numbers = NUMBERS[name]
+    given = {
+        key: torch.tensor([x, 1.1 * x], dtype=torch.float64) if isinstance(x, float) and key not in _SHARED else x
+        for key, x in numbers.items()
+    }
+    with pretended_device():
+        found = named(function(**to_device(given)))
+    equal(found, named(function(**given)), 1e-9)
+
+
+# the device itself
+
+
+def _refused(f: Callable[[], object]) -> bool:
+    try:
+        f()
+    except RuntimeError as error:
+        return "same device" in str(error)
+    return False
+
+
+def test_the_device_refuses_mixed_operands_as_cuda_does() -> None:
+    with pretended_device():
+        there, here = torch.arange(3.0, device=DEVICE), torch.ones(3)
+        assert _refused(lambda: there + here)
+        assert _refused(lambda: there.sum() * here)
+        assert _refused(lambda: torch.stack([there, here]))
+        assert _refused(lambda: here.add_(there.sum()))
+        assert _refused(lambda: torch.complex(there, torch.tensor(1.0)))
+        assert _refused(lambda: there @ here)
+        assert _refused(lambda: here.gather(0, there.long()))
+        assert to_host(there * torch.tensor(2.0)).tolist() == [0, 2, 4]
+        assert to_host(there[torch.tensor([2, 0])]).tolist() == [2, 0]
+        assert to_host(torch.where(there > 1, there, 0.0)).tolist() == [0, 0, 2]
+        with pytest.raises(RuntimeError):
+            there.numpy()
+
+
+def test_the_device_counts_what_makes_the_host_wait() -> None:
+    def of(f: Callable[[Tensor], object]) -> tuple[int, int]:
+        x = to_device(torch.arange(4.0))
+        with pretended_device() as counts:
+            f(x)
+        return counts.waits.total(), counts.uploads.total()
+
+    assert of(lambda x: x.square().sum()) == (0, 0)
+    assert of(lambda x: float(x.sum())) == (1, 0)
+    assert of(lambda x: bool((x > 1).any())) == (1, 0)
+    assert of(lambda x: x.tolist()) == (1, 0)
+    assert of(lambda x: x.cpu()) == (1, 0)
+    assert of(lambda x: x[x > 1]) == (1, 0)
+    assert of(lambda x: x.nonzero()) == (1, 0)
+    assert of(lambda x: x[x.argmax()]) == (1, 0)
+    assert of(lambda x: torch.linalg.inv(torch.diag(x + 1))) == (1, 0)
+    assert of(lambda x: x.masked_fill(x > 1, 0.0)) == (0, 0)
+    assert of(lambda x: x.__setitem__(x > 1, 0.0)) == (0, 0)
+    assert of(lambda x: x.__setitem__(x > 1, x[:2].clone())) == (1, 0)
+    assert of(lambda x: torch.tensor([1.0, 2.0], device=x.device)) == (0, 1)
+    assert of(lambda x: torch.ones(4).to(x)) == (0, 1)
+    assert of(lambda x: x[torch.tensor([1, 2])]) == (0, 1)
+    assert of(lambda x: x[[1, 2]]) == (0, 1)
+    assert of(lambda x: torch.full((), 3.0, device=x.device) + x) == (0, 0)
+
+
+def test_gradients_pass_through_the_device() -> None:
+    x = torch.linspace(-1, 1, 5, dtype=torch.float64)
+    with pretended_device():
+        there = to_device(x).requires_grad_()
+        (slope,) = torch.autograd.grad((there.exp() * torch.fft.fft(there).abs()).sum(), there)
+    here = x.clone().requires_grad_()
+    (expected,) = torch.autograd.grad((here.exp() * torch.fft.fft(here).abs()).sum(), here)
+    torch.testing.assert_close(to_host(slope), expected)
