@@ -149,7 +149,7 @@ class DopplerLines:
                 1/s^2, ..., shape (..., order - 1), float64.
             duration_s: Aperture time T in seconds.
         """
-        return torch.as_tensor(1 / self.oversampling, dtype=torch.float64, device=k.device)
+        return torch.full((), 1 / self.oversampling, dtype=torch.float64, device=k.device)
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,7 @@ class Kernel:
         Returns:
             Weight of each tap, shape (taps, *offset.shape).
         """
-        coefficients = _polynomials(self).to(dtype=offset.dtype, device=offset.device)
+        coefficients = _polynomials(self, offset.device).to(offset.dtype)
         u = 2 * offset
         powers = [torch.ones_like(u), u]
         for _ in range(coefficients.shape[-1] - 2):
@@ -133,12 +133,12 @@ class Kernel:
             self.taps
             * torch.where(square > 0, torch.sinh(root), torch.sin(root))
             / root
-            / torch.special.i0(torch.tensor(self.shape, dtype=torch.float64, device=cycles.device))
+            / torch.special.i0(torch.full((), self.shape, dtype=torch.float64, device=cycles.device))
         )
 
 
 @functools.lru_cache
-def _polynomials(kernel: Kernel) -> Tensor:
+def _polynomials(kernel: Kernel, device: torch.device) -> Tensor:
     """Coefficients of the piece of the kernel at each tap in powers of twice the offset, float64
     (taps, degree + 1).
     """
@@ -149,7 +149,7 @@ def _polynomials(kernel: Kernel) -> Tensor:
     value = torch.special.i0(kernel.shape * torch.sqrt((1 - z.square()).clamp_min(0))) / torch.special.i0(
         torch.tensor(kernel.shape, dtype=torch.float64)
     )
-    return torch.linalg.lstsq(u[:, None] ** torch.arange(degree + 1), value.T).solution.T.contiguous()
+    return torch.linalg.lstsq(u[:, None] ** torch.arange(degree + 1), value.T).solution.T.contiguous().to(device)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import block_bytes_of, linear_phasor
+from torchsar.core import block_bytes_of, linear_phasor, numbers_on
 from torchsar.core.spline import second_differences
 from torchsar.core.warp import warp, warp_rate
 from torchsar.focus.chirp_z import chirp_z
@@ -81,7 +81,7 @@ def whole_warp(k: Tensor, duration_s: float) -> Tensor:
     Returns:
         phi(T) in seconds, shape (..., 1), float64.
     """
-    return warp(torch.tensor([duration_s], dtype=torch.float64, device=k.device), k)
+    return warp(numbers_on(k.device, duration_s), k)
 
 
 class Sum(Protocol):

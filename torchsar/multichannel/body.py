@@ -344,11 +344,12 @@ def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
         ValueError: If the data have no range cell of the body, or fewer than 12 beside it.
     """
     off = (frame.range_m - motion.range_m).abs()
-    body, beside = off <= extraction.range_m, off > extraction.range_m + _GUARD_CELLS * frame.radar.range_step_m
-    if not bool(body.any()) or int(beside.sum()) < _LEAST_LINES:
+    guard_m = _GUARD_CELLS * frame.radar.range_step_m
+    body, beside = (near.nonzero()[:, 0] for near in (off <= extraction.range_m, off > extraction.range_m + guard_m))
+    if not len(body) or len(beside) < _LEAST_LINES:
         counts = (
-            f"{int(body.sum())} cells within {extraction.range_m:g} m of "
-            f"its range of {float(motion.range_m):.0f} m and {int(beside.sum())} beside it"
+            f"{len(body)} cells within {extraction.range_m:g} m of "
+            f"its range of {float(motion.range_m):.0f} m and {len(beside)} beside it"
         )
         raise ValueError(
             f"the data must hold range cells of the body and at least {_LEAST_LINES} beside it for the covariance of "
@@ -530,8 +531,8 @@ def _closing_speed(chip: Chip, image_s: float, image_m: float, half_m_s: float) 
 
 def _peak(values: Tensor) -> tuple[Tensor, Tensor]:
     """Return the position of the maximum from the middle, in steps, and its curvature."""
-    inner = min(max(int(values.argmax()), 1), len(values) - 2)
-    low, top, high = values[inner - 1 : inner + 2]
+    inner = values.argmax().clamp(1, len(values) - 2)
+    low, top, high = values[inner + torch.arange(-1, 2, device=values.device)]
     curvature = (2 * top - low - high).clamp_min(_TINY)
     return inner - len(values) // 2 + (0.5 * (high - low) / curvature).clamp(-1, 1), curvature
 

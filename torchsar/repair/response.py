@@ -196,7 +196,7 @@ def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, or
     half_log = 0.5 * torch.log((ratio / level.clamp_min(1e-300)).clamp_min(1e-6))
     terms = unit_legendre(u, order).mT
     terms = terms.expand(*half_log.shape[:-1], *terms.shape)
-    coefficients = torch.linalg.lstsq(terms, half_log[..., None]).solution[..., 1:, 0]
+    coefficients = torch.linalg.lstsq(terms, half_log[..., None], driver="gels").solution[..., 1:, 0]
     fitted = torch.exp(coefficients @ unit_legendre(band_grid(power.device), order)[1:])
     return torch.where(level > 0, fitted, 1)
 

@@ -478,9 +478,9 @@ def point_average_coefficients(
     steps = torch.angle(average[..., 1:] * average[..., :-1].conj())
     phase = torch.nn.functional.pad(torch.cumsum(steps, -1), (1, 0))
     magnitude = (average.abs() + 1e-12)[..., None]
-    return torch.linalg.lstsq(magnitude * unit_legendre(u[inside], order).mT, magnitude * phase[..., None]).solution[
-        ..., 2:, 0
-    ]
+    return torch.linalg.lstsq(
+        magnitude * unit_legendre(u[inside], order).mT, magnitude * phase[..., None], driver="gels"
+    ).solution[..., 2:, 0]
 
 
 def _align(spectra: Tensor, reference: Tensor) -> Tensor:

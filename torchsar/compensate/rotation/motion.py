@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import outer_phasor, phasor_tables, unit_phasor
+from torchsar.core import numbers_on, outer_phasor, phasor_tables, unit_phasor
 from torchsar.core.warp import warp
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
@@ -156,8 +156,8 @@ class Motion:
         Returns:
             True where the rotation is possible, shape (trial,), bool.
         """
-        ends = sampling.range_m(torch.tensor([0.0, sampling.cells - 1.0], dtype=torch.float64, device=self.w.device))
-        whole = warp(torch.tensor([sampling.duration_s], dtype=torch.float64, device=self.w.device), self.k)
+        ends = sampling.range_m(numbers_on(self.w.device, 0.0, sampling.cells - 1.0))
+        whole = warp(numbers_on(self.w.device, sampling.duration_s), self.k)
         turns = sampling.turns_per_square * (self.w[:, None] * ends + self.offset[:, None]).abs() * whole.square()
         return torch.isfinite(self.k).all(-1) & (turns < sampling.pulses / 4).all(-1)
 
@@ -213,7 +213,7 @@ class Warped:
         Returns:
             The warped time, its normalised value, and the derivatives with respect to k.
         """
-        end = torch.tensor([duration_s], dtype=torch.float64, device=k.device)
+        end = numbers_on(k.device, duration_s)
         whole, phi = warp(end, k), warp(times_s, k)
         u = phi / whole
         rows = [

@@ -102,7 +102,7 @@ def bank_search(
     energy = torch.zeros(data.shape[:-2], dtype=torch.float64, device=data.device)
     for u_r in _steps(search.u_r_m_s, search.u_r_step_m_s, data.device):
         for offsets in _blocks(_steps(search.u_a_m_s, search.u_a_step_m_s, data.device), data):
-            u_a = torch.as_tensor(u_a_m_s, dtype=torch.float64, device=data.device)[..., None] + offsets
+            u_a = per_trial(u_a_m_s, 1, data) + offsets
             there = PointMotion.of(radar, data, u_r, u_a, 0.0, None if range_m is None else per_trial(range_m, 1, data))
             if image_s is not None:
                 there = replace(there, y0_m=there.position_m(per_trial(image_s, 1, data)))
@@ -208,7 +208,7 @@ def _best_tone(
 
 def _illuminated(weight: Tensor) -> slice:
     """Return the slice from the first to the last pulse with amplitude in any hypothesis."""
-    illuminated = (weight != 0).flatten(0, -2).any(0).nonzero()[:, 0]
+    illuminated = (weight != 0).flatten(0, -2).any(0).cpu().nonzero()[:, 0]
     return slice(int(illuminated[0]), int(illuminated[-1]) + 1) if len(illuminated) else slice(None)
 
 
