@@ -121,3 +121,16 @@ def test_requirements_name_the_skew_and_limit_the_phase_of_range_doppler():
     assert ahead["one Doppler centroid for all range frequencies"].ok
     limit = replace(ahead["range-Doppler"], phase_rad=0.49, error_db=-25.0)
     assert limit.ok and not replace(limit, phase_rad=0.76).ok
+
+
+def test_an_error_of_the_device_is_not_taken_for_vmap(monkeypatch: pytest.MonkeyPatch):
+    raw, centre = noise(2, 12, 16), torch.tensor([DOPPLER_HZ, -170.0], dtype=torch.float64)
+    geometry = FrameGeometry.of(L_BAND, raw, centre, None, 0.0)
+    skew = DopplerSkew.of(L_BAND, raw, centre, geometry.velocity_m_s, 20.0)
+
+    def failing(*_: object) -> torch.Tensor:
+        raise RuntimeError("the device has failed")
+
+    with monkeypatch.context() as patched, pytest.raises(RuntimeError, match="device has failed"):
+        patched.setattr(torch.Tensor, "nonzero", failing)
+        skew.jumps(slice(None))
