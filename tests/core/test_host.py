@@ -154,8 +154,12 @@ def test_numbers_reach_a_device_without_a_copy() -> None:
 def test_a_mask_that_does_not_fit_into_memory_is_no_wrong_mask(monkeypatch: pytest.MonkeyPatch) -> None:
     image, mask = torch.ones(4, 4, dtype=torch.complex64), torch.ones(4, 4)
 
-    def full(*_: object, **__: object) -> Tensor:
-        raise torch.OutOfMemoryError("the device is full")
+    to = Tensor.to
+
+    def full(x: Tensor, *args: object, **kwargs: object) -> Tensor:
+        if x is mask:
+            raise torch.OutOfMemoryError("the device is full")
+        return to(x, *args, **kwargs)
 
     with monkeypatch.context() as patched, pytest.raises(torch.OutOfMemoryError):
         patched.setattr(Tensor, "to", full)

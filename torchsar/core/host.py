@@ -120,6 +120,9 @@ def gathered_checks() -> Iterator[None]:
     acceptable may be the reason. On the CPU every check is made at once. Blocks may be nested; at
     the end of each no check waits any longer.
 
+    Returns:
+        The context manager, which also serves as a decorator.
+
     Raises:
         Exception: What a check raises.
     """
@@ -141,7 +144,7 @@ def gathered_checks() -> Iterator[None]:
 
 def _is_mapped(x: Tensor) -> bool:
     """Whether a tensor belongs to a transform of torch.func, outside which it must not be kept."""
-    return torch._C._functorch.is_functorch_wrapped_tensor(x)
+    return torch._C._functorch.is_functorch_wrapped_tensor(x)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _taken() -> list[tuple[Tensor, Check]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch._C import _LinAlgError as LinAlgError
 
 from torchsar.core.host import check_value
 
@@ -68,7 +69,7 @@ def _check(info: Tensor, what: str) -> None:
 
     def check(failed: float) -> None:
         if failed:
-            raise torch.linalg.LinAlgError(f"{what}, or not finite; add a small multiple of the identity")
+            raise LinAlgError(f"{what}, or not finite; add a small multiple of the identity")
 
     if info.numel():
         check_value((info != 0).any(), check)
