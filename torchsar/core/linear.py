@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch._C import _LinAlgError as LinAlgError
 
 from torchsar.core.host import check_value
 
@@ -69,7 +68,8 @@ def _check(info: Tensor, what: str) -> None:
 
     def check(failed: float) -> None:
         if failed:
-            raise LinAlgError(f"{what}, or not finite; add a small multiple of the identity")
+            text = f"{what}, or not finite; add a small multiple of the identity"
+            raise torch.linalg.LinAlgError(text)  # pyright: ignore[reportPrivateImportUsage]
 
     if info.numel():
         check_value((info != 0).any(), check)
