@@ -177,6 +177,37 @@ def test_small_errors_of_geometry_cost_less_than_one_db() -> None:
     assert off < exact + 1.0
 
 
+def test_one_percent_of_lines_takes_few_focusings(monkeypatch) -> None:
+    """The bright part settles after a dozen steps; the scene model takes four in each round."""
+    columns, compress = [], InvertibleOmegaK.compress
+
+    def counted(self, spectra: Tensor, rows: slice = slice(None)) -> Tensor:
+        columns.append(spectra.shape[-2])
+        return compress(self, spectra, rows)
+
+    monkeypatch.setattr(InvertibleOmegaK, "compress", counted)
+    radar, _, signal, missing = scene(1, LostLines(fraction=0.01))
+    SparseFill(radar)(signal, missing)
+    assert sum(columns) <= 22 * signal.data.shape[-2]
+
+
+@pytest.mark.parametrize("pulses, looks", [(96, 4), (90, 5), (77, 6), (64, 1)])
+def test_blocks_equal_the_whole(monkeypatch, pulses: int, looks: int) -> None:
+    """With gradients the scene is focused as a whole, without them in blocks."""
+    monkeypatch.setattr("torchsar.repair.sparse.block_bytes_of", lambda _: 1 << 15)
+    recording, _ = small_recording(pulses, 80, trials=2, dtype=torch.complex128)
+    missing = torch.zeros(2, pulses, dtype=torch.bool)
+    missing[0, 5], missing[1, 20:23] = True, True
+    geometry = {"doppler_hz": torch.tensor([3.0, -400.0]), "velocity_m_s": torch.tensor([120.0, 121.0])}
+    x = recording.signal.data
+    blocks = sparse_fill(x, missing, RADAR, looks=looks, **geometry)
+    assert (
+        error_db(sparse_fill(x.clone().requires_grad_(), missing, RADAR, looks=looks, **geometry), blocks).max() < -200
+    )
+    alone = sparse_fill(x[1], missing[1], RADAR, looks=looks, doppler_hz=-400.0, velocity_m_s=121.0)
+    assert error_db(blocks[1], alone) < -200
+
+
 def test_chain_from_line_numbers_to_filled_lines() -> None:
     recording, truth = small_recording(trials=2, impairments={"loss": LostLines(count=3)})
     chain = Chain(

@@ -160,7 +160,7 @@ def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor)
         like: The array, whose device and storage decide whether threads can be used.
     """
     parts, threads = list(parts), torch.get_num_threads()
-    if threads == 1 or len(parts) < 2 * threads or like.device.type != "cpu" or not _has_storage(like):
+    if threads == 1 or len(parts) < 2 * threads or like.device.type != "cpu" or not is_plain(like):
         for part in parts:
             work(part)
         return
@@ -181,8 +181,17 @@ def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor)
         torch.set_num_threads(threads)
 
 
-def _has_storage(x: Tensor) -> bool:
-    """Whether x is a plain tensor; torch.func transforms do not reach other threads."""
+def is_plain(x: Tensor) -> bool:
+    """Return whether a tensor has storage of its own, unlike one inside a torch.func transform.
+
+    Transforms do not reach other threads, and wrapped values cannot be written into a plain tensor.
+
+    Args:
+        x: Tensor, any shape.
+
+    Returns:
+        False inside a transform such as vmap.
+    """
     try:
         return x.data_ptr() != 0
     except RuntimeError:

@@ -33,8 +33,8 @@ class InvertibleOmegaK:
     """Omega-K without Stolt interpolation and its adjoint, with filters stored for repeated use.
 
     The approximation is that of `omega_k`. The adjoint maps an image to raw lines; it is the exact
-    inverse where |reference| = 1 or `reference` is None. `to_doppler` and `from_doppler` transform
-    between raw lines and focused azimuth spectra in the domain (Doppler, range). The stored filters
+    inverse where |reference| = 1 or `reference` is None. `compress` and `expand` are the parts that
+    work on each Doppler row by itself, for callers that process blocks of rows. The stored filters
     take one complex number per sample. Doppler and velocity may differ between trials.
 
     Args:
@@ -72,33 +72,35 @@ class InvertibleOmegaK:
         self.bulk = bulk_filter(FrequencyBasis(radar, n, like.device, at.sin_reach), at, range_m, reference, like.dtype)
         self.fine, self.coarse = phasor_tables(refocus_turns_per_sample(at), -centre, n, like.dtype)
 
-    def _residual(self) -> Tensor:
-        """Phase of the refocusing step."""
-        return outer_phasor(self.fine, self.coarse, self.n)
-
-    def to_doppler(self, lines: Tensor) -> Tensor:
-        """Transform raw lines into focused azimuth spectra.
+    def compress(self, spectra: Tensor, rows: slice = slice(None)) -> Tensor:
+        """Transform Doppler rows of the two-dimensional spectrum into focused azimuth spectra.
 
         Args:
-            lines: Raw lines, shape (..., pulse, range), complex.
+            spectra: Rows of the spectrum of raw lines, shape (..., row, range frequency), complex.
+            rows: Slice of the Doppler axis to which the rows belong.
 
         Returns:
-            Azimuth spectra, shape (..., doppler, range).
+            Rows of focused azimuth spectra, shape (..., row, range).
         """
-        return torch.fft.ifft(torch.fft.fft2(lines) * self.bulk) * self._residual()
+        return torch.fft.ifft(spectra * self.bulk[..., rows, :]) * outer_phasor(
+            self.fine[..., rows, :], self.coarse[..., rows, :], self.n
+        )
 
-    def from_doppler(self, spectra: Tensor) -> Tensor:
-        """Transform focused azimuth spectra into raw lines by the adjoint of `to_doppler`.
+    def expand(self, spectra: Tensor, rows: slice = slice(None)) -> Tensor:
+        """Transform Doppler rows by the inverse of `compress`.
 
-        The adjoint is the inverse where the range reference has unit modulus or is None.
+        The result is the adjoint times the number of range samples, which is the inverse where the
+        range reference has unit modulus or is None.
 
         Args:
-            spectra: Azimuth spectra, shape (..., doppler, range), complex.
+            spectra: Rows of focused azimuth spectra, shape (..., row, range), complex.
+            rows: Slice of the Doppler axis to which the rows belong.
 
         Returns:
-            Raw lines, shape (..., pulse, range).
+            Rows of the two-dimensional spectrum of raw lines, shape (..., row, range frequency).
         """
-        return torch.fft.ifft2(torch.fft.fft(spectra * self._residual().conj()) * self.bulk.conj())
+        fine, coarse = self.fine[..., rows, :].conj(), self.coarse[..., rows, :].conj()
+        return torch.fft.fft(spectra * outer_phasor(fine, coarse, self.n)) * self.bulk[..., rows, :].conj()
 
     def focus(self, lines: Tensor) -> Tensor:
         """Focus raw lines with the stored filters; the image equals that of `omega_k`.
@@ -109,7 +111,7 @@ class InvertibleOmegaK:
         Returns:
             Image, same shape.
         """
-        return torch.fft.ifft(self.to_doppler(lines), dim=-2)
+        return torch.fft.ifft(self.compress(torch.fft.fft2(lines)), dim=-2)
 
     def defocus(self, image: Tensor) -> Tensor:
         """Transform an image into raw lines by the adjoint of `focus`.
@@ -122,7 +124,7 @@ class InvertibleOmegaK:
         Returns:
             Raw lines, same shape.
         """
-        return self.from_doppler(torch.fft.fft(image, dim=-2))
+        return torch.fft.ifft2(self.expand(torch.fft.fft(image, dim=-2)))
 
 
 def defocus_omega_k(

@@ -149,8 +149,11 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
     filled = filled / level
     spectrum = azimuth_spectrum(filled.detach(), ~mask.expand(filled.shape)[..., 0, :]).clamp_min(0.05)
     for _ in range(rounds):
-        weight = (1 / spectrum)[..., None, :]
-        filled = conjugate_fill(lambda x, w=weight: torch.fft.ifft(torch.fft.fft(x) * w), filled, mask, steps)
+
+        def precision(x: Tensor, weight: Tensor = (1 / spectrum)[..., None, :]) -> Tensor:
+            return torch.where(mask, torch.fft.ifft(torch.fft.fft(x) * weight), 0)
+
+        filled = conjugate_fill(precision, filled, -precision(filled), steps)
         spectrum = azimuth_spectrum(
             filled.detach(), torch.ones_like(filled[..., 0, :], dtype=torch.bool), 96
         ).clamp_min(2e-3)
@@ -269,7 +272,7 @@ class SparseFill(Stage):
         doppler_hz: Tensor | float | None = None,
         looks: int = 4,
         rounds: int = 2,
-        steps: int = 4,
+        steps: int = 2,
     ) -> None:
         super().__init__()
         if reference is not None and reference not in REFERENCES:
