@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,9 @@ from torchsar.core import Signal, host_value, level_of, unit_level
 
 # quantities that sharpness is defined for, with their power of the modulus |I|
 _OF = {"intensity": 2, "amplitude": 1}
+# chosen: range of the mean and of the total intensity of an image, in which fourth powers of single
+# precision neither underflow nor overflow
+_LEAST_MEAN, _LARGEST_TOTAL = 1e-12, 1e16
 # precision in which images of half precision are evaluated
 _WORKING = {torch.float16: torch.float32, torch.bfloat16: torch.float32, torch.complex32: torch.complex64}
 
@@ -53,9 +58,17 @@ def pair_of(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor,
 
 
 def _power(image: Tensor) -> Tensor:
-    """Intensity |image|^2 relative to its level."""
-    unit = unit_level(image)
-    return unit.real.square() + unit.imag.square() if unit.is_complex() else unit.square()
+    """Intensity |image|^2, relative to the level of each image where single precision needs it."""
+    power = _squares(image)
+    least, largest = torch.aminmax(power.detach().sum((-2, -1)))
+    least = least / (image.shape[-2] * image.shape[-1])
+    usual = host_value(least, 0.0) > _LEAST_MEAN and host_value(largest, math.inf) < _LARGEST_TOTAL
+    return power if usual else _squares(unit_level(image))
+
+
+def _squares(image: Tensor) -> Tensor:
+    """Squared moduli of the pixels."""
+    return image.real.square().add_(image.imag.square()) if image.is_complex() else image.square()
 
 
 def _levels(image: Tensor | Signal, of: str, mask: Tensor | None, what: str) -> tuple[Tensor, Tensor | None]:
@@ -130,9 +143,13 @@ def entropy(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None =
             has negative or non-finite weights.
     """
     level, weight = _levels(image, of, mask, "entropy")
-    total = _sum(level, weight)[..., None, None]
-    p = level / torch.where(total > 0, total, 1)
-    return -_sum(p * torch.log(p.clamp_min(torch.finfo(p.dtype).tiny)), weight)
+    total = _sum(level, weight)
+    total = torch.where(total > 0, total, 1)
+    # -sum p ln p = ln(total / scale) - sum level ln(level / scale) / total, for any scale
+    scale = total.detach()
+    # ln p is finite at 0 with the derivatives that autograd needs
+    log = torch.log((level / scale[..., None, None]).add_(math.sqrt(torch.finfo(level.dtype).tiny)))
+    return torch.log(total / scale) - _sum(level * log, weight) / total
 
 
 def contrast(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None = None) -> Tensor:
