@@ -706,6 +706,7 @@ REASONS = {
     "core.block_bytes_of": "takes a device only",
     "core.keep_freed_memory": "takes no arguments",
     "core.machine_memory_bytes": "takes no arguments",
+    "core.is_plain": "whether a tensor has storage, whatever its values",
     "core.over_blocks": "runs a function; takes no numbers",
     "core.use": "names connections; takes no numbers",
     "core.checked_samples": "the check itself; tests/core/test_core.py",
