@@ -29,8 +29,9 @@ from torchsar.compensate import (
     sca,
 )
 from torchsar.compensate.pulse_phase.data import without_line
-from torchsar.compensate.pulse_phase.gradient import _centred, _solver, _view, _windowed
+from torchsar.compensate.pulse_phase.gradient import _centred, _Rows, _solver, _view, _windowed
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
+from torchsar.compensate.pulse_phase.pairs import pair_products
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point
 from torchsar.core import Chain, Signal, use
 from torchsar.metrics import entropy, phase_rmse, residual_phase
@@ -205,10 +206,29 @@ def test_coherent_kernels_find_the_first_eigenvector(kernel):
     x = noisy(turned(still(1, 64, 32, per_row=1), a[None]), 30.0)
     assert float(phase_rmse(pga(x, kernel=kernel)["phase_rad"][0], a)) < 0.03
     view, everywhere = _view(x.mT.contiguous(), a[None]), torch.ones(1, 64, dtype=torch.bool)
-    g = torch.fft.ifft(_windowed(view, torch.tensor([4])), norm="ortho")[..., :64]
-    rows = _centred(g, view, everywhere)[0]
+    windowed = _Rows(_windowed(view, torch.tensor([4])), 128, everywhere)
+    rows = _centred(windowed, view)[0]
     first = torch.from_numpy(np.linalg.eigh((rows.mT @ rows.conj()).numpy())[1][:, -1])
-    assert constant_apart(_solver(kernel)(g, view, everywhere)[0], torch.angle(first)) < 0.01
+    assert constant_apart(_solver(kernel)(windowed, view)[0], torch.angle(first)) < 0.01
+
+
+@pytest.mark.parametrize("n", [64, 81])
+@pytest.mark.parametrize("half", [1, 2, 7, 15, 40])
+def test_sums_over_range_are_exact_with_any_window(n, half, monkeypatch):
+    """A narrow window is transformed with fewer cells, a wide one or a missing pulse with all."""
+    x = torch.randn(2, 40, n, dtype=torch.complex128, generator=torch.Generator().manual_seed(n + half))
+    view, present = _view(x, torch.zeros(2, n)), torch.ones(2, n, dtype=torch.bool)
+    windowed = _Rows(_windowed(view, torch.tensor([half, max(1, half // 2)])), 2 * n, present)
+    g = windowed.pulses()
+    sizes, ifft = [], torch.fft.ifft
+    monkeypatch.setattr(torch.fft, "ifft", lambda x, **options: (sizes.append(x.numel()), ifft(x, **options))[1])
+    products, before = windowed.adjacent()
+    assert half > 7 or sum(sizes) <= 1.5 * x.numel(), "a padded transform has 2 samples for each of x"
+    torch.testing.assert_close(products, pair_products(g, present))
+    torch.testing.assert_close(before, g[..., :-1].abs().square().sum(-2))
+    present[0, 3] = False
+    holes = _Rows(windowed.cells, 2 * n, present).adjacent()[0]
+    torch.testing.assert_close(holes, pair_products(g, present))
 
 
 @pytest.mark.parametrize("kernel", ["lumv", "ml", "synchronised", "eigenvector"])

@@ -265,7 +265,7 @@ def pga_sca(
     return estimated(prepare(data, "pga_sca"), None, find)
 
 
-Solver = Callable[[Tensor, "_View", Tensor], Tensor]
+Solver = Callable[["_Rows", "_View"], Tensor]
 
 
 @dataclass(frozen=True)
@@ -329,9 +329,13 @@ class _View:
 def _view(rows: Tensor, phase: Tensor) -> _View:
     """Padded image of the pulses with a phase removed."""
     image = torch.fft.fft(rotate(rows, phase), _PADDING * rows.shape[-1], norm="ortho")
-    real, imag = (part.contiguous() for part in (image.detach().real, image.detach().imag))
-    power = torch.addcmul(real * real, imag, imag)
+    power = _power(image.detach())
     return _View(image, power, power.max(-1).indices)
+
+
+def _power(x: Tensor) -> Tensor:
+    """Squared moduli of complex values."""
+    return x.real.square().add_(x.imag.square())
 
 
 def _step(view: _View, width: Tensor, present: Tensor, solve: Solver) -> Tensor:
@@ -339,35 +343,72 @@ def _step(view: _View, width: Tensor, present: Tensor, solve: Solver) -> Tensor:
 
     width: (trial,) in cells of the plain image.
     """
-    g = torch.fft.ifft(_windowed(view, (_PADDING * width / 2).floor().long()), norm="ortho")[..., : present.shape[-1]]
-    return without_line(solve(g, view, present), present)
+    cells = _windowed(view, (_PADDING * width / 2).floor().long())
+    return without_line(solve(_Rows(cells, view.image.shape[-1], present), view), present)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows whose image holds only the cells (trial, range, 2 reach + 1) about zero Doppler.
+
+    `padded` is the number of all cells of the image, `present` (trial, pulse) of the pulses.
+    """
+
+    cells: Tensor
+    padded: int
+    present: Tensor
+
+    def pulses(self) -> Tensor:
+        """The pulses (trial, range, pulse)."""
+        image = _spread(self.cells, self.padded)
+        return torch.fft.ifft(image, norm="ortho")[..., : self.present.shape[-1]]
+
+    def adjacent(self) -> tuple[Tensor, Tensor]:
+        """Products (trial, pulse - 1) of pulses with the conjugate of the pulse before, summed over
+        range, and powers of the pulse before.
+
+        The sums hold only the differences of Doppler within the window. Where it is narrow, they
+        are computed at fewer times than there are pulses and interpolated, which is exact.
+        """
+        reach = self.cells.shape[-1] // 2
+        length = 1 << (4 * reach).bit_length()
+        if 2 * length > self.padded or not bool(self.present.all()):
+            g = self.pulses()
+            return pair_products(g, self.present), _power(g[..., :-1]).sum(-2)
+        offsets = torch.arange(-reach, reach + 1, dtype=torch.float64, device=self.cells.device)
+        earlier = self.cells * unit_phasor(-offsets / self.padded, self.cells.dtype)
+        now, before = (torch.fft.ifft(_spread(x, length), norm="forward") for x in (self.cells, earlier))
+        sums = torch.stack([(now * before.conj()).sum(-2), _power(before).sum(-2).to(now.dtype)])
+        harmonics = torch.fft.fftshift(torch.fft.fft(sums, norm="forward"), dim=-1)[..., 1:]
+        products, powers = torch.fft.ifft(_spread(harmonics, self.padded))[..., 1 : self.present.shape[-1]]
+        return products, powers.real
 
 
 def _windowed(view: _View, half: Tensor) -> Tensor:
-    """The cells within `half` (trial,) of the peak of each row, peak first; zero elsewhere.
+    """The cells within `half` (trial,) of the peak of each row, and zeros beyond.
 
-    (trial, range, 2 n).
+    (trial, range, 2 reach + 1) with the peak in the middle.
     """
     padded = view.image.shape[-1]
     reach = min(int(half.max()), padded // 2 - 1)
     offsets = torch.arange(-reach, reach + 1, device=view.peak.device)
-    cells = view.peak[..., None] + offsets
-    cells = torch.where(cells < 0, cells + padded, torch.where(cells >= padded, cells - padded, cells))
-    near = view.image.gather(-1, cells)
-    if bool((half < reach).any()):
-        near = near * (offsets.abs() <= half[:, None, None])
-    return torch.cat(
-        [near[..., reach:], near.new_zeros((*near.shape[:-1], padded - 2 * reach - 1)), near[..., :reach]], -1
-    )
+    near = view.image.gather(-1, torch.remainder(view.peak[..., None] + offsets, padded))
+    return near * (offsets.abs() <= half[:, None, None]) if bool((half < reach).any()) else near
+
+
+def _spread(cells: Tensor, n: int) -> Tensor:
+    """Cells (..., 2 reach + 1) about zero in FFT order, with zeros up to n."""
+    reach = cells.shape[-1] // 2
+    zeros = cells.new_zeros((*cells.shape[:-1], n - cells.shape[-1]))
+    return torch.cat([cells[..., reach:], zeros, cells[..., :reach]], -1)
 
 
 def _entropy(power: Tensor) -> Tensor:
-    """Entropy (trial,) of images in nats from their powers (trial, range, Doppler)."""
+    """Entropy (trial,) of images in nats from their detached powers (trial, range, Doppler)."""
     total = power.sum((-2, -1))
     tiny = torch.finfo(power.dtype).tiny
-    return torch.log(total.clamp_min(tiny)) - (power * torch.log(power.clamp_min(tiny))).sum((-2, -1)) / torch.where(
-        total > 0, total, 1
-    )
+    terms = power.clamp_min(tiny).log_().mul_(power)
+    return torch.log(total.clamp_min(tiny)) - terms.sum((-2, -1)) / torch.where(total > 0, total, 1)
 
 
 def _profile(view: _View) -> Tensor:
@@ -398,30 +439,30 @@ def _solver(kernel: Kernel) -> Solver:
     return solvers[kernel]
 
 
-def _ml(g: Tensor, view: _View, present: Tensor) -> Tensor:
+def _ml(rows: _Rows, view: _View) -> Tensor:
     """Maximum likelihood kernel: the phases between adjacent pulses."""
-    return running_sum(pair_products(g, present))
+    return running_sum(rows.adjacent()[0])
 
 
-def _lumv(g: Tensor, view: _View, present: Tensor) -> Tensor:
+def _lumv(rows: _Rows, view: _View) -> Tensor:
     """LUMV kernel: sum of Im(conj(g) dg) / sum |g|^2, with dg = g[k] - g[k - 1]."""
-    before = (g.real.square() + g.imag.square()).sum(-2)[..., :-1]
-    step = pair_products(g, present).imag / torch.where(before > 0, before, 1)
+    products, before = rows.adjacent()
+    step = products.imag / torch.where(before > 0, before, 1)
     return torch.cat([torch.zeros_like(step[..., :1]), step.cumsum(-1)], -1)
 
 
-def _eigenvector(g: Tensor, view: _View, present: Tensor) -> Tensor:
+def _eigenvector(rows: _Rows, view: _View) -> Tensor:
     """Phase of the first eigenvector of the sum over rows of g g^H, by power steps."""
-    g = _centred(g, view, present)
+    g = _centred(rows, view)
     v = torch.ones_like(g[:, 0])
     for _ in range(_POWER_STEPS):
         v = _covariance_times(g, v)
     return safe_angle(v)
 
 
-def _synchronised(g: Tensor, view: _View, present: Tensor) -> Tensor:
+def _synchronised(rows: _Rows, view: _View) -> Tensor:
     """Phases that make the rows most coherent over the aperture: power steps of unit modulus."""
-    g = _centred(g, view, present)
+    g = _centred(rows, view)
     v = torch.ones_like(g[:, 0])
     for _ in range(_POWER_STEPS):
         v = _covariance_times(g, v)
@@ -429,17 +470,15 @@ def _synchronised(g: Tensor, view: _View, present: Tensor) -> Tensor:
     return safe_angle(v)
 
 
-def _centred(g: Tensor, view: _View, present: Tensor) -> Tensor:
+def _centred(rows: _Rows, view: _View) -> Tensor:
     """The rows with their interpolated peaks at zero Doppler, and zeros for missing pulses.
 
     Kernels that are coherent over the aperture need the peaks to a fraction of a cell.
     """
+    g = rows.pulses()
     k = torch.arange(g.shape[-1], dtype=torch.float64, device=g.device)
-    return (
-        g
-        * unit_phasor(-(_fraction(view) / view.power.shape[-1])[..., None].double() * k, g.dtype)
-        * present[:, None, :]
-    )
+    turns = -(_fraction(view) / view.power.shape[-1])[..., None].double() * k
+    return g * unit_phasor(turns, g.dtype) * rows.present[:, None, :]
 
 
 def _covariance_times(g: Tensor, v: Tensor) -> Tensor:
