@@ -9,7 +9,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchsar.core import Axis, Signal
-from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
+from torchsar.metrics import contrast, correlation, entropy, error_db, impulse, impulse_response
 
 
 def test_entropy_known_answers():
@@ -236,3 +236,15 @@ def test_invalid_arguments_of_impulse_response_raise():
         impulse_response(image, (math.nan, 1035.0))
     with pytest.raises(ValueError, match="NaN or Inf"):
         impulse_response(image.with_data(image.data * math.nan), (65.0, 1035.0))
+
+
+def test_a_maximum_near_its_sample_is_refined_once(monkeypatch):
+    """The position is refined again only where the maximum lies beyond half a sample."""
+    calls, refined = [], impulse._refined
+    monkeypatch.setattr(impulse, "_refined", lambda *args: (calls.append(1), refined(*args))[1])
+    t = torch.arange(256, dtype=torch.float64)
+    cut = torch.sinc(0.8 * (t - 127.8)).to(torch.complex128)
+    signal = Signal(cut[:, None] * cut, (Axis("azimuth", 256, 0.0, 1.0, "m"), Axis("range", 256, 0.0, 1.0, "m")))
+    out = impulse_response(signal, (torch.tensor([128.0, 126.0]), torch.tensor([128.0, 129.0])))
+    torch.testing.assert_close(out["position_range_m"], torch.full((2,), 127.8, dtype=torch.float64), atol=2e-3, rtol=0)
+    assert len(calls) == 1

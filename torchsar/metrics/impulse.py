@@ -117,11 +117,12 @@ def _patch(data: Tensor, rows: Tensor, cols: Tensor, height: int, width: int) ->
     n_a, n_r = data.shape[-2:]
     i = rows[..., None, None] + torch.arange(height, device=data.device)[:, None] - height // 2
     j = cols[..., None, None] + torch.arange(width, device=data.device) - width // 2
-    inside = (i >= 0) & (i < n_a) & (j >= 0) & (j < n_r)
+    down, right = (i >= 0) & (i < n_a), (j >= 0) & (j < n_r)
     flat = (i.clamp(0, n_a - 1) * n_r + j.clamp(0, n_r - 1)).flatten(-3)
     trials = np.broadcast_shapes(data.shape[:-2], flat.shape[:-1])
     values = data.flatten(-2).expand(*trials, -1).gather(-1, flat.expand(*trials, -1))
-    return values.reshape(*trials, *inside.shape[-3:]) * inside
+    values = values.reshape(*trials, rows.shape[-1], height, width)
+    return values if bool(down.all() & right.all()) else torch.where(down & right, values, 0)
 
 
 def _brightest(data: Tensor, centre: list[Tensor], reach: list[int]) -> tuple[Tensor, Tensor]:
@@ -138,10 +139,14 @@ def _climb(
     per sample, offsets in samples. A skewed response that is sampled finely in one axis and
     coarsely in the other has its maximum more than a sample away from its strongest sample.
     """
+    found = _refined(data, rows, cols, centre_turns)
     for _ in range(rounds):
-        _, _, da, dr = _refined(data, rows, cols, centre_turns)
-        rows, cols = rows + da.round().long(), cols + dr.round().long()
-    return rows, cols, *_refined(data, rows, cols, centre_turns)
+        down, right = (offset.round().long() for offset in found[2:])
+        if not bool(down.any() | right.any()):
+            break
+        rows, cols = rows + down, cols + right
+        found = _refined(data, rows, cols, centre_turns)
+    return rows, cols, *found
 
 
 def _refined(
@@ -199,7 +204,8 @@ def _fine_peak(patch: Tensor, tone_a: Tensor, tone_r: Tensor) -> tuple[Tensor, T
     """
     grid = torch.linspace(-1, 1, 2 * _FINE + 1, dtype=torch.float64, device=patch.device)
     grid = grid.expand(*tone_a.shape, -1)
-    fine = (_kernel(grid, patch.shape[-2], tone_a) @ patch @ _kernel(grid, patch.shape[-1], tone_r).mT).abs().square()
+    fine = _kernel(grid, patch.shape[-2], tone_a) @ patch @ _kernel(grid, patch.shape[-1], tone_r).mT
+    fine = fine.real.square() + fine.imag.square()
     best = fine.flatten(-2).argmax(-1)
     i, j = best // grid.shape[-1], best % grid.shape[-1]
     along_a = fine.gather(-1, j[..., None, None].expand(*j.shape, fine.shape[-2], 1))[..., 0]
@@ -245,7 +251,7 @@ def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[
     wide = torch.zeros((*spectrum.shape[:-1], 2 * n * factor), dtype=spectrum.dtype, device=cut.device)
     wide[..., :n], wide[..., -n:] = spectrum[..., :n], spectrum[..., n:]
     fine = torch.fft.ifft(wide) * factor
-    power = torch.fft.fftshift(fine.abs().square(), dim=-1)
+    power = torch.fft.fftshift(fine.real.square() + fine.imag.square(), dim=-1)
     middle = n * factor
     right, left = power[..., middle:], power[..., 1 : middle + 1].flip(-1)
     widths = [_crossing(side) for side in (right, left)]
