@@ -33,7 +33,8 @@ ELSEWHERE = {
     "rotation_evolution": "like rotation_genetic, with more steps",
 }
 # How many more waits and copies from the host four trials need than two, where it is not none:
-# searches that work through one trial after another. A figure may only fall; then write the new one.
+# searches that work through one trial after another. A figure may only fall; then write the new
+# one.
 GROWTH = {"rotation_search": 4, "rotation_genetic": 12}
 
 SMALL = {
