@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -106,48 +107,59 @@ def test_transform_in_blocks_equals_the_plain_one(dim):
     torch.testing.assert_close(transform_in_blocks(expected.clone(), dim, inverse=True, block_bytes=5000), x)
 
 
+@pytest.mark.parametrize("source", ["numpy", "philox"])
 class TestDraws:
-    def test_chunks_and_order_do_not_matter(self):
-        whole = Draws(7, trials=range(6)).normal("noise", (4, 5), torch.complex64)
+    def test_chunks_and_order_do_not_matter(self, source):
+        draws = Draws(7, trials=range(6), source=source)
+        whole = draws.normal("noise", (4, 5), torch.complex64)
         parts = torch.cat(
-            [Draws(7, trials=t).normal("noise", (4, 5), torch.complex64) for t in ([0, 1], [2], [3, 4, 5])]
+            [draws.for_trials(t).normal("noise", (4, 5), torch.complex64) for t in ([0, 1], [2], [3, 4, 5])]
         )
         assert torch.equal(whole, parts)
-        assert torch.equal(Draws(7, trials=[5, 0]).normal("noise", (4, 5), torch.complex64), whole[[5, 0]])
+        assert torch.equal(draws.for_trials([5, 0]).normal("noise", (4, 5), torch.complex64), whole[[5, 0]])
 
-    def test_a_number_of_trials_in_place_of_indices_is_refused(self):
+    def test_a_number_of_trials_in_place_of_indices_is_refused(self, source):
         with pytest.raises(TypeError, match=r"trials=range\(4\)"):
-            Draws(7, trials=4)  # type: ignore[arg-type]
+            Draws(7, trials=4, source=source)  # type: ignore[arg-type]
 
-    def test_earlier_draws_do_not_change_a_draw(self):
-        a, b = Draws(7), Draws(7)
+    def test_earlier_draws_do_not_change_a_draw(self, source):
+        a, b = Draws(7, source=source), Draws(7, source=source)
         b.uniform("something else", (1000,))
         assert torch.equal(a.normal("noise", (9,)), b.normal("noise", (9,)))
 
-    @pytest.mark.parametrize("other", [Draws(8), Draws(7, case="snr=3"), Draws(7).part("sea"), Draws(7, trials=[1])])
-    def test_every_part_of_the_address_changes_the_draw(self, other):
-        assert not torch.equal(Draws(7).normal("noise", (9,)), other.normal("noise", (9,)).reshape(-1))
+    @pytest.mark.parametrize(
+        "change",
+        [
+            lambda draws: replace(draws, seed=8),
+            lambda draws: replace(draws, case="snr=3"),
+            lambda draws: draws.part("sea"),
+            lambda draws: draws.for_trials([1]),
+        ],
+    )
+    def test_every_part_of_the_address_changes_the_draw(self, source, change):
+        draws = Draws(7, source=source)
+        assert not torch.equal(draws.normal("noise", (9,)), change(draws).normal("noise", (9,)).reshape(-1))
 
-    def test_precisions_draw_the_same_noise(self):
-        double = Draws(7).normal("noise", (99,), torch.complex128)
-        assert torch.equal(double.to(torch.complex64), Draws(7).normal("noise", (99,), torch.complex64))
+    def test_precisions_draw_the_same_noise(self, source):
+        double = Draws(7, source=source).normal("noise", (99,), torch.complex128)
+        assert torch.equal(double.to(torch.complex64), Draws(7, source=source).normal("noise", (99,), torch.complex64))
 
-    def test_moments(self):
-        x = Draws(3).normal("noise", (200_000,), torch.complex128)
+    def test_moments(self, source):
+        x = Draws(3, source=source).normal("noise", (200_000,), torch.complex128)
         assert float(x.abs().square().mean()) == pytest.approx(1, abs=0.02)
         assert abs(complex((x * x).mean())) < 0.02
 
-    def test_subset_has_no_repetition(self):
-        picked = Draws(1, trials=range(3)).subset("lost", 50, 20)
+    def test_subset_has_no_repetition(self, source):
+        picked = Draws(1, trials=range(3), source=source).subset("lost", 50, 20)
         assert picked.shape == (3, 20) and all(len(set(row.tolist())) == 20 for row in picked)
 
-    def test_a_permutation_begins_with_the_subset(self):
-        draws = Draws(1, trials=range(3))
+    def test_a_permutation_begins_with_the_subset(self, source):
+        draws = Draws(1, trials=range(3), source=source)
         order = draws.permutation("lost", 50)
         assert torch.equal(order[:, :20].sort(-1).values, draws.subset("lost", 50, 20))
         uneven = draws.permutation("lost", [50, 7, 30])
         assert torch.equal(uneven[0], order[0]) and uneven[1, 7:].tolist() == list(range(7, 50))
-        assert torch.equal(uneven[1, :7], Draws(1, trials=[1]).permutation("lost", 7)[0])
+        assert torch.equal(uneven[1, :7], Draws(1, trials=[1], source=source).permutation("lost", 7)[0])
 
 
 def test_take_and_best_of_choose_per_trial():

@@ -103,7 +103,7 @@ def test_automatic_chunks_follow_the_bytes_of_the_largest_tensor() -> None:
         x = draws.normal("x", (1024,), torch.complex64)
         return {"m": torch.fft.fft(torch.cat([x, x], -1)).abs().sum(-1)}
 
-    work = Work(trial, make_grid({}), 1)
+    work = Work(trial, make_grid({}), Draws(1))
     bytes_per_trial = probed_bytes(work, 0)
     # the doubled complex64 row, or the float64 draws
     assert bytes_per_trial in (16 * 1024, 32 * 1024)

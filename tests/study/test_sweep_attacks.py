@@ -18,6 +18,7 @@ import torch
 
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
+from torchsar.core import Draws
 from torchsar.study.montecarlo import Stop, read_sweep, sweep
 from torchsar.study.montecarlo.engines import _refuse_unsendable, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import address, check_name, make_grid
@@ -320,9 +321,9 @@ def test_an_algorithm_without_the_metric_neither_succeeds_nor_fails() -> None:
 def test_what_cannot_be_sent_is_a_sentence() -> None:
     pytest.importorskip("cloudpickle")
     lock = threading.Lock()
-    _refuse_unsendable(Work(lambda p, d: {}, make_grid({}), 1))
+    _refuse_unsendable(Work(lambda p, d: {}, make_grid({}), Draws(1)))
     with pytest.raises(ConfigError, match="cannot be sent to worker processes .*lock"):
-        _refuse_unsendable(Work(lambda p, d: {"m": lock}, make_grid({}), 1))
+        _refuse_unsendable(Work(lambda p, d: {"m": lock}, make_grid({}), Draws(1)))
 
 
 def test_a_script_without_its_guard_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

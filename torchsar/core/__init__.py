@@ -5,7 +5,7 @@ from torchsar.core.alternate import Alternate, Turn
 from torchsar.core.axis import Axis
 from torchsar.core.chain import Chain, Trace, Use, use
 from torchsar.core.check import checked_samples, level_of, refuse_non_finite, refuse_non_finite_values, unit_level
-from torchsar.core.draws import Draws
+from torchsar.core.draws import Draws, Source
 from torchsar.core.estimate import Estimate, settle
 from torchsar.core.fft import (
     block_bytes_of,
@@ -48,6 +48,7 @@ __all__ = [
     "PeakMemory",
     "Recording",
     "Signal",
+    "Source",
     "Stage",
     "StoredArray",
     "Trace",

@@ -5,10 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from torchsar.core import numpy_random, philox
+
+Source = Literal["numpy", "philox"]
+_SOURCES = {"numpy": numpy_random, "philox": philox}
 
 
 def generator_at(*address: str | int) -> np.random.Generator:
@@ -23,9 +29,12 @@ def generator_at(*address: str | int) -> np.random.Generator:
     Returns:
         A generator at the beginning of its sequence.
     """
-    return np.random.Generator(
-        np.random.Philox(key=int.from_bytes(hashlib.blake2b(repr(address).encode(), digest_size=16).digest(), "big"))
-    )
+    return np.random.Generator(np.random.Philox(key=_key(*address)))
+
+
+def _key(*address: str | int) -> int:
+    """Hash of an address, a number of 128 bits."""
+    return int.from_bytes(hashlib.blake2b(repr(address).encode(), digest_size=16).digest(), "big")
 
 
 @dataclass(frozen=True)
@@ -35,8 +44,8 @@ class Draws:
     The address of a draw is (seed, purpose, case, trial), where the purpose is the name of the
     quantity that is drawn. A draw therefore does not depend on draws made before it, on the
     division of trials into chunks, or on the device; a repeated draw gives the same numbers.
-    Numbers are drawn in float64 on the CPU and then converted, so that all precisions and devices
-    see the same noise.
+    Numbers are drawn in float64 and then converted, so that all precisions and devices see the same
+    noise.
 
     Args:
         seed: Seed of the whole study.
@@ -45,15 +54,23 @@ class Draws:
             a sweep. A tuple has one case per trial, for a batch that holds several points.
         trials: Indices of the trials of this chunk, which become the leading dimension. None draws
             a single trial without that dimension, with the numbers of trial 0.
+        source: "numpy" draws on the CPU with numpy's generator, and copies the numbers to their
+            device. "philox" computes them on their device from the words of the same generator, so
+            that only keys are copied: uniform numbers are those of "numpy", normal numbers and
+            orders are others. On a CPU it has the same speed for long draws, and is faster for
+            short draws of many trials. Its normal numbers are equal to rounding on all devices,
+            and none lies beyond 6.7 standard deviations.
 
     Raises:
         TypeError: If `trials` is a number instead of indices.
-        ValueError: If the case is a tuple whose length is not the number of trials.
+        ValueError: If the case is a tuple whose length is not the number of trials, or the source
+            is unknown.
     """
 
     seed: int
     case: str | int | tuple[str | int, ...] = 0
     trials: Sequence[int] | None = None
+    source: Source = "numpy"
 
     def __post_init__(self) -> None:
         if isinstance(self.trials, int):
@@ -67,6 +84,8 @@ class Draws:
                 f"{None if self.trials is None else len(self.trials)}; give one case for all trials, "
                 "or a tuple with one case per trial"
             )
+        if self.source not in get_args(Source):
+            raise ValueError(f"source of Draws must be {' or '.join(map(repr, get_args(Source)))}, got {self.source!r}")
 
     def for_trials(self, trials: Sequence[int]) -> Draws:
         """Return a source of random numbers with this seed and case, but for other trials.
@@ -96,16 +115,15 @@ class Draws:
             else f"{self.case}/{name}",
         )
 
-    def _generators(self, purpose: str) -> list[np.random.Generator]:
-        """Generators at the addresses of all trials."""
+    def _keys(self, purpose: str) -> list[int]:
+        """Keys of the addresses of all trials."""
         trials = self.trials if self.trials is not None else [0]
         cases = self.case if isinstance(self.case, tuple) else [self.case] * len(trials)
-        return [generator_at(self.seed, purpose, case, trial) for case, trial in zip(cases, trials, strict=True)]
+        return [_key(self.seed, purpose, case, trial) for case, trial in zip(cases, trials, strict=True)]
 
-    def _stack(self, arrays: list[np.ndarray], dtype: torch.dtype, device: torch.device | str | None) -> Tensor:
-        """Arrays of all trials as one tensor, without the leading dimension for a single trial."""
-        x = torch.from_numpy(np.stack(arrays))
-        return (x if self.trials is not None else x[0]).to(device=device, dtype=dtype)
+    def _of_trials(self, x: Tensor) -> Tensor:
+        """Numbers of all trials, without the leading dimension for a single trial."""
+        return x if self.trials is not None else x[0]
 
     def normal(
         self,
@@ -126,14 +144,8 @@ class Draws:
             Numbers of shape (trial, *shape) with mean zero and unit variance. For a complex dtype
             they are circular Gaussian, with a mean square magnitude of one.
         """
-        if dtype.is_complex:
-            parts = self._stack(
-                [g.standard_normal((*shape, 2)) for g in self._generators(purpose)], torch.float64, None
-            )
-            return (torch.view_as_complex(parts) / 2**0.5).to(device=device, dtype=dtype)
-        return self._stack(
-            [np.asarray(g.standard_normal(tuple(shape))) for g in self._generators(purpose)], dtype, device
-        )
+        made = _SOURCES[self.source].normal(self._keys(purpose), shape, dtype, _device(device))
+        return self._of_trials(made)
 
     def uniform(
         self,
@@ -157,9 +169,8 @@ class Draws:
         Returns:
             Numbers of shape (trial, *shape).
         """
-        return self._stack(
-            [np.asarray(g.uniform(low, high, tuple(shape))) for g in self._generators(purpose)], dtype, device
-        )
+        made = _SOURCES[self.source].uniform(self._keys(purpose), shape, low, high, dtype, _device(device))
+        return self._of_trials(made)
 
     def subset(self, purpose: str, n: int, k: int, device: torch.device | str | None = None) -> Tensor:
         """Draw k of the whole numbers 0 to n - 1 without repetition.
@@ -173,7 +184,7 @@ class Draws:
         Returns:
             Chosen numbers of shape (trial, k) in rising order, int64.
         """
-        return self._stack([np.sort(g.permutation(n)[:k]) for g in self._generators(purpose)], torch.int64, device)
+        return self.permutation(purpose, n, device)[..., :k].sort(-1).values
 
     def permutation(self, purpose: str, n: int | Sequence[int], device: torch.device | str | None = None) -> Tensor:
         """Draw the whole numbers 0 to n - 1 in random order.
@@ -189,10 +200,11 @@ class Draws:
             Numbers of shape (trial, largest n), int64. The row of a trial with a smaller n is
             filled up with the whole numbers from that n on, in rising order.
         """
-        generators = self._generators(purpose)
-        counts = [n] * len(generators) if isinstance(n, int) else list(n)
-        rows = [
-            np.concatenate([g.permutation(count), np.arange(count, max(counts))])
-            for g, count in zip(generators, counts, strict=True)
-        ]
-        return self._stack(rows, torch.int64, device)
+        keys = self._keys(purpose)
+        counts = [n] * len(keys) if isinstance(n, int) else list(n)
+        return self._of_trials(_SOURCES[self.source].permutation(keys, counts, _device(device)))
+
+
+def _device(device: torch.device | str | None) -> torch.device:
+    """The device; the CPU for None."""
+    return torch.device("cpu" if device is None else device)

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws
 from torchsar.study.commands.requires import refuse_beyond_limits
 from torchsar.study.output.arrays import write_arrays, write_json
 from torchsar.study.output.folder import fresh_result
@@ -111,7 +110,7 @@ def _case(bench: Bench, name: str) -> Result:
     neutral: dict[str, Counter[str]] = {}
     for chunk in _chunks(bench):
         keep = bench.chains if first is None else ()
-        batch = bench.batch(Draws(bench.config.seed, system.address, chunk), keep=keep, detail=True)
+        batch = bench.batch(bench.draws(system.address, chunk), keep=keep, detail=True)
         first = first or batch
         truth.append(_scalars(batch))
         for method, outcome in batch.outcomes.items():

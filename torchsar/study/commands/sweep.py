@@ -15,7 +15,15 @@ from torch import Tensor
 from torchsar.core import Draws
 from torchsar.study.montecarlo.engines import engine
 from torchsar.study.montecarlo.grid import Grid, make_grid
-from torchsar.study.montecarlo.loop import SWEEP_FILES, Interrupted, Plan, Stop, open_store, run_plan
+from torchsar.study.montecarlo.loop import (
+    SWEEP_FILES,
+    Interrupted,
+    Plan,
+    Stop,
+    identity_of_draws,
+    open_store,
+    run_plan,
+)
 from torchsar.study.montecarlo.pictures import draw_sweep
 from torchsar.study.montecarlo.record import Record
 from torchsar.study.montecarlo.report import write_sweep_report
@@ -30,12 +38,12 @@ from torchsar.study.trials.bench import Bench
 
 log = logging.getLogger("torchsar")
 # keys that change only how much is computed or shown are not part of the identity of results
-_NOT_IDENTITY: Any = dict.fromkeys(("sweep", "trade", "title", "seed", "cases", "beyond_limits"), True) | {
+_NOT_IDENTITY: Any = dict.fromkeys(("sweep", "trade", "title", "seed", "random", "cases", "beyond_limits"), True) | {
     "processor": {"__all__": {"title"}}
 }
 # results that the same trial does not give again
 _NOT_RESULTS = ("seconds",)
-_FIXED = ("sweep", "seed", "data", "title", "trade", "system", "cases")
+_FIXED = ("sweep", "seed", "random", "data", "title", "trade", "system", "cases")
 
 
 class SweepTrial:
@@ -128,7 +136,8 @@ def sweep(
     named = {"success": settings.success, "show": settings.show, "stop.metric": [stop.metric] if stop else []}
     needs = tuple((f"{loaded.file}: sweep.{key}", metric) for key, metrics in named.items() for metric in metrics)
     save = frozenset(settings.save.trials)
-    plan = Plan(grid, settings.trials, loaded.config.seed, settings.chunk, stop, save, device, needs)
+    seed, random = loaded.config.seed, loaded.config.random
+    plan = Plan(grid, settings.trials, seed, settings.chunk, stop, save, device, needs, random)
     plan.refuse_missing(trial)
     config_text = loaded.text()
     about = {"title": loaded.config.title, "config": config_text, "dtype": loaded.config.precision}
@@ -200,10 +209,11 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
 
 
 def identity(loaded: Loaded) -> dict[str, Any]:
-    """Return what the results depend on besides the grid: the seed, and all other keys of the
-    config that change results.
+    """Return what the results depend on besides the grid: the seed and the source of the random
+    numbers, and all other keys of the config that change results.
     """
-    return {"seed": loaded.config.seed, "config": loaded.config.model_dump(exclude=_NOT_IDENTITY)}
+    config = loaded.config
+    return {**identity_of_draws(config.seed, config.random), "config": config.model_dump(exclude=_NOT_IDENTITY)}
 
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> None:

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 
-from torchsar.core import device_fault, fingerprint
+from torchsar.core import Draws, Source, device_fault, fingerprint
 from torchsar.metrics.intervals import half_width_ratio
 from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import Grid, make_grid
@@ -98,9 +98,11 @@ class Plan:
         save: Numbers of the trials whose arrays are kept.
         device: Device on which batches are computed.
         needs: (key of the config, metric) of each metric that the trial function must return.
+        random: Source of the random numbers; see `torchsar.Draws`.
 
     Raises:
-        ConfigError: If a number is out of range, or the device cannot be used.
+        ConfigError: If a number is out of range, the source is unknown, or the device cannot be
+            used.
     """
 
     grid: Grid
@@ -111,6 +113,7 @@ class Plan:
     save: frozenset[int] = frozenset()
     device: str = "cpu"
     needs: tuple[tuple[str, str], ...] = ()
+    random: Source = "numpy"
 
     def __post_init__(self) -> None:
         for name, value, least in (("trials", self.trials, 1), ("chunk", self.chunk, 1), ("seed", self.seed, 0)):
@@ -121,13 +124,15 @@ class Plan:
             raise ConfigError(
                 f"sweep: save must list numbers of trials, which are 0 to {self.trials - 1}, got {absent!r}"
             )
+        if self.random not in get_args(Source):
+            raise ConfigError(f"sweep: random must be {' or '.join(get_args(Source))}, got {self.random!r}")
         reason = device_fault(self.device)
         if reason:
             raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {reason}")
 
     def work(self, trial: Trial) -> Work:
         """What a process needs to compute its chunks."""
-        return Work(trial, self.grid, self.seed, self.device, self.save)
+        return Work(trial, self.grid, Draws(self.seed, source=self.random), self.device, self.save)
 
     def refuse_missing(self, trial: Trial) -> None:
         """Compute the first trial, and check that it returns every metric in `needs`.
@@ -162,6 +167,7 @@ def sweep(
     device: str = "cpu",
     config: Mapping[str, Any] | None = None,
     version: str | int | None = None,
+    random: Source = "numpy",
 ) -> Record:
     """Run a trial function over a grid of parameters, many trials at once.
 
@@ -197,6 +203,8 @@ def sweep(
             it is resumed only if the code of `trial`, what it closes over and the global names that
             it uses are unchanged; see `torchsar.core.fingerprint`. Give a version if these change
             without an effect on the results, or if results depend on more than these.
+        random: Source of the random numbers: "numpy" draws them on the CPU, "philox" computes other
+            numbers on the device where they are used; see `torchsar.Draws`.
 
     Returns:
         The results, with the dims (algorithm, *parameters, trial).
@@ -219,14 +227,21 @@ def sweep(
     if out is None and set(save):
         raise ConfigError("sweep: save needs out, the folder in which the arrays are kept; give out as well")
     needs = () if stop is None else (("stop.metric", stop.metric),)
-    plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device, needs)
+    plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device, needs, random)
     plan.refuse_missing(trial)
     made = fingerprint(trial)
     about = made if version is None else {"name": made["name"], "version": version}
-    identity = {"seed": seed, "trial": about, "config": dict(config or {})}
+    identity = {**identity_of_draws(seed, random), "trial": about, "config": dict(config or {})}
     with nullcontext() if out is None else opened(Path(out), "sweep", SWEEP_FILES) as folder:
         store = None if folder is None else open_store(folder, plan, identity, resume)
         return run_plan(plan, trial, store, engine(workers, cluster, threads)).select(plan.grid.labels)
+
+
+def identity_of_draws(seed: int, random: Source) -> dict[str, Any]:
+    """Return what the random numbers of a sweep depend on besides their addresses. Sweeps that were
+    recorded before there were other sources than numpy go on with it.
+    """
+    return {"seed": seed, **({} if random == "numpy" else {"random": random})}
 
 
 def open_store(folder: ResultFolder, plan: Plan, identity: Mapping[str, Any], resume: bool) -> Store:
@@ -325,7 +340,10 @@ class _Run:
         finally:
             rows = {str(case): n for case, n in self.rows.items()}
             session |= {"seconds": count.seconds, "trials": count.new, "chunk_rows": rows}
-            self._about(seed=self.plan.seed, sessions=[*self.record.about.get("sessions", []), session])
+            self._about(
+                **identity_of_draws(self.plan.seed, self.plan.random),
+                sessions=[*self.record.about.get("sessions", []), session],
+            )
 
     def _tasks(self, first: int, last: int) -> Iterator[Task]:
         """Chunks of one level without the rows that are done."""

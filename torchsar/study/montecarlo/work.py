@@ -6,7 +6,7 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -93,7 +93,7 @@ class Work:
 
     trial: Trial
     grid: Grid
-    seed: int
+    draws: Draws
     device: str = "cpu"
     save: frozenset[int] = frozenset()
 
@@ -150,7 +150,8 @@ class Work:
 
     def _once(self, chunk: Chunk) -> Outcome:
         addresses = tuple(self.cases[chunk.case].points[p].address for p in chunk.points)
-        given = self.trial(self.parameters(chunk), Draws(self.seed, addresses, list(chunk.trials)))
+        draws = replace(self.draws, case=addresses, trials=list(chunk.trials))
+        given = self.trial(self.parameters(chunk), draws)
         if not isinstance(given, Mapping):
             raise ValueError(
                 "a trial function returns {metric: tensor} or {algorithm: {metric: tensor}}, "

@@ -83,7 +83,7 @@ def _check_case(name: str, values: Mapping[str, Any], loaded: Loaded) -> None:
         if root in _COMMON or key == "world.trials":
             raise ConfigError(
                 f"{loaded.file}: cases.{name}: the key {key!r} is common to all cases; a case may change radar, world, "
-                "data, processor, seed and precision"
+                "data, processor, seed, random and precision"
             )
         if root == "data" and loaded.config.data.file is None:
             raise ConfigError(

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from torchsar.core import fault_of_name
+from torchsar.core import Source, fault_of_name
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.settings.plausible import refuse_implausible
 from torchsar.study.settings.sentences import Strict, sentence
@@ -147,6 +147,9 @@ class Config(Strict):
     """A whole experiment. The system defines the keys of `radar`, `world` and `metrics`.
 
     Fields:
+        seed: Seed of all random numbers of the world.
+        random: Source of these numbers: `numpy` draws them on the CPU, `philox` computes other
+            numbers on the device of the trials; see `torchsar.Draws`.
         cases: Values by dotted key that each case changes, by name of the case.
         beyond_limits: Methods that are deliberately used beyond their limits.
     """
@@ -154,6 +157,7 @@ class Config(Strict):
     system: str = "stripmap"
     title: str
     seed: int = Field(default=1, ge=0)
+    random: Source = "numpy"
     precision: Literal["complex64", "complex128"] = "complex64"
     radar: dict[str, Any] | None = None
     world: dict[str, Any] | None = None

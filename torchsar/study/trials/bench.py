@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import takewhile
@@ -122,6 +122,10 @@ class Bench:
         if self.recording is not None:
             return self.recording.signal.data.numel() * self.recording.signal.data.element_size()
         return self.system.bytes_per_trial(self)
+
+    def draws(self, case: str | int = 0, trials: Sequence[int] | None = None) -> Draws:
+        """Return random numbers with the seed and the source of the config; see `Draws`."""
+        return Draws(self.config.seed, case, trials, self.config.random)
 
     def trials(self, draws: Draws, given: Mapping[str, Tensor] | None = None) -> Trials:
         """Return simulated trials, or the recording with the impairments of the config.

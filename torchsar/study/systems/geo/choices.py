@@ -212,9 +212,7 @@ def _alone(bench: Bench, dtype: torch.dtype | None = None, fastest: bool = False
         world = replace(world, targets={name: world.targets[name]})
     if changes.get("samples") is None:
         world = replace(world, targets={name: replace(t, range_m=0.0) for name, t in world.targets.items()})
-    return replace(world, **changes).trials_of(
-        bench.radar, Draws(bench.config.seed, "trade", [0]), dtype or bench.dtype
-    )
+    return replace(world, **changes).trials_of(bench.radar, bench.draws("trade", [0]), dtype or bench.dtype)
 
 
 def _image(
@@ -340,5 +338,5 @@ def _summed(bench: Bench) -> DirectlySummed:
 
     return points_at_rest(
         *(radar, StationaryImage(radar, LeastSquares(min(2, radar.channels))), (pulses, samples), gate.duration_s),
-        *(Draws(bench.config.seed), bench.dtype, echo),
+        *(bench.draws(), bench.dtype, echo),
     )

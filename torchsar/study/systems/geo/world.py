@@ -220,4 +220,4 @@ def _row_draws(draws: Draws, names: Mapping[str, Target]) -> Draws:
     trials = list(draws.trials if draws.trials is not None else [0])
     cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)
     addresses = tuple(f"{case}/{name}" for case in cases for name in names)
-    return Draws(draws.seed, addresses, [trial for trial in trials for _ in names])
+    return replace(draws, case=addresses, trials=[trial for trial in trials for _ in names])

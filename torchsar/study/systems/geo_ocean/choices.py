@@ -167,7 +167,7 @@ def _flows(bench: Bench) -> Measured:
     radar = replace(bench.radar, reference_range_m=bench.radar.reference_range_m + float(ship.range_m))
     pulses, samples = min(_CROP[0], world.pulses), min(_CROP[1], world.samples)
     crop = replace(world, pulses=pulses, samples=samples, targets={name: replace(ship, range_m=0.0)})
-    trials = crop.trials_of(radar, Draws(bench.config.seed, "trade", [0]), flow.extraction, bench.dtype, bench.device)
+    trials = crop.trials_of(radar, bench.draws("trade", [0]), flow.extraction, bench.dtype, bench.device)
     (frame,), clean = trials.own, RemoveTransmitRange(radar)(trials.recording.signal)
     kept: Mapping[str, Any] = {
         "extraction": flow.extraction,

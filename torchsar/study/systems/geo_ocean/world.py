@@ -129,7 +129,8 @@ class Ocean(World):
         trials = list(draws.trials if draws.trials is not None else [0])
         cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)
         # every trial is a case of its own, so that a scene has one address for all that it draws
-        scenes = Draws(draws.seed, tuple(f"{c}/{t}" for c, t in zip(cases, trials, strict=True)), [0] * len(trials))
+        addresses = tuple(f"{c}/{t}" for c, t in zip(cases, trials, strict=True))
+        scenes = replace(draws, case=addresses, trials=[0] * len(trials))
         fleet = Fleet({name: vessel.points() for name, vessel in self.targets.items()})
         world = BistaticWorld(fleet, self.gate, replace(self.sea, power_db=0.0), snr_db=self.sea.power_db)  # pyright: ignore
         size = (self.pulses, self.samples)

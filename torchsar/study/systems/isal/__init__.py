@@ -105,7 +105,7 @@ class Isal(System):
                 "recording; use a config that simulates the echoes"
             )
         radar, world = bench.radar, bench.world()
-        across, along = world.edge(Draws(bench.config.seed))
+        across, along = world.edge(bench.draws())
         time_s = torch.arange(4 * world.pulses, dtype=torch.float64) / (4 * radar.prf_hz)
         moved = displacement_m(world.motion, time_s)
         slope = torch.gradient(moved, spacing=(time_s,))[0]
@@ -141,7 +141,7 @@ class Isal(System):
 
 def _efforts(bench: Bench) -> Measured:
     """`autofocus` with fewer iterations, on trials with the echo model `phase_only`."""
-    world, draws = bench.world(), Draws(bench.config.seed, "trade", range(bench.config.trade.trials))
+    world, draws = bench.world(), bench.draws("trade", range(bench.config.trade.trials))
     trials = replace(world, fidelity=PhaseOnly()).trials_of(bench.radar, draws, bench.dtype, bench.device)
     data, truth, present = trials.recording.signal.data, whole_phase(trials), received(trials)
 
@@ -166,7 +166,7 @@ def _summed(bench: Bench) -> DirectlySummed:
     # the axis has the scale of the assumed rate
     cross, image = radar.image_axes(axes)[0].values() * (radar.rotation_rad_s / turning), AzimuthTransform(radar)
     return turning_target(
-        *(radar, angle, cross, 0.0, world.samples, Draws(bench.config.seed)),
+        *(radar, angle, cross, 0.0, world.samples, bench.draws()),
         lambda noise: image(Signal(noise.to(bench.dtype), axes)).data,
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Chain, Draws, Trace
+from torchsar.core import Chain, Trace
 from torchsar.metrics import contrast, entropy, phase_rmse, residual_phase, strehl
 from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad, turntable_responses
 from torchsar.scene import PhaseOnly
@@ -92,7 +92,7 @@ def _bound_ratio(bench: Bench) -> float | None:
     None if it would take too long.
     """
     size, world, radar = bench.world(), bench.world().of(bench.radar), bench.radar
-    scene = world.scene.scatterers(Draws(bench.config.seed, "bound"))
+    scene = world.scene.scatterers(bench.draws("bound"))
     few = scene.amplitude.shape[-1] <= _MOST_SCATTERERS and 2 < size.pulses <= _MOST_PULSES
     if not isinstance(world.fidelity, PhaseOnly) or not few:
         return None

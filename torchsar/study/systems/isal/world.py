@@ -85,7 +85,7 @@ def echo_choices(bench: Bench) -> list[Choice]:
     world, radar = bench.world(), bench.radar
     if radar.pulse_s is None:
         return []
-    edge = world.edge(Draws(bench.config.seed))
+    edge = world.edge(bench.draws())
     lost = {"echo_error_db": PhaseOnly().neglected_db(radar, world.of(radar), world.pulses, *edge)}
     alternatives = [
         Alternative(

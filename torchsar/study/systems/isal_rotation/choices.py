@@ -126,7 +126,7 @@ def _aliased(one: Gridding) -> dict[str, float]:
 
 def _scatterers(bench: Bench) -> list[Tensor]:
     """Cross range, range (m) and amplitude in the first trial of a run, (target,) each."""
-    scene = bench.world().of(bench.radar).scene.scatterers(Draws(bench.config.seed, "run", [0]))
+    scene = bench.world().of(bench.radar).scene.scatterers(bench.draws("run", [0]))
     values = {"x": scene.azimuth_m, "y": scene.range_m, "a": scene.amplitude}
     return first_values(values, "x", "y", "a")
 
@@ -242,13 +242,13 @@ def _summed(bench: Bench) -> DirectlySummed:
     cross = radar.wavelength_m * doppler / (2 * omega)
     about = (range_m, radar.wavelength_m, radar.prf_hz, omega, k, yc)
     return turning_target(
-        *(radar, omega * phi[:-1], cross, yc, world.samples, Draws(bench.config.seed)),
+        *(radar, omega * phi[:-1], cross, yc, world.samples, bench.draws()),
         lambda noise: matched_fourier(range_phase(noise.to(bench.dtype), *about), k, radar.prf_hz, lines=lines),
     )
 
 
 def _draws(bench: Bench) -> Draws:
-    return Draws(bench.config.seed, "trade", range(bench.config.trade.trials))
+    return bench.draws("trade", range(bench.config.trade.trials))
 
 
 _ESTIMATORS: dict[str, Callable[..., Estimate]] = {

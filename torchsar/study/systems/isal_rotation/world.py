@@ -23,7 +23,7 @@ class OneScene:
     seed: int
 
     def scatterers(self, draws: Draws) -> Scatterers:
-        return self.scene.scatterers(Draws(self.seed))
+        return self.scene.scatterers(Draws(self.seed, source=draws.source))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -107,7 +107,7 @@ class AnyPath(System):
         if stage is None:
             return []
         if bench.recording is None:
-            draws = Draws(bench.config.seed)
+            draws = bench.draws()
             clean = replace(bench.world(), impairments={}).trials_of(bench.radar, draws, bench.dtype, "cpu").clean
         else:
             clean = bench.recording
@@ -164,7 +164,7 @@ def _measured(
     stage: PathImage,
 ) -> Measured:
     """Images of white noise, at random pixels beside the direct sum."""
-    draws, every = Draws(bench.config.seed), stage.grid.pixels_m().reshape(-1, 3)
+    draws, every = bench.draws(), stage.grid.pixels_m().reshape(-1, 3)
     noise = white_noise(draws, geometry[1].shape[-2], len(geometry[0]))
     some = some_pixels(draws, len(every))
     pixels = every[some]

@@ -57,7 +57,7 @@ def moved(bench: Bench) -> Moved:
         ValueError: If no scatterer lies within the gate, or one within it lies behind the ladar or
             has a beat frequency that aliases.
     """
-    world, radar, draws = bench.world(), bench.radar, Draws(bench.config.seed, "run", [0])
+    world, radar, draws = bench.world(), bench.radar, bench.draws("run", [0])
     motion = drawn_motion(world.motion, draws, world.periods * radar.pulse_step_s)
     return Moved.of(radar, world.of().scene.scatterers(draws), motion, world.periods, world.gate_m)
 
@@ -139,7 +139,7 @@ def _echoes(bench: Bench, seen: Moved) -> Measured:
     """Echoes of the farthest scatterer alone by each model, each with its own complex gain."""
     world, nothing = bench.world(), {"impairments": {}, "record": None, "sweep_error": None, "log_amplitude": None}
     alone = replace(world, scene={"edge": seen.farthest}, noise=Noise(), **nothing)
-    draws = Draws(bench.config.seed, "run", [0])  # whose motion is predicted
+    draws = bench.draws("run", [0])  # whose motion is predicted
 
     def made(of: Ground, keys: Mapping[str, Any], dtype: torch.dtype) -> Tensor:
         trials = replace(of, fidelity=_fidelity(keys)).trials_of(bench.radar, draws, dtype)
@@ -155,7 +155,7 @@ def _echoes(bench: Bench, seen: Moved) -> Measured:
 
 def _estimates(bench: Bench) -> Measured:
     """Estimators alone, in the window of the recommended method, on the config's own trials."""
-    draws = Draws(bench.config.seed, "trade", range(bench.config.trade.trials))
+    draws = bench.draws("trade", range(bench.config.trade.trials))
     trials = bench.trials(draws)
     chain = bench.chains["recommended"]
     found = [name for name, stage in chain.stages.items() if "velocity_m_s" in getattr(stage, "provides", ())]
@@ -180,7 +180,7 @@ def _estimates(bench: Bench) -> Measured:
 
 def _summed(bench: Bench, name: str) -> DirectlySummed:
     """Image of white noise by a filter of the recommended method, on the axes of its data."""
-    draws, chain = Draws(bench.config.seed), bench.chains["recommended"]
-    data = chain.trace(bench.trials(Draws(bench.config.seed, "trade", [0])).recording).inputs[name]
+    draws, chain = bench.draws(), bench.chains["recommended"]
+    data = chain.trace(bench.trials(bench.draws("trade", [0])).recording).inputs[name]
     beam = getattr(chain.stages[name], "beam_rad", None) or bench.radar.beam_rad
     return ladar_strip(bench.radar, data.axes[-2], data.axes[-1], beam, draws, bench.dtype)

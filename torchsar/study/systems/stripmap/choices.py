@@ -186,7 +186,7 @@ def _summed(bench: Bench) -> DirectlySummed:
     """Points at random positions of the swath, by the recommended form."""
     probe, radar = probe_of(bench), bench.radar
     reach = max(0.0, probe.size[0] / radar.prf_hz - probe.dwell_s) / 2 * radar.velocity_m_s
-    at = Draws(bench.config.seed).uniform("trade.points", (2, PIXELS))
+    at = bench.draws().uniform("trade.points", (2, PIXELS))
     low, high = min(probe.edges_m), max(probe.edges_m)
     scene = Points(((2 * at[0] - 1) * reach).tolist(), (low + at[1] * (high - low)).tolist())
     recording, truth = replace(probe, world=replace(probe.world, scene=scene)).recorded(torch.complex128)
