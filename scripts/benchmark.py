@@ -69,8 +69,8 @@ CONFIGS = {
 SMALL = {"sweeps/sal_snr": 2}
 # calls are repeated until so much time is spent, and at most so often
 BUDGET_S, MOST = 1.0, 15
-# random numbers are drawn by these methods of `Draws`
-DRAWN = ("normal", "uniform", "subset", "permutation")
+# random numbers are drawn by these methods of `Draws`; `subset` takes those of `permutation`
+DRAWN = ("normal", "uniform", "permutation")
 
 Row = dict[str, Any]
 
@@ -156,7 +156,7 @@ def measured(config: str, count: int, budget_s: float, threads: int, device: str
     keep_freed_memory()  # as the commands do
     bench = Bench(load(find_config(config)), device)
     found = Measured({"config": config, "threads": threads, "device": device, "trials": count}, budget_s)
-    draws = Draws(bench.config.seed, trials=range(count))
+    draws = bench.draws(trials=range(count))
     batch = bench.batch(draws, keep=list(bench.chains))
     raw = batch.trials.recording.signal.data
 

@@ -40,7 +40,8 @@ class Simulated(IterableDataset[Pair]):
         source: Name of a packaged config or path of a YAML file, which is simulated as by
             `torchsar run`; or a function that is given Draws and returns a recording and its truth,
             such as one that calls `torchsar.echo.simulate`. A config needs the extra `study`.
-        draws: Seed, case and numbers of the trials.
+        draws: Seed, case, source and numbers of the trials; `seed` and `random` of a config are not
+            used.
         batch: Number of trials in a batch; the last one may be smaller.
         overrides: Changes of the config, as "key=value" with dotted keys.
         case: Name of the case, for a config with cases.

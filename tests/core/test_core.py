@@ -122,6 +122,10 @@ class TestDraws:
         with pytest.raises(TypeError, match=r"trials=range\(4\)"):
             Draws(7, trials=4, source=source)  # type: ignore[arg-type]
 
+    def test_an_unknown_source_is_refused(self, source):
+        with pytest.raises(ValueError, match=f"source of Draws must be 'numpy' or 'philox', got '{source}s'"):
+            Draws(7, source=f"{source}s")  # type: ignore[arg-type]
+
     def test_earlier_draws_do_not_change_a_draw(self, source):
         a, b = Draws(7, source=source), Draws(7, source=source)
         b.uniform("something else", (1000,))

@@ -17,7 +17,7 @@ from tests.study.scenes import IMAGE, ISAL, SCENES, bench_of, loaded_as, run, wr
 from torchsar import plot
 from torchsar.cli import main
 from torchsar.compensate.pulse_phase import Sca
-from torchsar.core import Axis, Draws, Signal
+from torchsar.core import Axis, Draws, Signal, numpy_random
 from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError
@@ -163,6 +163,21 @@ def test_numbers_follow_seed_and_trial_and_not_their_batch(system: str, tmp_path
     assert any(float(value[0]) != float(value[1]) for value in both.values())
     first, other = (bench.trials(Draws(seed, bench.system.address, [0])) for seed in (1, 2))
     assert not torch.equal(first.recording.signal.data, other.recording.signal.data)
+
+
+@EVERY
+def test_all_random_numbers_of_a_world_are_of_the_source_of_the_config(
+    system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Functions of numpy's source fail here; `scene_seed` draws apart from the noise."""
+    own = ["world.scene_seed=5"] if system == "isal_rotation" else []
+    plain, other = (bench_of(tmp_path, system, *own, random=source) for source in ("numpy", "philox"))
+    by_numpy = plain.trials(plain.draws("run", [0]))
+    for name in ("normal", "uniform", "permutation"):
+        monkeypatch.delattr(numpy_random, name)
+    made = other.trials(other.draws("run", [0]))
+    assert bool(made.recording.signal.data.isfinite().all())
+    assert not torch.equal(made.recording.signal.data, by_numpy.recording.signal.data)
 
 
 @EVERY

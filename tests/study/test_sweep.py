@@ -7,7 +7,9 @@ import logging
 import resource
 import time
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -255,6 +257,22 @@ def test_a_finished_sweep_is_not_overwritten_and_resuming_computes_nothing(tmp_p
 
     never.__qualname__ = "trial"
     assert toy.run(tmp_path / "s", trial=never, resume=True, version=1).done.all()
+
+
+def test_a_sweep_draws_from_its_source_and_goes_on_with_no_other(tmp_path: Path) -> None:
+    def drawn(parameters: Mapping[str, Any], draws: Draws) -> dict[str, torch.Tensor]:
+        return {"x": draws.normal("x")}
+
+    records = {s: sweep(drawn, {}, trials=3, out=tmp_path / s, random=s) for s in ("numpy", "philox")}
+    expected = Draws(1, (address({}),) * 3, range(3), "philox").normal("x")
+    assert records["philox"].metrics["x"][0].tolist() == expected.tolist()
+    assert records["numpy"].metrics["x"][0].tolist() != expected.tolist()
+    longer = sweep(drawn, {}, trials=4, out=tmp_path / "philox", random="philox", resume=True)
+    assert longer.about["random"] == "philox" and longer.metrics["x"][0, :3].tolist() == expected.tolist()
+    with pytest.raises(ConfigError, match="random was philox and is absent"):
+        sweep(drawn, {}, trials=3, out=tmp_path / "philox", resume=True)
+    with pytest.raises(ConfigError, match="random must be numpy or philox, got 'mersenne'"):
+        sweep(drawn, {}, random="mersenne")  # type: ignore[arg-type]
 
 
 def test_resuming_an_empty_folder_starts(tmp_path: Path) -> None:

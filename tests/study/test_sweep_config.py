@@ -186,6 +186,16 @@ def test_titles_and_trials_do_not_stop_a_resume() -> None:
     assert identity(config) != identity(config.changed({"world.pulses": 77}))
 
 
+def test_the_source_of_random_numbers_is_part_of_the_identity() -> None:
+    """That of numpy is not named, so that sweeps recorded before the key go on."""
+    config = load("isal_snr")
+    assert "random" not in identity(config) and "random" not in identity(config)["config"]
+    other = load("isal_snr", ["random=philox"])
+    assert identity(other) == {**identity(config), "random": "philox"}
+    with pytest.raises(ConfigError, match="'random' cannot be swept"):
+        sweep_grid(config.changed({"sweep.grid": {"random": ["numpy", "philox"]}}), SweepTrial(config))
+
+
 def test_squint_is_the_doppler_of_the_true_velocity(load_tree) -> None:
     tree = {**TINY, "world": {**TINY["world"], "squint_deg": 0.6, "velocity_m_s": 121.0}, "sweep": {"trials": 1}}
     found = record_of(load_tree(tree), 1, 1)
