@@ -57,7 +57,7 @@ class Draws:
         source: "numpy" draws on the CPU with numpy's generator, and copies the numbers to their
             device. "philox" computes them on their device from the words of the same generator, so
             that only keys are copied: uniform numbers are those of "numpy", normal numbers and
-            orders are others. Its normal numbers are equal to rounding on all devices, and none lies
+            orders are others. Its normal numbers are equal to rounding on all devices; none lies
             beyond 6.8 standard deviations. On a CPU it is about as fast for long draws, several
             times as fast for a few numbers of many trials, and several times slower for orders.
 
