@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.contract.pretended import DEVICE, Pretended, pretended_device, to_host
 from torchsar.core import Draws, philox
 
 CPU = torch.device("cpu")
@@ -60,6 +61,23 @@ def test_words_do_not_depend_on_a_division_of_the_counter(edges: tuple[int, ...]
     table = philox.key_table(keys(3))
     parts = [philox.words(table, first, last - first) for first, last in pairwise(edges)]
     assert torch.equal(torch.cat(parts, -1), philox.words(table, 0, 50))
+
+
+def test_draws_on_a_device_copy_their_keys_alone() -> None:
+    """The numbers are those of the CPU, and the host waits for none of them."""
+    draws = Draws(3, trials=range(4), source="philox")
+    for draw, copies in (
+        (lambda device: draws.normal("n", (5, 7), torch.complex64, device), 1),
+        (lambda device: draws.normal("n", (), torch.float32, device), 1),
+        (lambda device: draws.uniform("u", (9,), -1.0, 3.0, torch.float32, device), 1),
+        (lambda device: draws.subset("p", 50, 20, device), 1),
+        (lambda device: draws.permutation("p", [50, 0, 7, 3], device), 2),
+    ):
+        expected = draw(None)
+        with pretended_device() as counts:
+            found = draw(DEVICE)
+        assert torch.equal(to_host(found), expected) and isinstance(found, Pretended)
+        assert counts.uploads.total() == copies and not counts.waits.total()
 
 
 def test_tensors_and_numpy_give_the_same_numbers(request: pytest.FixtureRequest) -> None:

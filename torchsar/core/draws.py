@@ -115,11 +115,16 @@ class Draws:
             else f"{self.case}/{name}",
         )
 
-    def _keys(self, purpose: str) -> list[int]:
-        """Keys of the addresses of all trials."""
+    @property
+    def addresses(self) -> list[tuple[str | int, int]]:
+        """Case and index of each trial."""
         trials = self.trials if self.trials is not None else [0]
         cases = self.case if isinstance(self.case, tuple) else [self.case] * len(trials)
-        return [_key(self.seed, purpose, case, trial) for case, trial in zip(cases, trials, strict=True)]
+        return list(zip(cases, trials, strict=True))
+
+    def _keys(self, purpose: str) -> list[int]:
+        """Keys of the addresses of all trials."""
+        return [_key(self.seed, purpose, *address) for address in self.addresses]
 
     def _of_trials(self, x: Tensor) -> Tensor:
         """Numbers of all trials, without the leading dimension for a single trial."""

@@ -79,7 +79,7 @@ def device_fault(device: torch.device | str) -> str:
         Why it cannot compute, in one line; empty if it can.
     """
     try:
-        torch.zeros(1, dtype=torch.complex128, device=device).abs().item()
+        torch.zeros(1, dtype=torch.complex128, device=torch.device(device)).abs().item()
     except (RuntimeError, AssertionError, TypeError, ImportError) as error:
         return str(error).splitlines()[0].rstrip(".")
     return ""

@@ -179,5 +179,7 @@ def permutation(keys: Sequence[int], counts: Sequence[int], device: torch.device
     found = torch.empty(len(keys), longest, dtype=torch.int64, device=device)
     for rows, first, some in _blocks(keys, longest, device):
         found[rows, first : first + some.shape[1]] = some
-    last = torch.arange(longest, device=device) >= torch.tensor(counts, dtype=torch.int64, device=device)[:, None]
-    return found.masked_fill_(last, torch.iinfo(torch.int64).max).argsort(dim=-1, stable=True)
+    if any(count < longest for count in counts):
+        last = torch.arange(longest, device=device) >= torch.tensor(counts, device=device)[:, None]
+        found.masked_fill_(last, torch.iinfo(torch.int64).max)
+    return found.argsort(dim=-1, stable=True)

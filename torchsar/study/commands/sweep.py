@@ -136,8 +136,10 @@ def sweep(
     named = {"success": settings.success, "show": settings.show, "stop.metric": [stop.metric] if stop else []}
     needs = tuple((f"{loaded.file}: sweep.{key}", metric) for key, metrics in named.items() for metric in metrics)
     save = frozenset(settings.save.trials)
-    seed, random = loaded.config.seed, loaded.config.random
-    plan = Plan(grid, settings.trials, seed, settings.chunk, stop, save, device, needs, random)
+    plan = Plan(
+        *(grid, settings.trials, loaded.config.seed, settings.chunk, stop, save, device, needs),
+        random=loaded.config.random,
+    )
     plan.refuse_missing(trial)
     config_text = loaded.text()
     about = {"title": loaded.config.title, "config": config_text, "dtype": loaded.config.precision}
@@ -212,8 +214,10 @@ def identity(loaded: Loaded) -> dict[str, Any]:
     """Return what the results depend on besides the grid: the seed and the source of the random
     numbers, and all other keys of the config that change results.
     """
-    config = loaded.config
-    return {**identity_of_draws(config.seed, config.random), "config": config.model_dump(exclude=_NOT_IDENTITY)}
+    return {
+        **identity_of_draws(loaded.config.seed, loaded.config.random),
+        "config": loaded.config.model_dump(exclude=_NOT_IDENTITY),
+    }
 
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> None:

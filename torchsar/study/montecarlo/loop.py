@@ -101,8 +101,7 @@ class Plan:
         random: Source of the random numbers; see `torchsar.Draws`.
 
     Raises:
-        ConfigError: If a number is out of range, the source is unknown, or the device cannot be
-            used.
+        ConfigError: If a number is out of range, or the device cannot be used.
     """
 
     grid: Grid
@@ -124,8 +123,6 @@ class Plan:
             raise ConfigError(
                 f"sweep: save must list numbers of trials, which are 0 to {self.trials - 1}, got {absent!r}"
             )
-        if self.random not in get_args(Source):
-            raise ConfigError(f"sweep: random must be {' or '.join(get_args(Source))}, got {self.random!r}")
         reason = device_fault(self.device)
         if reason:
             raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {reason}")
@@ -220,6 +217,7 @@ def sweep(
         ("stop", stop is None or isinstance(stop, Stop), "be a Stop, such as Stop('error_m', 0.05)", stop),
         ("save", isinstance(save, Iterable), "list the numbers of trials", save),
         ("config", isinstance(config or {}, Mapping), "be a mapping of what else results depend on", config),
+        ("random", random in get_args(Source), f"be {' or '.join(get_args(Source))}", random),
         ("version", version is None or isinstance(version, (str, int)), "be a word or a whole number", version),
     ):
         if not good:

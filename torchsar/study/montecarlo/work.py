@@ -150,8 +150,7 @@ class Work:
 
     def _once(self, chunk: Chunk) -> Outcome:
         addresses = tuple(self.cases[chunk.case].points[p].address for p in chunk.points)
-        draws = replace(self.draws, case=addresses, trials=list(chunk.trials))
-        given = self.trial(self.parameters(chunk), draws)
+        given = self.trial(self.parameters(chunk), replace(self.draws, case=addresses, trials=list(chunk.trials)))
         if not isinstance(given, Mapping):
             raise ValueError(
                 "a trial function returns {metric: tensor} or {algorithm: {metric: tensor}}, "

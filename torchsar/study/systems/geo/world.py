@@ -217,7 +217,5 @@ def _row_draws(draws: Draws, names: Mapping[str, Target]) -> Draws:
     """One address for each trial and target, trials outermost; the random numbers of a target do
     not depend on other targets.
     """
-    trials = list(draws.trials if draws.trials is not None else [0])
-    cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)
-    addresses = tuple(f"{case}/{name}" for case in cases for name in names)
-    return replace(draws, case=addresses, trials=[trial for trial in trials for _ in names])
+    rows = [(f"{case}/{name}", trial) for case, trial in draws.addresses for name in names]
+    return replace(draws, case=tuple(case for case, _ in rows), trials=[trial for _, trial in rows])

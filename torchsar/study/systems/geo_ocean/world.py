@@ -126,16 +126,14 @@ class Ocean(World):
         Returns:
             Recordings and true values; `own` holds one `Frame` for each trial.
         """
-        trials = list(draws.trials if draws.trials is not None else [0])
-        cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)
         # every trial is a case of its own, so that a scene has one address for all that it draws
-        addresses = tuple(f"{c}/{t}" for c, t in zip(cases, trials, strict=True))
-        scenes = replace(draws, case=addresses, trials=[0] * len(trials))
+        cases = tuple(f"{case}/{trial}" for case, trial in draws.addresses)
+        scenes = replace(draws, case=cases, trials=[0] * len(cases))
         fleet = Fleet({name: vessel.points() for name, vessel in self.targets.items()})
         world = BistaticWorld(fleet, self.gate, replace(self.sea, power_db=0.0), snr_db=self.sea.power_db)  # pyright: ignore
         size = (self.pulses, self.samples)
         recording, _ = simulate_bistatic(radar, world, *size, scenes, dtype=dtype, device=device)
-        count, data, real = len(trials), recording.signal, recording.signal.data.real
+        count, data, real = len(cases), recording.signal, recording.signal.data.real
         remove, ships, still = RemoveTransmitRange(radar), dict[str, list[Ship]](), data.data
         clean = remove(data)
         for name, part in fleet.parts.items():

@@ -107,8 +107,9 @@ class AnyPath(System):
         if stage is None:
             return []
         if bench.recording is None:
-            draws = bench.draws()
-            clean = replace(bench.world(), impairments={}).trials_of(bench.radar, draws, bench.dtype, "cpu").clean
+            clean = (
+                replace(bench.world(), impairments={}).trials_of(bench.radar, bench.draws(), bench.dtype, "cpu").clean
+            )
         else:
             clean = bench.recording
         aux, grid = clean.aux, stage.grid

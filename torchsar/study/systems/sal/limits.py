@@ -155,8 +155,7 @@ def _echoes(bench: Bench, seen: Moved) -> Measured:
 
 def _estimates(bench: Bench) -> Measured:
     """Estimators alone, in the window of the recommended method, on the config's own trials."""
-    draws = bench.draws("trade", range(bench.config.trade.trials))
-    trials = bench.trials(draws)
+    trials = bench.trials(bench.draws("trade", range(bench.config.trade.trials)))
     chain = bench.chains["recommended"]
     found = [name for name, stage in chain.stages.items() if "velocity_m_s" in getattr(stage, "provides", ())]
     if not found:
