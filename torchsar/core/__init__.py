@@ -20,7 +20,7 @@ from torchsar.core.fft import (
     transform_in_blocks,
 )
 from torchsar.core.fingerprint import fingerprint
-from torchsar.core.host import check_value, device_fault, gathered_checks, host_largest, host_value
+from torchsar.core.host import check_value, device_fault, gathered_checks, host_largest, host_value, is_traced, untraced
 from torchsar.core.linear import cholesky_factor, linear_solve, matrix_inverse
 from torchsar.core.memory import LargestTensor, PeakMemory, is_out_of_memory, keep_freed_memory, machine_memory_bytes
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
@@ -82,6 +82,7 @@ __all__ = [
     "is_out_of_memory",
     "is_plain",
     "is_sealed",
+    "is_traced",
     "keep_freed_memory",
     "legendre",
     "level_of",
@@ -107,5 +108,6 @@ __all__ = [
     "transform_in_blocks",
     "unit_level",
     "unit_phasor",
+    "untraced",
     "use",
 ]

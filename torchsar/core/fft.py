@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core.check import checked_samples
+from torchsar.core.host import is_traced
 from torchsar.core.signal import Signal
 
 
@@ -184,16 +185,16 @@ def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor)
 def is_plain(x: Tensor) -> bool:
     """Return whether a tensor has storage of its own, unlike one inside a torch.func transform.
 
-    Transforms do not reach other threads, and wrapped values cannot be written into a plain tensor.
+    Transforms and traces do not reach other threads, and wrapped values cannot be written into a plain tensor.
 
     Args:
         x: Tensor, any shape.
 
     Returns:
-        False inside a transform such as vmap.
+        False inside a transform such as vmap, and for a tensor of a traced program.
     """
     try:
-        return x.data_ptr() != 0
+        return not is_traced(x) and x.data_ptr() != 0
     except RuntimeError:
         return False
 

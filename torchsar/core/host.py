@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TypeVar
 
 import torch
 from torch import Tensor
+from torch._guards import active_fake_mode
+from torch._subclasses.fake_tensor import is_fake
+from torch.utils._python_dispatch import _disable_current_modes
 
 from torchsar.core.memory import is_out_of_memory
 
@@ -32,11 +35,12 @@ def host_value(x: Tensor, otherwise: Number) -> Number:
     """Read a number from a tensor, which waits for its device.
 
     Checks that wait for values of this device (see `gathered_checks`) are made in the same wait.
-    Inside `torch.func.vmap` a tensor stands for many trials, and its value cannot be read.
+    Inside `torch.func.vmap` a tensor stands for many trials, and while a program is traced, as by
+    `torch.export`, for any data: its value cannot be read.
 
     Args:
         x: Tensor of one element, which may require a gradient.
-        otherwise: What to return inside vmap; its type is that of the result.
+        otherwise: What to return where the value cannot be read; its type is that of the result.
 
     Returns:
         The number.
@@ -48,12 +52,8 @@ def host_value(x: Tensor, otherwise: Number) -> Number:
         read: list[float] = []
         _make([*_taken(), (x.detach(), read.append)])
         return type(otherwise)(read[0])
-    try:
-        return type(otherwise)(x.item())
-    except RuntimeError as error:
-        if "vmap" not in str(error):
-            raise
-        return otherwise
+    value = _read(x)
+    return otherwise if value is None else type(otherwise)(value)
 
 
 def host_largest(x: Tensor, otherwise: Number) -> Number:
@@ -61,7 +61,7 @@ def host_largest(x: Tensor, otherwise: Number) -> Number:
 
     Args:
         x: Tensor of real numbers, any shape.
-        otherwise: What to return if the tensor is empty, and inside vmap.
+        otherwise: What to return if the tensor is empty, and where values cannot be read.
 
     Returns:
         The largest value.
@@ -85,10 +85,38 @@ def device_fault(device: torch.device | str) -> str:
     return ""
 
 
+def is_traced(x: Tensor) -> bool:
+    """Find out whether a tensor stands for any data while a program is traced.
+
+    Args:
+        x: Tensor.
+
+    Returns:
+        True for a tensor without values, which `torch.export` and the like use.
+    """
+    return is_fake(x)
+
+
+@contextmanager
+def untraced() -> Iterator[None]:
+    """Within the block, compute with the values of tensors even while a program is traced.
+
+    A plan of a geometry depends on numbers that are the same in all runs of a program. While
+    `torch.export` traces it, they are computed once, and their tensors become constants of the
+    program. Tensors that stand for any data (`is_traced`) must not be used in the block. Elsewhere
+    the block has no effect.
+
+    Returns:
+        The context manager, which also serves as a decorator.
+    """
+    with _disable_current_modes() if active_fake_mode() is not None else nullcontext():
+        yield
+
+
 def check_value(x: Tensor, check: Check) -> None:
     """Check a number in a tensor: at once, or in a block of `gathered_checks` perhaps later.
 
-    Inside `torch.func.vmap` a tensor stands for many trials, and nothing is checked.
+    Where values cannot be read, see `host_value`, nothing is checked.
 
     Args:
         x: Tensor of one real number, float, int or bool; it may require a gradient.
@@ -101,13 +129,9 @@ def check_value(x: Tensor, check: Check) -> None:
     if _gathered.blocks and x.device.type != "cpu" and not _is_mapped(x):
         _gathered.waiting.append((x.detach(), check))
         return
-    try:
-        value = x.item()
-    except RuntimeError as error:
-        if "vmap" not in str(error):
-            raise
-        return
-    check(value)
+    value = _read(x)
+    if value is not None:
+        check(value)
 
 
 @contextmanager
@@ -140,6 +164,18 @@ def gathered_checks() -> Iterator[None]:
         _gathered.blocks -= 1
         if not _gathered.blocks:
             _gathered.waiting = []
+
+
+def _read(x: Tensor) -> float | None:
+    """The number in a tensor; None where it cannot be read."""
+    if is_traced(x):
+        return None
+    try:
+        return x.item()
+    except RuntimeError as error:
+        if "vmap" not in str(error):
+            raise
+        return None
 
 
 def _is_mapped(x: Tensor) -> bool:

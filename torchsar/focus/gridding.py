@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from torchsar.core import block_bytes_of, host_largest, over_blocks, real_dtype
+from torchsar.core import block_bytes_of, host_largest, host_value, is_traced, over_blocks, real_dtype
 from torchsar.focus.nufft import Kernel, smooth_length
 
 # the three factors of the trilinear form, in the order of the arguments of `_Trilinear`
@@ -189,9 +189,9 @@ def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tens
 
 def _numbers_of(values: Tensor, length: int) -> Tensor:
     """How often each of the numbers 0 to length - 1 occurs, (length,) int64."""
-    if values.device.type == "cpu":
+    if values.device.type == "cpu" and not is_traced(values):
         return torch.bincount(values, minlength=length)
-    # on other devices `bincount` waits for the largest value
+    # the length of `bincount` depends on the largest value, for which it waits on other devices
     return torch.zeros(length, dtype=torch.int64, device=values.device).index_add_(0, values, torch.ones_like(values))
 
 
@@ -199,7 +199,7 @@ def _ranks(first: Tensor) -> Tensor:
     """Position of each point in the order of trial and grid row, (b * m,)."""
     every = torch.arange(first.numel(), device=first.device)
     # on other devices, sorting costs less than waiting for a value
-    if first.device.type == "cpu" and not bool((first.diff(dim=-1) < 0).any()):
+    if first.device.type == "cpu" and not host_value((first.diff(dim=-1) < 0).any(), True):
         return every
     order = first.argsort(dim=-1, stable=True)
     start = first.shape[-1] * torch.arange(first.shape[0], device=first.device)

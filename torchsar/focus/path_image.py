@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, real_dtype
+from torchsar.core import Axis, Signal, Stage, real_dtype, untraced
 from torchsar.focus.backprojection import backproject
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.motion_compensation import ProcessedBeam, compensated_omega_k, refuse_bistatic
@@ -134,9 +134,9 @@ class PathImage(Stage):
         weights = (window_weights(name, n, data.device) for name, n in zip(self.windows, data.shape[-2:], strict=True))
         rows, columns = (weight.to(real_dtype(data.dtype)) for weight in weights)
         history = frequency_samples(data) * columns * rows[:, None]
-        grid = ImageGrid(
-            self.grid.origin_m.to(data.device), self.grid.axes.to(data.device), self.grid.counts, self.grid.step_m
-        )
+        with untraced():
+            places = self.grid.origin_m.to(data.device), self.grid.axes.to(data.device)
+            grid = ImageGrid(*places, self.grid.counts, self.grid.step_m)
         antennas = AntennaPath(transmitter_m, receiver_m, path_reference_m)
         return Signal(self.form(history, frequency_hz, antennas, grid), self.axes)
 

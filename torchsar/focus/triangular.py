@@ -14,7 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, checked_samples, refuse_non_finite, unit_phasor
+from torchsar.core import Axis, Signal, Stage, check_value, checked_samples, refuse_non_finite, unit_phasor
 from torchsar.radar import TriangularLadar
 
 Ramp = Literal["up", "down"]
@@ -138,12 +138,17 @@ def azimuth_turns(
     """
     across = (radar.speed_m_s * pulse.values(device))[:, None].square()
     r = radar.reference_range_m + range_.values(device)
-    if bool((r <= 0).any()):
+    check_value(r.min(), _refuse_behind)
+    return 2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r)
+
+
+def _refuse_behind(nearest_m: float) -> None:
+    """Raise ValueError for a range axis that reaches the ladar."""
+    if nearest_m <= 0:
         raise ValueError(
             "the range axis must lie at positive distances from the ladar, got "
-            f"{float(r.min()):.4g} m from the ladar; crop it to ranges in front of the ladar"
+            f"{nearest_m:.4g} m from the ladar; crop it to ranges in front of the ladar"
         )
-    return 2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r)
 
 
 def _check_profiles(data: Tensor, pulse: Axis, range_: Axis, what: str) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import linear_solve, outer_phasor, phasor_tables, real_dtype, unit_phasor
+from torchsar.core import linear_solve, outer_phasor, phasor_tables, real_dtype, unit_phasor, untraced
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import CHUNK, Choice, profile_length
 from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
@@ -168,6 +168,7 @@ class Part:
             of_tile += wide * deep * 3 * math.isqrt(self.length)
         return MOMENTS * self.length * self.nodes * wide + len(self.centre) * of_tile
 
+    @untraced()
     def across(self, dtype: torch.dtype) -> list[Tensor]:
         """Matrices from nodes to pixels across the range, one for each moment of s.
 
@@ -188,6 +189,7 @@ class Part:
         found = torch.view_as_complex(found.view(MOMENTS, self.nodes, len(self.x), self.length, 2))
         return list(found.to(dtype).permute(0, 3, 1, 2).contiguous())
 
+    @untraced()
     def weights(self, rows: slice, dtype: torch.dtype, height_m: Tensor | None = None) -> Weights:
         """Compute what forms the pixels of some tiles, for any history.
 
@@ -231,6 +233,7 @@ class Part:
             total = total + ((u + self.x[:, None]).square() + ((v + self.y).square() + w.square())).sqrt()
         return (3 - len(self.reference)) * total
 
+    @untraced()
     def tables(self, rows: slice, places: Sequence[Tensor], reference_m: Tensor, dtype: torch.dtype) -> Tables:
         """Compute the tables of some tiles.
 

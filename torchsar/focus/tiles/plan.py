@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torchsar.core import block_bytes_of, checked_samples, over_blocks
+from torchsar.core import block_bytes_of, checked_samples, is_traced, over_blocks, untraced
 from torchsar.focus.backprojection import direct_sum, expanded_history
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import Lit, Scene, choose, part_bounds, tile_centres, tile_heights
@@ -111,11 +111,13 @@ class TilePlan:
         lit: Lit | None = None,
     ) -> None:
         self.frequency_hz, self.grid, self.error_db, self.lit = frequency_hz, grid, float(error_db), lit
-        refuse_unusable(frequency_hz=frequency_hz)
-        frequency_step_hz(frequency_hz)
-        self._set_path(transmitter_m, receiver_m, reference_m)
-        with torch.no_grad():
-            self._plan([place.detach() for place in self._places])
+        _refuse_traced(frequency_hz, transmitter_m, receiver_m, reference_m, grid.origin_m, grid.axes, grid.height_m)
+        with untraced():
+            refuse_unusable(frequency_hz=frequency_hz)
+            frequency_step_hz(frequency_hz)
+            self._set_path(transmitter_m, receiver_m, reference_m)
+            with torch.no_grad():
+                self._plan([place.detach() for place in self._places])
 
     def _set_path(self, transmitter_m: Tensor, receiver_m: Tensor | None, reference_m: Tensor) -> None:
         """Bring the positions to the shape (path, pulse, 3)."""
@@ -173,11 +175,13 @@ class TilePlan:
             ValueError: If shapes do not match, values are not finite, or tiles do not reach the
                 error for this path.
         """
+        _refuse_traced(transmitter_m, receiver_m, reference_m)
         plan = copy.copy(self)
-        plan._set_path(transmitter_m, receiver_m, reference_m)
+        with untraced():
+            plan._set_path(transmitter_m, receiver_m, reference_m)
         places = [place.detach() for place in plan._places]
         plan._tables = _Kept(len(places[0]) * plan._table_count)
-        with torch.no_grad():
+        with untraced(), torch.no_grad():
             if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places] or not all(
                 part.covers(places) for zone in self._zones for part in zone
             ):
@@ -255,10 +259,11 @@ class TilePlan:
         step = max(1, _GROUP // (paths * trials))
         for kept in (self._tables, self._weights):
             kept.begin(data.dtype, step)
-        heights = tile_heights(self.grid.transposed() if self._swapped else self.grid, *self._size)
-        if heights is not None:
-            assert self._height_m is not None
-            heights = (heights - self._height_m[..., None, None]).flatten(0, 1)
+        with untraced():
+            heights = tile_heights(self.grid.transposed() if self._swapped else self.grid, *self._size)
+            if heights is not None:
+                assert self._height_m is not None
+                heights = (heights - self._height_m[..., None, None]).flatten(0, 1)
         found: list[Tensor] = []
         given = [data, *self._places, self._reference_m, *([] if heights is None else [heights])]
         grad = torch.is_grad_enabled() and any(v.requires_grad for v in given)
@@ -345,6 +350,15 @@ class TilePlan:
         if fixed:
             self._tables.keep(key, tables, dtype)
         return tables
+
+
+def _refuse_traced(*known: Tensor | None) -> None:
+    """Raise ValueError for tensors on which a plan depends and whose values cannot be read."""
+    if any(v is not None and is_traced(v) for v in known):
+        raise ValueError(
+            "the sizes of tiles depend on the values of positions and frequencies, which must be constants of a traced "
+            "program; let it depend on the history alone, or use backproject"
+        )
 
 
 def image_tiles(
