@@ -98,18 +98,23 @@ def is_traced(x: Tensor) -> bool:
 
 
 @contextmanager
-def untraced() -> Iterator[None]:
+def untraced(*given: Tensor | float | None) -> Iterator[None]:
     """Within the block, compute with the values of tensors even while a program is traced.
 
     A plan of a geometry depends on numbers that are the same in all runs of a program. While
     `torch.export` traces it, they are computed once, and their tensors become constants of the
-    program. Tensors that stand for any data (`is_traced`) must not be used in the block. Elsewhere
-    the block has no effect.
+    program. What is computed in the block from a tensor that stands for any data (`is_traced`) must
+    not leave it. Elsewhere the block has no effect.
+
+    Args:
+        given: What results that leave the block depend on. The block has no effect if one of them
+            is a tensor that stands for any data.
 
     Returns:
         The context manager, which also serves as a decorator.
     """
-    with _disable_current_modes() if active_fake_mode() is not None else nullcontext():
+    known = not any(isinstance(x, Tensor) and is_traced(x) for x in given)
+    with _disable_current_modes() if known and active_fake_mode() is not None else nullcontext():
         yield
 
 

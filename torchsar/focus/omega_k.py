@@ -45,6 +45,7 @@ from torchsar.core import (
     spectrum_in_blocks,
     transform_in_blocks,
     unit_phasor,
+    untraced,
 )
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
@@ -194,28 +195,29 @@ class FrameGeometry:
                 of `doppler_hz` or `frame_hz` is not below 2 velocity / wavelength, or `band_hz` is
                 not positive.
         """
-        device = raw.device if device is None else device
-        centroid = torch.as_tensor(doppler_hz, dtype=torch.float64, device=device)
-        velocity = torch.as_tensor(
-            radar.velocity_m_s if velocity_m_s is None else velocity_m_s, dtype=torch.float64, device=device
-        )
-        default = radar.pointing_doppler_hz if radar.pointing_doppler_hz is not None else centroid
-        frame = torch.as_tensor(default if frame_hz is None else frame_hz, dtype=torch.float64, device=device)
-        for name, value in (("doppler_hz", centroid), ("velocity_m_s", velocity)):
-            if value.ndim and value.shape != raw.shape[:-2]:
-                raise ValueError(
-                    f"{name} must be one number, or one per trial in the shape "
-                    f"{tuple(raw.shape[:-2])} of the leading dims of the data, got shape {tuple(value.shape)}"
-                )
-        _check_squint(radar, velocity, centroid, frame)
-        doppler = radar.doppler_hz(raw.shape[-2], centroid, device)
-        return FrameGeometry(
-            radar,
-            doppler,
-            velocity,
-            frame,
-            None if band_hz is None else band_weight(radar, doppler - centroid[..., None], band_hz),
-        )
+        with untraced(doppler_hz, velocity_m_s, frame_hz):
+            device = raw.device if device is None else device
+            centroid = torch.as_tensor(doppler_hz, dtype=torch.float64, device=device)
+            velocity = torch.as_tensor(
+                radar.velocity_m_s if velocity_m_s is None else velocity_m_s, dtype=torch.float64, device=device
+            )
+            default = radar.pointing_doppler_hz if radar.pointing_doppler_hz is not None else centroid
+            frame = torch.as_tensor(default if frame_hz is None else frame_hz, dtype=torch.float64, device=device)
+            for name, value in (("doppler_hz", centroid), ("velocity_m_s", velocity)):
+                if value.ndim and value.shape != raw.shape[:-2]:
+                    raise ValueError(
+                        f"{name} must be one number, or one per trial in the shape "
+                        f"{tuple(raw.shape[:-2])} of the leading dims of the data, got shape {tuple(value.shape)}"
+                    )
+            _check_squint(radar, velocity, centroid, frame)
+            doppler = radar.doppler_hz(raw.shape[-2], centroid, device)
+            return FrameGeometry(
+                radar,
+                doppler,
+                velocity,
+                frame,
+                None if band_hz is None else band_weight(radar, doppler - centroid[..., None], band_hz),
+            )
 
     def rows(self, part: slice) -> FrameGeometry:
         """Return the geometry of some of the rows, which are Doppler bins.
@@ -239,9 +241,10 @@ class FrameGeometry:
         return lines if self.weight is None else lines * self.weight.to(real_dtype(lines.dtype))[..., None]
 
     @property
+    @untraced()
     def sin_reach(self) -> float:
         """Largest magnitude of the sine of the squint over all rows, at the carrier frequency; 0
-        inside vmap, where values are unknown.
+        where values cannot be read.
         """
         sine = self.radar.sin_squint(self.doppler_hz.detach(), self.velocity_m_s.detach()[..., None])
         return host_largest(sine.abs(), 0.0)
@@ -310,7 +313,7 @@ def is_below(values: Tensor, limit: float) -> bool:
         limit: Limit of their magnitude.
 
     Returns:
-        True if all are below; False inside vmap, where values are unknown.
+        True if all are below; False where values cannot be read.
     """
     return host_largest(values.detach().abs(), math.inf) < limit
 

@@ -21,10 +21,12 @@ from torchsar.core import (
     Signal,
     block_bytes_of,
     host_largest,
+    is_traced,
     over_blocks,
     real_dtype,
     spectrum_in_blocks,
     transform_in_blocks,
+    untraced,
 )
 from torchsar.focus.omega_k import BAND_EDGE, FrameGeometry, band_weight, raised_cosine_band, through_doppler
 from torchsar.radar import StripmapRadar
@@ -37,6 +39,7 @@ EXCESS = 0.05
 _LEAST_SKEW = 1e-3
 
 
+@untraced()
 def skew_hz(radar: StripmapRadar, doppler_hz: Tensor | float) -> float:
     """Compute by how much the Doppler centroid moves over the bandwidth of the pulse.
 
@@ -45,7 +48,7 @@ def skew_hz(radar: StripmapRadar, doppler_hz: Tensor | float) -> float:
         doppler_hz: Absolute Doppler centroid at the carrier in Hz, a number or one per trial.
 
     Returns:
-        Largest |doppler_hz| B / f0 of the trials in Hz; 0 inside vmap, where values are unknown.
+        Largest |doppler_hz| B / f0 of the trials in Hz; 0 where values cannot be read.
     """
     given = isinstance(doppler_hz, Tensor)
     largest = host_largest(doppler_hz.detach().to(torch.float64).abs(), 0.0) if given else abs(doppler_hz)
@@ -158,15 +161,17 @@ class DopplerSkew:
             ValueError: If `band_hz` is not positive, or is None and the Doppler band of the nominal
                 aperture of a squinted radar exceeds the PRF at the highest range frequency.
         """
-        centre = torch.as_tensor(doppler_hz, dtype=torch.float64, device=raw.device).detach()
-        if band_hz is None:
-            _refuse_aliased(radar, raw.shape[-1], centre, velocity_m_s.detach())
-        else:
-            band_weight(radar, centre.new_zeros(1), band_hz)
-        base = torch.fft.fftfreq(raw.shape[-2], 1 / radar.prf_hz, dtype=torch.float64, device=raw.device)
-        frequency = radar.range_frequency_hz(raw.shape[-1], raw.device)
-        return DopplerSkew(radar, centre, base, frequency, band_hz, azimuth_factor(radar, centre, band_hz))
+        with untraced(doppler_hz, velocity_m_s):
+            centre = torch.as_tensor(doppler_hz, dtype=torch.float64, device=raw.device).detach()
+            if band_hz is None:
+                _refuse_aliased(radar, raw.shape[-1], centre, velocity_m_s.detach())
+            else:
+                band_weight(radar, centre.new_zeros(1), band_hz)
+            base = torch.fft.fftfreq(raw.shape[-2], 1 / radar.prf_hz, dtype=torch.float64, device=raw.device)
+            frequency = radar.range_frequency_hz(raw.shape[-1], raw.device)
+            return DopplerSkew(radar, centre, base, frequency, band_hz, azimuth_factor(radar, centre, band_hz))
 
+    @untraced()
     def sin_reach(self, geometry: FrameGeometry) -> float:
         """Compute a bound of the sine of the squint, at the carrier, over all range frequencies.
 
@@ -177,7 +182,7 @@ class DopplerSkew:
             geometry: Geometry of all Doppler rows, at the centroid of the carrier.
 
         Returns:
-            Magnitude of the sine; 0 inside vmap, where values are unknown.
+            Magnitude of the sine; 0 where values cannot be read.
         """
         skewed = skew_hz(self.radar, self.centre_hz) * self.radar.sampling_hz / (2 * self.radar.pulse.bandwidth_hz)
         changes = math.ceil(skewed / self.radar.prf_hz) if skewed else 0
@@ -197,6 +202,7 @@ class DopplerSkew:
         centre = self.centre_hz[..., None, None] * scale
         return torch.round((centre - self.base_hz[part, None]) / self.radar.prf_hz)
 
+    @untraced()
     def jumps(self, part: slice) -> tuple[list[int] | slice, range]:
         """Find rows in which the number of PRFs changes over the range frequencies.
 
@@ -205,10 +211,12 @@ class DopplerSkew:
 
         Returns:
             Indices of these rows within the slice, and the changes relative to the number at the
-            carrier. Inside vmap, where values are unknown, all rows and changes by one PRF.
+            carrier. Where values cannot be read, all rows and changes by one PRF.
         """
         reach = self.radar.sampling_hz / (2 * self.radar.carrier_hz)
         ends = self.orders(part, torch.tensor([1 - reach, 1 + reach]).to(self.base_hz)) - self.orders(part)
+        if is_traced(ends):
+            return slice(None), range(-1, 2)
         try:
             rows = (ends != 0).any(-1).reshape(-1, ends.shape[-2]).any(0).nonzero()[:, 0].tolist()
             return rows, range(int(ends.min()), int(ends.max()) + 1)

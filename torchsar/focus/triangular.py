@@ -14,7 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, check_value, checked_samples, refuse_non_finite, unit_phasor
+from torchsar.core import Axis, Signal, Stage, check_value, checked_samples, refuse_non_finite, unit_phasor, untraced
 from torchsar.radar import TriangularLadar
 
 Ramp = Literal["up", "down"]
@@ -237,7 +237,9 @@ def azimuth_matched_filter(
             "move across the line of sight has no such image"
         )
     n = data.shape[-2]
-    half = _half_aperture(radar, pulse, range_, beam_rad, data.device)
+    with untraced():
+        half = _half_aperture(radar, pulse, range_, beam_rad, data.device)
+        whole = int(half.max()) >= n
     turns = azimuth_turns(pulse, range_, radar, data.device)
     lag = torch.arange(-(n - 1), n, device=data.device)
     across = (radar.speed_m_s * pulse.step * lag.to(torch.float64))[:, None].square()
@@ -249,9 +251,9 @@ def azimuth_matched_filter(
     lit = torch.minimum(2 * half + 1, torch.full_like(half, n))
     # the aperture is centred on the pixel, except that of the whole record, which is fixed
     weights, fixed = (
-        (_cosine(lag[:, None] / lit, weighting), 1.0)
-        if int(half.max()) < n
-        else (1.0, _cosine((lag[n - 1 :, None] - (n - 1) / 2) / n, weighting))
+        (1.0, _cosine((lag[n - 1 :, None] - (n - 1) / 2) / n, weighting))
+        if whole
+        else (_cosine(lag[:, None] / lit, weighting), 1.0)
     )
     data, filter_ = (
         x * w.to(x.real.dtype) if isinstance(w, Tensor) else x for x, w in ((data, fixed), (filter_, weights))

@@ -179,13 +179,13 @@ class TilePlan:
         plan = copy.copy(self)
         with untraced():
             plan._set_path(transmitter_m, receiver_m, reference_m)
-        places = [place.detach() for place in plan._places]
-        plan._tables = _Kept(len(places[0]) * plan._table_count)
-        with untraced(), torch.no_grad():
-            if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places] or not all(
-                part.covers(places) for zone in self._zones for part in zone
-            ):
-                plan._plan(places)
+            places = [place.detach() for place in plan._places]
+            plan._tables = _Kept(len(places[0]) * plan._table_count)
+            with torch.no_grad():
+                if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places] or not all(
+                    part.covers(places) for zone in self._zones for part in zone
+                ):
+                    plan._plan(places)
         return plan
 
     def image(self, history: Tensor) -> Tensor:
