@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.contract.pretended import pretended_device, to_device, to_host
 from torchsar.core import (
@@ -18,11 +19,13 @@ from torchsar.core import (
     gathered_checks,
     host_largest,
     host_value,
+    is_traced,
     linear_solve,
     matrix_inverse,
     numbers_on,
     refuse_non_finite,
     unit_phasor,
+    untraced,
 )
 from torchsar.metrics import entropy
 
@@ -63,6 +66,27 @@ def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_device_that_cannot_compute_says_why(device: str) -> None:
     assert device_fault("cpu") == device_fault(torch.device("cpu")) == ""
     assert device_fault(device) and "\n" not in device_fault(device)
+
+
+def test_values_are_not_read_while_a_program_is_traced() -> None:
+    real = torch.ones(2)
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        x = mode.from_tensor(real)
+        assert is_traced(x) and is_traced(torch.ones(2)) and is_traced(2 * real) and not is_traced(real)
+        assert host_value(x.sum(), 7.0) == host_largest(x, 7.0) == 7.0
+        check_value(x.sum(), at_most(0.0))
+        with untraced():
+            assert (2 * real).tolist() == [2.0, 2.0] and host_value(real.sum(), 7.0) == 2.0
+        with untraced(1.0, None, real):
+            assert not is_traced(torch.ones(2))
+        with untraced(real, x):
+            assert is_traced(torch.ones(2))
+    with untraced(), pretended_device() as counts:
+        host_value(to_device(real).sum(), 0.0)
+    assert counts.waits.total() == 1
+    with pretended_device() as counts, untraced():
+        host_value(to_device(real).sum(), 0.0)
+    assert counts.waits.total() == 1
 
 
 def at_most(limit: float) -> Callable[[float], None]:

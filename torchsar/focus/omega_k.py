@@ -35,6 +35,7 @@ from torchsar.core import (
     checked_samples,
     cis,
     host_largest,
+    is_traced,
     linear_phasor,
     outer_phasor,
     over_blocks,
@@ -514,13 +515,26 @@ def omega_k(
     return through_doppler(raw, focus_rows, differentiable=geometry.requires_grad or raw.requires_grad)
 
 
+def is_whole(raw: Tensor, differentiable: bool) -> bool:
+    """Return whether all Doppler rows are processed at once, not in blocks.
+
+    Args:
+        raw: Raw data.
+        differentiable: Whether gradients are required.
+
+    Returns:
+        True for gradients, and in a traced program, in which every block repeats all operations.
+    """
+    return is_traced(raw) or (differentiable and torch.is_grad_enabled())
+
+
 def through_doppler(
     raw: Tensor, focus_rows: Callable[[Tensor, slice], Tensor], differentiable: bool, block_bytes: int | None = None
 ) -> Tensor:
     """Apply a function to the rows of the two-dimensional spectrum, then an inverse azimuth FFT.
 
-    Where gradients are required, all rows are processed at once. Otherwise memory is saved: rows
-    are processed in blocks that overwrite one copy of the data.
+    Where gradients are required, and in a traced program, all rows are processed at once. Otherwise
+    memory is saved: rows are processed in blocks that overwrite one copy of the data.
 
     Args:
         raw: Raw data, shape (..., pulse, range), complex.
@@ -532,7 +546,7 @@ def through_doppler(
     Returns:
         Image, same shape as the data.
     """
-    if differentiable and torch.is_grad_enabled():
+    if is_whole(raw, differentiable):
         return torch.fft.ifft(focus_rows(torch.fft.fft2(raw), slice(None)), dim=-2)
     work = spectrum_in_blocks(raw)
     block_bytes = block_bytes_of(raw.device) if block_bytes is None else block_bytes

@@ -28,7 +28,7 @@ from torchsar.core import (
     transform_in_blocks,
     untraced,
 )
-from torchsar.focus.omega_k import BAND_EDGE, FrameGeometry, band_weight, raised_cosine_band, through_doppler
+from torchsar.focus.omega_k import BAND_EDGE, FrameGeometry, band_weight, is_whole, raised_cosine_band, through_doppler
 from torchsar.radar import StripmapRadar
 
 # tolerated excess of the band of an image over its sampling rate, relative to this rate; measured
@@ -353,7 +353,7 @@ def through_skewed_doppler(
     differentiable = geometry.requires_grad or raw.requires_grad
     if skew.factor == 1:
         return through_doppler(raw, whole, differentiable)
-    if differentiable and torch.is_grad_enabled():
+    if is_whole(raw, differentiable):
         spectrum = whole(torch.fft.fft2(raw), slice(None))
         return torch.fft.ifft(spectrum.flatten(-3, -2), dim=-2) * skew.factor
     work = spectrum_in_blocks(raw)
