@@ -359,6 +359,31 @@ def test_a_small_lit_part_between_the_corners_and_the_middle_is_found() -> None:
     assert len(truth) > 50 and float((found - truth).norm() / truth.norm()) < 10 ** (-57 / 20)
 
 
+class Program(torch.nn.Module):
+    """Module that images histories, with a plan or with a new one of other positions."""
+
+    def __init__(self, drawn: Case) -> None:
+        super().__init__()
+        self.drawn, self.plan = drawn, drawn.plan(-60.0)
+
+    def forward(self, history: Tensor, transmitter_m: Tensor | None = None) -> Tensor:
+        if transmitter_m is None:
+            return self.plan.image(history)
+        return replace(self.drawn, transmitter_m=transmitter_m).plan(-60.0).image(history)
+
+
+@torch.no_grad()
+def test_a_plan_can_be_exported_and_is_not_changed() -> None:
+    program = Program(hilly(small(case(1006)), 0.02))
+    history = program.drawn.history
+    exported = torch.export.export(program, (history,), strict=False).module()
+    other = history.flip(0).conj() + 1
+    expected = Program(program.drawn)(other)
+    assert torch.equal(exported(other), expected) and torch.equal(program(other), expected)
+    with pytest.raises(ValueError, match="must be constants"):
+        torch.export.export(program, (history, program.drawn.transmitter_m), strict=False)
+
+
 def test_an_error_that_tiles_do_not_reach_is_refused_with_the_figure() -> None:
     drawn = case(1001)
     near = replace(drawn, grid=replace(drawn.grid, step_m=float(drawn.reference_m.mean())))

@@ -275,7 +275,8 @@ class TilePlan:
         tiles = data.new_empty(count, paths * trials, *self._size)
         for zone, numbers in zip(self._zones, self._numbers, strict=True):
             across = [self._weights_of((part,), data.dtype, part.across, data.dtype) for part in zone]
-            above = None if heights is None else heights[numbers]
+            with untraced():
+                above = None if heights is None else heights[numbers]
             rows = [slice(i, min(i + step, len(numbers))) for i in range(0, len(numbers), step)]
             if grad:
                 fixed = across, profiles, above
@@ -309,7 +310,9 @@ class TilePlan:
     ) -> Tensor:
         """Pixels of some tiles, summed over the sub-apertures, (tile, path * trial, x, y)."""
         paths, _, trials, _ = profiles.shape
-        dtype, height_m = profiles.dtype, None if height_m is None else height_m[rows]
+        dtype = profiles.dtype
+        with untraced():
+            height_m = None if height_m is None else height_m[rows]
         total = profiles.new_zeros(rows.stop - rows.start, paths * trials, *self._size) if not zone else None
         for part, matrices in zip(zone, across, strict=True):
             x = profiles[:, part.pulses]
