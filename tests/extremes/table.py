@@ -731,6 +731,8 @@ REASONS = {
     "core.host_value": "reads one number",
     "core.check_value": "reads one number; tests/core/test_host.py",
     "core.gathered_checks": "takes no arguments; tests/core/test_host.py",
+    "core.is_traced": "whether a tensor has values, whatever they are; tests/core/test_host.py",
+    "core.untraced": "looks at the kinds of its arguments only; tests/core/test_host.py",
     "core.numbers_on": "makes a tensor of numbers",
     "core.linear_solve": "torch.linalg.solve; tests/core/test_host.py",
     "core.matrix_inverse": "torch.linalg.inv; tests/core/test_host.py",

@@ -185,7 +185,8 @@ def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor)
 def is_plain(x: Tensor) -> bool:
     """Return whether a tensor has storage of its own, unlike one inside a torch.func transform.
 
-    Transforms and traces do not reach other threads, and wrapped values cannot be written into a plain tensor.
+    Transforms and traces do not reach other threads, and wrapped values cannot be written into a
+    plain tensor.
 
     Args:
         x: Tensor, any shape.

@@ -97,7 +97,8 @@ class TilePlan:
         TypeError: If frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
             equal steps, `lit` returns other shapes, no pulse lights any of 64 x 64 pixels that are
-            spread over the image, or tiles do not reach the error in this geometry.
+            spread over the image, tiles do not reach the error in this geometry, or the geometry is
+            not constant in a program that is traced, as by `torch.export`.
     """
 
     def __init__(
