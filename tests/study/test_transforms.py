@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -49,14 +50,14 @@ class Held:
 
 
 class Program(nn.Module):
-    """Module that forms the image of other data."""
+    """Module that forms the image of other data, with the values that were held or with others."""
 
     def __init__(self, held: Held) -> None:
         super().__init__()
         self.held, self.chain = held, held.chain
 
-    def forward(self, data: Tensor) -> Tensor:
-        return self.held.image(data)
+    def forward(self, data: Tensor, values: dict[str, Tensor] | None = None) -> Tensor:
+        return self.held.image(data, values)
 
 
 @pytest.fixture(scope="module", params=SCENES)
@@ -122,9 +123,17 @@ def test_a_mapped_chain_equals_the_batch(held: Held) -> None:
 
 
 @torch.no_grad()
-def test_an_exported_chain_gives_the_same_image(held: Held) -> None:
+@pytest.mark.parametrize("values", ["held", "given"])
+def test_an_exported_chain_gives_the_same_image(held: Held, values: str) -> None:
+    """Values are constants of the program, or arguments of it like the data."""
+    if values == "given" and not held.values:
+        pytest.skip("no stage estimates a value")
+    given: list[Any] = [held.data]
+    others: list[Any] = [1.7 * held.data.flip(0) + 0.5 * direction(held.data)]
+    if values == "given":
+        given.append(held.values)
+        others.append({name: 1.001 * v for name, v in held.values.items()})
     module = Program(held)
-    exported = torch.export.export(module, (held.data,), strict=False)
-    other = 1.7 * held.data.flip(0) + 0.5 * direction(held.data)
-    found, expected = exported.module()(other), module(other)
+    found = torch.export.export(module, tuple(given), strict=False).module()(*others)
+    expected = module(*others)
     assert float((found - expected).abs().max()) < 1e-12 * float(expected.abs().max())
