@@ -112,9 +112,9 @@ def normal(keys: Sequence[int], shape: Sequence[int], dtype: torch.dtype, device
     """Draw standard normal numbers by the transform of Box and Muller.
 
     Each word gives two independent numbers: its high 32 bits the radius, its low 32 bits the angle.
-    They are computed in float64 and then converted, and are equal to rounding on all devices.
-    No number lies beyond the largest radius of 6.76 standard deviations,
-    sqrt(66 ln 2); of true normal numbers, one in 7e10 does.
+    They are computed in float64 and then converted, and are equal to rounding on all devices. No
+    number lies beyond the largest radius of 6.76 standard deviations, sqrt(66 ln 2); of true normal
+    numbers, one in 7e10 does.
 
     Args:
         keys: Key of each trial, of 128 bits.
