@@ -110,18 +110,25 @@ def _reach(search_m: float | None, step: float) -> int:
     return 8 if search_m is None else max(1, math.ceil(search_m / step))
 
 
-def _patch(data: Tensor, rows: Tensor, cols: Tensor, height: int, width: int) -> Tensor:
+def _patch(data: Tensor, rows: Tensor, cols: Tensor, height: int, width: int, image: Tensor | None = None) -> Tensor:
     """Neighbourhoods (..., target, height, width) with (rows, cols) at sample (height//2,
     width//2); zero outside the image.
+
+    image: Number of the image of each position (n,) among all of data; None where positions (...,
+    target) have the leading dimensions of data.
     """
     n_a, n_r = data.shape[-2:]
     i = rows[..., None, None] + torch.arange(height, device=data.device)[:, None] - height // 2
     j = cols[..., None, None] + torch.arange(width, device=data.device) - width // 2
     down, right = (i >= 0) & (i < n_a), (j >= 0) & (j < n_r)
-    flat = (i.clamp(0, n_a - 1) * n_r + j.clamp(0, n_r - 1)).flatten(-3)
-    trials = np.broadcast_shapes(data.shape[:-2], flat.shape[:-1])
-    values = data.flatten(-2).expand(*trials, -1).gather(-1, flat.expand(*trials, -1))
-    values = values.reshape(*trials, rows.shape[-1], height, width)
+    at = i.clamp(0, n_a - 1) * n_r + j.clamp(0, n_r - 1)
+    if image is None:
+        flat = at.flatten(-3)
+        trials = np.broadcast_shapes(data.shape[:-2], flat.shape[:-1])
+        values = data.flatten(-2).expand(*trials, -1).gather(-1, flat.expand(*trials, -1))
+        values = values.reshape(*trials, rows.shape[-1], height, width)
+    else:
+        values = data.take(at + image[:, None, None] * (n_a * n_r))
     return values if bool(down.all() & right.all()) else torch.where(down & right, values, 0)
 
 
@@ -139,30 +146,32 @@ def _climb(
     per sample, offsets in samples. A skewed response that is sampled finely in one axis and
     coarsely in the other has its maximum more than a sample away from its strongest sample.
     """
-    found = _refined(data, rows, cols, centre_turns)
+    found = _refined(_patch(data, rows, cols, _PATCH, _PATCH), centre_turns)
+    lead = data.shape[:-2]
+    image = torch.arange(math.prod(lead), device=data.device).reshape(*lead, 1).expand_as(found[0])
     for _ in range(rounds):
         down, right = (offset.round().long() for offset in found[2:])
-        if not bool(down.any() | right.any()):
+        moved = (down != 0) | (right != 0)
+        if not bool(moved.any()):
             break
         rows, cols = rows + down, cols + right
-        found = _refined(data, rows, cols, centre_turns)
+        patch = _patch(data, rows[moved], cols[moved], _PATCH, _PATCH, image[moved])
+        again = _refined(patch, centre_turns)
+        found = [old.masked_scatter(moved, new) for old, new in zip(found, again, strict=True)]
     return rows, cols, *found
 
 
-def _refined(
-    data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float | None, float | None]
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Spectral centres in turns per sample, and offsets of the interpolated maximum from (row,
-    column) in samples.
+def _refined(patch: Tensor, centre_turns: tuple[float | None, float | None]) -> list[Tensor]:
+    """Spectral centres in turns per sample, and offsets of the interpolated maximum from the
+    central sample of neighbourhoods (..., row, column) in samples, shape (...,) each.
     """
-    patch = _patch(data, rows, cols, _PATCH, _PATCH)
     tone_a, tone_r = (
         _centre_turns(patch, dim)
         if centre is None
         else torch.full(patch.shape[:-2], centre, dtype=torch.float64, device=patch.device)
         for dim, centre in zip((-2, -1), centre_turns, strict=True)
     )
-    return tone_a, tone_r, *_fine_peak(patch, tone_a, tone_r)
+    return [tone_a, tone_r, *_fine_peak(patch, tone_a, tone_r)]
 
 
 def cut_offset(cut: Tensor, tone: Tensor) -> Tensor:
