@@ -64,8 +64,10 @@ def compare(name: str, two: Counts, four: Counts) -> None:
     """Waits for four trials against those for two, and the table."""
     more = waits(four) - waits(two)
     growth = waits(four).total() - waits(two).total()
-    # rounding may cost one iteration more; a loop over trials costs two
-    assert abs(growth - GROWTH.get(name, 0)) <= 1, f"{name}: {growth} more, at {dict(more.most_common(8))}"
+    # rounding may cost some iterations more, here or on another processor; a search that works
+    # through one trial after another costs as much again
+    slack = max(1.0, 0.05 * waits(two).total())
+    assert abs(growth - GROWTH.get(name, 0)) <= slack, f"{name}: {growth} more, at {dict(more.most_common(8))}"
 
 
 def equal(found: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float) -> None:
