@@ -303,7 +303,8 @@ def pictures(snr_db: Sequence[float], table: Mapping[str, Tensor]) -> list[Any]:
     """Errors over SNR, and their ratio to the bound for the methods that come near it."""
     bound = table["bound"]
     near = {name: table[name] / bound for name in ("entropy_fixed_point", "autofocus", "learned")}
-    whole = {name: values for name, values in table.items() if name in (*LIBRARY, "learned")}
+    # these first, so that a method has one colour in both panels
+    whole = {name: table[name] for name in (*near, *LIBRARY)}
     return [
         *plot.error_curves([panel("Phase error on unseen scenes", snr_db, whole, bound)], X, "rms (rad)", log_y=True),
         *plot.error_curves(
