@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from torchsar.compensate import CorrectPath, PathAutofocus, PathPhase, path_autofocus, path_phase
+from torchsar.compensate.path import line_of_sight
+from torchsar.compensate.path.axes import Found
 from torchsar.compensate.path.envelopes import drift_m, moved
 from torchsar.compensate.path.fringes import rough_near, roughness, smooth_near, smoothest
 from torchsar.compensate.path.ground import ground_image
@@ -215,3 +218,21 @@ def test_an_envelope_that_drifts_against_the_phases_is_found() -> None:
     back = unit_phasor(-drift[:, None] * 2 * frequency.mean() / 299792458.0, late.dtype)  # keeps the carrier
     found = drift_m(late * back, frequency, imaging, slopes=True)
     assert float((found - drift).square().mean().sqrt()) < fringe
+
+
+def test_a_start_that_explains_the_samples_worse_does_not_widen_the_deviation() -> None:
+    present = torch.ones(PULSES, dtype=torch.bool)
+    search = SimpleNamespace(fringe_m=0.0156, present=present)
+
+    def found(noise: float, error_m: float, sharp: float) -> Found:
+        line = error_m * torch.randn(PULSES, dtype=F64, generator=torch.Generator().manual_seed(3))
+        image = torch.zeros(8, 8, dtype=torch.complex64)
+        image[0, 0], image[1, 1] = 1.0, sharp
+        value = torch.tensor(noise, dtype=F64)
+        return Found(line, torch.zeros(PULSES, 3), torch.full_like(line, 3e-5), image, value, value * 0)
+
+    best, near, far = found(1.0, 0.0, 0.1), found(1.02, 2e-5, 0.2), found(1.3, 3e-4, 0.3)
+    for others, std_m, only in (([far, near], 3.3e-5, False), ([near], 3.3e-5, False), ([far], 2e-4, True)):
+        sharpest, std, alone = line_of_sight._sharpest([*others, best], search)  # pyright: ignore[reportArgumentType]
+        assert sharpest is best and alone is only
+        assert float(std.square().mean().sqrt()) == pytest.approx(std_m, rel=0.2)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchsar.compensate.path import axes as joint
 from torchsar.compensate.path import scene as of_scene
 from torchsar.compensate.path.axes import three_axes
 from torchsar.compensate.path.ground import FINE_STEP, ground_image, line_free
@@ -156,3 +157,14 @@ def test_errors_across_are_not_taken_for_fringes() -> None:
     fine = ground_image(frequency, recorded(path, error), 0.0, None, FINE_STEP)
     found = three_axes(rows, fine, start, present).line_of_sight_m
     assert (found - start).abs().max() < RADAR.wavelength_m / 4
+
+
+def test_rounds_end_when_nothing_but_an_unobservable_line_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, frequency, path = seen(RandomPoints(12, 16.0, 12.0), 30.0)
+    error = torch.zeros(PULSES, 3, dtype=F64)
+    error[:, 0] = 1e-4 * torch.linspace(-1, 1, PULSES, dtype=F64)  # a scatterer may shift within its cell
+    rounds = []
+    monkeypatch.setattr(joint, "scene_of", lambda *known: rounds.append(1) or scene_of(*known))
+    operator = ground_image(frequency, recorded(path, error), 0.0, None, FINE_STEP)
+    three_axes(rows, operator, torch.zeros(PULSES, dtype=F64), torch.ones(PULSES, dtype=torch.bool))
+    assert len(rounds) <= 3, rounds

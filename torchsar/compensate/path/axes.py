@@ -93,9 +93,9 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, pre
         noise = scene.noise_of(left)
         std = motion.std_m() * (_UNKNOWN * noise / scene.noise).sqrt()
         fringes = _fringes(rows, rows - left, plan.frequency_hz, noise)
-        found = found + step
+        before, found = found, found + step
         found[:, 0] = line_free(found[:, 0] + fringes * fringe, present)
-        change = (lever @ step[..., None]).square().mean()
+        change = (lever @ (found - before)[..., None]).square().mean()
         if change <= _SETTLED**2 * std.square().mean() and not bool(fringes.any()):
             break
     offset = (found[:, None] @ axes)[:, 0]

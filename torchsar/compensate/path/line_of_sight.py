@@ -39,6 +39,10 @@ _HOPE = 1.25
 # number of standard deviations that may not lower the Strehl ratio below its limit, by choice: the
 # difference of two starts is itself uncertain
 _SPREAD = 1.5
+# factor by which another start may leave more of the samples than the sharpest image and still
+# count as a second opinion on it, by trial: those whose results were as good left up to 1.05 times
+# as much, those that had not come as far 1.1 to 1.35 times
+_AS_WELL = 1.1
 # largest share of the pulses whose fringes the last round may have changed, and factor by which the
 # sharpest image may leave more of the samples than that of another start, by trial: 3 % and 1.1
 # where the result was right, 19 % and 3 in a wrong minimum that all starts had in common; and share
@@ -78,8 +82,8 @@ def path_autofocus(
        differently over the scene, are assumed to have the spectrum of those along it. Whole
        fringes are added to pulses whose envelopes match the scene so much better.
     5. Step 4 is repeated from another start: phases of the whole band, with envelopes at rest; and
-       from a third one, half of the band in step 1, if the results differ. The sharpest image
-       counts.
+       from a third one, half of the band in step 1, if the results differ or explain the samples
+       unequally well. The sharpest image counts.
 
     Not observable are a constant and a linear term, which shift the image, and rotate and stretch
     it slightly; they are zero in the result. Where the errors are rough from pulse to pulse,
@@ -105,15 +109,15 @@ def path_autofocus(
         positions in metres, recorded minus true, of both antennas alike, for `CorrectPath`. The
         standard deviation, of `line_of_sight_m` only, is that modulo half a wavelength; it follows
         from what the estimated scene and motion leave of the samples, and from the difference from
-        the nearest result of another start. `quality` is the Strehl ratio predicted from it,
-        times the share of the sharpness that noise does not explain. Sharpness is the amount by
-        which the image entropy lies below that of speckle. `ok` is False unless the image is twice
-        as sharp as autofocus can make pure noise, more than one range cell contributes to the
-        sharpness, the Strehl ratio for 1.5 standard deviations exceeds 0.8, the fringes have
-        settled, and no start explains the samples better by far; it does not say whether fringes
-        are right. It is False for fewer than 8 pulses with samples. `info` holds
-        "roughness" (see `roughness`: about 1 if the fringes come from single envelopes, less for
-        smooth motions) and "entropy_nats" of the image, shape (...,).
+        the nearest result of another start that explains the samples as well. `quality` is the
+        Strehl ratio predicted from it, times the share of the sharpness that noise does not
+        explain. Sharpness is the amount by which the image entropy lies below that of speckle. `ok`
+        is False unless the image is twice as sharp as autofocus can make pure noise, more than one
+        range cell contributes to the sharpness, the Strehl ratio for 1.5 standard deviations
+        exceeds 0.8, the fringes have settled, and no start explains the samples better by far; it
+        does not say whether fringes are right. It is False for fewer than 8 pulses with samples.
+        `info` holds "roughness" (see `roughness`: about 1 if the fringes come from single
+        envelopes, less for smooth motions) and "entropy_nats" of the image, shape (...,).
 
     Raises:
         TypeError: If the profiles are not complex, or frequencies are not float64.
@@ -190,10 +194,10 @@ def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
 
     range_m, rough = search.by_envelopes(_FIRST_BAND)
     results = [refined(range_m), refined(search.by_phases())]
-    found, std_m = _sharpest(results, search)
-    if strehl(_SPREAD * std_m) <= LEAST_STREHL:
+    found, std_m, alone = _sharpest(results, search)
+    if alone or strehl(_SPREAD * std_m) <= LEAST_STREHL:
         results.append(refined(search.by_envelopes(_OTHER_BAND)[0]))
-        found, std_m = _sharpest(results, search)
+        found, std_m, _ = _sharpest(results, search)
     sharp, noise, telling = _sharpness(found.image)
     quality = strehl(std_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
     least = torch.stack([one.noise for one in results]).amin()
@@ -218,15 +222,21 @@ def _sharpness(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return sharp, sharpness_of_noise((effective * FINE_STEP).clamp_min(1)), telling
 
 
-def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor]:
-    """The result of the sharpest image, and the standard deviation of its line of sight (m).
+def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor, bool]:
+    """The result of the sharpest image, the standard deviation of its line of sight (m), and
+    whether it stands alone: no other result explains the samples as well.
 
-    The latter contains the difference from the nearest other result. All have the errors by noise
-    in common; what differs comes from the search.
+    The standard deviation contains the difference from the nearest other result, of those that
+    explain the samples as well if there are any: one that does not differs by errors of its own.
+    All have the errors by noise in common; what differs comes from the search.
     """
     best, *others = sorted(found, key=lambda one: float(entropy(one.image)))
+    as_well = [one for one in others if one.noise <= _AS_WELL * best.noise]
     radians, present = 2 * math.pi / search.fringe_m, search.present
-    phase, *others = (radians * placed(one.line_of_sight_m, present) for one in (best, *others))
-    apart = [residual_phase(phase, other, present)[present] for other in others]
+
+    def phase(one: Found) -> Tensor:
+        return radians * placed(one.line_of_sight_m, present)
+
+    apart = [residual_phase(phase(best), phase(other), present)[present] for other in as_well or others]
     least = torch.stack([x.square().mean() for x in apart]).amin() / radians**2
-    return best, (best.std_m.square() + least / 2).sqrt()
+    return best, (best.std_m.square() + least / 2).sqrt(), not as_well
