@@ -11,7 +11,7 @@ import pkgutil
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 
 import pytest
 import torch
@@ -584,42 +584,77 @@ def single(values: dict[str, Tensor], i: int) -> dict[str, Tensor]:
     return {name: value[i] for name, value in values.items()}
 
 
-@pytest.mark.parametrize("trials", [1, 3])
-@pytest.mark.parametrize("case", CASES, ids=IDS)
-def test_batch_equals_singles(case: Case, trials: int) -> None:
-    """To the tolerance times the value or, if that is larger, times its predicted deviation.
+@dataclass(frozen=True)
+class Called:
+    """A stage that was stored, loaded and moved, its input, and what it returned."""
 
-    The first and the last trial stand for all.
-    """
-    stage, signal = case.build(), entering(case, raw(trials, n_range=case.n_range))
-    values = case.values(signal)
-    together = results(stage(signal, **values))
-    for i in {0, trials - 1}:
-        out = stage(signal.with_data(signal.data[i]), **single(values, i))
-        deviations = out.std if isinstance(out, Estimate) else {}
-        for name, value in results(out).items():
-            scale = float(value.abs().max()) if value.dtype != torch.bool and value.numel() else 1.0
-            deviation = deviations.get(name, torch.zeros(())).nan_to_num(posinf=0.0)
-            torch.testing.assert_close(
-                together[name][i],
-                value,
-                atol=case.tolerance * max(scale, float(deviation.max()) if deviation.numel() else 0.0, 1e-30),
-                rtol=0,
-                msg=lambda m, n=name: f"{n}: {m}",
-            )
+    stage: Stage
+    signal: Signal
+    values: dict[str, Tensor]
+    results: dict[str, Tensor]
+    left_alone: bool
+
+
+@cache
+def called(case: Case, dtype: torch.dtype = torch.complex128) -> Called:
+    """A call with two trials, 60 dB apart, and a third one of zeros, which several tests share."""
+    stage, signal = case.build(), entering(case, raw(2, dtype, n_range=case.n_range))
+    signal = signal.with_data(torch.cat([signal.data, torch.zeros_like(signal.data[:1])]))
+    values, before = case.values(signal), signal.data.clone()
+    stage.load_state_dict(stage.state_dict())
+    found = results(stage.to("cpu")(signal, **values))
+    return Called(stage, signal, values, found, torch.equal(signal.data, before))
+
+
+def assert_equal_trials(
+    case: Case, found: dict[str, Tensor], wanted: dict[str, Tensor], std: dict[str, Tensor]
+) -> None:
+    """To the tolerance times the value or, if that is larger, times its predicted deviation."""
+    for name, value in wanted.items():
+        scale = float(value.abs().max()) if value.dtype != torch.bool and value.numel() else 1.0
+        deviation = std.get(name, torch.zeros(())).nan_to_num(posinf=0.0)
+        torch.testing.assert_close(
+            found[name],
+            value,
+            atol=case.tolerance * max(scale, float(deviation.max()) if deviation.numel() else 0.0, 1e-30),
+            rtol=0,
+            msg=lambda m, n=name: f"{n}: {m}",
+        )
+
+
+@pytest.mark.parametrize("case", CASES, ids=IDS)
+def test_batch_equals_singles(case: Case) -> None:
+    """Beside a trial of another level and an empty one, as a batch of one trial, and alone."""
+    of = called(case)
+    for i in range(2):
+        out = of.stage(of.signal.with_data(of.signal.data[i]), **single(of.values, i))
+        alone, std = results(out), out.std if isinstance(out, Estimate) else {}
+        assert_equal_trials(case, single(of.results, i), alone, std)
+        if i == 0:
+            first = of.signal.with_data(of.signal.data[:1])
+            batch = results(of.stage(first, **{name: value[:1] for name, value in of.values.items()}))
+            assert_equal_trials(case, single(batch, 0), alone, std)
 
 
 @pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
 @pytest.mark.parametrize("case", CASES, ids=IDS)
 def test_dtype_and_device_are_kept(case: Case, dtype: torch.dtype) -> None:
-    signal = entering(case, raw(2, dtype, n_range=case.n_range))
-    out = results(case.build()(signal, **case.values(signal)))
-    if "data" in out:
-        assert (
-            out["data"].dtype == (dtype if case.keeps_complex else real_dtype(dtype))
-            and out["data"].device == signal.data.device
-        )
-    assert all(torch.isfinite(value).all() for value in out.values())
+    of = called(case, dtype)
+    if "data" in of.results:
+        data = of.results["data"]
+        assert data.dtype == (dtype if case.keeps_complex else real_dtype(dtype))
+        assert data.device == of.signal.data.device
+
+
+@pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
+@pytest.mark.parametrize("case", CASES, ids=IDS)
+def test_results_are_finite_also_of_an_empty_trial(case: Case, dtype: torch.dtype) -> None:
+    assert all(torch.isfinite(value).all() for value in called(case, dtype).results.values())
+
+
+@pytest.mark.parametrize("case", CASES, ids=IDS)
+def test_state_moves_and_input_is_left_alone(case: Case) -> None:
+    assert called(case).left_alone
 
 
 @pytest.mark.parametrize(
@@ -666,24 +701,6 @@ def test_non_finite_input_is_refused(case: Case, bad: float) -> None:
         ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index " + re.escape(str(position))
     ):
         stage(signal.with_data(data), **case.values(signal))
-
-
-@pytest.mark.parametrize("case", CASES, ids=IDS)
-def test_state_moves_and_input_is_left_alone(case: Case) -> None:
-    stage, signal = case.build(), entering(case, raw(2, n_range=case.n_range))
-    before = signal.data.clone()
-    stage.load_state_dict(stage.state_dict())
-    stage.to("cpu")(signal, **case.values(signal))
-    assert torch.equal(signal.data, before)
-
-
-@pytest.mark.parametrize("case", CASES, ids=IDS)
-def test_all_zero_trial_stays_finite(case: Case) -> None:
-    stage, signal = case.build(), entering(case, raw(2, n_range=case.n_range))
-    data = signal.data.clone()
-    data[0] = 0
-    out = results(stage(signal.with_data(data), **case.values(signal)))
-    assert all(torch.isfinite(value).all() for value in out.values())
 
 
 def _estimators() -> set[type[Stage]]:
