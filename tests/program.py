@@ -1,5 +1,5 @@
 """Programs in processes of their own that start at once: they are forked from a server that has
-imported torch, which takes a new interpreter seconds.
+imported torch, which takes a new interpreter seconds. So are workers of dask.
 """
 
 from __future__ import annotations
@@ -10,13 +10,27 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
 
 _SERVER = multiprocessing.get_context("forkserver")
-_SERVER.set_forkserver_preload(["distributed", "torchsar.study.table", "torchsar.study.commands.sweep"])
+_IMPORTED = ["distributed", "torchsar.study.table", "torchsar.study.commands.sweep"]
+_SERVER.set_forkserver_preload(_IMPORTED)
+
+
+def fork_workers() -> None:
+    """Let dask start its workers from the server of this process, or one that imports the same."""
+    if find_spec("distributed") is None:
+        return
+    from dask import config
+    from distributed.utils import get_mp_context
+
+    config.set({"distributed.worker.multiprocessing-method": "forkserver"})
+    get_mp_context()  # at its first call it chooses other modules to import
+    _SERVER.set_forkserver_preload(_IMPORTED)
 
 
 class Program:
@@ -82,4 +96,5 @@ def _run(main: Callable[..., int | None], given: tuple, folder: Path, said: Path
     # a test that was started in the background ignores Ctrl-C
     signal.signal(signal.SIGINT, signal.default_int_handler)
     torch.set_num_threads(1)
+    fork_workers()
     sys.exit(main(*given))

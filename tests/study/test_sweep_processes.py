@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.program import Program
+from tests.program import Program, fork_workers
 from tests.study import toy
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
@@ -26,6 +26,11 @@ needs_dask = pytest.mark.skipif(
     pytest.importorskip("importlib.util").find_spec("distributed") is None,
     reason="dask.distributed (extra cluster) is not installed",
 )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _workers_start_at_once() -> None:
+    fork_workers()
 
 
 def swept(out: Path, slow_s: float, log: Path | None, workers: int | None) -> None:
