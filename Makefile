@@ -21,8 +21,9 @@ STAMP := $(VENV)/.torchsar-installed
 run: install
 	$(VENV)/bin/torchsar run $(CONFIG) $(ARGS) --out $(OUT)
 
+# Bytecode is kept: otherwise every worker, and every process that a test starts, compiles all files again.
 test: install
-	OMP_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
 
 lint: install
 	$(VENV)/bin/ruff check .
