@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -35,13 +36,19 @@ class Case:
             torch.linalg.vector_norm(pixels_m[:, None] - place, dim=-1) for place in (self.transmitter_m, receiver)
         )
         turns = (path - self.reference_m)[..., None] * self.frequency_hz / C
-        return (self.history.to(C128) * torch.exp(2j * math.pi * (turns - turns.detach().round()))).sum((-2, -1))
+        phasor = torch.polar(torch.ones_like(turns), 2 * math.pi * (turns - turns.detach().round()))
+        return (self.history.to(C128) * phasor).sum((-2, -1))
 
-    def error_db(self, image: Tensor, pixels: int = 200) -> float:
-        """Rms error of an image at random pixels, relative to their rms, in dB."""
+    @cached_property
+    def _sampled(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows and columns of 200 random pixels, and their values."""
         source = torch.Generator().manual_seed(1)
-        i, j = (torch.randint(0, n, (pixels,), generator=source) for n in self.grid.counts)
-        truth = self.direct(self.grid.pixels_m()[i, j])
+        i, j = (torch.randint(0, n, (200,), generator=source) for n in self.grid.counts)
+        return i, j, self.direct(self.grid.pixels_m()[i, j])
+
+    def error_db(self, image: Tensor) -> float:
+        """Rms error of an image at random pixels, relative to their rms, in dB."""
+        i, j, truth = self._sampled
         return 10 * math.log10(float((image[i, j] - truth).abs().square().mean() / truth.abs().square().mean()))
 
 
