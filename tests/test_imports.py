@@ -153,60 +153,62 @@ class _Study:
         return next((circle for circle in (walk(name, []) for name in self.paths) if circle), [])
 
 
-STUDY = _Study()
+@pytest.fixture(scope="module")
+def study() -> _Study:
+    return _Study()
 
 
 def _floor(module: str) -> str:
     return module.split(".")[2] if module.count(".") > 1 else "face"
 
 
-def test_study_has_no_import_circle() -> None:
-    assert not STUDY.circle(), " -> ".join(STUDY.circle())
+def test_study_has_no_import_circle(study: _Study) -> None:
+    assert not study.circle(), " -> ".join(study.circle())
 
 
-def test_a_circle_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    imports = dict(STUDY.imports)
+def test_a_circle_would_be_found(monkeypatch: pytest.MonkeyPatch, study: _Study) -> None:
+    imports = dict(study.imports)
     imports["torchsar.study.settings.errors"] = {"torchsar.study.table"}
-    monkeypatch.setattr(STUDY, "imports", imports)
-    assert STUDY.circle()[0] == STUDY.circle()[-1] and "torchsar.study.settings.errors" in STUDY.circle()
+    monkeypatch.setattr(study, "imports", imports)
+    assert study.circle()[0] == study.circle()[-1] and "torchsar.study.settings.errors" in study.circle()
 
 
-def test_study_imports_go_downward() -> None:
+def test_study_imports_go_downward(study: _Study) -> None:
     """The face, `torchsar.study` itself, hands out names of `montecarlo` and stands on top."""
     order = {floor: i for i, floor in enumerate((*FLOORS, "face"))}
-    for name, imports in STUDY.imports.items():
+    for name, imports in study.imports.items():
         for other in imports:
             assert not other.startswith("torchsar.cli"), f"{name} imports the command line"
             if other.startswith("torchsar.study"):
                 assert order[_floor(other)] <= order[_floor(name)], f"{name} imports {other}, which stands above it"
 
 
-def test_only_the_table_names_the_systems() -> None:
-    for name, imports in STUDY.imports.items():
+def test_only_the_table_names_the_systems(study: _Study) -> None:
+    for name, imports in study.imports.items():
         for other in (one for one in imports if _floor(one) == "systems"):
             system, used = (one.split(".")[3] for one in (name, other)) if _floor(name) == "systems" else ("", other)
             assert used in {system} | SHARED.get(system, set()), f"{name} imports {other}"
-    shown = {floor: {name for name in STUDY.paths if _floor(name) == floor} for floor in FLOORS}
+    shown = {floor: {name for name in study.paths if _floor(name) == floor} for floor in FLOORS}
     for name in set().union(*shown.values()) - shown["table"] - shown["systems"]:
-        assert "torchsar.study.systems." not in STUDY.paths[name].read_text(encoding="utf-8"), name
+        assert "torchsar.study.systems." not in study.paths[name].read_text(encoding="utf-8"), name
 
 
-def test_the_monte_carlo_loop_knows_no_physics() -> None:
-    for name, imports in STUDY.imports.items():
+def test_the_monte_carlo_loop_knows_no_physics(study: _Study) -> None:
+    for name, imports in study.imports.items():
         if _floor(name) == "montecarlo":
             general = ("torchsar.study", "torchsar.core", "torchsar.plot", "torchsar.metrics.intervals")
             outside = {one for one in imports if not one.startswith(general)}
             assert not outside and "torchsar.study.names" not in {one.rpartition(".")[0] for one in imports}, name
 
 
-def test_types_come_by_plain_imports() -> None:
+def test_types_come_by_plain_imports(study: _Study) -> None:
     """An import for types alone would hide a circle; the face needs one to stay lazy."""
-    for name, path in STUDY.paths.items():
+    for name, path in study.paths.items():
         assert ("TYPE_CHECKING" in path.read_text(encoding="utf-8")) == (name == "torchsar.study"), name
 
 
 @pytest.mark.parametrize("package", MOST_STATEMENTS)
-def test_study_keeps_to_its_size(package: str) -> None:
-    counted = [path for name, path in STUDY.paths.items() if f"{name}.".startswith(f"{package}.")]
+def test_study_keeps_to_its_size(package: str, study: _Study) -> None:
+    counted = [path for name, path in study.paths.items() if f"{name}.".startswith(f"{package}.")]
     count = sum(isinstance(node, ast.stmt) for path in counted for node in _nodes(path))
     assert count <= MOST_STATEMENTS[package], f"{package} has {count} statements"
