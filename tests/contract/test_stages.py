@@ -531,6 +531,7 @@ def results(out: Signal | Estimate | tuple) -> dict[str, Tensor]:
     return named
 
 
+@cache
 def raw(trials: int | None, dtype: torch.dtype = torch.complex128, n_pulse: int = 48, n_range: int = 64) -> Signal:
     recording, _ = small_recording(n_pulse, n_range, trials=trials, dtype=dtype)
     # levels of 60 dB apart: a loud trial must not change a quiet one
@@ -540,6 +541,7 @@ def raw(trials: int | None, dtype: torch.dtype = torch.complex128, n_pulse: int 
     return recording.signal
 
 
+@cache
 def raw_ladar(kind: str, trials: int | None, dtype: torch.dtype, n_pulse: int) -> Signal:
     """The same of a triangular ladar: "record", "sweeps", or "profiles" of the up sweeps."""
     signal = small_ladar_recording(n_pulse, trials=trials, dtype=dtype, record=kind == "record")[0].signal
@@ -550,6 +552,9 @@ def raw_ladar(kind: str, trials: int | None, dtype: torch.dtype, n_pulse: int) -
     return signal.with_data(signal.data * level[(slice(None),) + (None,) * len(signal.axes)])
 
 
+_echo = cache(small_bistatic_echo)
+
+
 def raw_channels(kind: str, like: Signal) -> Signal:
     """Channels of a bistatic receiver, as many trials and pulses: "range", "line" without the range
     axis, or "doppler", rebuilt.
@@ -557,7 +562,7 @@ def raw_channels(kind: str, like: Signal) -> Signal:
     n_pulse, n_range = (
         (like.axes[0].n, 32 if like.axes[0].n > 8 else 16) if kind == "range" else (6 * like.axes[0].n, 4)
     )
-    signal = small_bistatic_echo(n_pulse, n_range, like.trials.numel() if like.trials else None, like.data.dtype)
+    signal = _echo(n_pulse, n_range, like.trials.numel() if like.trials else None, like.data.dtype)
     if like.trials:
         level = torch.logspace(0, 3, len(signal.data)).to(like.data.dtype)
         signal = signal.with_data(signal.data * level[:, None, None, None])

@@ -95,9 +95,7 @@ def test_sizes_and_types(entry: Entry) -> None:
         outcome(lambda dtype=dtype: entry.call(whole.to(dtype) if dtype.is_complex else whole.real.to(dtype)))
 
 
-VALUED = [
-    case for case in contract.CASES if case.values(contract.entering(case, contract.raw(1, n_range=case.n_range)))
-]
+VALUED = [case for case in contract.CASES if case.values is not contract.Case.values]
 
 
 @pytest.mark.parametrize("case", VALUED, ids=[case.name for case in VALUED])

@@ -119,19 +119,16 @@ def test_impairments_stay_in_the_clean_image(tmp_path: Path) -> None:
     assert level[0]["mfta_db"] < -60 and level[1]["mfta_db"] > -35
 
 
-def test_trials_of_a_sweep_do_not_depend_on_their_batch_and_keep_to_the_bound(tmp_path: Path) -> None:
+def test_errors_of_a_sweep_keep_to_the_bound(tmp_path: Path) -> None:
     given = {"processor": ESTIMATORS, "metrics": None, "precision": "complex128", "world": world("geo", targets=ALONE)}
     trial, key = SweepTrial(loaded_as(tmp_path, "geo", **given)), "world.noise.raw_scnr_db"
-    records = [sweep(trial, {key: [-30.0, -10.0]}, batched=[key], trials=8, seed=3, chunk=chunk) for chunk in (5, 16)]
-    for name, values in records[0].metrics.items():
-        if name != "seconds":
-            np.testing.assert_allclose(values, records[1].metrics[name], atol=1e-6, rtol=1e-4, err_msg=name)
-    bound = records[0].bounds["u_r_error_m_s"]["Cramer-Rao, u_a known"][:, 0]
+    record = sweep(trial, {key: [-30.0, -10.0]}, batched=[key], trials=8, seed=3, chunk=16)
+    bound = record.bounds["u_r_error_m_s"]["Cramer-Rao, u_a known"][:, 0]
     np.testing.assert_allclose(bound, [0.2099, 0.02099], rtol=1e-3)
-    rms = np.sqrt((records[0].metrics["u_r_error_m_s"] ** 2).mean(-1))
+    rms = np.sqrt((record.metrics["u_r_error_m_s"] ** 2).mean(-1))
     # eight trials: the rms is within 0.5 to 1.6 of its expectation in 99 of 100 cases
     assert (rms[1] / bound > 0.5).all() and (rms[1] / bound < 1.6).all() and (rms[0] < 3 * bound).all()
-    assert "Cramer-Rao" not in records[0].bounds["u_r_error_m_s"]
+    assert "Cramer-Rao" not in record.bounds["u_r_error_m_s"]
 
 
 def test_the_sea_is_as_strong_as_said(tmp_path: Path) -> None:

@@ -68,21 +68,18 @@ def test_scene_and_noise_have_seeds_of_their_own(tmp_path: Path) -> None:
     assert torch.equal(quiet[1][0], quiet[1][1])
 
 
-def test_trials_of_a_sweep_do_not_depend_on_their_batch_and_stay_above_the_bound(tmp_path: Path) -> None:
+def test_errors_of_a_sweep_stay_above_the_bound_and_are_predicted(tmp_path: Path) -> None:
     processor = {"recommended": {"stages": {"rotation": {"stage": "rotation"}}}}
     changes = {"processor": processor, "metrics": None, "precision": "complex128"}
     trial, key = SweepTrial(loaded_as(tmp_path, "isal_rotation", **changes)), "world.noise.snr_db"
-    records = [sweep(trial, {key: [0.0, 20.0]}, batched=[key], trials=4, seed=3, chunk=chunk) for chunk in (1, 8)]
-    for name, values in records[0].metrics.items():
-        if name != "seconds":
-            np.testing.assert_allclose(values, records[1].metrics[name], atol=1e-5, rtol=1e-4, err_msg=name)
+    record = sweep(trial, {key: [0.0, 20.0]}, batched=[key], trials=4, seed=3, chunk=8)
     for name in ("omega_error_percent", "k1_error_percent", "k2_error_percent", "yc_error_m"):
-        bound = records[0].bounds[name]["Cramer-Rao"]
-        rms, least = (np.sqrt((x**2).mean(-1)).reshape(-1) for x in (records[0].metrics[name][0], bound))
+        bound = record.bounds[name]["Cramer-Rao"]
+        rms, least = (np.sqrt((x**2).mean(-1)).reshape(-1) for x in (record.metrics[name][0], bound))
         assert (rms > 0.2 * least).all() and rms[0] < 6 * least[0], name
         # other scenes at the other SNR
         np.testing.assert_allclose(least[0] / least[1], 10, rtol=0.2)
-        predicted = records[0].metrics[name.replace("error", "std")][0]
+        predicted = record.metrics[name.replace("error", "std")][0]
         assert (predicted > 0.5 * bound).all() and (predicted[0] < 3 * bound[0]).all(), name
 
 

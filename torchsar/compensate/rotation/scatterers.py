@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeAlias
 
 import torch
@@ -550,7 +551,7 @@ class _Step:
 
         The unknowns are relative amplitude, phase, Doppler cell and range cell.
         """
-        overlap, slope, back, bend = self._overlaps()
+        overlap, slope, back, bend = self._overlaps
         pairs = self.pairs
         flat, line, bent = (
             pairs.products[(0, 0)],
@@ -570,6 +571,7 @@ class _Step:
         diagonal += torch.where(diagonal > 0, _RIDGE * diagonal, 1.0)
         return local
 
+    @cached_property
     def _overlaps(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Inner product over range cells of the envelopes of each pair, and its derivatives.
 
@@ -597,30 +599,22 @@ class _Step:
         (trial, 4 scatterer, unknown) and, as sums over the pairs of each scatterer, (trial,
         scatterer, unknown, unknown).
         """
-        pairs = self.pairs
-        overlap, _, back, _ = self._overlaps()
-        size = slopes.shape[-1]
-        # (pair, unknown, base)
-        column, row = (slopes[pairs.trial, scatterer] for scatterer in (pairs.second, pairs.first))
-        seen, bowed = (
-            sum(pairs.products[(base, n)][:, None] * column[..., n] for n in range(2, size)) for base in (0, 1)
-        )
+        pairs, bases = self.pairs, range(2, slopes.shape[-1])
+        overlap, _, back, _ = self._overlaps
+        columns = slopes[pairs.trial, pairs.second].unbind(-1)[2:]
+
+        def summed(base: int, part: Callable[[Tensor], Tensor], envelopes: Tensor = overlap) -> Tensor:
+            weighted = (part(pairs.products[(base, n)] * envelopes)[:, None] * columns[n - 2] for n in bases)
+            return pairs.per_scatterer(sum(weighted, torch.zeros_like(columns[0])))
+
         parts = [
-            -(seen * overlap[:, None]).imag,
-            (seen * overlap[:, None]).real,
-            -2 * math.pi * (bowed * overlap[:, None]).real,
-            -(seen * back[:, None]).imag,
+            -summed(0, torch.imag),
+            summed(0, torch.real),
+            -2 * math.pi * summed(1, torch.real),
+            -summed(0, torch.imag, back),
         ]
-        cross = torch.cat([pairs.per_scatterer(part) for part in parts], 1)
-        shared = range(2, size)
-        both = torch.stack(
-            [
-                (pairs.products[(n, m)] * overlap).real[:, None, None] * row[..., n, None] * column[:, None, :, m]
-                for n in shared
-                for m in shared
-            ]
-        ).sum(0)
-        return cross, pairs.per_scatterer(both.flatten(1)).unflatten(-1, both.shape[1:])
+        shared = torch.stack([summed(base, torch.real) for base in bases], -1)
+        return torch.cat(parts, 1), torch.einsum("bpin,bpjn->bpij", slopes[..., 2:], shared)
 
     def _moved(self, change: Tensor) -> Motion:
         """The motion after a step of the common unknowns."""
