@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable, Sequence
 
 import torch
+from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchsar.core import Draws, Recording, Signal, Truth
 from torchsar.echo import simulate, simulate_bistatic, simulate_ladar, simulate_ladar_record
@@ -27,6 +30,41 @@ def enable_interrupts() -> None:
     children would, too.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def assert_forward_equals_backward(
+    function: Callable[..., Tensor | tuple[Tensor, ...]], inputs: tuple[Tensor, ...]
+) -> None:
+    """Derivatives of both modes in a random direction, of all inputs and of the first one alone.
+
+    It costs three calls of the function; `gradcheck(..., check_forward_ad=True)` costs dozens.
+    """
+    source = torch.Generator().manual_seed(1)
+
+    def alike(x: Tensor) -> Tensor:
+        return torch.randn(x.shape, dtype=x.dtype, generator=source)
+
+    def results(*given: Tensor) -> tuple[Tensor, ...]:
+        out = function(*given)
+        return out if isinstance(out, tuple) else (out,)
+
+    def products(left: Sequence[Tensor], right: Sequence[Tensor]) -> Tensor:
+        return torch.cat([(a.conj() * b).real.flatten() for a, b in zip(left, right, strict=True)])
+
+    out = results(*inputs)
+    chosen = [i for i, y in enumerate(out) if y.requires_grad]
+    weights, directions = [alike(out[i]) for i in chosen], [alike(x) for x in inputs]
+    slopes = torch.autograd.grad([out[i] for i in chosen], inputs, weights, materialize_grads=True)
+    for count in {1, len(inputs)}:
+        wanted = products(slopes[:count], directions[:count])
+        with forward_ad.dual_level():
+            moved = [forward_ad.make_dual(x.detach(), t) for x, t in zip(inputs[:count], directions[:count])]
+            tangents = [
+                forward_ad.unpack_dual(y).tangent for y in results(*moved, *(x.detach() for x in inputs[count:]))
+            ]
+            changes = [torch.zeros_like(out[i]) if tangents[i] is None else tangents[i] for i in chosen]
+            found = products(weights, changes).sum()
+        assert abs(found - wanted.sum()) <= 1e-7 * wanted.abs().sum(), (count, float(found), float(wanted.sum()))
 
 
 def small_radar(**changes: object) -> StripmapRadar:

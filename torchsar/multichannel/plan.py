@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchsar.core import Signal, Stage, block_bytes_of, unit_phasor
 from torchsar.multichannel.azimuth import azimuth_filter, image_axis
@@ -79,7 +80,8 @@ class AzimuthPlan:
                 f"this plan works on channels and pulses {expected}, got shape {tuple(data.shape)} of {data.dtype}; "
                 "build a plan for these data"
             )
-        if torch.is_grad_enabled() and data.requires_grad:
+        tangent = forward_ad.unpack_dual(data).tangent
+        if tangent is not None or (torch.is_grad_enabled() and data.requires_grad):
             spectrum = torch.fft.fft(data)
             return torch.fft.ifft(torch.einsum("bmp,...mp->...bp", self.matrix, spectrum).flatten(-2))
         rows = data.reshape(-1, *data.shape[-2:])
