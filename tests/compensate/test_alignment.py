@@ -12,7 +12,7 @@ from torchsar.compensate import autofocus, entropy_fixed_point, link_phases
 from torchsar.compensate.pulse_phase.alignment import coherent_jitter, displacement
 from torchsar.metrics.phase import phase_rmse
 
-PULSES, CELLS = 256, 128
+PULSES, CELLS = 192, 96
 TIME = torch.linspace(-0.5, 0.5, PULSES, dtype=torch.float64)
 COURSES = {
     "aligned": 0 * TIME,
