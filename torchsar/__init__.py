@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Truth,
         keep_freed_memory,
         use,
+        validate,
     )
 
 __version__ = "0.1.0"
@@ -56,6 +57,7 @@ __all__ = [
     "repair",
     "scene",
     "use",
+    "validate",
 ]
 
 

@@ -151,15 +151,22 @@ def line_doppler(lines: Tensor, radar: StripmapRadar) -> tuple[Tensor, Tensor]:
     modulus = lines.abs()
     level = 3 * modulus.mean((-2, -1), keepdim=True)
     limited = lines * (level / torch.where(modulus > 0, modulus, 1)).clamp_max(1)
-    spectra = torch.fft.fft(limited)
-    frequency = radar.range_frequency_hz(lines.shape[-1], lines.device)
+    n = lines.shape[-1]
+    frequency = radar.range_frequency_hz(n)
     inside = frequency.abs() < 0.475 * radar.pulse.bandwidth_hz
-    products = (spectra[..., :-1, :].conj() * spectra[..., 1:, :])[..., inside]
+    above, below = int(inside[frequency >= 0].sum()), int(inside[frequency < 0].sum())
+
+    def band(x: Tensor) -> Tensor:
+        return torch.cat([x[..., :above], x[..., x.shape[-1] - below :]], -1)
+
+    spectra = torch.fft.fft(limited)
+    products = band(spectra[..., :-1, :].conj() * spectra[..., 1:, :])
     blocks = torch.stack([part.sum(-2) for part in products.tensor_split(_BLOCKS, -2)], -2).to(torch.complex128)
     total = blocks.sum(-2, keepdim=True)
     scale = radar.prf_hz * radar.carrier_hz / (2 * math.pi)
-    value = scale * _phase_slope(total, frequency[inside])[..., 0]
-    left_out = scale * _phase_slope(total - blocks, frequency[inside])
+    frequency = band(radar.range_frequency_hz(n, lines.device))
+    value = scale * _phase_slope(total, frequency)[..., 0]
+    left_out = scale * _phase_slope(total - blocks, frequency)
     return settle(value, 0.0)[0], settle(jackknife_std(left_out), 1e9)[0]
 
 
@@ -194,7 +201,7 @@ def entropy_scores(
     """
     spectrum, weight = beam_spectrum(group, doppler_hz), block_weights(group.data, group.radar, doppler_hz, dwell_s)
     scores = []
-    for k in turns.tolist():
+    for k in turns:
         shift = k * group.radar.prf_hz
         scores.append(-block_entropy(spectrum.moved(shift).image(doppler_hz + shift, velocity_m_s)))
     return torch.stack(scores, -1), weight

@@ -84,7 +84,7 @@ def _refined(
     """One round: form an image with centroid doppler_hz, then update lines and centroid in turn."""
     parts = [_tiles(block, radar_part, doppler_hz, reference) for block, radar_part in _chunks(raw, radar, reference)]
     products = torch.cat([p for p, _, _ in parts], -1)
-    rate = torch.cat([r.expand(p.shape[-1]) for p, _, r in parts])
+    rate = torch.cat([torch.full(p.shape[-1:], r, dtype=torch.float64, device=raw.device) for p, _, r in parts])
     power = torch.cat([q for _, q, _ in parts], -1)
     weight = _above_noise(products, power)
     products, noise = products * weight, weight.square() * _noise_variance(power, radar)
@@ -92,7 +92,7 @@ def _refined(
     tile = raw.shape[-2] / products.shape[-2]
     line = (torch.arange(products.shape[-2], dtype=torch.float64, device=raw.device) + 0.5) * tile
     total, scale = doppler_hz, radar.prf_hz / (2 * math.pi)
-    half_way = math.pi / 2 * float(rate[0]) * dwell / radar.prf_hz**2  # rad, between centre and edge of the beam
+    half_way = math.pi / 2 * parts[0][2] * dwell / radar.prf_hz**2  # rad, between centre and edge of the beam
     std = torch.full_like(doppler_hz, math.inf)
     for _ in range(8):
         # in a frame with an error d, targets appear late by d / rate
@@ -135,10 +135,10 @@ def _chunks(raw: Tensor, radar: StripmapRadar, reference: str | None) -> list[tu
 
 def _tiles(
     raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, reference: str | None
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, float]:
     """Lag products and powers of image tiles, and the azimuth rate in the middle of the chunk.
 
-    The products and powers have shape (..., a, b), the rate has shape (1,) and is in Hz/s.
+    The products and powers have shape (..., a, b), the rate is in Hz/s.
     """
     spectrum = (
         None if reference is None else REFERENCES[reference](radar.pulse, raw.shape[-1], radar.sampling_hz, raw.device)
@@ -154,8 +154,8 @@ def _tiles(
     scale = (
         image.abs().amax((-2, -1)).to(torch.float64).square()[..., None, None]
     )  # lag_products is scale free, chunks must stay comparable
-    rate = radar.azimuth_rate_hz_s(radar.near_range_m + image.shape[-1] / 2 * radar.range_step_m).to(raw.device)
-    return products * scale, power * scale, rate[None]
+    rate = radar.azimuth_rate_hz_s(radar.near_range_m + image.shape[-1] / 2 * radar.range_step_m)
+    return products * scale, power * scale, float(rate)
 
 
 def _noise_variance(power: Tensor, radar: StripmapRadar) -> Tensor:

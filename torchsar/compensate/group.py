@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import fft_lines
+from torchsar.core import fft_lines, per_trial
 from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, refocus, refocus_turns_per_sample
 from torchsar.focus.reference import range_compress
 from torchsar.radar import StripmapRadar
@@ -150,7 +150,7 @@ class BeamSpectrum:
         at = FrameGeometry(
             radar,
             self.doppler_hz,
-            torch.as_tensor(velocity_m_s, dtype=torch.float64, device=self.data.device),
+            per_trial(velocity_m_s, 0, self.data),
             frame_hz,
         )
         middle = self.group.middle_m[..., None, None]

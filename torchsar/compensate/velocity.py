@@ -27,7 +27,7 @@ from torchsar.compensate.group import (
     entropy_parts,
     pick_group,
 )
-from torchsar.core import Estimate, Signal, Stage, checked_samples, fft_lines, settle, unit_level
+from torchsar.core import Estimate, Signal, Stage, checked_samples, fft_lines, per_trial, settle, unit_level
 from torchsar.optim.scalar import gradient_minimum, grid_minimum
 from torchsar.radar import StripmapRadar
 
@@ -254,7 +254,7 @@ def minimum_entropy_velocity(
         clear = inside & (curvature > 0) & (depth > _LEAST_DEPTH * _noise_std(spectrum, weight))
         if known is not None and lines.shape[-2] < known * group.radar.prf_hz:
             clear = torch.zeros_like(clear)
-    return VelocityMinimum(value, std, torch.as_tensor(most).to(std).expand(std.shape), clear, grid, costs)
+    return VelocityMinimum(value, std, per_trial(most, 0, std).expand(std.shape), clear, grid, costs)
 
 
 def _search(

@@ -20,14 +20,26 @@ from torchsar.core.fft import (
     transform_in_blocks,
 )
 from torchsar.core.fingerprint import fingerprint
-from torchsar.core.host import check_value, device_fault, gathered_checks, host_largest, host_value, is_traced, untraced
+from torchsar.core.host import (
+    Validation,
+    check_value,
+    device_fault,
+    gathered_checks,
+    host_largest,
+    host_value,
+    host_values,
+    is_traced,
+    untraced,
+    validate,
+    validation,
+)
 from torchsar.core.linear import cholesky_factor, linear_solve, matrix_inverse
 from torchsar.core.memory import LargestTensor, PeakMemory, is_out_of_memory, keep_freed_memory, machine_memory_bytes
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
 from torchsar.core.replace import OwnFiles, remove_empty
 from torchsar.core.seal import SEAL, address, canonical, checksum, is_sealed, sealed
-from torchsar.core.select import best_of, numbers_on, per_trial, take
+from torchsar.core.select import best_of, numbers_on, per_trial, take, true_positions
 from torchsar.core.signal import Recording, Signal, Truth
 from torchsar.core.spline import UniformSpline
 from torchsar.core.stage import Stage
@@ -57,6 +69,7 @@ __all__ = [
     "UnevenSpline",
     "UniformSpline",
     "Use",
+    "Validation",
     "address",
     "array_metadata",
     "best_of",
@@ -79,6 +92,7 @@ __all__ = [
     "group_attributes",
     "host_largest",
     "host_value",
+    "host_values",
     "is_out_of_memory",
     "is_plain",
     "is_sealed",
@@ -106,8 +120,11 @@ __all__ = [
     "take",
     "to_frequency",
     "transform_in_blocks",
+    "true_positions",
     "unit_level",
     "unit_phasor",
     "untraced",
     "use",
+    "validate",
+    "validation",
 ]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchsar.core.estimate import Estimate
+from torchsar.core.host import gathered_checks
 from torchsar.core.signal import Recording, Signal
 
 Given = Mapping[str, Tensor | Estimate]
@@ -363,6 +364,7 @@ class Chain(nn.Module):
             )
         return part, known
 
+    @gathered_checks()
     def _run(self, names: list[str], signal: Signal, known: _Known, log: _Log | None = None) -> Signal:
         for name in names:
             stage = self.stages[name]
@@ -371,7 +373,8 @@ class Chain(nn.Module):
             entered, began = signal, 0.0 if log is None else time.perf_counter()
             arguments, neutral = self._arguments(name, known, required=not held)
             if not held:
-                signal = self._step(name, stage, signal, arguments, known, neutral)
+                with gathered_checks(f"stage {name!r}"):
+                    signal = self._step(name, stage, signal, arguments, known, neutral)
             if log is not None:
                 _synchronise(signal.data)
                 log.inputs[name], log.outputs[name] = entered, signal

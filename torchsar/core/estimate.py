@@ -113,4 +113,6 @@ def settle(value: Tensor, fallback: Tensor | float) -> tuple[Tensor, Tensor]:
         both have the shape of `value`.
     """
     finite = torch.isfinite(value)
-    return torch.where(finite, value, torch.as_tensor(fallback, dtype=value.dtype, device=value.device)), finite
+    if isinstance(fallback, Tensor):
+        fallback = fallback.to(value)
+    return torch.where(finite, value, fallback), finite

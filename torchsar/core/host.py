@@ -5,7 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from typing import TypeVar
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Literal, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -16,26 +18,102 @@ from torch.utils._python_dispatch import _disable_current_modes
 from torchsar.core.memory import is_out_of_memory
 
 Number = TypeVar("Number", bool, int, float)
-# raises an error if a value is not acceptable
-Check = Callable[[float], None]
+# raises an error if the values are not acceptable
+Check = Callable[..., None]
+Validation = Literal["eager", "deferred", "off"]
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """A check that waits for its values.
+
+    Args:
+        x: The values, any shape.
+        check: The check of their numbers.
+        stage: Name of the stage for the message; empty to leave the message as it is.
+    """
+
+    x: Tensor
+    check: Check
+    stage: str = ""
+
+    def make(self, numbers: list[float]) -> None:
+        try:
+            self.check(*numbers)
+        except Exception as error:
+            if self.stage and error.args:
+                error.args = (f"{self.stage}: {error.args[0]}", *error.args[1:])
+            raise
 
 
 class _Gathered(threading.local):
-    """The checks that wait for their values, of this thread."""
+    """When values are checked, the names of the open blocks and the checks that wait, of this
+    thread.
+    """
 
     def __init__(self) -> None:
-        self.blocks = 0
-        self.waiting: list[tuple[Tensor, Check]] = []
+        self.validation: Validation = "eager"
+        self.blocks: list[str] = []
+        self.waiting: list[_Waiting] = []
 
 
 _gathered = _Gathered()
 
 
+class validate:
+    """Set when values of tensors are checked: for a block, or from now on.
+
+        with torchsar.validate("deferred"):
+            image = chain(recording)
+
+    Called without `with`, as `torchsar.validate("off")`, it holds until the next call. It holds for
+    the thread that calls it. Types, shapes and dtypes are checked in any case, and an estimator
+    that fails in a trial still says so by `ok`.
+
+    - "eager", the default: a stage raises an error if one of its own values is not acceptable, such
+      as a sample that is NaN. On an accelerator the checks of a stage wait for the next value that
+      the stage reads, at the latest for its end.
+    - "deferred": no stage waits for its checks. They are made at the end of the chain, of a stage
+      that is called alone, or of the block, with one reading, or earlier with a value that a stage
+      reads anyway. The error names the stage, and for samples that are not finite the index of the
+      first, which begins with the trial. Until then stages may compute with such values.
+    - "off": values are not checked. Results of values that are not acceptable are undefined.
+
+    Args:
+        mode: "eager", "deferred" or "off".
+
+    Raises:
+        ValueError: If `mode` is none of these.
+        Exception: At the end of the block, what a check raises.
+    """
+
+    def __init__(self, mode: Validation) -> None:
+        if mode not in get_args(Validation):
+            raise ValueError(f"values are checked 'eager', 'deferred' or 'off', got {mode!r}")
+        self._before, _gathered.validation = _gathered.validation, mode
+        self._block = gathered_checks()
+
+    def __enter__(self) -> None:
+        self._block.__enter__()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        # the surrounding block decides whether its checks may wait any longer
+        _gathered.validation = self._before
+        self._block.__exit__(kind, error, traceback)
+
+
+def validation() -> Validation:
+    """Return when values are checked, see `validate`."""
+    return _gathered.validation
+
+
 def host_value(x: Tensor, otherwise: Number) -> Number:
     """Read a number from a tensor, which waits for its device.
 
-    Checks that wait for values of this device (see `gathered_checks`) are made in the same wait.
-    Inside `torch.func.vmap` a tensor stands for many trials, and while a program is traced, as by
+    Checks that wait for values (see `gathered_checks`) are made in the same wait. Inside
+    `torch.func.vmap` a tensor stands for many trials, and while a program is traced, as by
     `torch.export`, for any data: its value cannot be read.
 
     Args:
@@ -48,12 +126,28 @@ def host_value(x: Tensor, otherwise: Number) -> Number:
     Raises:
         RuntimeError: If the tensor has more than one element, or the device fails.
     """
-    if _gathered.waiting and x.numel() == 1 and not _is_mapped(x):
-        read: list[float] = []
-        _make([*_taken(), (x.detach(), read.append)])
-        return type(otherwise)(read[0])
-    value = _read(x)
-    return otherwise if value is None else type(otherwise)(value)
+    if x.numel() != 1:
+        raise RuntimeError(f"host_value reads a tensor of one element, got {x.numel()} elements")
+    return host_values(x, otherwise)[0]
+
+
+def host_values(x: Tensor, otherwise: Number) -> list[Number]:
+    """Read the numbers of a small tensor in one wait for its device, see `host_value`.
+
+    Args:
+        x: Tensor of any shape, which may require a gradient.
+        otherwise: What to return for each where the values cannot be read; its type is that of the
+            numbers.
+
+    Returns:
+        The numbers in the order of the elements.
+    """
+    read: list[float] | None = []
+    if _gathered.waiting and not _is_mapped(x):
+        _make([*_taken(), _Waiting(x.detach(), lambda *numbers: read.extend(numbers))])
+    else:
+        read = _read(x)
+    return [otherwise] * x.numel() if read is None else [type(otherwise)(number) for number in read]
 
 
 def host_largest(x: Tensor, otherwise: Number) -> Number:
@@ -119,35 +213,58 @@ def untraced(*given: Tensor | float | None) -> Iterator[None]:
 
 
 def check_value(x: Tensor, check: Check) -> None:
-    """Check a number in a tensor: at once, or in a block of `gathered_checks` perhaps later.
+    """Check the numbers in a small tensor: at once, or in `gathered_checks` perhaps later.
 
-    Where values cannot be read, see `host_value`, nothing is checked.
+    Where values cannot be read, see `host_value`, and after `validate("off")` nothing is checked.
 
     Args:
-        x: Tensor of one real number, float, int or bool; it may require a gradient.
-        check: Function of the number that raises an error if it is not acceptable. It is kept for
-            as long as the check waits.
+        x: Tensor of real numbers, float, int or bool; it may require a gradient.
+        check: Function of the numbers, in the order of the elements, that raises an error if they
+            are not acceptable. It is kept for as long as the check waits.
 
     Raises:
         Exception: What `check` raises.
     """
-    if _gathered.blocks and x.device.type != "cpu" and not _is_mapped(x):
-        _gathered.waiting.append((x.detach(), check))
+    state = _gathered
+    if state.validation == "off":
         return
-    value = _read(x)
-    if value is not None:
-        check(value)
+    deferred = state.validation == "deferred"
+    if state.blocks and (deferred or x.device.type != "cpu") and not _is_mapped(x) and not is_traced(x):
+        stage = next(filter(None, state.blocks), "") if deferred else ""
+        state.waiting.append(_Waiting(x.detach(), check, stage))
+        return
+    numbers = _read(x)
+    if numbers is not None:
+        check(*numbers)
+
+
+def flat_index(at: float, shape: torch.Size) -> tuple[int, ...]:
+    """Return the index of an element of a tensor from its position in the flattened tensor.
+
+    Args:
+        at: The position, a whole number.
+        shape: Shape of the tensor.
+
+    Returns:
+        The index, one number per dimension.
+    """
+    return tuple(int(i) for i in torch.unravel_index(torch.tensor(int(at)), shape))
 
 
 @contextmanager
-def gathered_checks() -> Iterator[None]:
+def gathered_checks(stage: str = "") -> Iterator[None]:
     """Within the block, let the checks of `check_value` wait until a value is read from the device.
 
     On an accelerator every value that the host reads makes it wait for the device. Waiting checks
     are made, in their order, with the next number that `host_value` reads, and at the end of the
     block with one reading; also if the block ends with an error, of which a value that is not
     acceptable may be the reason. On the CPU every check is made at once. Blocks may be nested; at
-    the end of each no check waits any longer.
+    the end of each no check waits any longer. After `validate("deferred")` checks wait on the CPU
+    too, and beyond the end of a nested block.
+
+    Args:
+        stage: Name of the stage that the block runs, for errors of deferred checks. In nested
+            blocks the outermost name counts.
 
     Returns:
         The context manager, which also serves as a decorator.
@@ -155,7 +272,7 @@ def gathered_checks() -> Iterator[None]:
     Raises:
         Exception: What a check raises.
     """
-    _gathered.blocks += 1
+    _gathered.blocks.append(stage)
     try:
         yield
     except Exception as error:
@@ -164,19 +281,20 @@ def gathered_checks() -> Iterator[None]:
             _make(waiting)
         raise
     else:
-        _make(_taken())
+        if _gathered.validation != "deferred" or len(_gathered.blocks) == 1:
+            _make(_taken())
     finally:
-        _gathered.blocks -= 1
+        _gathered.blocks.pop()
         if not _gathered.blocks:
             _gathered.waiting = []
 
 
-def _read(x: Tensor) -> float | None:
-    """The number in a tensor; None where it cannot be read."""
+def _read(x: Tensor) -> list[float] | None:
+    """The numbers in a tensor; None where they cannot be read."""
     if is_traced(x):
         return None
     try:
-        return x.item()
+        return [x.item()] if x.numel() == 1 else x.flatten().tolist()
     except RuntimeError as error:
         if "vmap" not in str(error):
             raise
@@ -188,18 +306,19 @@ def _is_mapped(x: Tensor) -> bool:
     return torch._C._functorch.is_functorch_wrapped_tensor(x)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _taken() -> list[tuple[Tensor, Check]]:
+def _taken() -> list[_Waiting]:
     """The checks that wait, which then no longer do."""
     waiting, _gathered.waiting = _gathered.waiting, []
     return waiting
 
 
-def _make(checks: list[tuple[Tensor, Check]]) -> None:
+def _make(checks: list[_Waiting]) -> None:
     """Make checks, with one reading for each device."""
-    values: dict[int, float] = {}
-    for device in dict.fromkeys(x.device for x, _ in checks):
-        here = {i: x for i, (x, _) in enumerate(checks) if x.device == device}
-        read = torch.stack([x.reshape(()).to(torch.float64) for x in here.values()]).tolist()
-        values |= dict(zip(here, read, strict=True))
-    for i, (_, check) in enumerate(checks):
-        check(values[i])
+    values: dict[torch.device, list[float]] = {}
+    for device in dict.fromkeys(each.x.device for each in checks):
+        here = [each.x.flatten().to(torch.float64) for each in checks if each.x.device == device]
+        values[device] = torch.cat(here).tolist()
+    for each in checks:
+        numbers, count = values[each.x.device], each.x.numel()
+        each.make(numbers[:count])
+        del numbers[:count]

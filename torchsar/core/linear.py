@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core.host import check_value
+from torchsar.core.host import check_value, flat_index
 
 
 def linear_solve(matrix: Tensor, right: Tensor) -> Tensor:
@@ -68,7 +68,8 @@ def _check(info: Tensor, what: str) -> None:
 
     def check(failed: float) -> None:
         if failed:
-            text = f"{what}, or not finite; add a small multiple of the identity"
+            trial = f" at index {flat_index(int((info != 0).int().argmax()), info.shape)}" if info.ndim else ""
+            text = f"{what}{trial}, or not finite; add a small multiple of the identity"
             raise torch.linalg.LinAlgError(text)  # pyright: ignore[reportPrivateImportUsage]
 
     if info.numel():

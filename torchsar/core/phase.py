@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from torchsar.core.host import check_value
+from torchsar.core.host import check_value, flat_index, validation
 from torchsar.core.memory import is_out_of_memory
 
 # the distance of float64 numbers of this size is 6e-5 turn
@@ -104,15 +105,22 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
 
 def _check_resolution(turns: Tensor) -> None:
     """Raise ValueError for phases beyond the precision of float64."""
-    if turns.numel():
-        check_value(turns.detach().abs().max(), _check_worst)
+    if not turns.numel() or validation() == "off":
+        return
+    size = turns.detach().abs()
+    if validation() == "deferred":
+        worst, at = size.flatten().max(0)
+        check_value(torch.stack([worst, at.to(worst)]), partial(_check_worst, turns.shape))
+    else:
+        check_value(size.max(), partial(_check_worst, turns.shape))
 
 
-def _check_worst(worst: float) -> None:
+def _check_worst(shape: torch.Size, worst: float, at: float | None = None) -> None:
     if not worst <= MAX_TURNS:
+        index = "" if at is None else f" at index {flat_index(at, shape)}"
         raise ValueError(
             f"the phase must be at most {MAX_TURNS:.0e} turns, beyond which float64 resolves only 1e-4 turn, "
-            f"got {worst:.3g} turns; subtract the reference range from the range before computing the phase"
+            f"got {worst:.3g} turns{index}; subtract the reference range from the range before computing the phase"
         )
 
 

@@ -39,6 +39,21 @@ def per_trial(value: Tensor | float, trailing: int, like: Tensor) -> Tensor:
     return value[(...,) + (None,) * trailing]
 
 
+def true_positions(mask: Tensor, count: int) -> Tensor:
+    """Return the positions of the elements of a mask that are True, whose number is known.
+
+    Unlike `torch.nonzero` it does not wait for the device.
+
+    Args:
+        mask: Mask, shape (n,), bool.
+        count: Number of elements that are True.
+
+    Returns:
+        Their positions in rising order, shape (count,), int64.
+    """
+    return mask.to(torch.uint8).sort(descending=True, stable=True).indices[:count]
+
+
 def take(x: Tensor, index: Tensor, dim: int = -1) -> Tensor:
     """Take the element at one index per trial along a dimension.
 

@@ -52,7 +52,7 @@ class Stage(nn.Module):
     takes_empty: bool = True
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
-        with gathered_checks():
+        with gathered_checks(type(self).__name__):
             return self._called(signal, *args, **values)
 
     def _called(self, signal: Signal, *args: Any, **values: Any) -> Any:

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import host_value
+from torchsar.core import check_value, host_value
 from torchsar.radar import BistaticRadar, InverseRadar
 
 Value = Tensor | float
@@ -31,12 +31,17 @@ def nonnegative(value: Value) -> Tensor:
         ValueError: If an element is negative.
     """
     value = torch.as_tensor(value, dtype=torch.float64)
-    if host_value((value.detach() < 0).any(), False):
+    if value.numel():
+        check_value(value.detach().nan_to_num(0.0, neginf=-math.inf).min(), _check_sign)
+    return value
+
+
+def _check_sign(least: float) -> None:
+    if least < 0:
         raise ValueError(
             "the parameters of a bound (SNR as a power ratio, durations, wavelengths, counts) must not be negative, "
-            f"got {float(value.detach().min()):g}"
+            f"got {least:g}"
         )
-    return value
 
 
 def range_of_point(radar: BistaticRadar, range_m: Value | None) -> Value:

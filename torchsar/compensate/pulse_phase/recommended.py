@@ -15,7 +15,7 @@ from torchsar.compensate.pulse_phase.linking import linked
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
-from torchsar.core import Estimate
+from torchsar.core import Estimate, host_value, true_positions
 from torchsar.metrics import entropy
 
 # floor of the entropy fixed point in mean powers, found by trial: a lower floor includes noise, a
@@ -138,9 +138,11 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
     Where that description turns out to be less likely with the linked phases, the sharpest phases
     stay; they are not ok, because the descriptions contradict each other.
     """
-    at = sharpest.info["homogeneous"].flatten().nonzero()[:, 0]
-    if not len(at):
+    homogeneous = sharpest.info["homogeneous"].flatten()
+    count = host_value(homogeneous.sum(), 0)
+    if not count:
         return sharpest
+    at = true_positions(homogeneous, count)
     some = linked(Pulses(pulses.rows[at], pulses.present[at], at.shape))
     likelier = some.info["gain_nats"] > sharpest.info["sparse_gain_nats"].flatten()[at]
     at = at[likelier]

@@ -337,9 +337,10 @@ def bands_of(
     line = torch.arange(lines, device=sweeps.device)
     sides = torch.stack([shift, -shift], -2)
     # a mirrored sweep has the mirrored spectrum
-    mirror = torch.tensor([1, -1], device=sweeps.device)[:, None, None]
+    mirror = torch.arange(1, -2, -2, device=sweeps.device)[:, None, None]
     kept = spectrum.gather(-1, mirror * (first + line + sides[..., None]) % n)
-    shape = _raised_cosine(line.to(torch.float64), lines, taper if window_m is not None else 0.0)
+    edges = taper if window_m is not None else 0.0
+    shape = _raised_cosine(line.to(torch.float64), lines, edges)
     filters = torch.stack(
         [shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)]
     )
@@ -359,7 +360,8 @@ def bands_of(
         alike & (certain | ~_without_echo(up, down, alike)),
         lines,
         first,
-        float(shape.square().sum()),
+        # computed on the host, for which the device need not be read
+        float(_raised_cosine(torch.arange(lines, dtype=torch.float64), lines, edges).square().sum()),
         radar,
     )
 
@@ -412,7 +414,7 @@ def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int,
     """
     n = spectrum.shape[-1]
     sides = torch.stack([shift, -shift], -2)
-    mirror = torch.tensor([1, -1], device=spectrum.device)[:, None, None]
+    mirror = torch.arange(1, -2, -2, device=spectrum.device)[:, None, None]
     line = torch.arange(first - 1, first + lines + 1, device=spectrum.device)
     kept = spectrum.gather(-1, mirror * (line + sides[..., None]) % n) * scale
     smooth = kept[..., 1:-1] - (kept[..., :-2] + kept[..., 2:]) / 2

@@ -9,7 +9,17 @@ from torch import Tensor
 
 from torchsar.compensate.radial.bands import refuse_other_sweeps
 from torchsar.compensate.radial.trajectory import sweep_motion
-from torchsar.core import Axis, checked_samples, cis, host_largest, host_value, linear_phasor, real_dtype, unit_phasor
+from torchsar.core import (
+    Axis,
+    checked_samples,
+    cis,
+    host_largest,
+    host_value,
+    host_values,
+    linear_phasor,
+    real_dtype,
+    unit_phasor,
+)
 from torchsar.radar import TriangularLadar
 
 # phases in turns that are lost in the rounding of a phasor, by precision
@@ -109,9 +119,8 @@ def carrier_turns(motion: Tensor, radar: TriangularLadar, carrier_only: bool = F
     turns = torch.nn.functional.pad(motion * per_m, (0, 1))
     if carrier_only:
         return turns
-    slope = torch.tensor([1.0, -1.0], dtype=torch.float64, device=motion.device)[:, None, None] * (
-        2 * radar.chirp_rate_hz_s / radar.wave_speed_m_s
-    )
+    sign = torch.arange(1, -2, -2, dtype=torch.float64, device=motion.device)
+    slope = sign[:, None, None] * (2 * radar.chirp_rate_hz_s / radar.wave_speed_m_s)
     return turns + torch.nn.functional.pad(motion * slope, (1, 0))
 
 
@@ -137,21 +146,31 @@ def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) 
     u = (start + torch.arange(n, dtype=torch.float64, device=turns.device)) * step_s
     edge = abs(start) * step_s
     bend: Tensor | None = None
-    for k in range(turns.shape[-1] - 1, 1, -1):
+    reach = [largest * edge**k for k, largest in enumerate(_largest_of_power(turns))]
+    for k in range(len(reach) - 1, 1, -1):
         c = turns[..., k]
-        if not turns.requires_grad and _largest(c) * edge**k <= _NEGLIGIBLE_TURNS[real]:
+        if not turns.requires_grad and reach[k] <= _NEGLIGIBLE_TURNS[real]:
             continue
         # a term of many turns needs float64, a small one does not
-        exact = real == torch.float64 or _largest(c) * edge**k > _MANY_TURNS
+        exact = real == torch.float64 or reach[k] > _MANY_TURNS
         term = c[..., None] * u**k if exact else (c * edge**k).to(real)[..., None] * (u / edge).pow(k).to(real)
         bend = term if bend is None else bend + term
     if bend is None:
         return total
     return total * (
         cis(2 * torch.pi * bend)
-        if bend.dtype == real and _largest(bend) < 2 * _MANY_TURNS
+        if bend.dtype == real and (sum(reach[2:]) < 2 * _MANY_TURNS or _largest(bend) < 2 * _MANY_TURNS)
         else unit_phasor(bend.to(torch.float64), dtype)
     )
+
+
+def _largest_of_power(turns: Tensor) -> list[float]:
+    """Largest magnitude of the coefficients of each power; infinite inside vmap, where values
+    cannot be read.
+    """
+    if not turns.numel():
+        return [math.inf] * turns.shape[-1]
+    return host_values(turns.detach().abs().reshape(-1, turns.shape[-1]).amax(0), math.inf)
 
 
 def _largest(x: Tensor) -> float:

@@ -173,7 +173,7 @@ def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
     reach = min(round(_REACH * _PAD * n / bands.time_s.shape[-1]), n // 2)
     best = torch.cat([power[..., -reach:], power[..., : reach + 1]], -1).argmax(-1) - reach
     best = best + _parabola(power, best)
-    v = best.to(torch.float64) / (_PAD * n * float(u[1] - u[0]) * per)
+    v = best.to(torch.float64) / (_PAD * n * (u[1] - u[0]) * per)
     return climbed(z, 2 * math.pi * per * u, v, steps)
 
 

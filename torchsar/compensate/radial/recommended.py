@@ -26,7 +26,7 @@ from torchsar.compensate.radial.dense import linked_walk, phase_difference
 from torchsar.compensate.radial.mirror import Intercept, mirror_estimate, refuse_other_intercept
 from torchsar.compensate.radial.polish import ENOUGH_STD_RAD, scene_cells, sharpened
 from torchsar.compensate.radial.trajectory import integrated_range, sweep_motion
-from torchsar.core import Axis, Estimate
+from torchsar.core import Axis, Estimate, host_values, true_positions
 from torchsar.core.spline import UniformSpline
 from torchsar.focus.triangular import deramp_azimuth, profile_axes
 from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
@@ -174,7 +174,7 @@ def _judged(cells: Tensor, per_velocity: float, sharpest: Estimate) -> Estimate:
       of the velocities by far, `_confirmed` gives the verdict; else the estimate is kept.
     """
     n = cells.shape[-2]
-    if n < _FEW_PERIODS or not bool(sharpest.ok.any()):
+    if n < _FEW_PERIODS:
         return sharpest
     lines = cells.reshape(-1, *cells.shape[-2:])
     phase, std = sharpest["phase_rad"].reshape(-1, n), sharpest.std["phase_rad"].reshape(-1, n)
@@ -186,14 +186,15 @@ def _judged(cells: Tensor, per_velocity: float, sharpest: Estimate) -> Estimate:
     ok = ok & ~(modulated & (range_cells < _ONE_CELL))
     dense = ok & (image_cells > _DENSE_CELLS)
     doubtful = ok & ~dense & (modulated | (_rms_without_line(phase.detach(), lit) > walk_rad))
-    if bool(dense.any()):
-        at = dense.nonzero()[:, 0]
+    n_dense, n_doubtful = host_values(torch.stack([dense.sum(), doubtful.sum()]), 0)
+    if n_dense:
+        at = true_positions(dense, n_dense)
         linked = linked_walk(lines[at], phase[at], step_rad[at])
         phase = phase.index_copy(0, at, linked["phase_rad"].to(phase.dtype))
         std = std.index_copy(0, at, linked.std["phase_rad"].to(std.dtype))
         ok = ok.index_put((at,), linked.ok)
-    if bool(doubtful.any()):
-        at = doubtful.nonzero()[:, 0]
+    if n_doubtful:
+        at = true_positions(doubtful, n_doubtful)
         confirmed, apart = _confirmed(lines[at], phase[at].detach(), lit[at], range_cells[at])
         std = std.index_put((at,), (std[at].square() + apart[:, None].square()).sqrt())
         ok = ok.index_put((at,), confirmed)

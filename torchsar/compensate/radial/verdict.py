@@ -147,7 +147,7 @@ def _product_peaks(bands: Bands) -> tuple[Tensor, Tensor, Tensor]:
     bins = _power(spectrum).argmax(-1)
     bins = torch.where(bins >= n // 2, bins - n, bins)
     per = 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s
-    peak = climbed(z, 2 * math.pi * per * u, bins.to(torch.float64) / (n * float(u[1] - u[0]) * per), 3)
+    peak = climbed(z, 2 * math.pi * per * u, bins.to(torch.float64) / (n * (u[1] - u[0]) * per), 3)
     shared = spectrum.abs().amax(-1).to(torch.float64) * level[..., 0] / z.shape[-1]
     chance = level.to(torch.float64).mean(-2) / math.sqrt(min(z.shape[-1], 2 * bands.noise_lines))
     return peak, shared, shared > torch.maximum(_DARK * shared.mean(-1, keepdim=True), _CLEAR * chance)
