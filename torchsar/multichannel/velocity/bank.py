@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import level_of, per_trial, take, unit_phasor
+from torchsar.core import host_values, level_of, per_trial, take, unit_phasor
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
@@ -100,24 +100,29 @@ def bank_search(
     best = PointMotion.of(radar, data, 0.0, u_a_m_s, 0.0, range_m)
     best = best.each(lambda value: value.expand(data.shape[:-2]))
     energy = torch.zeros(data.shape[:-2], dtype=torch.float64, device=data.device)
+    hypotheses = []
     for u_r in _steps(search.u_r_m_s, search.u_r_step_m_s, data.device):
         for offsets in _blocks(_steps(search.u_a_m_s, search.u_a_step_m_s, data.device), data):
             u_a = per_trial(u_a_m_s, 1, data) + offsets
             there = PointMotion.of(radar, data, u_r, u_a, 0.0, None if range_m is None else per_trial(range_m, 1, data))
             if image_s is not None:
                 there = replace(there, y0_m=there.position_m(per_trial(image_s, 1, data)))
-            # a search that is the same for all trials needs the pulses of its aperture only
-            pulses = (
-                _illuminated(aperture.weight(radar, there, time_s))
-                if there.y0_m.ndim <= 1 and whitening is None
-                else slice(None)
-            )
-            found, position, along = _best_tone(
-                prepared[..., pulses], radar, there, aperture, time_s[pulses], search.y0_m, whitening
-            )
-            better = found > energy
-            energy = torch.where(better, found, energy)
-            best = chosen(replace(best, u_r_m_s=u_r.expand(found.shape), u_a_m_s=along, y0_m=position), best, better)
+            hypotheses.append(there)
+    # a search that is the same for all trials needs the pulses of its aperture only
+    few = whitening is None and all(there.y0_m.ndim <= 1 for there in hypotheses)
+    parts = (
+        _illuminated([aperture.weight(radar, there, time_s) for there in hypotheses])
+        if few
+        else [slice(None)] * len(hypotheses)
+    )
+    for there, pulses, fastest in zip(hypotheses, parts, _tone_rates(radar, hypotheses), strict=True):
+        found, position, along = _best_tone(
+            prepared[..., pulses], radar, there, aperture, time_s[pulses], search.y0_m, fastest, whitening
+        )
+        better = found > energy
+        energy = torch.where(better, found, energy)
+        u_r = there.u_r_m_s.expand(found.shape)
+        best = chosen(replace(best, u_r_m_s=u_r, u_a_m_s=along, y0_m=position), best, better)
     return best, energy * level[..., 0, 0].square()
 
 
@@ -145,11 +150,10 @@ def sharpest_tone(
     )
     size = max(1, _BLOCK_BYTES // (32 * data.numel()))
     parts = [slice(at, at + size) for at in range(0, motions.u_a_m_s.shape[-1], size)]
+    hypotheses = [motions.each(lambda value, part=part: value[..., part]) for part in parts]
     found = [
-        _best_tone(
-            prepared, radar, motions.each(lambda value, part=part: value[..., part]), aperture, time_s, reach_m, None
-        )
-        for part in parts
+        _best_tone(prepared, radar, there, aperture, time_s, reach_m, fastest, None)
+        for there, fastest in zip(hypotheses, _tone_rates(radar, hypotheses), strict=True)
     ]
     energy, position, along = (torch.stack(values, -1) for values in zip(*found, strict=True))
     at = energy.argmax(-1)
@@ -180,13 +184,17 @@ def _best_tone(
     aperture: Aperture,
     time_s: Tensor,
     reach_m: float,
+    fastest_hz_m: float,
     whitening: Whitening | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the greatest normalised correlation per trial, its position y0 and its u_a."""
+    """Return the greatest normalised correlation per trial, its position y0 and its u_a.
+
+    fastest_hz_m: Result of `_tone_rates` for this motion.
+    """
     weight = aperture.weight(radar, motion, time_s)
     model = weight[..., None, :].to(prepared.dtype) * point_phasor(radar, motion, time_s, prepared.dtype)
     scale = radar.wavelength_m * motion.range_m[..., None]
-    fastest = float((motion.along_m_s[..., None] / scale).max()) * reach_m
+    fastest = fastest_hz_m * reach_m
     tones, rate_hz = _decimated(model.conj() * prepared[..., None, :, :], radar.prf_hz, fastest)
     length = smooth_length(2 * tones.shape[-1])
     bins = _bins_within(fastest * length / rate_hz, length, prepared.device)
@@ -206,10 +214,21 @@ def _best_tone(
     )
 
 
-def _illuminated(weight: Tensor) -> slice:
-    """Return the slice from the first to the last pulse with amplitude in any hypothesis."""
-    illuminated = (weight != 0).flatten(0, -2).any(0).cpu().nonzero()[:, 0]
-    return slice(int(illuminated[0]), int(illuminated[-1]) + 1) if len(illuminated) else slice(None)
+def _tone_rates(radar: BistaticRadar, motions: list[PointMotion]) -> list[float]:
+    """Return the largest change of the residual tone with position for each block, in Hz/m."""
+    rates = [(each.along_m_s / (radar.wavelength_m * each.range_m)).max() for each in motions]
+    return host_values(torch.stack(rates), 0.0)
+
+
+def _illuminated(weights: list[Tensor]) -> list[slice]:
+    """Return, for weights (..., pulse) of blocks of hypotheses, the slices from the first to the
+    last pulse with amplitude in any hypothesis of the block.
+    """
+    lit = torch.stack([(weight != 0).flatten(0, -2).any(0) for weight in weights]).to(torch.uint8)
+    n = lit.shape[-1]
+    # the first largest element: of a block without amplitude, all pulses
+    ends = host_values(torch.stack([lit.argmax(-1), n - lit.flip(-1).argmax(-1)], -1), 0)
+    return [slice(first, end) for first, end in zip(ends[::2], ends[1::2], strict=True)]
 
 
 def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor, float]:

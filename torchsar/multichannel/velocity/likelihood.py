@@ -7,12 +7,13 @@ known covariance. In white noise the estimate reaches the Cramer-Rao bound of
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from torchsar.core import take
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
@@ -20,7 +21,6 @@ from torchsar.multichannel.velocity.model import (
     UNKNOWNS,
     Found,
     centred_slopes,
-    chosen,
     covariance_in,
     covariance_of,
     moved,
@@ -63,6 +63,10 @@ class Likelihood(Protocol):
 
     def fit(self, motion: PointMotion) -> PointFit:
         """Return the least-squares amplitudes for a motion, with derivatives by the unknowns."""
+        ...
+
+    def repeated(self, count: int) -> Likelihood:
+        """Return this likelihood for `count` motions per trial, which are a first dimension."""
         ...
 
 
@@ -165,6 +169,10 @@ class PointLikelihood:
         applied = self.whitening.applied
         return _coloured(self.data, applied(model), applied(tilted), applied(1j * slopes * model[..., None, :, :]))
 
+    def repeated(self, count: int) -> PointLikelihood:
+        """Return this likelihood for `count` motions per trial, shape (count, ...)."""
+        return self if self.whitening is None else replace(self, whitening=self.whitening.expanded(count))
+
     def noise_power(self, fit: PointFit) -> Tensor:
         """Return the residual power per sample in the pulses in which the point is illuminated.
 
@@ -256,25 +264,31 @@ def stepped(
     Returns:
         Motion after the step, and the fit for it.
     """
-    more = (None,) * (motion.u_r_m_s.ndim - fit.energy.ndim)
+    ndim = fit.energy.ndim
     step = solved(fit.normal, fit.gradient[..., None])[..., 0].reshape(*motion.u_r_m_s.shape, len(unknowns))
     step = _bounded(step, motion, unknowns)
-    pending = torch.ones_like(fit.energy, dtype=torch.bool)
-    for _ in range(_HALVINGS):
-        there = moved(motion, step, unknowns)
+    # on an accelerator all sizes of a step at once take less time than one after the other
+    together = 1 if step.device.type == "cpu" else _HALVINGS
+    sizes = torch.exp2(-torch.arange(_HALVINGS, dtype=step.dtype, device=step.device))
+    begin, before, problem = motion, fit.energy, problem.repeated(together)
+    pending = torch.ones_like(before, dtype=torch.bool)
+    for size in sizes.split(together):
+        there = moved(begin, size[(..., *(None,) * step.ndim)] * step, unknowns)
         fit_there = problem.fit(there)
-        better = pending & (fit_there.energy > fit.energy)
-        motion = chosen(there, motion, better[(..., *more)])
-        fit = PointFit(
-            *(
-                torch.where(better[(...,) + (None,) * (new.ndim - better.ndim)], new, old)
-                for new, old in zip(vars(fit_there).values(), vars(fit).values(), strict=True)
-            )
-        )
+        explains = fit_there.energy > before
+        largest, better = explains.to(torch.uint8).argmax(0), pending & explains.any(0)
+
+        def improved(new: Tensor, old: Tensor, at: Tensor = largest, better: Tensor = better) -> Tensor:
+            # the largest step that explains more energy
+            new = take(new.movedim(0, ndim), at, ndim)
+            return torch.where(better[(...,) + (None,) * (new.ndim - ndim)], new, old)
+
+        values = {name: improved(getattr(there, name), getattr(motion, name)) for name in unknowns}
+        motion = replace(motion, **values)
+        fit = PointFit(*map(improved, vars(fit_there).values(), vars(fit).values()))
         pending = pending & ~better
-        if not bool(pending.any()):
+        if together == _HALVINGS or not bool(pending.any()):
             break
-        step = torch.where(pending[(..., *more, None)], step / 2, 0.0)
     return motion, fit
 
 

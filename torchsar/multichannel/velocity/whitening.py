@@ -59,10 +59,9 @@ class Whitening:
     coloured: Tensor
 
     def expanded(self, count: int) -> Whitening:
-        """Return this whitening of a single trial repeated for `count` trials."""
-        return Whitening(
-            self.factor.expand(count, *self.factor.shape), self.log_det.expand(count), self.coloured.expand(count)
-        )
+        """Return this whitening repeated `count` times along a new first dimension."""
+        factor, log_det, coloured = (x.expand(count, *x.shape) for x in (self.factor, self.log_det, self.coloured))
+        return Whitening(factor, log_det, coloured)
 
     def applied(self, data: Tensor) -> Tensor:
         """Return the whitened Doppler spectra of the channels.
@@ -164,15 +163,16 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES)
     lines = checked_channels(lines, radar, "line_whitening", "line, channel, pulse")
     n, channels, count = lines.shape[-1], lines.shape[-2], lines.shape[-3]
     groups = max(1, n * count // max(samples, 4 * channels))
-    group = torch.arange(n, device=lines.device) * min(groups, n) // n
+    groups = min(groups, n)
+    group = torch.arange(n, device=lines.device) * groups // n
     rest = PointMotion.of(radar, lines)
     ramp = torch.roll(
         shared_response(radar, rest, n, 2, torch.complex128), -n, -1
     )  # bin i of an FFT is bin i - n of two bands
     flat = _spectrum(lines.to(torch.complex128)) * ramp.conj()
     products = flat[..., :, None, :] * flat.conj()[..., None, :, :]
-    total = products.new_zeros(*products.shape[:-1], int(group[-1]) + 1).index_add(-1, group, products).sum(-4)
-    size = torch.bincount(group).to(torch.float64) * count
+    total = products.new_zeros(*products.shape[:-1], (n - 1) * groups // n + 1).index_add(-1, group, products).sum(-4)
+    size = total.real.new_zeros(total.shape[-1]).index_add(0, group, total.real.new_ones(n)) * count
     covariance = (total / size).movedim(-1, -3)
     covariance, log_det, coloured = _or_white(covariance, size)
     inverse = matrix_inverse(cholesky_factor(covariance))
