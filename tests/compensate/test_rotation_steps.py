@@ -25,7 +25,7 @@ from tests.compensate.turning import (
 )
 from tests.direct.turntable import Turntable
 from torchsar.compensate.rotation.couplings import Pairs
-from torchsar.compensate.rotation.histories import change_by_histories, refined_by_histories, solved
+from torchsar.compensate.rotation.histories import change_by_histories, inverted, refined_by_histories
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of, without_range_term
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.compensate.rotation.range_response import RangeResponse
@@ -179,7 +179,7 @@ def test_small_normal_equations_of_any_scale_are_solved() -> None:
     answer = torch.tensor([1e9, 2.0, 3e-6, 0.0], dtype=F64)
     rows[:, :, 3] = 0
     torch.testing.assert_close(
-        solved(rows.mT @ rows, (rows.mT @ (rows @ answer)[..., None])[..., 0]),
+        (inverted(rows.mT @ rows)[0] @ rows.mT @ (rows @ answer)[..., None])[..., 0],
         answer.expand(3, -1),
         rtol=1e-6,
         atol=1e-9,

@@ -276,10 +276,13 @@ class PulseNufft:
         return PulsePoints(first.to(torch.int64), weights.movedim(0, -1), self._reach(first))
 
     def _reach(self, first: Tensor) -> int:
-        """Number of rows that the taps reach, so that rows beyond are not processed; all rows
-        inside vmap, where values cannot be read.
+        """Number of rows that the taps reach, so that rows beyond are not processed.
+
+        All rows inside vmap, where values cannot be read, and on an accelerator, where waiting for
+        them takes longer.
         """
-        return host_largest(first, self.length + 1) + self.kernel.taps
+        largest = self.length + 1
+        return (host_largest(first, largest) if first.device.type == "cpu" else largest) + self.kernel.taps
 
     def type1(self, y: Tensor, points: PulsePoints) -> Tensor:
         """Sum pulses into image lines q: sum_m y[m] exp(+2j pi p[m] (q - lines // 2)).

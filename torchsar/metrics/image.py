@@ -58,7 +58,11 @@ def pair_of(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor,
 
 
 def _power(image: Tensor) -> Tensor:
-    """Intensity |image|^2, relative to the level of each image where single precision needs it."""
+    """Intensity |image|^2, relative to the level of each image where single precision needs it, and
+    on an accelerator, where waiting to know that takes longer.
+    """
+    if image.device.type != "cpu":
+        return _squares(unit_level(image))
     power = _squares(image)
     least, largest = torch.aminmax(power.detach().sum((-2, -1)))
     least = least / (image.shape[-2] * image.shape[-1])

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.motion import SEARCH_EPS
+from torchsar.core import numbers_on
 from torchsar.core.warp import warp, warp_rate
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
@@ -146,7 +147,7 @@ def _image(rows: Tensor, prf_hz: float, k: Tensor) -> Tensor:
 
 def _corrected(k: Tensor, left: Tensor, duration_s: float) -> Tensor:
     """k1 and k2 (trial, 2) of a rotation whose rate changes by `left` once k is compensated."""
-    times = torch.tensor([duration_s / 2, duration_s], dtype=torch.float64, device=k.device)
+    times = numbers_on(k.device, duration_s / 2, duration_s)
     even = duration_s * warp(times, k) / warp(times[1:], k)
     return _third_order(warp_rate(times, k) * warp_rate(even, left), duration_s)
 

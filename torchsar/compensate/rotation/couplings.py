@@ -72,7 +72,7 @@ class Pairs:
         whole = position.floor().long().clamp_max(2 * _NEAR_CELLS * _TABLE - 1)
         weight = amplitude[trial, first].conj() * amplitude[trial, second] * (1 + _RIDGE * (first == second))
         index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
-        table = _product_tables(sampling, k, bases, index)
+        table = _product_tables(sampling, k, bases)
         low, high = table[trial, whole], table[trial, whole + 1]
         values = ((low + (position - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
         products = {pair: value for (n, m), value in zip(index, values) for pair in {(n, m), (m, n)}}
@@ -133,12 +133,12 @@ class Pairs:
         return values.new_zeros(self.shape[0], *values.shape[1:]).index_add(0, self.trial, values)
 
 
-def _product_tables(sampling: Sampling, k: Tensor, bases: Tensor, index: list[tuple[int, int]]) -> Tensor:
-    """Sums over pulses of b_n b_m exp(2j pi c u), (trial, step, product).
+def _product_tables(sampling: Sampling, k: Tensor, bases: Tensor) -> Tensor:
+    """Sums over pulses of b_n b_m exp(2j pi c u), m >= n, (trial, step, product).
 
     The steps are 1 / _TABLE of a Doppler cell c.
     """
-    first, second = (torch.tensor(side, device=bases.device) for side in zip(*index))
+    first, second = torch.triu_indices(bases.shape[1], bases.shape[1], device=bases.device)
     scale = bases.abs().amax(-1, keepdim=True).clamp_min(1e-300)
     unit = bases / scale
     products = (unit[:, first] * unit[:, second]).mT.to(torch.complex128)

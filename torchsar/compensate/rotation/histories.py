@@ -153,7 +153,7 @@ def _unambiguous(motion: Motion, sampling: Sampling, lines: int) -> Tensor:
     """
     times = sampling.times(motion.k.device)
     fastest = warp_rate(times, motion.k).amax(-1) * sampling.duration_s
-    whole = warp(times.new_tensor([sampling.duration_s]), motion.k)[..., 0]
+    whole = warp(times.new_full((1,), sampling.duration_s), motion.k)[..., 0]
     line = torch.arange(lines, device=times.device) - lines // 2
     return line.abs() * (fastest / whole)[:, None] <= lines / 2
 
@@ -188,7 +188,7 @@ def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u
 
 def _times_at(u: Tensor, k: Tensor, duration_s: float) -> Tensor:
     """Times (trial, sample) at which the normalised warp is u, by Newton steps."""
-    whole = warp(torch.tensor([duration_s], dtype=torch.float64, device=k.device), k)
+    whole = warp(u.new_full((1,), duration_s), k)
     time = (u * duration_s).expand(k.shape[0], -1)
     for _ in range(8):
         time = (time - (warp(time, k) - u * whole) / warp_rate(time, k)).clamp(0, duration_s)
@@ -209,53 +209,22 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tenso
     total = weight.sum(-1, keepdim=True).clamp_min(1e-300)
     angle = angle - (weight * angle).sum(-1, keepdim=True) / total
     difference = difference - (weight[..., None, :] * difference).sum(-1, keepdim=True) / total[..., None]
-    change, normal, rest = angle.new_zeros(bases.shape[0], bases.shape[2]), angle.new_zeros(0), angle.new_zeros(0)
+    change, inverse, rest = angle.new_zeros(bases.shape[0], bases.shape[2]), angle.new_zeros(0), angle.new_zeros(0)
     for _ in range(_ROBUST_ROUNDS):
         weighted = difference * weight[..., None, :]
-        normal = torch.einsum("bpij,bpkj->bik", weighted, difference)
-        change = solved(normal, torch.einsum("bpij,bpj->bi", weighted, angle))
+        inverse = inverted(torch.einsum("bpij,bpkj->bik", weighted, difference))[0]
+        change = (inverse @ torch.einsum("bpij,bpj->bi", weighted, angle)[..., None])[..., 0]
         residual = angle - torch.einsum("bi,bpij->bpj", change, difference)
         rest = weighted * residual[..., None, :]
         scale = 3 * residual.abs().flatten(1).median(-1).values[:, None, None].clamp_min(1e-12)
         weight = weight / (1 + (residual / scale).square())
     # few scatterers cannot disagree: what the samples of each show counts as well
-    inverse = inverted(normal)[0]
     own = lag * inverse @ torch.einsum("bpij,bpkj->bik", rest, rest) @ inverse
     pull, count = rest.sum(-1), used.sum(-1)
-    free = count / (count - normal.shape[-1]).clamp_min(_LEAST_FREE)
-    return change, sandwich(normal, pull.mT @ pull) * free[:, None, None] + own
-
-
-def sandwich(normal: Tensor, pulls: Tensor) -> Tensor:
-    """Compute a covariance from the differences between contributions to a fit.
-
-    The mean square of the contributions to the gradient is measured and not derived from the noise,
-    so that errors of the model count (the sandwich covariance of least squares).
-
-    Args:
-        normal: Normal matrices, shape (trial, n, n).
-        pulls: Sums of the products of the gradients that two scatterers contribute at the solution,
-            over all pairs that are not independent, shape (trial, n, n).
-
-    Returns:
-        The covariance, shape (trial, n, n); zero along directions that the data do not determine.
-    """
-    inverse = inverted(normal)[0]
-    return inverse @ pulls @ inverse
-
-
-def solved(normal: Tensor, right: Tensor) -> Tensor:
-    """Solve small normal equations, one set per trial.
-
-    Args:
-        normal: Normal matrices, shape (trial, n, n).
-        right: Right-hand sides, shape (trial, n).
-
-    Returns:
-        The solution, shape (trial, n); zero along directions that the data do not determine.
-    """
-    inverse, _ = inverted(normal)
-    return (inverse @ right[..., None])[..., 0]
+    free = count / (count - inverse.shape[-1]).clamp_min(_LEAST_FREE)
+    # measured and not derived from the noise, so that errors of the model count: the sandwich
+    # covariance of least squares
+    return change, inverse @ (pull.mT @ pull) @ inverse * free[:, None, None] + own
 
 
 def inverted(normal: Tensor) -> tuple[Tensor, Tensor]:

@@ -21,7 +21,16 @@ from torchsar.compensate.rotation.verdicts import (
     focus_of,
     warp_phase_error,
 )
-from torchsar.core import Estimate, block_bytes_of, checked_samples, level_of, over_blocks, refuse_non_finite, settle
+from torchsar.core import (
+    Estimate,
+    block_bytes_of,
+    checked_samples,
+    host_values,
+    level_of,
+    over_blocks,
+    refuse_non_finite,
+    settle,
+)
 from torchsar.core.warp import k_of_shape, shape_of
 from torchsar.metrics import entropy
 
@@ -297,14 +306,15 @@ def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_
             f"{name}: range_m must be a tensor of the {data.shape[-1]} coordinates of the range cells (m), got {got}"
         )
     refuse_non_finite(range_m, f"{name}: range_m")
-    steps = torch.diff(range_m.to(torch.float64))
-    step = float(steps.mean()) if len(steps) else 1.0
-    if step == 0 or bool(((steps - step).abs() > 1e-6 * abs(step)).any()):
+    range_m = range_m.to(torch.float64)
+    steps = torch.diff(range_m) if len(range_m) > 1 else torch.ones_like(range_m)
+    first, step, least, largest = host_values(torch.stack([range_m[0], steps.mean(), *torch.aminmax(steps)]), 0.0)
+    if step == 0 or max(step - least, largest - step) > 1e-6 * abs(step):
         raise ValueError(
-            f"{name}: range_m must be evenly spaced, got steps of {float(steps.min()):g} to "
-            f"{float(steps.max()):g} m; resample the data in range first"
+            f"{name}: range_m must be evenly spaced, got steps of {least:g} to {largest:g} m; resample the data in "
+            "range first"
         )
-    return Sampling(wavelength_m, prf_hz, data.shape[-2], data.shape[-1], float(range_m[0]), step)
+    return Sampling(wavelength_m, prf_hz, data.shape[-2], data.shape[-1], first, step)
 
 
 def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> Estimate:

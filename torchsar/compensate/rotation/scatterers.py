@@ -26,11 +26,11 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.compensate.rotation.couplings import Pairs
-from torchsar.compensate.rotation.histories import inverted, solved
+from torchsar.compensate.rotation.histories import inverted
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.compensate.rotation.range_response import Envelopes, RangeResponse
-from torchsar.core import real_dtype, reduced_turns
+from torchsar.core import host_value, real_dtype, reduced_turns
 from torchsar.core.warp import least_rate
 
 _OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
@@ -267,7 +267,8 @@ def fit_scatterers(
             )
         if new is not None:
             fit = replace(fit, scatterers=fit.scatterers.joined(new, fit.settled).apart(), noise=noise)
-        if iteration == rounds or bool(fit.settled.all()):
+        # no trial settles before the search is over
+        if iteration == rounds or (iteration > max(_SEARCHES) and bool(fit.settled.all())):
             break
         residual, step = _Step.of(data, sampling, fit, present, unknowns, count)
     return fit
@@ -502,7 +503,8 @@ class _Step:
         curvature, pull = shared - taken_up[..., :-1], torch.einsum("bpin,bpn->bpi", slopes, turned.imag)
         pull = pull - taken_up[..., -1]
         normal = curvature.sum(1)
-        change, inverse = solved(normal, pull.sum(1)), inverted(normal)[0]
+        inverse, lost = inverted(normal)
+        change = (inverse @ pull.sum(1)[..., None])[..., 0]
         informed = torch.einsum("bpij,bin,bjn->bpn", curvature, inverse, inverse)
         rest = pull - torch.einsum("bpij,bj->bpi", curvature, change)
         # share of each scatterer, with those that it is not independent of, in the variances
@@ -521,7 +523,7 @@ class _Step:
             self._moved(change),
             Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), position),
             change,
-            _covariance(normal),
+            inverse / 2 + torch.diag_embed(torch.where(lost, math.inf, 0.0)),  # infinite if undetermined
             disagreement,
             disagreement.square() / or_one((spread * (alike @ spread)).sum(1)),
             informed / or_one(informed.sum(1, keepdim=True)),
@@ -641,31 +643,27 @@ class _Step:
 class _Factor:
     """Symmetric matrices (trial, n, n), factorised.
 
-    factor: their Cholesky factors. failed: True for matrices that rounding has made indefinite.
+    factor: their Cholesky factors. failed: True for matrices that rounding has made indefinite;
+    None if there are none.
     """
 
     matrix: Tensor
     factor: Tensor
-    failed: Tensor
+    failed: Tensor | None
 
     @staticmethod
     def of(matrix: Tensor) -> _Factor:
         """Factorise matrices."""
         factor, info = torch.linalg.cholesky_ex(matrix)
-        return _Factor(matrix, factor, info != 0)
+        failed = info != 0
+        return _Factor(matrix, factor, failed if host_value(failed.any(), True) else None)
 
     def solve(self, right: Tensor) -> Tensor:
         """Solutions for right-hand sides; how one is found does not depend on the other trials."""
         solution = torch.cholesky_solve(right, self.factor)
-        if bool(self.failed.any()):
+        if self.failed is not None:
             solution[self.failed] = torch.linalg.solve(self.matrix[self.failed], right[self.failed])
         return solution
-
-
-def _covariance(normal: Tensor) -> Tensor:
-    """Covariance of the common unknowns per unit noise power; infinite if undetermined."""
-    inverse, lost = inverted(normal)
-    return inverse / 2 + torch.diag_embed(torch.where(lost, math.inf, 0.0))
 
 
 def _after_step(
