@@ -154,7 +154,9 @@ class BeamSpectrum:
             frame_hz,
         )
         middle = self.group.middle_m[..., None, None]
-        rows = self.data * bulk_filter(FrequencyBasis(radar, n, self.data.device), at, middle, None, self.data.dtype)
+        rows = self.data * bulk_filter(
+            FrequencyBasis(radar, n, self.data.device, wait=False), at, middle, None, self.data.dtype
+        )
         return refocus(torch.fft.ifft(rows), refocus_turns_per_sample(at), n // 2)
 
     def image(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:

@@ -157,14 +157,14 @@ def outer_phasor(fine: Tensor, coarse: Tensor, n: int) -> Tensor:
     return (coarse[..., :, None] * fine[..., None, :]).flatten(-2)[..., :n]
 
 
-def phasor_tables(turns_per_step: Tensor, start: float, n: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+def phasor_tables(turns_per_step: Tensor, start: Tensor | float, n: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Return two short tables whose products are the phasors exp(2j pi s (start + i)), i < n.
 
     `linear_phasor` multiplies them; the tables serve where the full product is not needed.
 
     Args:
         turns_per_step: Phase step s in turns, shape (...,), float64.
-        start: Offset of the first element in steps.
+        start: Offset of the first element in steps, a number or a tensor without dimensions.
         n: Number of elements.
         dtype: complex64 or complex128.
 

@@ -97,8 +97,8 @@ def range_phase(
     phi = warp(slow_times(n_pulse, prf_hz, data.device), k.to(torch.float64))
     # turns per metre of range
     slope = -(per_trial(omega_rad_s, 1, data) * phi).square() / wavelength_m
-    ends = (range_m[0], range_m[1] - range_m[0]) if n_range > 1 else (range_m[0], torch.ones_like(range_m[0]))
-    start, step = torch.stack(ends).tolist()
+    ends = range_m[:2].to(torch.float64)
+    start, step = ends[0], ends[1] - ends[0] if n_range > 1 else torch.ones_like(ends[0])
     fine, coarse = phasor_tables(slope * step, start / step, n_range, data.dtype)
     offset = unit_phasor(slope * per_trial(yc_m, 1, data), data.dtype)
     return data * outer_phasor(fine, coarse * offset[..., None], n_range)
