@@ -105,7 +105,11 @@ class validate:
 
 
 def validation() -> Validation:
-    """Return when values are checked, see `validate`."""
+    """Return when values are checked, see `validate`.
+
+    Returns:
+        "eager", "deferred" or "off".
+    """
     return _gathered.validation
 
 
