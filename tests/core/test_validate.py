@@ -80,7 +80,8 @@ def test_deferred_checks_name_stage_and_trial_at_the_end_of_the_chain(place: Cal
 
 def test_deferred_checks_of_a_chain_are_made_with_one_reading() -> None:
     made = Chain(**{f"stage_{i}": Doubled() for i in range(5)})
-    for mode, waits in (("eager", 5), ("deferred", 1), ("off", 0)):
+    expected: dict[torchsar.core.Validation, int] = {"eager": 5, "deferred": 1, "off": 0}
+    for mode, waits in expected.items():
         torchsar.validate(mode)
         with pretended_device() as counts:
             made(there(signal()))

@@ -90,7 +90,8 @@ class validate:
     def __init__(self, mode: Validation) -> None:
         if mode not in get_args(Validation):
             raise ValueError(f"values are checked 'eager', 'deferred' or 'off', got {mode!r}")
-        self._before, _gathered.validation = _gathered.validation, mode
+        self._before: Validation = _gathered.validation
+        _gathered.validation = mode
         self._block = gathered_checks()
 
     def __enter__(self) -> None:
