@@ -27,8 +27,19 @@ from torchsar.compensate.group import (
     entropy_parts,
     pick_group,
 )
-from torchsar.core import Estimate, Signal, Stage, checked_samples, fft_lines, per_trial, settle, unit_level
-from torchsar.optim.scalar import gradient_minimum, grid_minimum
+from torchsar.core import (
+    Estimate,
+    Signal,
+    Stage,
+    checked_samples,
+    fft_lines,
+    host_value,
+    per_trial,
+    settle,
+    take,
+    unit_level,
+)
+from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import StripmapRadar
 
 Refine = Callable[..., tuple[Tensor, Tensor]]
@@ -51,6 +62,7 @@ _REST, _REST_STEP = 0.45, 0.11
 _MOST_WIDTHS = 0.27
 _COMBS = 4  # interleaved sets of Doppler rows, of independent noise, for the standard deviation
 _PARTS = 8  # parts of the image along azimuth, for the standard deviation
+_STEP_SHARE = 20  # the refinement stops at this share of the step of the grid; half that of the last parabola
 _GRID = 16  # largest number of steps of the grid search to either side
 
 
@@ -96,14 +108,18 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
     lines = checked_samples(group.data, "velocity_objective", "pulse, range")
     group = RangeGroup(unit_level(lines), group.start, group.radar)
     spectrum = beam_spectrum(group, doppler_hz)
-    return _objective(spectrum, doppler_hz, _weights(spectrum, doppler_hz, dwell_s))
+    return _objective(spectrum, doppler_hz, _nominal(spectrum, doppler_hz, dwell_s)[0])
 
 
 @torch.no_grad()
-def _weights(spectrum: BeamSpectrum, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """Weights of the blocks (..., block) in the image of the nominal velocity."""
+def _nominal(spectrum: BeamSpectrum, doppler_hz: Tensor, dwell_s: float) -> tuple[Tensor, Tensor]:
+    """Weights of the blocks (..., block) and entropy (...,), from the image of the nominal
+    velocity.
+    """
     radar = spectrum.group.radar
-    return block_weights(spectrum.image(doppler_hz, radar.velocity_m_s), radar, doppler_hz, dwell_s)
+    image = spectrum.image(doppler_hz, radar.velocity_m_s)
+    weight = block_weights(image, radar, doppler_hz, dwell_s)
+    return weight, (block_entropy(image) * weight).sum(-1)
 
 
 def _objective(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Callable[[Tensor], Tensor]:
@@ -115,22 +131,40 @@ def _objective(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Ca
     return blocks
 
 
-def _fine(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """Function of the velocity (...,) that returns the summands of the entropies of parts of the
-    image and their shares of the energy, each times the weight of the block, (..., block, part).
+class _Parts(NamedTuple):
+    """Entropies of parts of an image, each times the weight of its block.
 
     The image has twice as many azimuth samples as the spectrum has rows. The entropy of an image of
     one sample per resolution cell changes with the place of a target between two samples, and a
     wrong velocity moves targets.
+
+    Args:
+        summands: What parts along azimuth add to the entropies of the blocks, (..., block, part).
+        shares: Their shares of the energy, (..., block, part).
+        combs: Entropies of the images of interleaved sets of Doppler rows, (..., comb).
+        whole: Function that returns the entropy of the image of as many azimuth samples as rows,
+            (...,).
     """
-    height = 2 * spectrum.data.shape[-2]
 
-    def summands(velocity_m_s: Tensor) -> tuple[Tensor, Tensor]:
-        image = fft_lines(spectrum.rows(doppler_hz, velocity_m_s), inverse=True, n=height)
-        entropy, share = entropy_parts(image, _PARTS)
-        return entropy * weight[..., None], share * weight[..., None]
+    summands: Tensor
+    shares: Tensor
+    combs: Tensor
+    whole: Callable[[], Tensor]
 
-    return summands
+
+def _parts(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, velocity_m_s: Tensor) -> _Parts:
+    """Entropies of the parts of the image that belongs to a velocity (...,)."""
+    rows = spectrum.rows(doppler_hz, velocity_m_s)
+    count = rows.shape[-2]
+    image = fft_lines(rows, inverse=True, n=2 * count)
+    entropy, share = entropy_parts(image, _PARTS)
+
+    def whole() -> Tensor:
+        return (block_entropy(image[..., ::2, :]) * weight).sum(-1)
+
+    sets = [rows[..., first::_COMBS, :] for first in range(min(_COMBS, count))]
+    combs = [(block_entropy(fft_lines(part, inverse=True)) * weight).sum(-1) for part in sets]
+    return _Parts(entropy * weight[..., None], share * weight[..., None], torch.stack(combs, -1), whole)
 
 
 def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float:
@@ -181,8 +215,9 @@ def minimum_entropy_velocity(
     middle of the Doppler band is focused at first, with fewer and wider steps. Then the band is
     doubled, and velocities about the best one are searched, until the band is whole.
 
-    The refinement stops at a two-hundredth of the step of the grid or at `tolerance_m_s`, whichever
-    is larger. The result is the vertex of a parabola through entropies of images with twice as many
+    The refinement starts at the vertex of a parabola through the best velocity of the grid and its
+    neighbours, and stops at a twentieth of the step of the grid or at `tolerance_m_s`, whichever is
+    larger. The result is the vertex of a parabola through entropies of images with twice as many
     azimuth samples, a tenth of a step to either side.
 
     The depth of the minimum is measured against velocities 2 steps away, or 8 steps where that
@@ -220,57 +255,94 @@ def minimum_entropy_velocity(
     lines = checked_samples(group.data, "minimum_entropy_velocity", "pulse, range", empty=False)
     group = RangeGroup(unit_level(lines), group.start, group.radar)
     spectrum, nominal = beam_spectrum(group, doppler_hz), group.radar.velocity_m_s
-    weight = _weights(spectrum, doppler_hz, dwell_s)
-    whole = _objective(spectrum, doppler_hz, weight)
-    fine = _fine(spectrum, doppler_hz, weight)
+    weight, cost = _nominal(spectrum, doppler_hz, dwell_s)
+    blocks = _objective(spectrum, doppler_hz, weight)
+
+    def whole(velocity_m_s: Tensor) -> Tensor:
+        return blocks(velocity_m_s).sum(-1)
 
     full_step = grid_step_m_s(group.radar, float(group.radar.near_range_m), dwell_s)
     start = torch.full(doppler_hz.shape, nominal, dtype=torch.float64, device=doppler_hz.device)
     reach = min(reach_m_s, nominal / 2)
-    value, step, costs = _search(spectrum, doppler_hz, weight, start, reach, full_step)
-    best = costs.argmin(-1)
-    grid = nominal + torch.linspace(-reach, reach, costs.shape[-1], dtype=torch.float64, device=doppler_hz.device)
-    value, _ = refine(lambda velocity: whole(velocity).sum(-1), value, step, max(tolerance_m_s, full_step / 200))
+    grid = _search(spectrum, doppler_hz, weight, start, cost, reach, full_step)
+    tolerance = max(tolerance_m_s, full_step / _STEP_SHARE)
+    value = grid.vertex_m_s
+    if grid.near_m_s > tolerance:
+        value, _ = refine(whole, value, grid.near_m_s, tolerance)
     value, _ = settle(value, nominal)
     with torch.no_grad():
         half = min(full_step, nominal / 2) / 10
-        (low, low_share), (middle, share), (high, high_share) = (fine(value + side * half) for side in (-1, 0, 1))
-        curvature = (low - 2 * middle + high).sum((-2, -1)) / half**2
+        low, middle, high = (_parts(spectrum, doppler_hz, weight, value + side * half) for side in (-1, 0, 1))
+        curvature = (low.summands - 2 * middle.summands + high.summands).sum((-2, -1)) / half**2
         # without the energy that moves from one part to another, which changes no entropy by itself
-        level = middle.sum(-1, keepdim=True) / share.sum(-1, keepdim=True).clamp_min(1e-300)
-        slope = (high - low - level * (high_share - low_share)) / (2 * half)
+        level = middle.summands.sum(-1, keepdim=True) / middle.shares.sum(-1, keepdim=True).clamp_min(1e-300)
+        slope = (high.summands - low.summands - level * (high.shares - low.shares)) / (2 * half)
         # the step to the vertex of the parabola, at most to its ends
         value = value - (_over(slope.sum((-2, -1)), curvature)).clamp(-half, half)
-        depth, width = _depth(lambda velocity: whole(velocity).sum(-1), value, curvature, min(full_step, nominal / 18))
+        depth, width = _depth(whole, value, middle.whole(), curvature, min(full_step, nominal / 18))
         scatter = torch.maximum(
             _over(slope.flatten(-2).square().sum(-1).sqrt(), curvature),
-            _comb_std(spectrum, doppler_hz, weight, value, half),
+            _comb_std(low.combs, middle.combs, high.combs, half),
         )
         rest = (_REST * width.square()).clamp_min(_REST_STEP * full_step**2) / nominal
         std = torch.hypot(scatter, rest).clamp_max(1e6)
         known = group.radar.integration_s
         most = _MOST_WIDTHS * width if known is None else full_step / 8
-        inside = (best > 0) & (best < costs.shape[-1] - 1)
-        clear = inside & (curvature > 0) & (depth > _LEAST_DEPTH * _noise_std(spectrum, weight))
+        clear = grid.inside & (curvature > 0) & (depth > _LEAST_DEPTH * _noise_std(spectrum, weight))
         if known is not None and lines.shape[-2] < known * group.radar.prf_hz:
             clear = torch.zeros_like(clear)
-    return VelocityMinimum(value, std, per_trial(most, 0, std).expand(std.shape), clear, grid, costs)
+    points = nominal + torch.linspace(-reach, reach, grid.costs.shape[-1], dtype=torch.float64, device=start.device)
+    return VelocityMinimum(value, std, per_trial(most, 0, std).expand(std.shape), clear, points, grid.costs)
+
+
+class _Grid(NamedTuple):
+    """Result of the grid search.
+
+    Args:
+        vertex_m_s: Vertex of the parabola through the best velocity and its neighbours, or the best
+            velocity where it has only one neighbour, (...,).
+        near_m_s: Half width about the vertex for its refinement.
+        inside: Whether the best velocity of the first grid is not at an end, (...,).
+        costs: Entropies of the first grid, (..., grid).
+    """
+
+    vertex_m_s: Tensor
+    near_m_s: float
+    inside: Tensor
+    costs: Tensor
 
 
 def _search(
-    spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, start: Tensor, reach: float, full_step: float
-) -> tuple[Tensor, float, Tensor]:
-    """Best velocity (...,) of the whole band, its step, and costs (..., grid) of the first grid."""
+    spectrum: BeamSpectrum,
+    doppler_hz: Tensor,
+    weight: Tensor,
+    start: Tensor,
+    cost: Tensor,
+    reach: float,
+    full_step: float,
+) -> _Grid:
+    """Search the whole band; first its middle, with few and wide steps, where it has many.
+
+    cost: Entropy of the image of the whole band at the start, (...,).
+    """
     share, value, first = min(1.0, math.sqrt(_GRID * full_step / reach)), start, None
     while True:
         blocks = _objective(_middle_rows(spectrum, share), doppler_hz, weight)
         step = min(full_step / share**2, reach / 2)
         count = 2 * math.ceil(reach / step - 1e-9) + 1
-        value, costs = grid_minimum(lambda velocity, f=blocks: f(velocity).sum(-1), value, reach, count)
+        known = cost if share == 1 and first is None else None
+        value, costs = grid_minimum(lambda velocity, f=blocks: f(velocity).sum(-1), value, reach, count, known)
         first = costs if first is None else first
         if share == 1:
-            return value, 2 * reach / (count - 1), first
+            break
         reach, share = 2 * step, min(1.0, 2 * share)
+    step, best = 2 * reach / (count - 1), costs.argmin(-1)
+    low, middle, high = (take(costs, (best + side).clamp(0, count - 1)) for side in (-1, 0, 1))
+    bend = low - 2 * middle + high
+    bent = (best > 0) & (best < count - 1) & (bend > 0)
+    vertex = torch.where(bent, value + 0.5 * step * (low - high) / torch.where(bent, bend, 1), value)
+    best = first.argmin(-1)
+    return _Grid(vertex, step / 4, (best > 0) & (best < first.shape[-1] - 1), first)
 
 
 def _middle_rows(spectrum: BeamSpectrum, share: float) -> BeamSpectrum:
@@ -281,15 +353,25 @@ def _middle_rows(spectrum: BeamSpectrum, share: float) -> BeamSpectrum:
     return replace(spectrum, data=spectrum.data[..., part, :], doppler_hz=spectrum.doppler_hz[..., part])
 
 
-def _depth(cost: Callable[[Tensor], Tensor], value: Tensor, curvature: Tensor, step: float) -> tuple[Tensor, Tensor]:
-    """Depth of the minimum in nats and its width in m/s, (...,) each."""
-    least, depth, width = cost(value), torch.zeros_like(value), torch.zeros_like(value)
-    for distance in _DISTANCES:
+def _depth(
+    cost: Callable[[Tensor], Tensor], value: Tensor, least: Tensor, curvature: Tensor, step: float
+) -> tuple[Tensor, Tensor]:
+    """Depth of the minimum in nats and its width in m/s, (...,) each.
+
+    least: Entropy at the minimum, (...,).
+    """
+    near, far = _DISTANCES
+
+    def measured(distance: float) -> tuple[Tensor, Tensor]:
         beside = 0.5 * (cost(value - distance * step) + cost(value + distance * step)) - least
-        wide = _over(2 * beside.clamp_min(0), curvature).sqrt()
-        taken = width <= 0 if distance == _DISTANCES[0] else width > _DISTANCES[0] * step / 2
-        depth, width = torch.where(taken, beside, depth), torch.where(taken, wide, width)
-    return depth, width
+        return beside, _over(2 * beside.clamp_min(0), curvature).sqrt()
+
+    depth, width = measured(near)
+    wide = width > near * step / 2
+    if not host_value(wide.any(), True):
+        return depth, width
+    far_depth, far_width = measured(far)
+    return torch.where(wide, far_depth, depth), torch.where(wide, far_width, width)
 
 
 def _over(value: Tensor, curvature: Tensor) -> Tensor:
@@ -306,18 +388,13 @@ def _noise_std(spectrum: BeamSpectrum, weight: Tensor) -> Tensor:
     return (_NOISE_ENTROPY / pixels * weight.square().sum(-1)).sqrt()
 
 
-def _comb_std(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, velocity: Tensor, half: float) -> Tensor:
-    """Standard deviation (...,) in m/s from the slopes of interleaved sets of Doppler rows."""
-    if spectrum.data.shape[-2] < _COMBS:
-        return torch.full_like(velocity, 1e6)
-    values = []
-    for first in range(_COMBS):
-        rows = replace(
-            spectrum, data=spectrum.data[..., first::_COMBS, :], doppler_hz=spectrum.doppler_hz[..., first::_COMBS]
-        )
-        part = _objective(rows, doppler_hz, weight)
-        values.append(torch.stack([part(velocity + step * half).sum(-1) for step in (-1, 0, 1)], -1))
-    low, middle, high = torch.stack(values, -1).unbind(-2)
+def _comb_std(low: Tensor, middle: Tensor, high: Tensor, half: float) -> Tensor:
+    """Standard deviation (...,) in m/s from the slopes of interleaved sets of Doppler rows.
+
+    low, middle, high: Entropies of the sets (..., comb) at three velocities, `half` m/s apart.
+    """
+    if middle.shape[-1] < _COMBS:
+        return torch.full_like(middle[..., 0], 1e6)
     curvature = (low - 2 * middle + high).mean(-1) / half**2
     return _over(((high - low) / (2 * half)).std(-1) / math.sqrt(_COMBS), curvature)
 
@@ -351,7 +428,7 @@ class EffectiveVelocity(Stage):
         focuser: Focuser,
         reach_m_s: float = 80.0,
         lines: int = 512,
-        refine: Refine = gradient_minimum,
+        refine: Refine = parabola_minimum,
         tolerance_m_s: float = 0.01,
     ) -> None:
         super().__init__()

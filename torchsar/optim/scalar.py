@@ -13,7 +13,9 @@ from torchsar.core import host_value, take
 Cost = Callable[[Tensor], Tensor]
 
 
-def grid_minimum(cost: Cost, centre: Tensor, reach: float, count: int) -> tuple[Tensor, Tensor]:
+def grid_minimum(
+    cost: Cost, centre: Tensor, reach: float, count: int, middle: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Return, per trial, the point of lowest cost among equally spaced points in centre +- reach.
 
     Args:
@@ -21,18 +23,21 @@ def grid_minimum(cost: Cost, centre: Tensor, reach: float, count: int) -> tuple[
         centre: Middle of the interval, shape (...,).
         reach: Half width of the interval.
         count: Number of points, at least 3.
+        middle: Cost at the centre, shape (...,), where it is known; `count` must then be odd.
 
     Returns:
         The best point, shape (...,), and all costs, shape (..., count).
 
     Raises:
-        ValueError: If `count` is below 3.
+        ValueError: If `count` is below 3, or even although `middle` is given.
     """
-    if count < 3:
-        raise ValueError(f"a grid search needs at least 3 points, got {count}")
+    if count < 3 or (middle is not None and count % 2 == 0):
+        odd = "" if middle is None else ", an odd number of them where the cost in the middle is given"
+        raise ValueError(f"a grid search needs at least 3 points{odd}, got {count}")
     offsets = torch.linspace(-reach, reach, count, dtype=centre.dtype, device=centre.device)
     with torch.no_grad():
-        costs = torch.stack([cost(centre + offset) for offset in offsets], -1)
+        known = {} if middle is None else {count // 2: middle}
+        costs = torch.stack([known[i] if i in known else cost(centre + offset) for i, offset in enumerate(offsets)], -1)
     return centre + take(offsets.expand(costs.shape), costs.argmin(-1)), costs
 
 
@@ -58,20 +63,18 @@ def parabola_minimum(
         parabola had a minimum), each of shape (...,).
     """
     with torch.no_grad():
-        x, half, best = start, torch.full_like(start, step), cost(start)
+        x, half = start, torch.full_like(start, step)
         curvature = torch.zeros_like(start)
         active = torch.ones_like(start, dtype=torch.bool)
         for _ in range(rounds):
-            low, high = cost(x - half), cost(x + half)
-            bend = low - 2 * best + high
+            low, middle, high = cost(x - half), cost(x), cost(x + half)
+            bend = low - 2 * middle + high
             vertex = torch.where(
                 bend > 0, 0.5 * (low - high) / torch.where(bend > 0, bend, 1), torch.sign(low - high)
             ).clamp(-1, 1)
             curvature = torch.where(active & (bend > 0), bend / half.square(), curvature)
-            moved = torch.where(active, torch.clamp(x + vertex * half, start - 2 * step, start + 2 * step), x)
-            value = cost(moved)
+            x = torch.where(active, torch.clamp(x + vertex * half, start - 2 * step, start + 2 * step), x)
             inside = vertex.abs() < 0.99
-            x, best = torch.where(active, moved, x), torch.where(active, value, best)
             half = torch.where(active & inside, half / 4, half)
             active = active & (half > tolerance)
             if _finished(active):

@@ -30,7 +30,7 @@ def effective_velocity(
     reference: Literal["matched", "flat", "phase"] | None = "matched",
     reach_m_s: float = 80.0,
     lines: int = 512,
-    refine: Literal["gradient", "parabola"] = "gradient",
+    refine: Literal["gradient", "parabola"] = "parabola",
     tolerance_m_s: float = 0.01,
 ) -> EffectiveVelocity:
     """Estimator of the effective velocity, as the velocity that gives the least image entropy.
