@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torchsar.core import Axis, Signal
+from torchsar.core import Axis, Draws, Signal
 from torchsar.metrics import contrast, correlation, entropy, error_db, impulse, impulse_response
 
 
@@ -248,3 +248,46 @@ def test_a_maximum_near_its_sample_is_refined_once(monkeypatch):
     out = impulse_response(signal, (torch.tensor([128.0, 126.0]), torch.tensor([128.0, 129.0])))
     torch.testing.assert_close(out["position_range_m"], torch.full((2,), 127.8, dtype=torch.float64), atol=2e-3, rtol=0)
     assert len(calls) == 1
+
+
+def bell(row: float, column: float, width: tuple[float, float]) -> torch.Tensor:
+    """A Gaussian response, whose interpolation is exact, in an image of 384 x 384 samples."""
+    t = torch.arange(384, dtype=torch.float64)
+    row_cut, column_cut = (
+        torch.exp(-0.5 * ((t - at) / w).square() + 1j * 0.3 * (t - at))
+        for at, w in zip((row, column), width, strict=True)
+    )
+    return row_cut[:, None] * column_cut
+
+
+def test_the_interpolated_maximum_is_exact():
+    image = bell(190.4321, 201.1234, (2.0, 3.0))
+    axes = tuple(Axis(name, 384, 0.0, 1.0, "m") for name in ("azimuth", "range"))
+    found = impulse_response(Signal(image, axes), (190.0, 201.0))
+    assert float(found["position_azimuth_m"]) == pytest.approx(190.4321, abs=1e-7)
+    assert float(found["position_range_m"]) == pytest.approx(201.1234, abs=1e-7)
+    assert abs(complex(found["peak"]) - 1) < 1e-9
+
+
+def test_only_responses_that_are_wide_are_interpolated_farther_out(monkeypatch):
+    calls, about = [], impulse._about_zero
+    monkeypatch.setattr(
+        impulse, "_about_zero", lambda x, reach: (calls.append((x[..., 0].numel(), reach)), about(x, reach))[1]
+    )
+    images = torch.stack([bell(190.4, 201.1, (2.0, 2.0)), bell(190.4, 201.1, (14.0, 2.0)), bell(190, 201, (2.0, 2.0))])
+    images = images + 1e-3 * Draws(5, trials=range(3)).normal("impulse", (384, 384), torch.complex128)
+    axes = tuple(Axis(name, 384, 0.0, 1.0, "m") for name in ("azimuth", "range"))
+    together = impulse_response(Signal(images, axes), (190.0, 201.0), sidelobe_nulls=2)
+    assert calls == [(6, 32), (1, 128)]
+    for k in range(3):
+        alone = impulse_response(Signal(images[k], axes), (190.0, 201.0), sidelobe_nulls=2)
+        for name, value in alone.items():
+            torch.testing.assert_close(together[name][k], value, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("n", [64, 100, 384])
+def test_a_part_of_an_interpolated_cut_equals_that_part_of_the_whole(n):
+    spectrum = Draws(6, trials=range(2)).normal("impulse", (2 * n,), torch.complex128)
+    part, whole = impulse._about_zero(spectrum, 32), impulse._about_zero(spectrum, n)
+    middle = whole.shape[-1] // 2
+    torch.testing.assert_close(part, whole[..., middle - 511 : middle + 512], rtol=0, atol=1e-12)

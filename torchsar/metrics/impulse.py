@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,8 +15,15 @@ from torchsar.core import Signal, checked_samples, cis
 _PATCH = 64
 # chosen: samples of a slice; 10 null spacings of up to 25 samples fit on either side
 _SLICE = 512
-# chosen: grid points per sample of the search for the maximum, before a parabola refines it
-_FINE = 32
+# chosen: grid points per sample of the search for the maximum, and Newton steps from the best point
+_FINE, _STEPS = 8, 2
+# points per sample of an interpolated cut
+_FACTOR = 16
+# chosen: samples to either side of the peak within which a cut is interpolated; the second number
+# serves the responses that do not end within the first, and the whole cut those that end in neither
+_NEAR = (32, 128)
+# chosen: responses that are measured at once; the slices of one take a megabyte
+_AT_ONCE = 64
 
 
 def impulse_response(
@@ -76,23 +84,52 @@ def impulse_response(
         _nearest(axis.index_of(p.cpu()).to(p.device), axis.n, axis.name).expand(shape)
         for axis, p in zip(signal.axes, positions, strict=True)
     ]
-    reach = [_reach(search_m, axis.step) for axis in signal.axes]
-    data = signal.data.to(torch.complex128)
-    rows, cols = _brightest(data, centre, reach)
-    rows, cols, tone_a, tone_r, da, dr = _climb(data, rows, cols, centre_turns)
-    azimuth = _slice_through(_patch(data, rows, cols, min(_SLICE, signal.axes[0].n), _PATCH), tone_r, dr, -1)
-    range_ = _slice_through(_patch(data, rows, cols, _PATCH, min(_SLICE, signal.axes[1].n)), tone_a, da, -2)
+    reach = [min(_reach(search_m, axis.step), axis.n - 1) for axis in signal.axes]
+    image = torch.arange(math.prod(signal.trials), device=signal.data.device).reshape(*signal.trials, 1).expand(shape)
+    images = _Images.of(signal.data.reshape(-1, *signal.data.shape[-2:]), reach)
+    number = [x.flatten().split(_AT_ONCE) for x in (image, *centre)]
+    parts = [
+        _measured(images, some, rows, cols, reach, sidelobe_nulls, centre_turns)
+        for some, rows, cols in zip(*number, strict=True)
+    ]
     out: dict[str, Tensor] = {}
-    for axis, cut, tone, index, offset in (
-        (signal.axes[0], azimuth, tone_a, rows, da),
-        (signal.axes[1], range_, tone_r, cols, dr),
-    ):
-        figures, peak = cut_figures(cut, tone, offset, sidelobe_nulls)
+    for k, axis in enumerate(signal.axes):
+        figures = {key: torch.cat([part[k][key] for part in parts]).reshape(shape) for key in parts[0][k]}
         out[f"irw_{axis.name}_m"] = figures["irw"] * axis.step
         out[f"pslr_{axis.name}_db"], out[f"islr_{axis.name}_db"] = figures["pslr"], figures["islr"]
-        out[f"position_{axis.name}_m"] = axis.start + axis.step * (index + offset)
-        out["peak"] = peak
+        out[f"position_{axis.name}_m"] = axis.start + axis.step * figures["index"]
+        out["peak"] = figures["peak"]
     return out if per_target else {name: value[..., 0] for name, value in out.items()}
+
+
+def _measured(
+    images: _Images,
+    image: Tensor,
+    rows: Tensor,
+    cols: Tensor,
+    reach: list[int],
+    nulls: int,
+    centre_turns: tuple[float | None, float | None],
+) -> list[dict[str, Tensor]]:
+    """Figures along both axes of the responses nearest to samples (n,) of images (n,)."""
+    rows, cols = _brightest(images, image, rows, cols, reach)
+    rows, cols, tone_a, tone_r, da, dr = _climb(images, image, rows, cols, centre_turns)
+    height, width = (min(_SLICE, n) for n in images.shape)
+    cuts = [
+        _slice_through(images.patch(image, rows, cols, height, _PATCH), tone_r, dr, -1),
+        _slice_through(images.patch(image, rows, cols, _PATCH, width), tone_a, da, -2),
+    ]
+    tones, offsets = [tone_a, tone_r], [da, dr]
+    if height == width:
+        figures, peak = cut_figures(torch.stack(cuts), torch.stack(tones), torch.stack(offsets), nulls)
+        found = [{name: value[k] for name, value in {**figures, "peak": peak}.items()} for k in (0, 1)]
+    else:
+        each = [cut_figures(*cut, nulls) for cut in zip(cuts, tones, offsets, strict=True)]
+        found = [{**figures, "peak": peak} for figures, peak in each]
+    return [
+        {**figures, "index": index + offset}
+        for figures, index, offset in zip(found, (rows, cols), offsets, strict=True)
+    ]
 
 
 def _nearest(index: Tensor, n: int, name: str) -> Tensor:
@@ -110,53 +147,67 @@ def _reach(search_m: float | None, step: float) -> int:
     return 8 if search_m is None else max(1, math.ceil(search_m / step))
 
 
-def _patch(data: Tensor, rows: Tensor, cols: Tensor, height: int, width: int, image: Tensor | None = None) -> Tensor:
-    """Neighbourhoods (..., target, height, width) with (rows, cols) at sample (height//2,
-    width//2); zero outside the image.
+@dataclass(frozen=True)
+class _Images:
+    """Images (image, row, column) with margins of zeros about them.
 
-    image: Number of the image of each position (n,) among all of data; None where positions (...,
-    target) have the leading dimensions of data.
+    Args:
+        padded: The images with their margins.
+        margin: Width of the margins along both dimensions.
     """
-    n_a, n_r = data.shape[-2:]
-    i = rows[..., None, None] + torch.arange(height, device=data.device)[:, None] - height // 2
-    j = cols[..., None, None] + torch.arange(width, device=data.device) - width // 2
-    down, right = (i >= 0) & (i < n_a), (j >= 0) & (j < n_r)
-    at = i.clamp(0, n_a - 1) * n_r + j.clamp(0, n_r - 1)
-    if image is None:
-        flat = at.flatten(-3)
-        trials = np.broadcast_shapes(data.shape[:-2], flat.shape[:-1])
-        values = data.flatten(-2).expand(*trials, -1).gather(-1, flat.expand(*trials, -1))
-        values = values.reshape(*trials, rows.shape[-1], height, width)
-    else:
-        values = data.take(at + image[:, None, None] * (n_a * n_r))
-    return values if bool(down.all() & right.all()) else torch.where(down & right, values, 0)
+
+    padded: Tensor
+    margin: tuple[int, int]
+
+    @staticmethod
+    def of(data: Tensor, reach: list[int]) -> _Images:
+        """Images with margins for slices and for a search within `reach` samples."""
+        # the maximum may lie a few samples beyond the strongest sample of the search
+        down, right = (max(_PATCH, min(_SLICE, n)) // 2 + r + 8 for n, r in zip(data.shape[-2:], reach, strict=True))
+        return _Images(torch.nn.functional.pad(data, (right, right, down, down)), (down, right))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns without the margins."""
+        return self.padded.shape[-2] - 2 * self.margin[0], self.padded.shape[-1] - 2 * self.margin[1]
+
+    def patch(self, image: Tensor, rows: Tensor, cols: Tensor, height: int, width: int) -> Tensor:
+        """Neighbourhoods (n, height, width), complex128, with the sample (rows, cols) (n,) of an
+        image (n,) at (height // 2, width // 2).
+        """
+        every = self.padded.unfold(-2, height, 1).unfold(-2, width, 1)
+        return every[image, rows + self.margin[0] - height // 2, cols + self.margin[1] - width // 2].to(
+            torch.complex128
+        )
 
 
-def _brightest(data: Tensor, centre: list[Tensor], reach: list[int]) -> tuple[Tensor, Tensor]:
+def _brightest(images: _Images, image: Tensor, rows: Tensor, cols: Tensor, reach: list[int]) -> tuple[Tensor, Tensor]:
     """Row and column of the strongest sample within reach of each position."""
     height, width = 2 * reach[0] + 1, 2 * reach[1] + 1
-    best = _patch(data, centre[0], centre[1], height, width).abs().flatten(-2).argmax(-1)
-    return centre[0] + best // width - reach[0], centre[1] + best % width - reach[1]
+    best = images.patch(image, rows, cols, height, width).abs().flatten(-2).argmax(-1)
+    return rows + best // width - reach[0], cols + best % width - reach[1]
 
 
 def _climb(
-    data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float | None, float | None], rounds: int = 3
+    images: _Images,
+    image: Tensor,
+    rows: Tensor,
+    cols: Tensor,
+    centre_turns: tuple[float | None, float | None],
+    rounds: int = 3,
 ) -> tuple[Tensor, ...]:
     """From the strongest sample to the interpolated maximum: row, column, spectral centres in turns
-    per sample, offsets in samples. A skewed response that is sampled finely in one axis and
-    coarsely in the other has its maximum more than a sample away from its strongest sample.
+    per sample, offsets in samples, (n,) each. A skewed response that is sampled finely in one axis
+    and coarsely in the other has its maximum more than a sample away from its strongest sample.
     """
-    found = _refined(_patch(data, rows, cols, _PATCH, _PATCH), centre_turns)
-    lead = data.shape[:-2]
-    image = torch.arange(math.prod(lead), device=data.device).reshape(*lead, 1).expand_as(found[0])
+    found = _refined(images.patch(image, rows, cols, _PATCH, _PATCH), centre_turns)
     for _ in range(rounds):
         down, right = (offset.round().long() for offset in found[2:])
         moved = (down != 0) | (right != 0)
         if not bool(moved.any()):
             break
         rows, cols = rows + down, cols + right
-        patch = _patch(data, rows[moved], cols[moved], _PATCH, _PATCH, image[moved])
-        again = _refined(patch, centre_turns)
+        again = _refined(images.patch(image[moved], rows[moved], cols[moved], _PATCH, _PATCH), centre_turns)
         found = [old.masked_scatter(moved, new) for old, new in zip(found, again, strict=True)]
     return rows, cols, *found
 
@@ -165,13 +216,13 @@ def _refined(patch: Tensor, centre_turns: tuple[float | None, float | None]) -> 
     """Spectral centres in turns per sample, and offsets of the interpolated maximum from the
     central sample of neighbourhoods (..., row, column) in samples, shape (...,) each.
     """
-    tone_a, tone_r = (
+    tones = [
         _centre_turns(patch, dim)
         if centre is None
         else torch.full(patch.shape[:-2], centre, dtype=torch.float64, device=patch.device)
         for dim, centre in zip((-2, -1), centre_turns, strict=True)
-    )
-    return [tone_a, tone_r, *_fine_peak(patch, tone_a, tone_r)]
+    ]
+    return [*tones, *_fine_peak(patch, *tones)]
 
 
 def cut_offset(cut: Tensor, tone: Tensor) -> Tensor:
@@ -184,10 +235,7 @@ def cut_offset(cut: Tensor, tone: Tensor) -> Tensor:
     Returns:
         Offset of the maximum from sample n // 2 in samples, shape (...,).
     """
-    grid = torch.linspace(-1, 1, 2 * _FINE + 1, dtype=torch.float64, device=cut.device).expand(*tone.shape, -1)
-    fine = (_kernel(grid, cut.shape[-1], tone) @ cut[..., None])[..., 0].abs().square()
-    best = fine.argmax(-1)
-    return (best + _parabola(fine, best) - _FINE) / _FINE
+    return _fine_peak(cut[..., None], tone, torch.zeros_like(tone))[0]
 
 
 def _centre_turns(patch: Tensor, dim: int) -> Tensor:
@@ -199,41 +247,71 @@ def _centre_turns(patch: Tensor, dim: int) -> Tensor:
     return torch.angle(lag) / (2 * math.pi)
 
 
-def _kernel(offsets: Tensor, n: int, tone: Tensor) -> Tensor:
-    """Weights (..., offset, n) that interpolate a band about `tone` at fractional offsets (...,
-    offset) from sample n//2.
-    """
-    distance = offsets[..., None] - (torch.arange(n, dtype=torch.float64, device=offsets.device) - n // 2)
-    return torch.sinc(distance) * cis(2 * math.pi * tone[..., None, None] * distance)
+def _distance(offset: Tensor, n: int) -> Tensor:
+    """Distances (..., n) of positions (...,), relative to sample n // 2, from all samples."""
+    return offset[..., None] - (torch.arange(n, dtype=torch.float64, device=offset.device) - n // 2)
+
+
+def _at_baseband(patch: Tensor, tone: Tensor, dim: int) -> Tensor:
+    """Neighbourhoods whose spectra along a dim are shifted from `tone` (...,) to zero."""
+    turns = tone[..., None] * _distance(torch.zeros_like(tone), patch.shape[dim])
+    return patch * cis(2 * math.pi * turns)[..., None, :].transpose(dim, -1)
+
+
+def _sinc_derivatives(x: Tensor) -> Tensor:
+    """The sinc of x (..., n) and its first two derivatives, (..., 3, n)."""
+    near = x.abs() < 1e-3
+    over, squared = 1 / torch.where(near, 1, x), (math.pi * x).square()
+    value = torch.sinc(x)
+    first = torch.where(near, -(math.pi**2) / 3 * x * (1 - squared / 10), (torch.cos(math.pi * x) - value) * over)
+    second = torch.where(near, -(math.pi**2) / 3 * (1 - 0.3 * squared), -(math.pi**2) * value - 2 * first * over)
+    return torch.stack([value, first, second], -2)
 
 
 def _fine_peak(patch: Tensor, tone_a: Tensor, tone_r: Tensor) -> tuple[Tensor, Tensor]:
-    """Offset of the interpolated maximum from the central sample along each dim in samples, (...,
-    target).
+    """Offset of the interpolated maximum from the central sample along each dim in samples, (...,).
+
+    The best point of a grid is refined by Newton steps on the squared modulus, which a step leaves
+    where it is not concave.
     """
+    patch = _at_baseband(_at_baseband(patch, tone_a, -2), tone_r, -1)
+    parts = torch.stack([patch.real, patch.imag], -3)
     grid = torch.linspace(-1, 1, 2 * _FINE + 1, dtype=torch.float64, device=patch.device)
-    grid = grid.expand(*tone_a.shape, -1)
-    fine = _kernel(grid, patch.shape[-2], tone_a) @ patch @ _kernel(grid, patch.shape[-1], tone_r).mT
-    fine = fine.real.square() + fine.imag.square()
-    best = fine.flatten(-2).argmax(-1)
-    i, j = best // grid.shape[-1], best % grid.shape[-1]
-    along_a = fine.gather(-1, j[..., None, None].expand(*j.shape, fine.shape[-2], 1))[..., 0]
-    along_r = fine.gather(-2, i[..., None, None].expand(*i.shape, 1, fine.shape[-1]))[..., 0, :]
-    return tuple((index + _parabola(curve, index) - _FINE) / _FINE for index, curve in ((i, along_a), (j, along_r)))  # type: ignore[return-value]
+    rows, cols = (torch.sinc(_distance(grid, n)) for n in patch.shape[-2:])
+    power = (rows @ parts @ cols.mT).square().sum(-3)
+    best = power.flatten(-2).argmax(-1)
+    at = torch.stack([grid[best // len(grid)], grid[best % len(grid)]])
+    for _ in range(_STEPS):
+        along_a, along_r = (_sinc_derivatives(_distance(x, n)) for x, n in zip(at, patch.shape[-2:], strict=True))
+        at = (at + _newton_step(along_a[..., None, :, :] @ parts @ along_r[..., None, :, :].mT)).clamp(-1, 1)
+    return at[0], at[1]
 
 
-def _parabola(curve: Tensor, index: Tensor) -> Tensor:
-    """Sub-sample offset of the maximum near `index` of curve (..., n)."""
-    index = index.clamp(1, curve.shape[-1] - 2)
-    low, mid, high = (curve.gather(-1, index[..., None] + k)[..., 0] for k in (-1, 0, 1))
-    bend = low - 2 * mid + high
-    return torch.where(bend < 0, 0.5 * (low - high) / torch.where(bend < 0, bend, -1), 0).clamp(-1, 1)
+def _newton_step(jet: Tensor) -> Tensor:
+    """Newton step (2, ...) to a maximum of the squared modulus, at most half a grid step along each
+    dim; 0 where the squared modulus is not concave.
+
+    jet: Real and imaginary part of the function and its derivatives, (..., 2, order along the
+    first dim, order along the second dim).
+    """
+
+    value, slope = jet[..., :1, :1], torch.stack([jet[..., 1, 0], jet[..., 0, 1]], -1)
+    bends = (value * jet).sum(-3)
+    squares = slope.mT @ slope
+    slope_a, slope_r = bends[..., 1, 0], bends[..., 0, 1]
+    bend_a, bend_r = bends[..., 2, 0] + squares[..., 0, 0], bends[..., 0, 2] + squares[..., 1, 1]
+    twist = bends[..., 1, 1] + squares[..., 0, 1]
+    area = bend_a * bend_r - twist.square()
+    concave = (bend_a < 0) & (area > 0)
+    step = torch.stack([twist * slope_r - bend_r * slope_a, twist * slope_a - bend_a * slope_r])
+    return torch.where(concave, step / torch.where(concave, area, 1), 0).clamp(-0.5 / _FINE, 0.5 / _FINE)
 
 
 def _slice_through(patch: Tensor, tone: Tensor, offset: Tensor, dim: int) -> Tensor:
-    """Cut (..., target, n) along the other dim, at a fractional offset along `dim`."""
-    weights = _kernel(offset[..., None], patch.shape[dim], tone)[..., 0, :]
-    return (patch * (weights[..., None, :] if dim == -1 else weights[..., :, None])).sum(dim)
+    """Cut (..., n) along the other dim, at a fractional offset along `dim`."""
+    distance = _distance(offset, patch.shape[dim])
+    weights = torch.sinc(distance) * cis(2 * math.pi * tone[..., None] * distance)
+    return (patch @ weights[..., None])[..., 0] if dim == -1 else (weights[..., None, :] @ patch)[..., 0, :]
 
 
 def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[dict[str, Tensor], Tensor]:
@@ -250,40 +328,79 @@ def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[
         A dict with `irw` (-3 dB width in samples), `pslr` and `islr` in dB, and the complex peak,
         each of shape (...,).
     """
-    n, factor = cut.shape[-1], 16
+    n = cut.shape[-1]
     base = torch.arange(n, dtype=torch.float64, device=cut.device) - n // 2
-    base = cut * cis(-2 * math.pi * tone[..., None] * base)
-    spectrum = torch.fft.fft(base, 2 * n)
+    spectrum = torch.fft.fft(cut * cis(-2 * math.pi * tone[..., None] * base), 2 * n)
     frequency = torch.fft.fftfreq(2 * n, dtype=torch.float64, device=cut.device)
-    shift = offset + n // 2
-    spectrum = spectrum * cis(2 * math.pi * frequency * shift[..., None])
-    wide = torch.zeros((*spectrum.shape[:-1], 2 * n * factor), dtype=spectrum.dtype, device=cut.device)
-    wide[..., :n], wide[..., -n:] = spectrum[..., :n], spectrum[..., n:]
-    fine = torch.fft.ifft(wide) * factor
-    power = torch.fft.fftshift(fine.real.square() + fine.imag.square(), dim=-1)
-    middle = n * factor
-    right, left = power[..., middle:], power[..., 1 : middle + 1].flip(-1)
-    widths = [_crossing(side) for side in (right, left)]
-    first_nulls = [_first_minimum(side) for side in (right, left)]
-    irw = widths[0] + widths[1]
+    spectrum = spectrum * cis(2 * math.pi * frequency * (offset + n // 2)[..., None])
+    first, *wider = *(reach for reach in _NEAR if reach < n), n
+    figures, peak, contained = _lobes(_about_zero(spectrum, first), nulls)
+    for reach in wider:
+        rest = ~contained
+        if not bool(rest.any()):
+            break
+        again, _, inside = _lobes(_about_zero(spectrum[rest], reach), nulls)
+        figures = {name: value.masked_scatter(rest, again[name]) for name, value in figures.items()}
+        contained = contained.masked_scatter(rest, inside)
+    return figures, peak * cis(2 * math.pi * tone * offset)
+
+
+def _about_zero(spectrum: Tensor, reach: int) -> Tensor:
+    """Interpolate cuts, given by their spectra (..., n), about position 0.
+
+    Returns `_FACTOR` points per sample at distances below `reach` samples on both sides, (..., 2
+    _FACTOR reach - 1). Where that is not the whole cut, the sum over the frequencies k is written
+    as a convolution: k m = (k^2 + m^2 - (m - k)^2) / 2 (Bluestein's chirp transform).
+    """
+    n, m = spectrum.shape[-1], _FACTOR * reach - 1
+    bins = torch.fft.fftshift(spectrum, dim=-1)
+    if 2 * reach >= n:
+        half = (n * _FACTOR - n) // 2
+        wide = torch.fft.ifftshift(torch.nn.functional.pad(bins, (half, half)), dim=-1)
+        return torch.fft.fftshift(torch.fft.ifft(wide), dim=-1)[..., 1:] * _FACTOR
+    size = n + 2 * m + 2
+    k = torch.arange(-(n // 2), n // 2, device=spectrum.device)
+    to = torch.arange(-m, m + 1, device=spectrum.device)
+    apart = torch.arange(size, device=spectrum.device)
+    apart = torch.where(apart <= 2 * m, apart, apart - size) + n // 2 - m
+    over_k, over_m, between = (_chirp(x, n * _FACTOR) for x in (k, to, apart))
+    product = torch.fft.fft(bins * over_k, size) * torch.fft.fft(between.conj())
+    return torch.fft.ifft(product)[..., : 2 * m + 1] * over_m / n
+
+
+def _chirp(index: Tensor, period: int) -> Tensor:
+    """exp(j pi index^2 / period), with the square reduced as a whole number."""
+    return cis(math.pi * torch.remainder(index.square(), 2 * period).to(torch.float64) / period)
+
+
+def _lobes(fine: Tensor, nulls: int) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """Figures of interpolated cuts (..., 2 m - 1) about their peaks, the peaks, and whether the
+    cuts contain all that the figures depend on, (...,) each.
+    """
+    power = fine.real.square() + fine.imag.square()
+    middle = fine.shape[-1] // 2
+    right, left = power[..., middle:], power[..., : middle + 1].flip(-1)
+    irw = _crossing(right) + _crossing(left)
     extent = nulls * irw / 0.8859
-    position = torch.arange(right.shape[-1], dtype=torch.float64, device=cut.device)
-    main = torch.zeros_like(irw)
-    side_energy, strongest = torch.zeros_like(irw), torch.zeros_like(irw)
-    for side, null in zip((right, left), first_nulls, strict=True):
+    position = torch.arange(right.shape[-1], dtype=torch.float64, device=fine.device)
+    main, side_energy, strongest = torch.zeros_like(irw), torch.zeros_like(irw), torch.zeros_like(irw)
+    contained = extent < middle
+    for side in (right, left):
+        null = _first_minimum(side)
+        contained = contained & (null < middle)
         inside_main = position < null[..., None]
-        inside_side = ~inside_main & (position <= extent[..., None])
+        beside = side * (~inside_main & (position <= extent[..., None]))
         main = main + (side * inside_main)[..., 1:].sum(-1) + 0.5 * side[..., 0]
-        side_energy = side_energy + (side * inside_side).sum(-1)
-        strongest = torch.maximum(strongest, (side * inside_side).amax(-1))
+        side_energy = side_energy + beside.sum(-1)
+        strongest = torch.maximum(strongest, beside.amax(-1))
     floor = torch.finfo(power.dtype).tiny
     peak = right[..., 0].clamp_min(floor)
     figures = {
-        "irw": irw / factor,
+        "irw": irw / _FACTOR,
         "pslr": 10 * torch.log10((strongest / peak).clamp_min(1e-30)),
         "islr": 10 * torch.log10((side_energy / main.clamp_min(floor)).clamp_min(1e-30)),
     }
-    return figures, fine[..., 0] * cis(2 * math.pi * tone * offset)
+    return figures, fine[..., middle], contained
 
 
 def _crossing(side: Tensor) -> Tensor:
