@@ -57,27 +57,32 @@ def pair_of(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor,
     return a, b
 
 
-def _power(image: Tensor) -> Tensor:
-    """Intensity |image|^2, relative to the level of each image where single precision needs it, and
-    on an accelerator, where waiting to know that takes longer.
+def _power(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Intensity |image|^2 and its sum over the pixels, relative to the level of each image where
+    single precision needs it, and on an accelerator, where waiting to know that takes longer.
     """
-    if image.device.type != "cpu":
-        return _squares(unit_level(image))
-    power = _squares(image)
-    least, largest = torch.aminmax(power.detach().sum((-2, -1)))
-    least = least / (image.shape[-2] * image.shape[-1])
-    usual = host_value(least, 0.0) > _LEAST_MEAN and host_value(largest, math.inf) < _LARGEST_TOTAL
-    return power if usual else _squares(unit_level(image))
+    if image.device.type == "cpu":
+        power = _squares(image)
+        total = _sum(power)
+        least, largest = torch.aminmax(total.detach())
+        lowest = _LEAST_MEAN * image.shape[-2] * image.shape[-1]
+        if host_value(least, 0.0) > lowest and host_value(largest, math.inf) < _LARGEST_TOTAL:
+            return power, total
+    power = _squares(unit_level(image))
+    return power, _sum(power)
 
 
 def _squares(image: Tensor) -> Tensor:
     """Squared moduli of the pixels."""
-    return image.real.square().add_(image.imag.square()) if image.is_complex() else image.square()
+    if not image.is_complex():
+        return image.square()
+    squares = torch.view_as_real(image.resolve_conj()).square()
+    return squares[..., 0] + squares[..., 1]
 
 
-def _levels(image: Tensor | Signal, of: str, mask: Tensor | None, what: str) -> tuple[Tensor, Tensor | None]:
-    """Intensities or amplitudes relative to the peak of the selected pixels, and the weights of the
-    pixels in the same precision.
+def _levels(image: Tensor | Signal, of: str, mask: Tensor | None, what: str) -> tuple[Tensor, Tensor | None, Tensor]:
+    """Intensities or amplitudes relative to the peak of the selected pixels, the weights of the
+    pixels in the same precision, and the weighted sum over the pixels.
     """
     if of not in _OF:
         raise ValueError(f"{what} of {of!r} is not defined; choose 'intensity' or 'amplitude'")
@@ -85,10 +90,15 @@ def _levels(image: Tensor | Signal, of: str, mask: Tensor | None, what: str) -> 
     weight = None if mask is None else _weights(mask, x, what)
     if weight is not None:
         x = torch.where(weight > 0, x, 0)
-    level = (
-        _power(x) if of == "intensity" else unit_level(x).abs()
-    )  # abs has the gradient 0 at zero, where the square root of the power has none
-    return level, None if weight is None else weight.to(level.dtype)
+    if of == "intensity":
+        level, total = _power(x)
+    else:  # abs has the gradient 0 at zero, where the square root of the power has none
+        level = unit_level(x).abs()
+        total = _sum(level)
+    if weight is None:
+        return level, None, total
+    weight = weight.to(level.dtype)
+    return level, weight, _sum(level, weight)
 
 
 def _weights(mask: Tensor, image: Tensor, what: str) -> Tensor:
@@ -146,14 +156,15 @@ def entropy(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None =
         ValueError: If `of` is not known, the image has no pixels, or the mask does not broadcast or
             has negative or non-finite weights.
     """
-    level, weight = _levels(image, of, mask, "entropy")
-    total = _sum(level, weight)
-    total = torch.where(total > 0, total, 1)
+    level, weight, total = _levels(image, of, mask, "entropy")
+    tiny = torch.finfo(level.dtype).tiny
+    total = total + (total == 0)
     # -sum p ln p = ln(total / scale) - sum level ln(level / scale) / total, for any scale
     scale = total.detach()
     # ln p is finite at 0 with the derivatives that autograd needs
-    log = torch.log((level / scale[..., None, None]).add_(math.sqrt(torch.finfo(level.dtype).tiny)))
-    return torch.log(total / scale) - _sum(level * log, weight) / total
+    share = (level / scale[..., None, None]).add_(math.sqrt(tiny))
+    summand = torch.log(share) * level if level.requires_grad else share.log_().mul_(level)
+    return torch.log(total / scale) - _sum(summand, weight) / total
 
 
 def contrast(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None = None) -> Tensor:
@@ -175,9 +186,9 @@ def contrast(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None 
         ValueError: If `of` is not known, the image has no pixels, or the mask does not broadcast or
             has negative or non-finite weights.
     """
-    level, weight = _levels(image, of, mask, "contrast")
+    level, weight, total = _levels(image, of, mask, "contrast")
     count = level.shape[-2] * level.shape[-1] if weight is None else torch.where(_sum(weight) > 0, _sum(weight), 1)
-    mean = _sum(level, weight) / count
+    mean = total / count
     spread = _sum((level - mean[..., None, None]).square(), weight) / count
     flat = spread <= torch.finfo(spread.dtype).tiny
     return torch.where(flat, 0, torch.where(flat, 1, spread).sqrt()) / torch.where(mean == 0, 1, mean)
