@@ -21,6 +21,7 @@ from torchsar.compensate import (
     velocity_objective,
 )
 from torchsar.compensate.aperture import _noise_variance
+from torchsar.compensate.group import BeamSpectrum
 from torchsar.core import Chain, Draws, Recording, Signal, use
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK
@@ -295,6 +296,34 @@ def test_velocity_is_ok_when_the_search_is_narrower_than_the_minimum(scene: Scen
     assert bool(found.ok.all())
     rms = (found["velocity_m_s"] - 7003).square().mean().sqrt()
     assert 0.5 < float(rms / found.std["velocity_m_s"].square().mean().sqrt()) < 1.6
+
+
+def test_velocity_search_focuses_the_group_ten_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The nominal velocity, four others, three about the minimum, and two for its depth."""
+    calls, rows = [], BeamSpectrum.rows
+    monkeypatch.setattr(BeamSpectrum, "rows", lambda *args: (calls.append(1), rows(*args))[1])
+    doppler = torch.full((2,), 652.0, dtype=torch.float64)
+    world = StripmapWorld(Points([0.0], [0.0]), Dwell(0.3), velocity_m_s=7003.0, doppler_hz=doppler, snr_db=20.0)
+    signal = simulate(SATELLITE, world, 512, 192, Draws(16, trials=range(2)))[0].signal
+    found = EffectiveVelocity(OmegaK(SATELLITE), 30.0, 128)(signal, doppler)
+    assert bool(found.ok.all()) and len(calls) == 10
+
+
+def test_a_cost_that_is_known_in_the_middle_of_a_grid_is_not_computed_again() -> None:
+    points: list[float] = []
+
+    def cost(x: torch.Tensor) -> torch.Tensor:
+        points.extend(x.tolist())
+        return (x - 0.4).square()
+
+    centre = torch.zeros(1, dtype=torch.float64)
+    whole = grid_minimum(cost, centre, 2.0, 5)
+    points.clear()
+    for found, expected in zip(grid_minimum(cost, centre, 2.0, 5, cost(centre)), whole, strict=True):
+        torch.testing.assert_close(found, expected)
+    assert sorted(points) == [-2.0, -1.0, 0.0, 1.0, 2.0]
+    with pytest.raises(ValueError, match=r"an odd number .* got 4"):
+        grid_minimum(cost, centre, 2.0, 4, cost(centre))
 
 
 def test_velocity_without_an_image_is_not_ok() -> None:
