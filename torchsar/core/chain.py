@@ -370,7 +370,7 @@ class Chain(nn.Module):
             stage = self.stages[name]
             provided = {f"{name}.{key}" for key in _provided(stage)}
             held = name in known.stages or bool(provided and provided <= known.held)
-            entered, began = signal, 0.0 if log is None else time.perf_counter()
+            entered, began = signal, 0.0 if log is None else _clock()
             arguments, neutral = self._arguments(name, known, required=not held)
             if not held:
                 with gathered_checks(f"stage {name!r}"):
@@ -378,7 +378,7 @@ class Chain(nn.Module):
             if log is not None:
                 _synchronise(signal.data)
                 log.inputs[name], log.outputs[name] = entered, signal
-                log.seconds[name] = time.perf_counter() - began
+                log.seconds[name] = _clock() - began
                 log.bytes[name] = signal.data.numel() * signal.data.element_size()
                 log.arguments[name] = arguments
                 log.neutral.update({} if held and name not in known.stages else neutral)
@@ -469,3 +469,8 @@ def _check_member(name: str, stage: object) -> None:
 def _synchronise(x: Tensor) -> None:
     if x.is_cuda:
         torch.cuda.synchronize(x.device)
+
+
+def _clock() -> float:
+    """Time in seconds; none passes while a program is compiled."""
+    return 0.0 if torch.compiler.is_dynamo_compiling() else time.perf_counter()

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchsar.core.host import check_value, flat_index, validation
+from torchsar.core.host import check_value, flat_index, is_traced, validation
 from torchsar.core.memory import is_out_of_memory
 
 # the distance of float64 numbers of this size is 6e-5 turn
@@ -46,7 +46,7 @@ def cis(angle_rad: Tensor) -> Tensor:
     Returns:
         Unit phasors of the same shape, complex64 or complex128.
     """
-    if angle_rad.requires_grad:
+    if angle_rad.requires_grad or is_traced(angle_rad):
         return torch.complex(torch.cos(angle_rad), torch.sin(angle_rad))
     try:
         parts = angle_rad.new_empty((*angle_rad.shape, 2))

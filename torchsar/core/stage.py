@@ -52,6 +52,10 @@ class Stage(nn.Module):
     takes_empty: bool = True
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
+        if torch.compiler.is_dynamo_compiling():
+            from torchsar.core.whole import called
+
+            return called(self, (signal, *args), values)
         with gathered_checks(type(self).__name__):
             return self._called(signal, *args, **values)
 

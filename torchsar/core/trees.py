@@ -10,7 +10,7 @@ structure and stays as it is.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -18,25 +18,15 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils.data._utils.collate import collate, default_collate_fn_map
 
+from torchsar.core.axis import Axis
 from torchsar.core.estimate import Estimate
 from torchsar.core.signal import Recording, Signal, Truth
 
 _NODES = (Tensor, Signal, Recording)
 # attribute of an object whose leaves are not tensors: its nodes and its structure
 _BARE = "_tree"
-
-
-@dataclass(frozen=True)
-class _Structure:
-    """What the tree of an object holds beside its tensors.
-
-    Args:
-        names: Fields that hold tensors, in order.
-        static: Other fields, and the entries of mappings that are not tensors.
-    """
-
-    names: tuple[str, ...]
-    static: Mapping[str, Any]
+_Structure = tuple[tuple[str, ...], dict[str, Any]]
+_AXIS = tuple(field.name for field in fields(Axis))
 
 
 def _parts(x: Any) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -53,23 +43,28 @@ def _parts(x: Any) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _flatten(x: Any) -> tuple[list[Any], _Structure]:
-    if _BARE in vars(x):
-        return vars(x)[_BARE]
+    if hasattr(x, _BARE):
+        return getattr(x, _BARE)
     nodes, static = _parts(x)
-    return list(nodes.values()), _Structure(tuple(nodes), static)
+    if "axes" in static:
+        static["axes"] = tuple(tuple([getattr(axis, name) for name in _AXIS]) for axis in static["axes"])
+    return list(nodes.values()), (tuple(nodes), static)
 
 
 def _flatten_with_keys(x: Any) -> tuple[list[tuple[Any, Any]], _Structure]:
     nodes, structure = _flatten(x)
-    return [(pytree.GetAttrKey(name), node) for name, node in zip(structure.names, nodes)], structure
+    return [(pytree.GetAttrKey(name), node) for name, node in zip(structure[0], nodes)], structure
 
 
 def _unflatten(kind: type, nodes: Iterable[Any], structure: _Structure) -> Any:
     """The object with these tensors. torch also builds trees of other things, such as the numbers
     of `in_dims`; the constructor would reject them, and the object keeps its structure instead.
     """
-    whole, nodes = dict(structure.static), list(nodes)
-    for name, value in zip(structure.names, nodes):
+    names, static = structure
+    whole, nodes = dict(static), list(nodes)
+    if "axes" in whole:
+        whole["axes"] = tuple([Axis(*values) for values in whole["axes"]])
+    for name, value in zip(names, nodes):
         whole[name] = {**value, **whole[name]} if name in whole else value
     if all(map(_holds_tensors, nodes)):
         return kind(**whole)
