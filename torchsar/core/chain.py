@@ -89,7 +89,7 @@ class Trace:
         outputs: Signal after each stage.
         estimates: Estimates of the stages that returned an Estimate.
         values: Estimated and given values under "STAGE.VALUE", side data under "aux.NAME".
-        seconds: Wall time of each stage, in seconds.
+        seconds: Wall time of each stage, in seconds; empty inside a program of `torch.compile`.
         bytes: Size of the samples after each stage, in bytes.
         neutral: Trials in which a stage did not use an estimate because it is not ok, bool with the
             shape of `ok`: under "STAGE.PARAMETER" those in which this parameter of the stage got a
@@ -366,19 +366,21 @@ class Chain(nn.Module):
 
     @gathered_checks()
     def _run(self, names: list[str], signal: Signal, known: _Known, log: _Log | None = None) -> Signal:
+        timed = log is not None and not torch.compiler.is_dynamo_compiling()
         for name in names:
             stage = self.stages[name]
             provided = {f"{name}.{key}" for key in _provided(stage)}
             held = name in known.stages or bool(provided and provided <= known.held)
-            entered, began = signal, 0.0 if log is None else _clock()
+            entered, began = signal, time.perf_counter() if timed else 0.0
             arguments, neutral = self._arguments(name, known, required=not held)
             if not held:
                 with gathered_checks(f"stage {name!r}"):
                     signal = self._step(name, stage, signal, arguments, known, neutral)
             if log is not None:
-                _synchronise(signal.data)
+                if timed:
+                    _synchronise(signal.data)
+                    log.seconds[name] = time.perf_counter() - began
                 log.inputs[name], log.outputs[name] = entered, signal
-                log.seconds[name] = _clock() - began
                 log.bytes[name] = signal.data.numel() * signal.data.element_size()
                 log.arguments[name] = arguments
                 log.neutral.update({} if held and name not in known.stages else neutral)
@@ -469,8 +471,3 @@ def _check_member(name: str, stage: object) -> None:
 def _synchronise(x: Tensor) -> None:
     if x.is_cuda:
         torch.cuda.synchronize(x.device)
-
-
-def _clock() -> float:
-    """Time in seconds; none passes while a program is compiled."""
-    return 0.0 if torch.compiler.is_dynamo_compiling() else time.perf_counter()

@@ -31,6 +31,8 @@ class Stage(nn.Module):
       (a phase of 0, a gain of 1), or a nominal one. If there is none, a sentence that says why; the
       estimated value is then used in all trials.
     - `takes_real`: True if it also accepts the real samples of a one-channel detector.
+    - `fixed`: names of values on whose numbers the plan of the computation depends. torch.compile
+      makes constants of them, and the program raises RuntimeError if they change.
     - `takes_empty`: False if it refuses a batch without trials. Otherwise the result is empty, or a
       function that it calls refuses the batch.
 
@@ -50,12 +52,14 @@ class Stage(nn.Module):
     neutral: Mapping[str, Tensor | float | str] = MappingProxyType({})
     takes_real: bool = False
     takes_empty: bool = True
+    fixed: tuple[str, ...] = ()
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
         if torch.compiler.is_dynamo_compiling():
-            from torchsar.core.whole import called
+            # imports torch._dynamo, which takes seconds
+            from torchsar.core.compiled import call_as_one
 
-            return called(self, (signal, *args), values)
+            return call_as_one(self, (signal, *args), values)
         with gathered_checks(type(self).__name__):
             return self._called(signal, *args, **values)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
+from operator import index
 from typing import Any
 
 from torch import Tensor
@@ -26,7 +27,6 @@ _NODES = (Tensor, Signal, Recording)
 # attribute of an object whose leaves are not tensors: its nodes and its structure
 _BARE = "_tree"
 _Structure = tuple[tuple[str, ...], dict[str, Any]]
-_AXIS = tuple(field.name for field in fields(Axis))
 
 
 def _parts(x: Any) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -47,8 +47,13 @@ def _flatten(x: Any) -> tuple[list[Any], _Structure]:
         return getattr(x, _BARE)
     nodes, static = _parts(x)
     if "axes" in static:
-        static["axes"] = tuple(tuple([getattr(axis, name) for name in _AXIS]) for axis in static["axes"])
+        static["axes"] = tuple([_numbers(axis) for axis in static["axes"]])
     return list(nodes.values()), (tuple(nodes), static)
+
+
+def _numbers(axis: Axis) -> tuple[Any, ...]:
+    """What defines an axis; a program of torch.compile holds it as a constant, the length too."""
+    return axis.name, index(axis.n), axis.start, axis.step, axis.unit, axis.dual_start
 
 
 def _flatten_with_keys(x: Any) -> tuple[list[tuple[Any, Any]], _Structure]:

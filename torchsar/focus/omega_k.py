@@ -243,13 +243,13 @@ class FrameGeometry:
         return lines if self.weight is None else lines * self.weight.to(real_dtype(lines.dtype))[..., None]
 
     @property
-    @untraced()
     def sin_reach(self) -> float:
         """Largest magnitude of the sine of the squint over all rows, at the carrier frequency; 0
         where values cannot be read.
         """
-        sine = self.radar.sin_squint(self.doppler_hz.detach(), self.velocity_m_s.detach()[..., None])
-        return host_largest(sine.abs(), 0.0)
+        with untraced(self.doppler_hz, self.velocity_m_s):
+            sine = self.radar.sin_squint(self.doppler_hz.detach(), self.velocity_m_s.detach()[..., None])
+            return host_largest(sine.abs(), 0.0)
 
     @property
     def requires_grad(self) -> bool:

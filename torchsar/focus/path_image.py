@@ -162,6 +162,8 @@ class TileImage(PathImage):
         ValueError: If the beam is not valid, see `ProcessedBeam`.
     """
 
+    fixed = ("frequency_hz", "transmitter_m", "path_reference_m", "receiver_m")
+
     def __init__(
         self,
         azimuth_m: float,

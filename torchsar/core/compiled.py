@@ -1,0 +1,74 @@
+"""Calls of stages in a program of torch.compile.
+
+The module is imported only while torch.compile traces a program: torch._dynamo takes seconds to
+import.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from operator import index
+from typing import Any
+
+import torch
+import torch._dynamo
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from torchsar.core.host import untraced
+
+
+def call_as_one(stage: Any, args: Sequence[Any], values: Mapping[str, Any]) -> Any:
+    """Call a stage as one node of the graph of torch.compile.
+
+    torch.compile does not read the code of the stage. The compiler behind it traces the stage as a
+    non-strict `torch.export` does. All lengths are constants of the program; torch.compile makes a
+    new program for other lengths. A stage that cannot be traced runs as it is, between two graphs.
+
+    Args:
+        stage: Stage. Its values in `fixed` become constants of the program.
+        args: Arguments of the call.
+        values: Values by name.
+
+    Returns:
+        Result of the stage.
+
+    Raises:
+        RuntimeError: When the program runs, if a fixed value is not that of the first call.
+    """
+    tensors = [x for x in pytree.tree_leaves((args, values)) if isinstance(x, Tensor)]
+    for x in tensors:
+        [index(n) for n in x.shape]
+    names = [name for name in stage.fixed if values.get(name) is not None]
+    if names and torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
+        return _call_apart(stage, args, values)
+    # torch.compile takes the text for a constant only as a part of another one
+    return _call(stage, args, values, [f"{name} {_digits(values[name])}" for name in names])
+
+
+@torch._dynamo.nonstrict_trace
+@torch.compiler.disable
+def _call(stage: Any, args: Sequence[Any], values: Mapping[str, Any], fixed: Sequence[str]) -> Any:
+    """Call a stage with the constants that `fixed` holds in place of the values given."""
+    known = {}
+    for name, digits in map(str.split, fixed):
+        x = values[name]
+        with untraced():
+            known[name] = torch.frombuffer(bytearray.fromhex(digits), dtype=x.dtype).reshape(x.shape).to(x.device)
+        torch._assert_async(
+            (x == known[name]).all(),
+            f"{type(stage).__name__}: {name} is not that of the first call, which the compiled program holds as a "
+            "constant; compile a new one",
+        )
+    return stage(*args, **{**values, **known})
+
+
+@torch.compiler.disable(reason="with constants of a program in its plan, a stage has no derivatives in one graph")
+def _call_apart(stage: Any, args: Sequence[Any], values: Mapping[str, Any]) -> Any:
+    return stage(*args, **values)
+
+
+@torch.compiler.assume_constant_result
+def _digits(x: Tensor) -> str:
+    """The numbers of a tensor as a text."""
+    return x.detach().cpu().contiguous().numpy().tobytes().hex()
