@@ -1,5 +1,5 @@
-"""Derivatives, maps and exported programs of whole chains: torch.func and torch.export through the
-recommended chain of every system.
+"""Derivatives, maps, exported and compiled programs of whole chains: torch.func, torch.export and
+torch.compile through the recommended chain of every system.
 
 Estimates are held, as in `chain.trace(recording, estimates)`.
 """
@@ -21,12 +21,15 @@ from torchsar.core import Chain, Draws, Recording
 STEP = 1e-5
 # the stage that forms the recommended image estimates as well; held estimates would replace it
 METHODS = {"geo_ocean": "conventional"}
+# "aot_eager" traces the stages themselves, as inductor does, in twice the time of "eager"
+BACKENDS = {"stripmap": "aot_eager", "path": "aot_eager"}
 
 
 @dataclass(frozen=True)
 class Held:
     """A chain with the recording of two trials and the estimates that it found."""
 
+    system: str
     chain: Chain
     recording: Recording
     values: dict[str, Tensor]
@@ -71,7 +74,7 @@ def held(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     with torch.no_grad():
         estimates = chain.trace(recording).estimates
     values = {f"{stage}.{name}": v for stage, found in estimates.items() for name, v in found.value.items()}
-    return Held(chain, recording, values)
+    return Held(request.param, chain, recording, values)
 
 
 def slope(of: Callable[[Tensor], Tensor], x: Tensor, along: Tensor) -> Tensor:
@@ -136,4 +139,14 @@ def test_an_exported_chain_gives_the_same_image(held: Held, values: str) -> None
     module = Program(held)
     found = torch.export.export(module, tuple(given), strict=False).module()(*others)
     expected = module(*others)
+    assert float((found - expected).abs().max()) < 1e-12 * float(expected.abs().max())
+
+
+@torch.no_grad()
+def test_a_compiled_chain_is_one_graph(held: Held) -> None:
+    """Data, values and side data are arguments of the graph."""
+    module, other = Program(held), 1.7 * held.data.flip(0) + 0.5 * direction(held.data)
+    compiled = torch.compile(module, fullgraph=True, backend=BACKENDS.get(held.system, "eager"))
+    compiled(held.data)
+    found, expected = compiled(other), module(other)
     assert float((found - expected).abs().max()) < 1e-12 * float(expected.abs().max())
