@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
-from operator import index
 from typing import Any
 
 from torch import Tensor
@@ -52,8 +51,8 @@ def _flatten(x: Any) -> tuple[list[Any], _Structure]:
 
 
 def _numbers(axis: Axis) -> tuple[Any, ...]:
-    """What defines an axis; a program of torch.compile holds it as a constant, the length too."""
-    return axis.name, index(axis.n), axis.start, axis.step, axis.unit, axis.dual_start
+    """What defines an axis; torch.compile makes constants of the numbers in a slice."""
+    return axis.name, axis.unit, slice(axis.n, axis.start, axis.step), slice(axis.dual_start)
 
 
 def _flatten_with_keys(x: Any) -> tuple[list[tuple[Any, Any]], _Structure]:
@@ -68,7 +67,9 @@ def _unflatten(kind: type, nodes: Iterable[Any], structure: _Structure) -> Any:
     names, static = structure
     whole, nodes = dict(static), list(nodes)
     if "axes" in whole:
-        whole["axes"] = tuple([Axis(*values) for values in whole["axes"]])
+        whole["axes"] = tuple(
+            [Axis(name, grid.start, grid.stop, grid.step, unit, dual.stop) for name, unit, grid, dual in whole["axes"]]
+        )
     for name, value in zip(names, nodes):
         whole[name] = {**value, **whole[name]} if name in whole else value
     if all(map(_holds_tensors, nodes)):
