@@ -43,7 +43,7 @@ def call_as_one(stage: Any, args: Sequence[Any], values: Mapping[str, Any]) -> A
     if names and torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
         return _call_apart(stage, args, values)
     # torch.compile takes the text for a constant only as a part of another one
-    return _call(stage, args, values, [f"{name} {_digits(values[name])}" for name in names])
+    return _call(stage, args, values, [f"{name} {_digits(values[name])}" for name in names])  # pyright: ignore[reportCallIssue]
 
 
 @torch._dynamo.nonstrict_trace
@@ -55,7 +55,7 @@ def _call(stage: Any, args: Sequence[Any], values: Mapping[str, Any], fixed: Seq
         x = values[name]
         with untraced():
             known[name] = torch.frombuffer(bytearray.fromhex(digits), dtype=x.dtype).reshape(x.shape).to(x.device)
-        torch._assert_async(
+        torch.ops.aten._assert_async.msg(
             (x == known[name]).all(),
             f"{type(stage).__name__}: {name} is not that of the first call, which the compiled program holds as a "
             "constant; compile a new one",
