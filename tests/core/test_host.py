@@ -19,6 +19,7 @@ from torchsar.core import (
     gathered_checks,
     host_largest,
     host_value,
+    host_values,
     is_traced,
     linear_solve,
     matrix_inverse,
@@ -39,15 +40,15 @@ def test_values_are_read_with_their_type() -> None:
 
 
 def test_inside_vmap_there_is_no_value() -> None:
-    seen: list[float] = []
+    seen: list[float | list[float]] = []
 
     def look(x: Tensor) -> Tensor:
-        seen.append(host_largest(x, 5.0))
+        seen.extend([host_largest(x, 5.0), host_values(x, 5.0)])
         return x
 
     torch.func.vmap(look)(torch.ones(2, 3))
-    torch.func.grad(lambda x: look(x).sum())(torch.ones(3))
-    assert seen == [5.0, 1.0]
+    torch.func.grad(lambda x: look(x).sum())(torch.arange(3.0))
+    assert seen == [5.0, [5.0, 5.0, 5.0], 2.0, [0.0, 1.0, 2.0]]
 
 
 def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:

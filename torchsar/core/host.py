@@ -265,7 +265,8 @@ def gathered_checks(stage: str = "") -> Iterator[None]:
     block with one reading; also if the block ends with an error, of which a value that is not
     acceptable may be the reason. On the CPU every check is made at once. Blocks may be nested; at
     the end of each no check waits any longer. After `validate("deferred")` checks wait on the CPU
-    too, and beyond the end of a nested block.
+    too, and beyond the end of a nested block. While torch.compile traces a program, a block has no
+    effect: no value is checked there.
 
     Args:
         stage: Name of the stage that the block runs, for errors of deferred checks. In nested
@@ -277,6 +278,9 @@ def gathered_checks(stage: str = "") -> Iterator[None]:
     Raises:
         Exception: What a check raises.
     """
+    if torch.compiler.is_dynamo_compiling():
+        yield
+        return
     _gathered.blocks.append(stage)
     try:
         yield
@@ -299,7 +303,8 @@ def _read(x: Tensor) -> list[float] | None:
     if is_traced(x):
         return None
     try:
-        return [x.item()] if x.numel() == 1 else x.flatten().tolist()
+        # a tensor of a transform has no storage, from which `tolist` reads
+        return [one.item() for one in x.flatten()] if _is_mapped(x) else x.flatten().tolist()
     except RuntimeError as error:
         if "vmap" not in str(error):
             raise
