@@ -326,6 +326,15 @@ def test_a_position_known_from_an_image():
     assert rms(found.motion.y0_m - 300) < 15
 
 
+def test_the_bank_finds_the_same_where_values_cannot_be_read():
+    """Inside vmap it searches all bins of all pulses."""
+    data, speed = noisy(0.0, 2, u_r=10.0).data, torch.tensor([0.0, 0.5], dtype=torch.float64)
+    search = Search(u_r_m_s=15.0, y0_m=30.0)
+    mapped = torch.vmap(lambda x, u_a: bank_search(x, RADAR, GATE, search, u_a)[0].u_r_m_s)(data, speed)
+    assert torch.equal(mapped, bank_search(data, RADAR, GATE, search, speed)[0].u_r_m_s)
+    assert rms(mapped - 10) <= 2.0
+
+
 class TestClutter:
     """A point at u_r = 10 m/s in a K-distributed sea 30 dB above unit noise."""
 

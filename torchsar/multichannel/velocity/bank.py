@@ -7,6 +7,7 @@ PRF, but the cubic phase of the range history resolves this ambiguity.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -215,9 +216,11 @@ def _best_tone(
 
 
 def _tone_rates(radar: BistaticRadar, motions: list[PointMotion]) -> list[float]:
-    """Return the largest change of the residual tone with position for each block, in Hz/m."""
+    """Return the largest change of the residual tone with position for each block, in Hz/m;
+    infinite inside vmap, where values cannot be read.
+    """
     rates = [(each.along_m_s / (radar.wavelength_m * each.range_m)).max() for each in motions]
-    return host_values(torch.stack(rates), 0.0)
+    return host_values(torch.stack(rates), math.inf)
 
 
 def _illuminated(weights: list[Tensor]) -> list[slice]:
@@ -228,7 +231,8 @@ def _illuminated(weights: list[Tensor]) -> list[slice]:
     n = lit.shape[-1]
     # the first largest element: of a block without amplitude, all pulses
     ends = host_values(torch.stack([lit.argmax(-1), n - lit.flip(-1).argmax(-1)], -1), 0)
-    return [slice(first, end) for first, end in zip(ends[::2], ends[1::2], strict=True)]
+    # inside vmap, where values cannot be read, all pulses as well
+    return [slice(first, end or n) for first, end in zip(ends[::2], ends[1::2], strict=True)]
 
 
 def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor, float]:
@@ -242,7 +246,7 @@ def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor,
 
 def _bins_within(reach: float, length: int, device: torch.device) -> Tensor:
     """Return the bins of an FFT, negative ones first, that lie within `reach` bins of zero."""
-    half = min(length // 2, int(reach) + 1)
+    half = int(min(length // 2, reach + 1))
     return torch.arange(-half, min(half + 1, length - half), device=device)
 
 
