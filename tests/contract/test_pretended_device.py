@@ -33,9 +33,8 @@ ELSEWHERE = {
     "rotation": "in the chain of the system isal_rotation",
     "rotation_evolution": "like rotation_genetic, with more steps",
 }
-# Readings and copies from the host of the recommended chain of a sweep, for two trials (more may
-# need some iterations more),
-# and what makes it small enough for a test. A figure may only fall; then write the new one.
+# Readings and copies from the host of the recommended chain of a sweep, for two trials, and what
+# makes it small enough for a test. A figure may only fall; then write the new one.
 CHAIN_WAITS = {
     "stripmap_doppler": (4, []),
     "sal_snr": (5, []),

@@ -136,7 +136,7 @@ TABLE = [
 @pytest.mark.parametrize(("prf_hz", "raw_db", "error"), TABLE)
 def test_mean_errors_of_the_second_table(prf_hz, raw_db, error):
     radar = published_radar(prf_hz=prf_hz)
-    found = SignalIntensityRatio(radar, BAND, search_m_s=(-20.0, 20.0))(noisy(radar, 12, raw_db))
+    found = SignalIntensityRatio(radar, BAND, search_m_s=(-20.0, 20.0))(noisy(radar, 24, raw_db))
     assert error / 1.8 < float((found["u_r_m_s"] - 10).abs().mean()) < error * 1.8
 
 

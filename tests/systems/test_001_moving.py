@@ -67,7 +67,7 @@ def test_a_target_without_prior_knowledge_is_sharp_and_without_replicas(speeds: 
 def test_estimators_stand_where_the_bound_lets_them() -> None:
     # raw -30 dB
     world = BistaticWorld(MovingPoints([10.0], [0.0], [0.0], [0.0]), GATE, snr_db=-3.0)
-    recording, _ = simulate_bistatic(RADAR, world, 900, None, Draws(6, trials=range(72)))
+    recording, _ = simulate_bistatic(RADAR, world, 900, None, Draws(6, trials=range(80)))
     signal = multichannel.RemoveTransmitRange(RADAR)(recording.signal)
     known = multichannel.MovingPointVelocity(
         RADAR, multichannel.Dwell(4.5), search=multichannel.Search(u_r_m_s=21.0), u_a_m_s=0.0
