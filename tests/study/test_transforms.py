@@ -22,7 +22,7 @@ STEP = 1e-5
 # the stage that forms the recommended image estimates as well; held estimates would replace it
 METHODS = {"geo_ocean": "conventional"}
 # "aot_eager" traces the stages themselves, as inductor does, in twice the time of "eager"
-BACKENDS = {"stripmap": "aot_eager", "path": "aot_eager"}
+BACKENDS = {"stripmap": "aot_eager"}
 
 
 @dataclass(frozen=True)

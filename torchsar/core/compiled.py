@@ -38,7 +38,7 @@ def call_as_one(stage: Any, args: Sequence[Any], values: Mapping[str, Any]) -> A
     """
     tensors = [x for x in pytree.tree_leaves((args, values)) if isinstance(x, Tensor)]
     for x in tensors:
-        [index(n) for n in x.shape]
+        [index(n) for n in x.shape]  # a length that is read as a number is a constant
     names = [name for name in stage.fixed if values.get(name) is not None]
     if names and torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
         return _call_apart(stage, args, values)
