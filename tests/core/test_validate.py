@@ -8,11 +8,23 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import torchsar
 from tests.contract.pretended import pretended_device, to_device
-from torchsar.core import Axis, Chain, Signal, Stage, check_value, linear_solve, refuse_non_finite, unit_phasor
+from torchsar.core import (
+    Axis,
+    Chain,
+    Signal,
+    Stage,
+    check_value,
+    gathered_checks,
+    host_value,
+    linear_solve,
+    refuse_non_finite,
+    unit_phasor,
+    untraced,
+)
 
 AXES = (Axis("pulse", 4, 0.0, 1.0, "s"), Axis("range", 3, 0.0, 1.0, "m"))
 
@@ -153,6 +165,30 @@ def test_modes_are_nested() -> None:
         check_value(torch.tensor(1.0), refused)
     with pytest.raises(ValueError, match="'eager', 'deferred' or 'off', got 'lazy'"):
         torchsar.validate("lazy")  # pyright: ignore[reportArgumentType]
+
+
+class Scaled(nn.Module):
+    """Multiplies by the largest sample, where it can be read, and has checked a constant before."""
+
+    def __init__(self, check: Callable[[float], None]) -> None:
+        super().__init__()
+        self.held, self.check = torch.arange(3.0), check
+
+    @gathered_checks()
+    def forward(self, x: Tensor) -> Tensor:
+        with untraced():
+            check_value(self.held.sum(), self.check)
+        return x * host_value(x.max(), 2.0)
+
+
+@pytest.mark.parametrize("mode", ["eager", "deferred"])
+def test_constants_are_checked_while_a_program_is_traced(mode: torchsar.core.Validation) -> None:
+    seen: list[float] = []
+    x = torch.tensor([1.0, 7.0])
+    with torchsar.validate(mode):
+        program = torch.export.export(Scaled(seen.append), (x,), strict=False)
+    assert set(seen) == {3.0}
+    torch.testing.assert_close(program.module()(x), 2 * x)
 
 
 def test_estimates_do_not_depend_on_when_values_are_checked() -> None:

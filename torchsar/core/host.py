@@ -148,7 +148,7 @@ def host_values(x: Tensor, otherwise: Number) -> list[Number]:
         The numbers in the order of the elements.
     """
     read: list[float] | None = []
-    if _gathered.waiting and not _is_mapped(x):
+    if _gathered.waiting and not _is_mapped(x) and not is_traced(x):
         _make([*_taken(), _Waiting(x.detach(), lambda *numbers: read.extend(numbers))])
     else:
         read = _read(x)
@@ -322,6 +322,7 @@ def _taken() -> list[_Waiting]:
     return waiting
 
 
+@untraced()
 def _make(checks: list[_Waiting]) -> None:
     """Make checks, with one reading for each device."""
     values: dict[torch.device, list[float]] = {}
