@@ -26,6 +26,7 @@ from torchsar.focus.range_doppler import RangeDoppler, range_doppler
 from torchsar.focus.reference import RangeCompress, flat_reference, matched_reference, phase_reference, range_compress
 from torchsar.focus.requirements import Requirement, recommended_form, requirements
 from torchsar.focus.spotlight import GroundGrid, SpotlightBackprojection, backproject_spotlight
+from torchsar.focus.spotlight_image import SceneGrid, SpotlightImage, scene_grid
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
 from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
 from torchsar.focus.strip_backprojection import (
@@ -89,7 +90,9 @@ __all__ = [
     "RangePhase",
     "Requirement",
     "Resampling",
+    "SceneGrid",
     "SpotlightBackprojection",
+    "SpotlightImage",
     "StoredOmegaK",
     "StripPlan",
     "TargetImage",
@@ -136,6 +139,7 @@ __all__ = [
     "reach_lines",
     "recommended_form",
     "requirements",
+    "scene_grid",
     "to_db",
     "write_strip",
 ]

@@ -1,7 +1,27 @@
-"""Readers of recorded radar data in `.npz` files."""
+"""Readers and writers of recorded radar data and of images."""
 
+from torchsar.io.cphd import read_cphd
+from torchsar.io.formats import FORMATS, Format, format_of, read, read_history
+from torchsar.io.geotiff import write_geotiff
 from torchsar.io.inverse import read_inverse
 from torchsar.io.path import read_path
 from torchsar.io.recorded import read_stripmap
+from torchsar.io.sicd import read_sicd
+from torchsar.io.write_cphd import write_cphd
+from torchsar.io.write_sicd import write_sicd
 
-__all__ = ["read_inverse", "read_path", "read_stripmap"]
+__all__ = [
+    "FORMATS",
+    "Format",
+    "format_of",
+    "read",
+    "read_cphd",
+    "read_history",
+    "read_inverse",
+    "read_path",
+    "read_sicd",
+    "read_stripmap",
+    "write_cphd",
+    "write_geotiff",
+    "write_sicd",
+]

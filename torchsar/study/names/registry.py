@@ -244,6 +244,7 @@ FOCUS: dict[str, Callable[..., Any]] = {
     "tile_image": focus.TileImage,
     "direct_image": focus.DirectImage,
     "omega_k_image": focus.OmegaKImage,
+    "spotlight_image": focus.SpotlightImage,
     "compress_dechirped": focus.CompressDechirped,
     "azimuth_transform": focus.AzimuthTransform,
     "target_image": focus.TargetImage,
@@ -267,7 +268,7 @@ _AUTOMATIC = (
     "rotation.order",
     "matched_fourier.transform",
 )
-_GIVEN = ("radar", "geometry", "expected_power")
+_GIVEN = ("radar", "geometry", "side_data", "expected_power")
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 
 

@@ -87,7 +87,7 @@ class Bench:
     def _read(self) -> Recording:
         try:
             return self.system.read(self.config.data.file, self.dtype)
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, ModuleNotFoundError) as error:
             text = one_line(error).removeprefix("data.file: ")
             raise ConfigError(f"{self.file}: data.file: {text}") from None
 

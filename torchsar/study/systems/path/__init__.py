@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from torch import Tensor
 from torchsar.core import Draws, Recording, Trace
 from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
 from torchsar.focus.motion_compensation import possible_compensations
-from torchsar.io import read_path
+from torchsar.io import read_history
 from torchsar.metrics import error_db, registered_error_db
 from torchsar.metrics.direct_images import some_pixels, white_noise
 from torchsar.radar import AntennaPath, InverseRadar
@@ -39,7 +40,7 @@ class AnyPath(System):
     World = Flown
     impairments = PATH_IMPAIRMENTS
     reads = "phase history with positions"
-    ending = "tile_image, omega_k_image or direct_image"
+    ending = "tile_image, spotlight_image, omega_k_image or direct_image"
     tolerance = {"image_error_db": -40.0}
     exact = {"stage": {"stage": "direct_image"}}
     definitions = {
@@ -79,7 +80,10 @@ class AnyPath(System):
     }
 
     def read(self, path: str, dtype: torch.dtype) -> Recording:
-        return read_path(path, dtype)
+        return read_history(path, dtype)
+
+    def context(self, recording: Recording) -> dict[str, Any]:
+        return {"side_data": recording.aux}
 
     def samples(self, world: Flown, radar: InverseRadar) -> int:
         return world.pulses * world.samples

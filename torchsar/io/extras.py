@@ -1,0 +1,82 @@
+"""Libraries of optional extras, imported when a format needs them, and files that they read."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+def library(module: str, extra: str, purpose: str) -> Any:
+    """Import a library of an optional extra.
+
+    Args:
+        module: Name of the module.
+        extra: Extra of the package that installs it.
+        purpose: What needs it, as the subject of the message.
+
+    Returns:
+        The module.
+
+    Raises:
+        ModuleNotFoundError: If it is not installed; the message says how to install it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{purpose} needs the package {str(error.name).partition('.')[0]}: "
+            f'pip install "torchsar-lab[{extra}]"',
+            name=error.name,
+        ) from None
+
+
+@contextmanager
+def reading(path: Path, kind: str) -> Iterator[None]:
+    """Turn whatever a library raises for a damaged file into one sentence that names the file.
+
+    Args:
+        path: Path of the file.
+        kind: What it should be, for messages.
+
+    Yields:
+        Nothing.
+
+    Raises:
+        ValueError: If the block raises anything but an error of import, memory or file system.
+    """
+    try:
+        yield
+    except (ImportError, MemoryError, FileNotFoundError, PermissionError):
+        raise
+    except Exception as error:  # libraries raise errors of any type for damaged files
+        text = " ".join(str(error).split())
+        if str(error).startswith(str(path)):
+            raise ValueError(text) from None
+        plain = isinstance(error, ValueError) and text
+        reason = text if plain else f"{type(error).__name__}{': ' if text else ''}{text}"
+        raise ValueError(f"{path} cannot be read as {kind}: {reason[:300]}") from None
+
+
+def write_whole(path: str | Path, write: Callable[[Path], None]) -> None:
+    """Write a file completely, or leave what was there.
+
+    Args:
+        path: Path of the file.
+        write: Function that writes the file at the path that it gets, in the same folder.
+
+    Raises:
+        FileNotFoundError: If the folder does not exist.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path} cannot be written: its folder does not exist; create it")
+    part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        write(part)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)

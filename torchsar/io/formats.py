@@ -1,0 +1,135 @@
+"""The formats of data files, and the function that reads any of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from torchsar.core import Recording, Signal
+from torchsar.io.cphd import read_cphd
+from torchsar.io.fields import archive
+from torchsar.io.inverse import read_inverse
+from torchsar.io.path import read_path
+from torchsar.io.recorded import read_stripmap
+from torchsar.io.sicd import read_sicd
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of data files.
+
+    Args:
+        name: Its name.
+        suffixes: Endings of its files, in lower case.
+        magic: Bytes with which its files may begin.
+        read: Function that reads a file as a dtype.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    magic: tuple[bytes, ...]
+    read: Callable[[Path, torch.dtype], Recording | Signal]
+
+
+def _read_archive(path: Path, dtype: torch.dtype) -> Recording:
+    """The recording in a numpy archive of any of the kinds that this package reads."""
+    keys = archive(path, "recorded data")
+    if "iq" in keys:
+        return read_stripmap(path, dtype)
+    return (read_path if "history" in keys or "fp" in keys else read_inverse)(path, dtype)
+
+
+def _refuse_crsd(path: Path, dtype: torch.dtype) -> Recording:
+    raise ValueError(
+        f"{path} holds received signals before range compression (CRSD), which are not read; convert it to compensated "
+        "phase histories (CPHD)"
+    )
+
+
+# the content decides, then the ending
+FORMATS = (
+    Format("CPHD", (".cphd",), (b"CPHD/",), read_cphd),
+    Format("CRSD", (".crsd",), (b"CRSDsar/", b"CRSDtx/", b"CRSDrcv/"), _refuse_crsd),
+    Format("SICD", (".nitf", ".ntf", ".sicd"), (b"NITF", b"NSIF"), read_sicd),
+    Format("numpy archive", (".npz",), (b"PK\x03\x04", b"PK\x05\x06", b"\x93NUMPY"), _read_archive),
+)
+
+
+def format_of(path: str | Path) -> Format:
+    """Find the format of a file by its first bytes, or else by its ending.
+
+    Args:
+        path: Path of the file.
+
+    Returns:
+        The format.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the format is not known.
+    """
+    path = Path(path)
+    if not path.is_file():
+        what = "is no file" if path.exists() else "does not exist"
+        raise FileNotFoundError(f"data.file: {path} {what}; give the path of a data file")
+    with path.open("rb") as file:
+        head = file.read(16)
+    matches = (
+        *(one for one in FORMATS if head.startswith(one.magic)),
+        *(one for one in FORMATS if path.suffix.lower() in one.suffixes),
+    )
+    if not matches:
+        known = ", ".join(f"{one.name} ({', '.join(one.suffixes)})" for one in FORMATS)
+        raise ValueError(f"{path} is of no known format; files that can be read are {known}")
+    return matches[0]
+
+
+def read(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording | Signal:
+    """Read a data file of any format, which its first bytes or its ending tell.
+
+    Numpy archives (.npz) are read by `read_stripmap`, `read_path` or `read_inverse`, as their keys
+    say; phase histories (CPHD) by `read_cphd`; complex images (SICD) by `read_sicd`.
+
+    Args:
+        path: Path of the file.
+        dtype: complex64 or complex128, dtype of the samples.
+
+    Returns:
+        Recording; of an image a Signal with the axes (azimuth, range).
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ModuleNotFoundError: If a library for the format is not installed; the message names the
+            extra.
+        ValueError: If the format is not known, or the file is damaged.
+    """
+    path = Path(path)
+    return format_of(path).read(path, dtype)
+
+
+def read_history(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
+    """Read a phase history with the positions of its antennas from a file of any format.
+
+    Args:
+        path: Path of the file.
+        dtype: complex64 or complex128, dtype of the profiles.
+
+    Returns:
+        Recording as by `read_path`.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ModuleNotFoundError: If a library for the format is not installed.
+        ValueError: If the file is damaged, of no known format, or has no such content.
+    """
+    path = Path(path)
+    found = format_of(path)
+    if found.read is _read_archive:
+        return read_path(path, dtype)
+    recording = found.read(path, dtype)
+    if not isinstance(recording, Recording) or "transmitter_m" not in recording.aux:
+        raise ValueError(f"{path}: {found.name} holds no phase history with positions of the antennas")
+    return recording

@@ -1,0 +1,108 @@
+"""Writer of detected images in map coordinates (GeoTIFF)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchsar.core import Signal
+from torchsar.focus.detection import to_db
+from torchsar.focus.path_image import PathImage
+from torchsar.io.extras import library, write_whole
+from torchsar.io.geometry import image_samples
+from torchsar.radar import LocalFrame
+
+# largest distance in pixels between the affine map and the projection, by choice; images for which
+# it is larger get ground control points
+_MOST_PIXELS = 0.1
+# points along either axis at which the map is fitted, and which become control points
+_POINTS = 7
+
+
+def write_geotiff(
+    signal: Signal, path: str | Path, image: PathImage, frame: LocalFrame, decibels: bool = False
+) -> float:
+    """Write the amplitude of an image as a GeoTIFF in the projection UTM (polar stereographic near
+    the poles).
+
+    Samples are not resampled. Columns are along the axis of the image that is closest to east, and
+    rows along that closest to south; the file has the affine map of the pixels to the projection,
+    with its rotation. If this map is wrong by more than a tenth of a pixel, as for large images, the
+    file has a grid of ground control points instead.
+
+    Args:
+        signal: Image of one trial with the axes (azimuth, range), as `image` returns it.
+        path: Path of the file.
+        image: Stage that formed the image.
+        frame: Frame of its coordinates, such as LocalFrame(latitude_deg, longitude_deg, height_m);
+            LocalFrame(*recording.aux["origin_deg_m"].tolist()) for a recording that holds it.
+        decibels: True to write 20 lg of the amplitude relative to the largest one, False for the
+            amplitude.
+
+    Returns:
+        Largest error of the affine map in pixels.
+
+    Raises:
+        ModuleNotFoundError: If rasterio is not installed (extra `geo`).
+        FileNotFoundError: If the folder does not exist.
+        ValueError: If the image has several trials, or is not of the stage.
+    """
+    rasterio, warp = (library(name, "geo", f"writing {path}") for name in ("rasterio", "rasterio.warp"))
+    control = library("rasterio.control", "geo", f"writing {path}")
+    data = image_samples(signal)
+    if signal.axes != image.axes:
+        raise ValueError(f"the image has the axes {signal.axes}, but its stage forms {image.axes}; give the stage of the image")
+    amplitude = data.abs().double()
+    values = to_db(amplitude.square()) if decibels else amplitude
+    raster, corner, down, right = _north_up(values.float().numpy(), image)
+    rows, columns = (np.linspace(0, n - 1, _POINTS) for n in raster.shape)
+    rows, columns = (v.ravel() for v in np.meshgrid(rows, columns, indexing="ij"))
+    local = torch.from_numpy(corner + rows[:, None] * down + columns[:, None] * right)
+    crs = f"EPSG:{_zone(frame)}"
+    earth = frame.geocentric_m(local).numpy()
+    x, y = (np.asarray(v) for v in warp.transform("EPSG:4978", crs, *earth.T.tolist())[:2])
+    terms = np.stack([columns + 0.5, rows + 0.5, np.ones_like(rows)], -1)  # pixels are areas
+    affine, *_ = np.linalg.lstsq(terms, np.stack([x, y], -1), rcond=None)
+    error = np.linalg.norm(terms @ affine - np.stack([x, y], -1), axis=-1).max() / image.grid.step_m
+    place: dict[str, Any] = {"transform": rasterio.Affine(*affine[:, 0], *affine[:, 1])}
+    if error > _MOST_PIXELS:
+        found = zip(rows + 0.5, columns + 0.5, x, y, strict=True)
+        place = {"gcps": [control.GroundControlPoint(*map(float, point)) for point in found]}
+
+    def write(part: Path) -> None:
+        height, width = raster.shape
+        profile = {"driver": "GTiff", "height": height, "width": width, "count": 1, "dtype": "float32"}
+        with rasterio.open(part, "w", **profile, crs=crs, **place) as file:
+            file.write(raster, 1)
+            file.set_band_description(1, "amplitude (dB)" if decibels else "amplitude")
+
+    write_whole(path, write)
+    return float(error)
+
+
+def _north_up(values: np.ndarray, image: PathImage) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The image with rows closest to south and columns closest to east, the position of its first
+    pixel, and the steps along rows and columns in metres.
+    """
+    corner, step = image.grid.origin_m.numpy(), image.grid.step_m
+    axes = [step * axis for axis in image.grid.axes.numpy()]
+    if abs(axes[0][0]) > abs(axes[1][0]):
+        values, axes = values.T, axes[::-1]
+    for dim, ahead in ((0, -axes[0][1]), (1, axes[1][0])):
+        if ahead < 0:
+            corner = corner + (values.shape[dim] - 1) * axes[dim]
+            values, axes[dim] = np.flip(values, dim), -axes[dim]
+    return np.ascontiguousarray(values), corner, axes[0], axes[1]
+
+
+def _zone(frame: LocalFrame) -> int:
+    """Number of the projection in the register EPSG."""
+    north = frame.latitude_deg >= 0
+    if abs(frame.latitude_deg) > 84 or frame.latitude_deg < -80:
+        return 32661 if north else 32761
+    longitude = (frame.longitude_deg + 180) % 360
+    return (32600 if north else 32700) + math.floor(longitude / 6) + 1

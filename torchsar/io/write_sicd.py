@@ -1,0 +1,381 @@
+"""Writer of complex images in the format SICD, NGA.STND.0024."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsar.core import Recording, Signal, unit_phasor
+from torchsar.focus.image_grid import ImageGrid
+from torchsar.focus.path_image import PathImage
+from torchsar.focus.spotlight import window_weights
+from torchsar.io.extras import library, write_whole
+from torchsar.io.geometry import antennas_of, frame_of, image_samples, pulse_time_s, single
+from torchsar.io.write_cphd import UNKNOWN_START
+from torchsar.radar import LIGHT_M_S, AntennaPath, LocalFrame
+
+_NAMESPACE = "urn:SICD:1.4.0"
+# highest order of the polynomials of positions, and rms distance in metres at which a lower one suffices
+_MOST_ORDER, _NEAR_M = 9, 1e-4
+# points along either axis at which spatial frequencies are fitted, and order of the polynomials, by choice
+_POINTS, _ORDER = 7, 2
+# width at -3 dB times bandwidth, and names of the windows
+_WIDTHS = {"none": 0.885892941378905, "hann": 1.4405}
+_NAMES = {"none": "UNIFORM", "hann": "HANNING"}
+_WEIGHTS = 65  # samples of a window in the file, by choice
+
+
+def write_sicd(
+    signal: Signal,
+    path: str | Path,
+    recording: Recording,
+    image: PathImage,
+    frame: LocalFrame | None = None,
+    start: datetime = UNKNOWN_START,
+    mode: str = "SPOTLIGHT",
+) -> None:
+    """Write a complex image with its geometry as a SICD file (version 1.4.0, NITF).
+
+    The grid is of type PLANE on the imaged plane, and its centre point (SCP) is the middle sample.
+    Rows are along the axis of the image that is closest to the line of sight and point away from the
+    radar; columns follow a quarter turn later, so that the normal points up. With Sgn = -1 a phase
+    of +2 pi K x has the spatial frequency K: a scatterer is summed with K = f times the gradient of
+    its path over c. KCtr is that of the middle of aperture and band at the SCP, and samples are
+    multiplied by exp(-2j pi KCtr x), so that their spectrum lies about zero; DeltaKCOAPoly is the
+    change of the middle over the image, DeltaK1 and DeltaK2 are the limits of the spectrum with it.
+    Positions of the antennas are polynomials of time of order 9 at most.
+
+    Args:
+        signal: Image of one trial with the axes (azimuth, range), as `image` returns it.
+        path: Path of the file.
+        recording: Recording of which the image was formed.
+        image: Stage that formed the image.
+        frame: Frame of the positions; None for that in `origin_deg_m` of the side data.
+        start: Time of the start of the collection.
+        mode: Mode of the radar, "SPOTLIGHT", "STRIPMAP" or "DYNAMIC STRIPMAP".
+
+    Raises:
+        ModuleNotFoundError: If sarkit is not installed (extra `formats`).
+        FileNotFoundError: If the folder does not exist.
+        ValueError: If the image or the recording has several trials, the image is not of the
+            stage, or no frame is known.
+    """
+    sarkit, wgs84, etree = (
+        library(name, "formats", f"writing {path}") for name in ("sarkit.sicd", "sarkit.wgs84", "lxml.etree")
+    )
+    data = image_samples(signal)
+    if signal.axes != image.axes:
+        raise ValueError(f"the image has the axes {signal.axes}, but its stage forms {image.axes}; give the stage of the image")
+    scene = _Scene(recording, image, frame_of(recording, frame))
+    tree = etree.Element(f"{{{_NAMESPACE}}}SICD").getroottree()
+    root = sarkit.ElementWrapper(tree.getroot())
+    root.from_dict(_content(scene, wgs84, start, mode))
+    known = sarkit.compute_scp_coa(tree)
+    for node in known.iter():  # an antenna at rest has no cone angle
+        if node.text == "nan" and etree.QName(node).localname == "DopplerConeAng":
+            node.text = "90.0"
+    root["SCPCOA"] = known
+    samples = scene.samples(data)
+    security = sarkit.NitfSecurityFields(clas="U")
+    metadata = sarkit.NitfMetadata(
+        xmltree=tree,
+        file_header_part=sarkit.NitfFileHeaderPart(ostaid="torchsar", security=security),
+        im_subheader_part=sarkit.NitfImSubheaderPart(isorce="torchsar", security=security),
+        de_subheader_part=sarkit.NitfDeSubheaderPart(security=security),
+    )
+
+    def write(part: Path) -> None:
+        with part.open("wb") as file, sarkit.NitfWriter(file, metadata) as writer:
+            writer.write_image(samples)
+
+    write_whole(path, write)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """Spatial frequencies along rows or columns in cycles per metre.
+
+    Args:
+        middle: Middle of the spectrum of a scatterer at the centre.
+        poly: Change of the middle over the image, by powers of row and column in metres.
+        bandwidth: Extent of the spectrum of a scatterer at the centre.
+        limits: Limits of the spectrum of the image, relative to the middle at the centre.
+    """
+
+    middle: float
+    poly: np.ndarray
+    bandwidth: float
+    limits: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """Pixels whose rows, columns and up are right-handed.
+
+    Args:
+        corner_m: Position of the first pixel.
+        down: Direction in which rows are counted.
+        right: Direction in which columns are counted.
+        counts: Number of rows and columns.
+        step_m: Spacing of rows and columns.
+        turns: Quarter turns by `torch.rot90` that bring the transposed image into this order.
+    """
+
+    corner_m: Tensor
+    down: Tensor
+    right: Tensor
+    counts: tuple[int, int]
+    step_m: float
+    turns: int = 0
+
+    @staticmethod
+    def of(grid: ImageGrid) -> _Pixels:
+        """Pixels of an image (azimuth, range) in the order (range, azimuth)."""
+        return _Pixels(grid.origin_m, grid.axes[1], grid.axes[0], grid.counts[::-1], grid.step_m)
+
+    def turned(self) -> _Pixels:
+        corner = self.corner_m + self.step_m * (self.counts[1] - 1) * self.right
+        return _Pixels(corner, -self.right, self.down, self.counts[::-1], self.step_m, self.turns + 1)
+
+    def away_from(self, position_m: Tensor) -> _Pixels:
+        """The order in which rows point away from a position as directly as possible."""
+        orders = [self]
+        for _ in range(3):
+            orders.append(orders[-1].turned())
+        sight = self.at(*self.middle) - position_m
+        return max(orders, key=lambda one: float(one.down @ sight))
+
+    @property
+    def middle(self) -> tuple[int, int]:
+        return self.counts[0] // 2, self.counts[1] // 2
+
+    def at(self, row: Tensor | float, column: Tensor | float) -> Tensor:
+        """Positions of pixels in metres, (..., 3)."""
+        row, column = (torch.as_tensor(v, dtype=torch.float64)[..., None] for v in (row, column))
+        return self.corner_m + self.step_m * (row * self.down + column * self.right)
+
+
+class _Scene:
+    """An image with the antennas that see it.
+
+    Args:
+        recording: Recording of which the image was formed.
+        image: Stage that formed it.
+        frame: Frame of the positions.
+    """
+
+    def __init__(self, recording: Recording, image: PathImage, frame: LocalFrame) -> None:
+        self.frame, self.antennas = frame, antennas_of(recording)
+        self.frequency = single(recording.aux["frequency_hz"], 1, "frequency_hz")
+        time = pulse_time_s(recording)
+        self.time = time - time[0]
+        self.pixels = _Pixels.of(image.grid).away_from(
+            torch.stack([place.mean(0) for place in self.antennas.places]).mean(0)
+        )
+        self.windows = image.windows[::-1]  # rows are along range
+        rows, columns = (
+            torch.tensor(np.linspace(0, n - 1, _POINTS), dtype=torch.float64).round() for n in self.pixels.counts
+        )
+        # the corners are the first, the last and those between
+        self.rows, self.columns = (v.reshape(-1) for v in torch.meshgrid(rows, columns, indexing="ij"))
+        self.lit = self._lit(image)
+        middle = self.pixels.middle
+        self.scp_m = self.pixels.at(*middle)
+        self.row_m, self.column_m = (
+            (v - n) * self.pixels.step_m for v, n in zip((self.rows, self.columns), middle, strict=True)
+        )
+
+    def _lit(self, image: PathImage) -> Tensor:
+        """First and last pulse that see the points and, at the end, the centre, (point, 2)."""
+        points = torch.cat([self.pixels.at(self.rows, self.columns), self.pixels.at(*self.pixels.middle)[None]])
+        of = image.lit(self.antennas)
+        last = self.antennas.pulses - 1
+        if of is None:
+            return torch.tensor([[0, last]]).expand(len(points), 2)
+        lit = of(points)
+        return torch.stack([lit[:, 0], lit[:, 1] - 1], -1).clamp(0, last)
+
+    def samples(self, data: Tensor) -> np.ndarray:
+        """Samples (row, column) whose spectrum lies about zero."""
+        data = torch.rot90(data.T, self.pixels.turns)
+        for dim, side in enumerate(self.sides):
+            n = self.pixels.counts[dim]
+            x = self.pixels.step_m * (torch.arange(n, dtype=torch.float64) - self.pixels.middle[dim])
+            carrier = unit_phasor(-side.middle * x, data.dtype)
+            data = data * (carrier[:, None] if dim == 0 else carrier)
+        return data.to(torch.complex64).contiguous().numpy()
+
+    @cached_property
+    def sides(self) -> tuple[_Side, _Side]:
+        """Spatial frequencies along rows and columns."""
+        points = torch.cat([self.pixels.at(self.rows, self.columns), self.scp_m[None]])
+        low, high = (torch.full((len(points), 2), sign * torch.inf, dtype=torch.float64) for sign in (1, -1))
+        axes = torch.stack([self.pixels.down, self.pixels.right])
+        for share in np.linspace(0, 1, 33):  # of the aperture, by choice
+            pulse = (self.lit[:, 0] + share * (self.lit[:, 1] - self.lit[:, 0])).round().long()
+            away = [points - place[pulse] for place in self.antennas.places]
+            unit = [v / torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in away]
+            slope = (sum(unit) * (2 if len(unit) == 1 else 1)) @ axes.T
+            for frequency in (self.frequency[0], self.frequency[-1]):
+                k = slope * frequency / LIGHT_M_S
+                low, high = torch.minimum(low, k), torch.maximum(high, k)
+        return self._side(low[:, 0], high[:, 0]), self._side(low[:, 1], high[:, 1])
+
+    def _side(self, low: Tensor, high: Tensor) -> _Side:
+        """Spatial frequencies along one axis from those at the points and the centre."""
+        nyquist = 0.5 / self.pixels.step_m
+        middle = (low + high) / 2
+        poly = self._fitted(middle[:-1] - middle[-1], 0.0)
+        width = min(float(high[-1] - low[-1]), 2 * nyquist)
+        corners = [i * (_POINTS - 1) + j * (_POINTS - 1) * _POINTS for i in (0, 1) for j in (0, 1)]
+        change = np.polynomial.polynomial.polyval2d(self.row_m.numpy(), self.column_m.numpy(), poly)[corners]
+        limits = (float(change.min()) - width / 2, float(change.max()) + width / 2)
+        if max(-limits[0], limits[1]) > nyquist:  # the spectrum wraps around
+            limits = (-nyquist, nyquist)
+        return _Side(float(middle[-1]), poly, width, limits)
+
+    def _fitted(self, values: Tensor, at_centre: float) -> np.ndarray:
+        """Polynomial of row and column in metres through values at the points, and at the centre."""
+        powers = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1) if 0 < i + j <= _ORDER]
+        scale = float(torch.maximum(self.row_m.abs().max(), self.column_m.abs().max()).clamp_min(1e-9))
+        terms = torch.stack([(self.row_m / scale) ** i * (self.column_m / scale) ** j for i, j in powers], -1)
+        found = torch.linalg.lstsq(terms, values[:, None] - at_centre, driver="gelsd").solution[:, 0]
+        poly = np.zeros((_ORDER + 1, _ORDER + 1))
+        for (i, j), value in zip(powers, found.tolist(), strict=True):
+            poly[i, j] = value / scale ** (i + j)
+        poly[0, 0] = at_centre
+        return poly
+
+    @cached_property
+    def time_poly(self) -> np.ndarray:
+        """Time of the middle of the aperture in seconds, by powers of row and column in metres."""
+        times = self.time[self.lit].mean(-1)
+        if bool((self.lit == self.lit[0]).all()):
+            return np.array([[float(times[-1])]])
+        return self._fitted(times[:-1], float(times[-1]))
+
+    def positions(self) -> dict[str, Any]:
+        """Polynomials of the positions by name."""
+        places = self.antennas.places
+        if len(places) == 1:
+            return {"ARPPoly": self._poly(self.time, places[0])}
+        away = [place - self.scp_m for place in places]
+        ranges = [torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in away]
+        middle = sum(v / r for v, r in zip(away, ranges, strict=True))
+        assert isinstance(middle, Tensor)
+        # on the bisector, at the mean range
+        bisector = self.scp_m + (ranges[0] + ranges[1]) / 2 * middle / torch.linalg.vector_norm(
+            middle, dim=-1, keepdim=True
+        )
+        delay = [r[:, 0] / LIGHT_M_S for r in ranges]
+        centre = self.frame.geocentric_m(self.scp_m).numpy()
+        return {
+            "ARPPoly": self._poly(self.time, bisector),
+            "GRPPoly": centre[None],
+            "TxAPCPoly": self._poly(self.time - delay[0], places[0]),
+            "RcvAPC": {"@size": 1, "RcvAPCPoly": self._poly(self.time + delay[1], places[1])},
+        }
+
+    def _poly(self, time: Tensor, position: Tensor) -> np.ndarray:
+        """Polynomial of time in seconds through geocentric positions, (power, 3)."""
+        t, earth = time.numpy(), self.frame.geocentric_m(position).numpy()
+        found = np.zeros((1, 3))
+        for order in range(1, min(_MOST_ORDER, len(t) - 1) + 1):
+            fits = [np.polynomial.Polynomial.fit(t, earth[:, axis], order) for axis in range(3)]
+            found = np.stack([fit.convert().coef.tolist() + [0.0] * (order + 1 - len(fit.convert().coef)) for fit in fits], -1)
+            error = np.stack([fit(t) for fit in fits], -1) - earth
+            if np.sqrt((error**2).sum(-1).mean()) <= _NEAR_M:
+                break
+        return found
+
+
+def _content(scene: _Scene, wgs84: Any, start: datetime, mode: str) -> dict[str, Any]:
+    """Content of the XML by element, but for SCPCOA."""
+    pixels, frame, antennas = scene.pixels, scene.frame, scene.antennas
+    rows, columns = pixels.counts
+    ends = torch.tensor([[0, 0], [0, columns - 1], [rows - 1, columns - 1], [rows - 1, 0]])
+    corners = wgs84.cartesian_to_geodetic(frame.geocentric_m(pixels.at(ends[:, 0], ends[:, 1])).numpy())[:, :2]
+    centre = frame.geocentric_m(scene.scp_m).numpy()
+    low, high = float(scene.frequency[0]), float(scene.frequency[-1])
+    bistatic = antennas.receiver_m is not None
+    names = {"CollectorName": "receiver", "IlluminatorName": "transmitter"} if bistatic else {"CollectorName": "radar"}
+    channel = {"@index": 1, "TxRcvPolarization": "UNKNOWN", **({"RcvAPCIndex": 1} if bistatic else {})}
+    return {
+        "CollectionInfo": {
+            **names,
+            "CoreName": "torchsar",
+            "CollectType": "BISTATIC" if bistatic else "MONOSTATIC",
+            "RadarMode": {"ModeType": mode},
+            "Classification": "UNCLASSIFIED",
+        },
+        "ImageData": {
+            "PixelType": "RE32F_IM32F",
+            "NumRows": rows,
+            "NumCols": columns,
+            "FirstRow": 0,
+            "FirstCol": 0,
+            "FullImage": {"NumRows": rows, "NumCols": columns},
+            "SCPPixel": list(pixels.middle),
+        },
+        "GeoData": {
+            "EarthModel": "WGS_84",
+            "SCP": {"ECF": centre, "LLH": wgs84.cartesian_to_geodetic(centre)},
+            "ImageCorners": corners,
+        },
+        "Grid": {
+            "ImagePlane": "GROUND",
+            "Type": "PLANE",
+            "TimeCOAPoly": scene.time_poly,
+            **{
+                name: _direction(side, frame, axis, pixels.step_m, window)
+                for name, side, axis, window in zip(
+                    ("Row", "Col"), scene.sides, (pixels.down, pixels.right), scene.windows, strict=True
+                )
+            },
+        },
+        "Timeline": {"CollectStart": start, "CollectDuration": float(scene.time[-1])},
+        "Position": scene.positions(),
+        "RadarCollection": {
+            "TxFrequency": {"Min": low, "Max": high},
+            "TxPolarization": "UNKNOWN",
+            "RcvChannels": {"@size": 1, "ChanParameters": [channel]},
+        },
+        "ImageFormation": {
+            "RcvChanProc": {"NumChanProc": 1, "ChanIndex": [1]},
+            "TxRcvPolarizationProc": "UNKNOWN",
+            "TStartProc": 0.0,
+            "TEndProc": float(scene.time[-1]),
+            "TxFrequencyProc": {"MinProc": low, "MaxProc": high},
+            "ImageFormAlgo": "OTHER",
+            "STBeamComp": "NO",
+            "ImageBeamComp": "NO",
+            "AzAutofocus": "NO",
+            "RgAutofocus": "NO",
+        },
+    }
+
+
+def _direction(side: _Side, frame: LocalFrame, axis: Tensor, step_m: float, window: str) -> dict[str, Any]:
+    """Parameters of rows or columns."""
+    along = frame.geocentric_m(axis) - frame.geocentric_m(torch.zeros_like(axis))
+    weights = {} if window == "none" else {"WgtFunct": window_weights(window, _WEIGHTS).numpy()}
+    return {
+        "UVectECF": (along / torch.linalg.vector_norm(along)).numpy(),
+        "SS": step_m,
+        "ImpRespWid": _WIDTHS[window] / side.bandwidth,
+        "Sgn": -1,
+        "ImpRespBW": side.bandwidth,
+        "KCtr": side.middle,
+        "DeltaK1": side.limits[0],
+        "DeltaK2": side.limits[1],
+        "DeltaKCOAPoly": side.poly,
+        "WgtType": {"WindowName": _NAMES[window]},
+        **weights,
+    }
