@@ -28,7 +28,7 @@ def library(module: str, extra: str, purpose: str) -> Any:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            f"{purpose} needs the package {str(error.name).partition('.')[0]}: "
+            f"{purpose} needs the package {(error.name or module).partition('.')[0]}: "
             f'pip install "torchsar-lab[{extra}]"',
             name=error.name,
         ) from None

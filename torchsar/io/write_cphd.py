@@ -83,7 +83,8 @@ def write_cphd(
     for name, value in vectors.items():
         packed[name] = value
     tree.getroot().find("{*}PVP").addnext(_dwell(sarkit, tree, packed))
-    tree.getroot().find("{*}Dwell").addnext(sarkit.compute_reference_geometry(tree, packed))
+    with np.errstate(invalid="ignore"):  # an antenna at rest has no cone angle, for which 90 degrees stand
+        tree.getroot().find("{*}Dwell").addnext(sarkit.compute_reference_geometry(tree, packed))
 
     def write(part: Path) -> None:
         with part.open("wb") as file, sarkit.Writer(file, sarkit.Metadata(xmltree=tree)) as writer:

@@ -280,7 +280,7 @@ class _Scene:
             "ARPPoly": self._poly(self.time, bisector),
             "GRPPoly": centre[None],
             "TxAPCPoly": self._poly(self.time - delay[0], places[0]),
-            "RcvAPC": {"@size": 1, "RcvAPCPoly": self._poly(self.time + delay[1], places[1])},
+            "RcvAPC": [self._poly(self.time + delay[1], places[1])],
         }
 
     def _poly(self, time: Tensor, position: Tensor) -> np.ndarray:
