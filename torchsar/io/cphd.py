@@ -105,11 +105,11 @@ class _Head:
                     raise ValueError(f"{self._path} holds compressed samples; decompress it with the tools of its producer")
                 form = self("Data/SignalArrayFormat")
                 counts = [int(node.findtext(f"{{*}}{key}")) for key in ("NumVectors", "NumSamples")]
-                needed = counts[0] * counts[1] * {"CI2": 2, "CI4": 4, "CF8": 8}.get(form, 1)
+                needed = counts[0] * (counts[1] * {"CI2": 2, "CI4": 4, "CF8": 8}[form] + int(self("Data/NumBytesPVP")))
                 if not (min(counts) >= 2 and needed <= size):
                     raise ValueError(
-                        f"{self._path} is cut off or damaged: {counts[0]} vectors of {counts[1]} samples {form} take "
-                        f"{needed} bytes, and the file has {size}"
+                        f"{self._path} is cut off or damaged: {counts[0]} vectors of {counts[1]} samples {form} with their "
+                        f"parameters take {needed} bytes, and the file has {size}"
                     )
 
     def corners_m(self, frame: LocalFrame) -> Tensor:

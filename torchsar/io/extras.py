@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,6 +36,18 @@ def library(module: str, extra: str, purpose: str) -> Any:
 
 
 @contextmanager
+def quiet() -> Iterator[None]:
+    """Leave out what libraries warn of their own code, which a user cannot change.
+
+    Yields:
+        Nothing.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        yield
+
+
+@contextmanager
 def reading(path: Path, kind: str) -> Iterator[None]:
     """Turn whatever a library raises for a damaged file into one sentence that names the file.
 
@@ -49,7 +62,8 @@ def reading(path: Path, kind: str) -> Iterator[None]:
         ValueError: If the block raises anything but an error of import, memory or file system.
     """
     try:
-        yield
+        with quiet():
+            yield
     except (ImportError, MemoryError, FileNotFoundError, PermissionError):
         raise
     except Exception as error:  # libraries raise errors of any type for damaged files

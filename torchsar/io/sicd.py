@@ -41,10 +41,11 @@ def read_sicd(path: str | Path, dtype: torch.dtype = torch.complex64) -> Signal:
         pixel = xml.load("{*}ImageData/{*}PixelType")
         needed = counts[0] * counts[1] * sarkit.PIXEL_TYPES[pixel]["bytes"]
         stored = sum(int(segment["Data"].size) for segment in reader.jbp["ImageSegments"])
-        if not (min(counts) >= 1 and (needed <= stored or stored > path.stat().st_size)):
-            raise ValueError(f"{counts[0]} rows of {counts[1]} samples take {needed} bytes, and the file has {stored}")
-        if stored > path.stat().st_size:
-            raise ValueError(f"it is cut off: its header counts {stored} bytes of samples, and it has less in all")
+        if min(counts) < 1 or not needed <= stored <= path.stat().st_size:
+            raise ValueError(
+                f"it is cut off or damaged: {counts[0]} rows of {counts[1]} samples take {needed} bytes, its header counts "
+                f"{stored}, and the file has {path.stat().st_size}"
+            )
         samples = torch.from_numpy(_complex(reader.read_image(), xml)).T.contiguous()
         first = [int(xml.load(f"{{*}}ImageData/{{*}}First{name}")) for name in ("Row", "Col")]
         centre = [int(v) for v in xml.load("{*}ImageData/{*}SCPPixel")]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Recording, unit_phasor
-from torchsar.io.extras import library, write_whole
+from torchsar.io.extras import library, quiet, write_whole
 from torchsar.io.geometry import antennas_of, frame_of, pulse_time_s, single
 from torchsar.radar import LIGHT_M_S, AntennaPath, LocalFrame, frequency_samples
 from torchsar.radar.spotlight import frequency_step_hz
@@ -34,6 +34,7 @@ _ORDER = (
 )
 
 
+@quiet()
 def write_cphd(
     recording: Recording,
     path: str | Path,

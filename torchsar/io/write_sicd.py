@@ -16,7 +16,7 @@ from torchsar.core import Recording, Signal, unit_phasor
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.path_image import PathImage
 from torchsar.focus.spotlight import window_weights
-from torchsar.io.extras import library, write_whole
+from torchsar.io.extras import library, quiet, write_whole
 from torchsar.io.geometry import antennas_of, frame_of, image_samples, pulse_time_s, single
 from torchsar.io.write_cphd import UNKNOWN_START
 from torchsar.radar import LIGHT_M_S, AntennaPath, LocalFrame
@@ -32,6 +32,7 @@ _NAMES = {"none": "UNIFORM", "hann": "HANNING"}
 _WEIGHTS = 65  # samples of a window in the file, by choice
 
 
+@quiet()
 def write_sicd(
     signal: Signal,
     path: str | Path,

@@ -35,10 +35,9 @@ def listing(systems: Mapping[str, System]) -> str:
         lines += ["", f"STAGES, {group} (processor.METHOD.stages)", *_entries(stages(), names)] if names else []
     for title, catalogue in WORLD.items():
         lines += ["", title, *_entries(catalogue, catalogue.entries)]
-    lines += ["", "DATA (data.file=PATH, a numpy archive)"]
+    lines += ["", "DATA (data.file=PATH, a numpy archive; of system path also CPHD)"]
     for name, reader in (("stripmap", read_stripmap), ("isal", read_inverse), ("path", read_path)):
-        schema = inspect.cleandoc(reader.__doc__ or "").split("\n\n")[1]
-        lines += [f"  system {name}", textwrap.indent(schema, "    ")]
+        lines += [f"  system {name}", textwrap.indent(inspect.cleandoc(reader.__doc__ or "").split("\n\n")[1], "    ")]
     return "\n".join(lines)
 
 

@@ -310,7 +310,7 @@ def _check_source(config: Config, system: Any, file: str) -> None:
         if len(missing) == 2 and system.reads:
             raise ConfigError(
                 f"{file}: data.file is not set; write data.file=PATH after the command, the path of a "
-                f"{system.reads} .npz file"
+                f"{system.reads} file"
             )
         if missing:
             raise ConfigError(f"{file}: section {missing[0]!r} is missing; a simulation needs 'radar' and 'world'")
@@ -318,7 +318,7 @@ def _check_source(config: Config, system: Any, file: str) -> None:
         raise ConfigError(f"{file}: data.file: system {config.system} reads no recordings; omit this key")
     elif not Path(recorded).is_file():
         what = "is no file" if Path(recorded).exists() else "does not exist"
-        raise ConfigError(f"{file}: data.file: {recorded!r} {what}; give the path of a {system.reads} .npz file")
+        raise ConfigError(f"{file}: data.file: {recorded!r} {what}; give the path of a {system.reads} file")
 
 
 def _check_reruns(methods: Mapping[str, Method], file: str) -> None:

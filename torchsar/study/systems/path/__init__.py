@@ -157,7 +157,8 @@ class AnyPath(System):
         yield partial(comparisons, results, self.columns)
         for case, result in results.items():
             yield partial(figures.images, case, result)
-            yield partial(figures.paths, case, result)
+            if result.first.trials.truth:  # not a recording without errors added
+                yield partial(figures.paths, case, result)
 
 
 def _measured(

@@ -9,16 +9,20 @@ from torchsar.study.output.pictures import Drawn, first_named
 from torchsar.study.settings.cases import titled, word_of
 from torchsar.study.trials.batch import Result
 
+# caption of the figure of paths
+_PATHS = (
+    "The first trial. The error of the line of sight is that of half the path over the middle of the scene, "
+    "recorded and corrected minus true, without constant and linear terms, which hardly change the focus."
+)
+
 
 def images(case: str, result: Result) -> Drawn:
     """Draw the images of all methods, the ideal one first."""
     shown = first_named(result.images)
-    reference = next(iter(shown))
     caption = (
-        f"The first trial, in dB: 0.1 % of the samples of '{reference}' exceed 0 dB, the same level for all methods."
+        f"The first trial, in dB: 0.1 % of the samples of '{next(iter(shown))}' exceed 0 dB, the same level for all methods."
     )
-    figure = plot.images(shown, dynamic_range_db=45.0)
-    yield f"images_{word_of(case)}", titled("Images by every method", case), caption, figure
+    yield f"images_{word_of(case)}", titled("Images by every method", case), caption, plot.images(shown, 45.0)
 
 
 def paths(case: str, result: Result) -> Drawn:
@@ -33,14 +37,13 @@ def paths(case: str, result: Result) -> Drawn:
             bent = place - line @ np.linalg.lstsq(line, place, rcond=None)[0]
             series = {axis: (time, bent[:, i]) for i, axis in enumerate("xyz")}
             parts.append(_panel(f"true path of the {name} minus a straight line", "distance (m)", series))
-    views = {name: outcome.judged.view for name, outcome in result.first.outcomes.items() if not outcome.failed}
-    series = {name: (time, 1e3 * plot.array(view[0])) for name, view in views.items() if name != "ideal"}
+    series = {
+        name: (time, 1e3 * plot.array(outcome.judged.view[0]))
+        for name, outcome in result.first.outcomes.items()
+        if name != "ideal" and not outcome.failed
+    }
     parts.append(_panel("error of the line of sight that is left", "error (mm)", series))
-    caption = (
-        "The first trial. The error of the line of sight is that of half the path over the middle of the scene, "
-        "recorded and corrected minus true, without constant and linear terms, which hardly change the focus."
-    )
-    yield f"paths_{word_of(case)}", titled("Paths", case), caption, plot.panels(parts)
+    yield f"paths_{word_of(case)}", titled("Paths", case), _PATHS, plot.panels(parts)
 
 
 def _panel(title: str, ylabel: str, series: dict[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, object]:
