@@ -67,7 +67,9 @@ def test_the_stage_needs_no_connection():
 def test_the_stage_takes_a_corrected_path():
     recording = RECORDED[False].to(torch.complex64)
     stage = SpotlightImage({**recording.aux, "scene_corners_m": CORNERS}, 10.0, 11.0, 0.5, error_db=-40.0)
-    path = recording.aux["transmitter_m"] + 0.01 * torch.randn(3, dtype=torch.float64) * torch.linspace(-1, 1, 48)[:, None]
+    path = (
+        recording.aux["transmitter_m"] + 0.01 * torch.randn(3, dtype=torch.float64) * torch.linspace(-1, 1, 48)[:, None]
+    )
     image = Chain(image=use(stage, transmitter_m="given.path"))(recording, {"given.path": path})
     grid = scene_grid(recording.aux["frequency_hz"], antennas(recording.aux), CORNERS)
     other = TileImage(10.0, 11.0, 0.5, grid.centre_m, grid.range_axis_rad, error_db=-40.0)

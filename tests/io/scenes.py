@@ -1,4 +1,4 @@
-"""A small recording of two points, and CPHD files that are built without the writer of this package."""
+"""A small recording of two points, and CPHD files that are built without `write_cphd`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchsar.core import Draws, Recording
+from torchsar.core import Draws, Recording, Signal
 from torchsar.echo import simulate_path
+from torchsar.focus import PathImage
 from torchsar.radar import LIGHT_M_S, InverseRadar, LocalFrame
 from torchsar.scene import Flight, PathWorld, Points, StraightPath
 
@@ -83,9 +84,9 @@ class Built:
         self.rx = right if bistatic else left + 2 * 5000 / LIGHT_M_S * np.array(_LEFT[1])
         self.srp = np.array([3.0, -2.0, 1.0]) + np.zeros((PULSES, 3))
         self.low, self.high = 9.45e9, 9.75e9
-        default = (
-            (self.low, (self.high - self.low) / (SAMPLES - 1)) if domain == "FX" else (-31 / 360e6 + 0.3 / 360e6, 1 / 360e6)
-        )
+        default = (self.low, (self.high - self.low) / (SAMPLES - 1))
+        if domain == "TOA":
+            default = (-30.7 / 360e6, 1 / 360e6)
         self.start, self.step = (np.broadcast_to(d if v is None else v, PULSES) for d, v in zip(default, (start, step)))
         self.delay = (self.legs(POINT) - self.legs(self.srp)) / LIGHT_M_S
 
@@ -139,9 +140,9 @@ class Built:
         import sarkit.cphd as sarkit
 
         vectors = self.vectors() | (vectors or {})
-        xml = element(
-            'CPHD xmlns="http://api.nsgreg.nga.mil/schema/cphd/1.0.1"', self._content(list(vectors))
-        ).replace("</CPHD xmlns=", "</CPHD")
+        xml = element('CPHD xmlns="http://api.nsgreg.nga.mil/schema/cphd/1.0.1"', self._content(list(vectors))).replace(
+            "</CPHD xmlns=", "</CPHD"
+        )
         tree = lxml.etree.fromstring(xml).getroottree()
         packed = np.zeros(PULSES, sarkit.get_pvp_dtype(tree))
         for name, value in vectors.items():
@@ -192,3 +193,9 @@ class Built:
                 for name, at, size in zip(names, offsets, sizes)
             },
         }
+
+
+def imaged(stage: PathImage, recording: Recording) -> Signal:
+    """The image of a recording by a stage."""
+    used = ("frequency_hz", "transmitter_m", "receiver_m", "path_reference_m")
+    return stage(recording.signal, **{name: recording.aux[name] for name in used if name in recording.aux})

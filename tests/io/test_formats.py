@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.io.scenes import FRAME, Built, recorded
+from tests.io.scenes import FRAME, Built, imaged, recorded
 from tests.io.test_damaged import PATH, PROFILES, SPOTLIGHT, STRIPMAP, TURNTABLE, loads_or_says, packed
 from torchsar.cli import main
 from torchsar.core import Recording
@@ -54,13 +54,18 @@ def test_the_table_of_formats_has_no_two_owners():
         assert len(values) == len(set(values))
 
 
-@pytest.mark.parametrize(("module", "extra"), [("sarkit.cphd", "formats"), ("sarkit.sicd", "formats"), ("rasterio", "geo")])
+@pytest.mark.parametrize(
+    ("module", "extra"), [("sarkit.cphd", "formats"), ("sarkit.sicd", "formats"), ("rasterio", "geo")]
+)
 def test_an_absent_library_is_named_with_its_extra(tmp_path, monkeypatch, capsys, module, extra):
     monkeypatch.setitem(sys.modules, module, None)
     path = tmp_path / "a.cphd"
     path.write_bytes(b"CPHD/1.1.0\n")
     recording, stage = recorded(), DirectImage(4.0, 4.0, 1.0)
-    image = stage(recording.signal, **{name: recording.aux[name] for name in ("frequency_hz", "transmitter_m", "path_reference_m")})
+    image = stage(
+        recording.signal,
+        **{name: recording.aux[name] for name in ("frequency_hz", "transmitter_m", "path_reference_m")},
+    )
     calls = {
         "sarkit.cphd": [lambda: read(path), lambda: write_cphd(recording, tmp_path / "b", FRAME)],
         "sarkit.sicd": [lambda: read_sicd(path), lambda: write_sicd(image, tmp_path / "b", recording, stage, FRAME)],
@@ -68,7 +73,8 @@ def test_an_absent_library_is_named_with_its_extra(tmp_path, monkeypatch, capsys
     }[module]
     package = module.partition(".")[0]
     for call in calls:
-        with pytest.raises(ModuleNotFoundError, match=rf'needs the package {package}: pip install "torchsar-lab\[{extra}\]"'):
+        said = rf'needs the package {package}: pip install "torchsar-lab\[{extra}\]"'
+        with pytest.raises(ModuleNotFoundError, match=said):
             call()
     if module == "sarkit.cphd":
         assert main(["run", "spotlight", f"data.file={path}", "--out", str(tmp_path / "out")]) == 2
@@ -99,8 +105,7 @@ def test_damage_gives_a_sentence_or_loads(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "data.bin"
     if kind == "sicd":
         stage, recording = DirectImage(8.0, 8.0, 0.5), recorded()
-        used = ("frequency_hz", "transmitter_m", "path_reference_m")
-        image = stage(recording.signal, **{name: recording.aux[name] for name in used})
+        image = imaged(stage, recording)
         write_sicd(image, path, recording, stage, FRAME)
     elif kind == "cphd":
         write_cphd(recorded(), path, FRAME)
@@ -125,7 +130,7 @@ def test_damage_gives_a_sentence_or_loads(tmp_path: Path, kind: str) -> None:
 def test_an_image_is_no_phase_history(tmp_path):
     pytest.importorskip("sarkit", reason="sarkit is not installed (extra `formats`)")
     stage, recording = DirectImage(8.0, 8.0, 0.5), recorded()
-    image = stage(recording.signal, **{n: recording.aux[n] for n in ("frequency_hz", "transmitter_m", "path_reference_m")})
+    image = imaged(stage, recording)
     write_sicd(image, tmp_path / "a.nitf", recording, stage, FRAME)
     with pytest.raises(ValueError, match=r"a.nitf: SICD holds no phase history with positions"):
         read_history(tmp_path / "a.nitf")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.io.scenes import FRAME, POINT, PULSES, recorded
+from tests.io.scenes import FRAME, POINT, PULSES, imaged, recorded
 from torchsar.core import Recording, Signal, unit_phasor
 from torchsar.focus import DirectImage, PathImage, TileImage, backproject
 from torchsar.io import read, read_sicd, write_sicd
@@ -33,13 +33,6 @@ CASES = {
 }
 # axes of the image against the line of sight: each quarter turn of the pixels
 ANGLES = (0.1, math.pi / 2, math.pi - 0.3, -math.pi / 2 + 0.4)
-
-
-_USED = ("frequency_hz", "transmitter_m", "receiver_m", "path_reference_m")
-
-
-def imaged(stage: PathImage, recording: Recording) -> Signal:
-    return stage(recording.signal, **{name: recording.aux[name] for name in _USED if name in recording.aux})
 
 
 def formed(recording: Recording, **keys) -> tuple[PathImage, Signal]:
@@ -124,10 +117,11 @@ def test_spatial_frequencies_lie_where_the_file_says_and_points_where_they_are(t
         assert float(power[half].sum() / power.sum()) < 0.9  # the band is not wider than the spectrum
     # samples of the file are those of the image at their position, without the carrier
     pixel = np.array(peak) - xml.load("{*}ImageData/{*}SCPPixel")
-    along = [FRAME.local_m(torch.tensor(xml.load(f"{{*}}Grid/{{*}}{side}/{{*}}UVectECF")) + origin) for side in ("Row", "Col")]
+    sides = ("Row", "Col")
+    along = [FRAME.local_m(torch.tensor(xml.load(f"{{*}}Grid/{{*}}{side}/{{*}}UVectECF")) + origin) for side in sides]
     away = 0.5 * (pixel[0] * along[0] + pixel[1] * along[1])
     direct = backproject(frequency_samples(recording.signal.data), f, *places, (centre + away)[None])[0]
-    turns = sum(xml.load(f"{{*}}Grid/{{*}}{side}/{{*}}KCtr") * 0.5 * n for side, n in zip(("Row", "Col"), pixel))
+    turns = sum(xml.load(f"{{*}}Grid/{{*}}{side}/{{*}}KCtr") * 0.5 * n for side, n in zip(sides, pixel))
     assert abs(complex(direct) * np.exp(-2j * np.pi * turns) - samples[peak]) < 1e-5 * abs(samples[peak])
     spectrum = np.abs(np.fft.fftshift(np.fft.fft2(samples))) ** 2
     axes = [np.fft.fftshift(np.fft.fftfreq(n, 0.5)) for n in samples.shape]

@@ -142,17 +142,20 @@ class SpotlightImage(TileImage):
         antennas = AntennaPath(known["transmitter_m"], known.get("receiver_m"), known["path_reference_m"])
         grid = scene_grid(known["frequency_hz"], antennas, side_data.get("scene_corners_m"))
         step = grid.step_m if step_m is None else step_m
-        extents = [of if given is None else given for given, of in ((azimuth_m, grid.azimuth_m), (range_m, grid.range_m))]
+        wanted = ((azimuth_m, grid.azimuth_m), (range_m, grid.range_m))
+        extents = [of if given is None else given for given, of in wanted]
         pixels = extents[0] * extents[1] / step**2
         if azimuth_m is None and range_m is None and pixels > _MOST_PIXELS:
             shown = [extent * math.sqrt(_MOST_PIXELS / pixels) for extent in extents]
             warnings.warn(
-                f"the scene of {extents[0]:.0f} x {extents[1]:.0f} m has {pixels:.3g} pixels of {step:.3g} m; the image "
-                f"shows its middle, {shown[0]:.0f} x {shown[1]:.0f} m; give azimuth_m and range_m to see more",
+                f"the scene of {extents[0]:.0f} x {extents[1]:.0f} m has {pixels:.3g} pixels of {step:.3g} m; the "
+                f"image shows its middle, {shown[0]:.0f} x {shown[1]:.0f} m; give azimuth_m and range_m to see more",
                 stacklevel=2,
             )
             extents = shown
-        super().__init__(*extents, step, grid.centre_m, grid.range_axis_rad, grid.height_m, window, error_db)
+        super().__init__(
+            extents[0], extents[1], step, grid.centre_m, grid.range_axis_rad, grid.height_m, window, error_db
+        )
         self.side_data = known
 
     def forward(

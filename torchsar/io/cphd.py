@@ -15,9 +15,9 @@ from torchsar.io.extras import library, reading
 from torchsar.radar import LIGHT_M_S, AntennaPath, InverseRadar, LocalFrame, geocentric, range_profiles
 from torchsar.radar.spotlight import frequency_step_hz
 
-# largest error of a frequency in steps that is ignored, by choice: 3e-4 rad at the edge of the swath
+# largest error of a frequency in steps that is ignored, by choice: 3e-4 rad at the swath's edge
 _SAME_STEP = 1e-4
-# largest error of a path in wavelengths by one antenna in the place of two that is ignored, by choice
+# largest error of a path in wavelengths by one antenna in place of two that is ignored, by choice
 _SAME_ANTENNA = 1e-3
 # shift of profiles in cells that is taken as rounding
 _ZERO_SHIFT = 1e-9
@@ -32,9 +32,9 @@ def read_cphd(path: str | Path, dtype: torch.dtype = torch.complex64, channel: s
     arrives dt after that of the reference point (SRP) of its vector; in the domain TOA the peak of
     a target has the phase SGN 2 pi f_c dt, f_c the middle of FX1 and FX2. Both signs are accepted.
     Samples are multiplied by AmpSF, those of the domain FX beyond FX1 and FX2 are set to zero, as
-    are vectors with SIGNAL = 0, and vectors without finite parameters are dropped. Vectors whose SC0
-    or SCSS differ are resampled to a common band (chirp-z, in the domain FX only). Delays by the
-    troposphere and the ionosphere are taken as those of the reference point.
+    are vectors with SIGNAL = 0, and vectors without finite parameters are dropped. Vectors whose
+    SC0 or SCSS differ are resampled to a common band (chirp-z, in the domain FX only). Delays by
+    the troposphere and the ionosphere are taken as those of the reference point.
 
     Args:
         path: Path of the file.
@@ -98,18 +98,20 @@ class _Head:
         return value
 
     def refuse_cut_off(self, size: int) -> None:
-        """Raise ValueError for compressed samples, or more samples than a file of some size holds."""
+        """Raise ValueError for compressed samples, or more of them than some bytes hold."""
         for node in self._xml.element_tree.findall("{*}Data/{*}Channel"):
             if node.findtext("{*}Identifier") == self.channel:
                 if node.find("{*}CompressedSignalSize") is not None:
-                    raise ValueError(f"{self._path} holds compressed samples; decompress it with the tools of its producer")
+                    raise ValueError(
+                        f"{self._path} holds compressed samples; decompress it with the tools of its producer"
+                    )
                 form = self("Data/SignalArrayFormat")
                 counts = [int(node.findtext(f"{{*}}{key}")) for key in ("NumVectors", "NumSamples")]
                 needed = counts[0] * (counts[1] * {"CI2": 2, "CI4": 4, "CF8": 8}[form] + int(self("Data/NumBytesPVP")))
                 if not (min(counts) >= 2 and needed <= size):
                     raise ValueError(
-                        f"{self._path} is cut off or damaged: {counts[0]} vectors of {counts[1]} samples {form} with their "
-                        f"parameters take {needed} bytes, and the file has {size}"
+                        f"{self._path} is cut off or damaged: {counts[0]} vectors of {counts[1]} samples {form} with "
+                        f"their parameters take {needed} bytes, and the file has {size}"
                     )
 
     def corners_m(self, frame: LocalFrame) -> Tensor:
@@ -182,7 +184,9 @@ def _from_frequencies(history: Tensor, of: dict[str, Tensor], path: Path) -> tup
     n, start, step = history.shape[-1], of["SC0"], of["SCSS"]
     k = torch.arange(n, dtype=torch.float64)
     if not bool((step > 0).all() and (start > 0).all()):
-        raise ValueError(f"{path} must have positive SC0 and SCSS, got a least SC0 of {start.min():g} and SCSS {step.min():g}")
+        raise ValueError(
+            f"{path} must have positive SC0 and SCSS, got a least SC0 of {start.min():g} and SCSS {step.min():g}"
+        )
     f = start[:, None] + step[:, None] * k
     lit = (f >= (of["FX1"] - step / 2)[:, None]) & (f <= (of["FX2"] + step / 2)[:, None])
     history = torch.where(lit, history, 0)
@@ -243,9 +247,7 @@ def _antennas(
     if not monostatic:
         return pair
     middle = (transmitter + receiver) / 2
-    apart = 2 * torch.linalg.vector_norm(middle - point, dim=-1) - torch.linalg.vector_norm(
-        transmitter - point, dim=-1
-    )
+    apart = 2 * torch.linalg.vector_norm(middle - point, dim=-1) - torch.linalg.vector_norm(transmitter - point, dim=-1)
     one = AntennaPath(middle, None, reference + apart - torch.linalg.vector_norm(receiver - point, dim=-1))
     error = (one.path_m(corners) - pair.path_m(corners)).abs().max()
     return one if float(error * frequency[-1]) <= _SAME_ANTENNA * LIGHT_M_S else pair

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Recording, Signal
+from torchsar.focus.path_image import PathImage
 from torchsar.radar import AntennaPath, LocalFrame
 
 
@@ -61,6 +62,9 @@ def antennas_of(recording: Recording) -> AntennaPath:
     Args:
         recording: Recording with the side data of `AntennaPath.side_data`.
 
+    Returns:
+        The path, without trials and on the CPU.
+
     Raises:
         ValueError: If side data are missing, or there are several trials.
     """
@@ -73,37 +77,48 @@ def antennas_of(recording: Recording) -> AntennaPath:
         )
     receiver = single(aux["receiver_m"], 2, "receiver_m") if "receiver_m" in aux else None
     return AntennaPath(
-        single(aux["transmitter_m"], 2, "transmitter_m"), receiver, single(aux["path_reference_m"], 1, "path_reference_m")
+        single(aux["transmitter_m"], 2, "transmitter_m"),
+        receiver,
+        single(aux["path_reference_m"], 1, "path_reference_m"),
     )
 
 
 def pulse_time_s(recording: Recording) -> Tensor:
-    """Return the times of the pulses in seconds, float64 (pulse,).
-
-    They are those of the side data `pulse_time_s`, or else those of the axis of the pulses.
+    """Return the times of the pulses.
 
     Args:
         recording: Recording.
+
+    Returns:
+        The side data `pulse_time_s`, or else the axis of the pulses, in seconds, float64 (pulse,).
     """
     if "pulse_time_s" in recording.aux:
         return single(recording.aux["pulse_time_s"], 1, "pulse_time_s")
     return recording.signal.axis("pulse").values()
 
 
-def image_samples(signal: Signal) -> Tensor:
+def image_samples(signal: Signal, image: PathImage) -> Tensor:
     """Return the samples of an image with one trial, (azimuth, range).
 
     Args:
         signal: Image with the axes (azimuth, range) in metres.
+        image: Stage that formed it.
+
+    Returns:
+        The samples on the CPU, without gradient.
 
     Raises:
-        ValueError: If it has other axes, or several trials.
+        ValueError: If it has other axes than the stage forms, several trials, or samples that are
+            not finite.
     """
     if signal.names != ("azimuth", "range") or any(axis.unit != "m" for axis in signal.axes):
         raise ValueError(
             "only images with the axes ('azimuth', 'range') in metres can be written, got "
             f"{[f'{axis.name} ({axis.unit})' for axis in signal.axes]}"
         )
+    if signal.axes != image.axes:
+        ours, theirs = (" x ".join(f"{axis.n} of {axis.step:g} m" for axis in of.axes) for of in (signal, image))
+        raise ValueError(f"the image has {ours}, but its stage forms {theirs}; give the stage that formed the image")
     data = single(signal.data, 2, "the image")
     if not bool(torch.isfinite(data.abs()).all()):
         raise ValueError("the image has samples that are NaN or Inf and cannot be written")

@@ -31,8 +31,8 @@ def write_geotiff(
 
     Samples are not resampled. Columns are along the axis of the image that is closest to east, and
     rows along that closest to south; the file has the affine map of the pixels to the projection,
-    with its rotation. If this map is wrong by more than a tenth of a pixel, as for large images, the
-    file has a grid of ground control points instead.
+    with its rotation. If this map is wrong by more than a tenth of a pixel, as for images of more
+    than about 100 km, the file has a grid of ground control points instead.
 
     Args:
         signal: Image of one trial with the axes (azimuth, range), as `image` returns it.
@@ -53,9 +53,7 @@ def write_geotiff(
     """
     rasterio, warp = (library(name, "geo", f"writing {path}") for name in ("rasterio", "rasterio.warp"))
     control = library("rasterio.control", "geo", f"writing {path}")
-    data = image_samples(signal)
-    if signal.axes != image.axes:
-        raise ValueError(f"the image has the axes {signal.axes}, but its stage forms {image.axes}; give the stage of the image")
+    data = image_samples(signal, image)
     amplitude = data.abs().double()
     values = to_db(amplitude.square()) if decibels else amplitude
     raster, corner, down, right = _north_up(values.float().numpy(), image)

@@ -43,8 +43,8 @@ def read_sicd(path: str | Path, dtype: torch.dtype = torch.complex64) -> Signal:
         stored = sum(int(segment["Data"].size) for segment in reader.jbp["ImageSegments"])
         if min(counts) < 1 or not needed <= stored <= path.stat().st_size:
             raise ValueError(
-                f"it is cut off or damaged: {counts[0]} rows of {counts[1]} samples take {needed} bytes, its header counts "
-                f"{stored}, and the file has {path.stat().st_size}"
+                f"it is cut off or damaged: {counts[0]} rows of {counts[1]} samples take {needed} bytes, its header "
+                f"counts {stored}, and the file has {path.stat().st_size}"
             )
         samples = torch.from_numpy(_complex(reader.read_image(), xml)).T.contiguous()
         first = [int(xml.load(f"{{*}}ImageData/{{*}}First{name}")) for name in ("Row", "Col")]

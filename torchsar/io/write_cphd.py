@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +20,16 @@ from torchsar.radar.spotlight import frequency_step_hz
 _NAMESPACE = "http://api.nsgreg.nga.mil/schema/cphd/1.1.0"
 _CHANNEL = "1"
 # start of the collection where none is known
-UNKNOWN_START = datetime(1970, 1, 1, tzinfo=timezone.utc)
+UNKNOWN_START = datetime(1970, 1, 1, tzinfo=UTC)
 # samples per delay that the file declares as valid: the recommendation of the standard is 1.2
 _OVERSAMPLING = 1.25
 # a reference path that differs by less from that over the reference point is the same, in metres
 _SAME_M = 1e-8
-_SCALARS = ("TxTime", "RcvTime", "aFDOP", "aFRR1", "aFRR2", "FX1", "FX2", "TOA1", "TOA2", "TDTropoSRP", "SC0", "SCSS")
-_VECTORS = ("TxPos", "TxVel", "RcvPos", "RcvVel", "SRPPos")
-# order of the schema
-_ORDER = (
-    *("TxTime", "TxPos", "TxVel", "RcvTime", "RcvPos", "RcvVel", "SRPPos", "aFDOP", "aFRR1", "aFRR2"),
-    *("FX1", "FX2", "TOA1", "TOA2", "TDTropoSRP", "SC0", "SCSS"),
-)
+# numbers per vector of each parameter, in the order of the schema
+_SIZES: dict[str, int] = {
+    **{"TxTime": 1, "TxPos": 3, "TxVel": 3, "RcvTime": 1, "RcvPos": 3, "RcvVel": 3, "SRPPos": 3, "aFDOP": 1},
+    **{"aFRR1": 1, "aFRR2": 1, "FX1": 1, "FX2": 1, "TOA1": 1, "TOA2": 1, "TDTropoSRP": 1, "SC0": 1, "SCSS": 1},
+}
 
 
 @quiet()
@@ -47,9 +45,9 @@ def write_cphd(
     Samples are written in the domain FX as CF8, with SGN = -1. They are the frequency samples of
     the profiles, rounded to single precision; their phases refer to `scene_reference_m` of the side
     data, by default the origin. If the recording has other reference paths, its samples are turned
-    to these. Antennas in one place are written as monostatic. The imaged area is the rectangle around
-    `scene_corners_m`, or a square of the side of the unambiguous range. Velocities are differences
-    of the positions.
+    to these. Antennas in one place are written as monostatic. The imaged area is the rectangle
+    around `scene_corners_m`, or a square of the side of the unambiguous range. Velocities are
+    differences of the positions.
 
     Args:
         recording: Recording of one trial with the axes (pulse, range), as by `read_path`,
@@ -80,7 +78,7 @@ def write_cphd(
     area = _area(recording, frequency, antennas)
     content = _content(samples.shape, vectors, antennas, area, frame, start, mode)
     sarkit.ElementWrapper(tree.getroot()).from_dict(content)
-    packed = np.zeros(len(samples), sarkit.get_pvp_dtype(tree))
+    packed: Any = np.zeros(len(samples), sarkit.get_pvp_dtype(tree))
     for name, value in vectors.items():
         packed[name] = value
     tree.getroot().find("{*}PVP").addnext(_dwell(sarkit, tree, packed))
@@ -116,17 +114,15 @@ def _vectors(
     if float(time[0]) < 0:
         time = time - time[0]
     times = {"Tx": time, "Rcv": time + (legs["Tx"] + legs["Rcv"]) / LIGHT_M_S}
-    # one antenna at one place for both: its velocity is that over the times of pulses
     swath = 1 / (_OVERSAMPLING * step)
-    found: dict[str, np.ndarray | float] = dict.fromkeys(_SCALARS, 0.0)
+    found: dict[str, np.ndarray | float] = dict.fromkeys(("aFDOP", "aFRR1", "aFRR2", "TDTropoSRP"), 0.0)
     for side, place in places.items():
         earth = frame.geocentric_m(place).numpy()
-        clock = times["Tx" if one else side].numpy()
-        order = min(2, len(clock) - 1)
+        clock = times["Tx" if one else side].numpy()  # one antenna has one place for both times
         found |= {
             f"{side}Time": times[side].numpy(),
             f"{side}Pos": earth,
-            f"{side}Vel": np.gradient(earth, clock, axis=0, edge_order=order),
+            f"{side}Vel": np.gradient(earth, clock, axis=0, edge_order=2 if len(clock) > 2 else 1),
         }
     return found | {
         "SRPPos": frame.geocentric_m(point).numpy(),
@@ -162,8 +158,7 @@ def _content(
     east, north, _ = (frame.geocentric_m(torch.eye(3, dtype=torch.float64)) - origin).numpy()
     west_m, south_m, east_m, north_m = area.tolist()
     corners = [(west_m, south_m), (west_m, north_m), (east_m, north_m), (east_m, south_m)]
-    fields = {name: ("f8", 1) for name in _SCALARS} | {name: ("3f8", 3) for name in _VECTORS}
-    offsets = np.cumsum([0, *(fields[name][1] for name in _ORDER)]).tolist()
+    offsets = np.cumsum([0, *_SIZES.values()]).tolist()
     band, swath = vectors["FX2"] - vectors["FX1"], vectors["TOA2"] - vectors["TOA1"]
     fixed = bool((vectors["SRPPos"] == vectors["SRPPos"][0]).all())
     bistatic = {} if antennas.receiver_m is None else {"IlluminatorName": "transmitter"}
@@ -231,8 +226,8 @@ def _content(
             ],
         },
         "PVP": {
-            name: {"Offset": at, "Size": fields[name][1], "dtype": np.dtype(fields[name][0])}
-            for name, at in zip(_ORDER, offsets, strict=False)
+            name: {"Offset": at, "Size": size, "dtype": np.dtype("f8" if size == 1 else "3f8")}
+            for (name, size), at in zip(_SIZES.items(), offsets, strict=False)
         },
     }
 

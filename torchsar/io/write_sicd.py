@@ -19,12 +19,14 @@ from torchsar.focus.spotlight import window_weights
 from torchsar.io.extras import library, quiet, write_whole
 from torchsar.io.geometry import antennas_of, frame_of, image_samples, pulse_time_s, single
 from torchsar.io.write_cphd import UNKNOWN_START
-from torchsar.radar import LIGHT_M_S, AntennaPath, LocalFrame
+from torchsar.radar import LIGHT_M_S, LocalFrame
 
 _NAMESPACE = "urn:SICD:1.4.0"
-# highest order of the polynomials of positions, and rms distance in metres at which a lower one suffices
+# highest order of the polynomials of positions, and rms distance in metres at which a lower one
+# suffices, by choice
 _MOST_ORDER, _NEAR_M = 9, 1e-4
-# points along either axis at which spatial frequencies are fitted, and order of the polynomials, by choice
+# points along either axis at which spatial frequencies are fitted, and order of these
+# polynomials, by choice
 _POINTS, _ORDER = 7, 2
 # width at -3 dB times bandwidth, and names of the windows
 _WIDTHS = {"none": 0.885892941378905, "hann": 1.4405}
@@ -45,12 +47,12 @@ def write_sicd(
     """Write a complex image with its geometry as a SICD file (version 1.4.0, NITF).
 
     The grid is of type PLANE on the imaged plane, and its centre point (SCP) is the middle sample.
-    Rows are along the axis of the image that is closest to the line of sight and point away from the
-    radar; columns follow a quarter turn later, so that the normal points up. With Sgn = -1 a phase
-    of +2 pi K x has the spatial frequency K: a scatterer is summed with K = f times the gradient of
-    its path over c. KCtr is that of the middle of aperture and band at the SCP, and samples are
-    multiplied by exp(-2j pi KCtr x), so that their spectrum lies about zero; DeltaKCOAPoly is the
-    change of the middle over the image, DeltaK1 and DeltaK2 are the limits of the spectrum with it.
+    Rows are along the axis of the image that is closest to the line of sight and point away from
+    the radar; columns follow a quarter turn later, so that the normal points up. With Sgn = -1 a
+    phase of +2 pi K x has the spatial frequency K: a scatterer is summed with K = f times the
+    gradient of its path over c. KCtr is the middle of these at the SCP, and samples are multiplied
+    by exp(-2j pi KCtr x), so that their spectrum lies about zero; DeltaKCOAPoly is the change of
+    the middle over the image, DeltaK1 and DeltaK2 are the limits of the spectrum with it.
     Positions of the antennas are polynomials of time of order 9 at most.
 
     Args:
@@ -71,9 +73,7 @@ def write_sicd(
     sarkit, wgs84, etree = (
         library(name, "formats", f"writing {path}") for name in ("sarkit.sicd", "sarkit.wgs84", "lxml.etree")
     )
-    data = image_samples(signal)
-    if signal.axes != image.axes:
-        raise ValueError(f"the image has the axes {signal.axes}, but its stage forms {image.axes}; give the stage of the image")
+    data = image_samples(signal, image)
     scene = _Scene(recording, image, frame_of(recording, frame))
     tree = etree.Element(f"{{{_NAMESPACE}}}SICD").getroottree()
     root = sarkit.ElementWrapper(tree.getroot())
@@ -139,15 +139,17 @@ class _Pixels:
     @staticmethod
     def of(grid: ImageGrid) -> _Pixels:
         """Pixels of an image (azimuth, range) in the order (range, azimuth)."""
-        return _Pixels(grid.origin_m, grid.axes[1], grid.axes[0], grid.counts[::-1], grid.step_m)
+        rows, columns = grid.counts[1], grid.counts[0]
+        return _Pixels(grid.origin_m, grid.axes[1], grid.axes[0], (rows, columns), grid.step_m)
 
     def turned(self) -> _Pixels:
         corner = self.corner_m + self.step_m * (self.counts[1] - 1) * self.right
-        return _Pixels(corner, -self.right, self.down, self.counts[::-1], self.step_m, self.turns + 1)
+        counts = self.counts[1], self.counts[0]
+        return _Pixels(corner, -self.right, self.down, counts, self.step_m, self.turns + 1)
 
     def away_from(self, position_m: Tensor) -> _Pixels:
         """The order in which rows point away from a position as directly as possible."""
-        orders = [self]
+        orders: list[_Pixels] = [self]
         for _ in range(3):
             orders.append(orders[-1].turned())
         sight = self.at(*self.middle) - position_m
@@ -223,7 +225,7 @@ class _Scene:
             pulse = (self.lit[:, 0] + share * (self.lit[:, 1] - self.lit[:, 0])).round().long()
             away = [points - place[pulse] for place in self.antennas.places]
             unit = [v / torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in away]
-            slope = (sum(unit) * (2 if len(unit) == 1 else 1)) @ axes.T
+            slope = torch.stack(unit).mean(0) * 2 @ axes.T
             for frequency in (self.frequency[0], self.frequency[-1]):
                 k = slope * frequency / LIGHT_M_S
                 low, high = torch.minimum(low, k), torch.maximum(high, k)
@@ -243,7 +245,7 @@ class _Scene:
         return _Side(float(middle[-1]), poly, width, limits)
 
     def _fitted(self, values: Tensor, at_centre: float) -> np.ndarray:
-        """Polynomial of row and column in metres through values at the points, and at the centre."""
+        """Polynomial of row and column in metres that fits the points and meets the centre."""
         powers = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1) if 0 < i + j <= _ORDER]
         scale = float(torch.maximum(self.row_m.abs().max(), self.column_m.abs().max()).clamp_min(1e-9))
         terms = torch.stack([(self.row_m / scale) ** i * (self.column_m / scale) ** j for i, j in powers], -1)
@@ -290,7 +292,9 @@ class _Scene:
         found = np.zeros((1, 3))
         for order in range(1, min(_MOST_ORDER, len(t) - 1) + 1):
             fits = [np.polynomial.Polynomial.fit(t, earth[:, axis], order) for axis in range(3)]
-            found = np.stack([fit.convert().coef.tolist() + [0.0] * (order + 1 - len(fit.convert().coef)) for fit in fits], -1)
+            found = np.zeros((order + 1, 3))
+            for axis, coefficients in enumerate(fit.convert().coef for fit in fits):
+                found[: len(coefficients), axis] = coefficients  # trailing zeros are left out
             error = np.stack([fit(t) for fit in fits], -1) - earth
             if np.sqrt((error**2).sum(-1).mean()) <= _NEAR_M:
                 break

@@ -20,7 +20,8 @@ def images(case: str, result: Result) -> Drawn:
     """Draw the images of all methods, the ideal one first."""
     shown = first_named(result.images)
     caption = (
-        f"The first trial, in dB: 0.1 % of the samples of '{next(iter(shown))}' exceed 0 dB, the same level for all methods."
+        f"The first trial, in dB: 0.1 % of the samples of '{next(iter(shown))}' exceed 0 dB, the same level for all "
+        "methods."
     )
     yield f"images_{word_of(case)}", titled("Images by every method", case), caption, plot.images(shown, 45.0)
 
