@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Recording, unit_phasor
+from torchsar.core import Recording, refuse_non_finite, unit_phasor
 from torchsar.focus.chirp_z import chirp_z
 from torchsar.io.extras import library, reading
 from torchsar.radar import LIGHT_M_S, AntennaPath, InverseRadar, LocalFrame, geocentric, range_profiles
@@ -21,6 +21,8 @@ _SAME_STEP = 1e-4
 _SAME_ANTENNA = 1e-3
 # shift of profiles in cells that is taken as rounding
 _ZERO_SHIFT = 1e-9
+# samples that are transformed at once, by choice: 64 MB as complex128
+_BLOCK = 1 << 22
 _POSITIONS = ("TxPos", "RcvPos", "SRPPos")
 _NEEDED = ("TxTime", *_POSITIONS, "FX1", "FX2", "SC0", "SCSS")
 
@@ -126,111 +128,155 @@ def _recording(head: _Head, samples: np.ndarray, vectors: np.ndarray, dtype: tor
     finite = np.all([np.isfinite(vectors[name]).reshape(len(vectors), -1).all(-1) for name in _NEEDED], 0)
     if finite.sum() < 2:
         raise ValueError(f"{path} has {finite.sum()} vectors with finite parameters; an image needs two or more")
-    vectors = vectors[finite]
-    of = {name: torch.from_numpy(np.ascontiguousarray(vectors[name], "f8")) for name in (*_NEEDED, "RcvTime")}
-    history = _scaled(samples[finite], vectors)
-    if not bool(torch.isfinite(history.abs()).all()):
-        raise ValueError(f"{path} has samples that are NaN or Inf")
-    history = history if head.sign < 0 else history.conj().resolve_conj()
-    frame = LocalFrame(*np.asarray(head("SceneCoordinates/IARP/LLH"), float).tolist())
-    transmitter, receiver, point = (frame.local_m(of[name]) for name in _POSITIONS)
-    reference = sum(torch.linalg.vector_norm(place - point, dim=-1) for place in (transmitter, receiver))
-    assert isinstance(reference, Tensor)
-    if head.domain == "FX":
-        profiles, frequency = _from_frequencies(history, of, path)
-    else:
-        profiles, frequency, shift = _from_delays(history, of, path)
-        reference = reference + LIGHT_M_S * shift
-    step = frequency_step_hz(frequency)
-    corners = head.corners_m(frame)
-    antennas = _antennas(transmitter, receiver, reference, point, corners, frequency, head.monostatic)
+    if not finite.all():
+        samples, vectors = samples[finite], vectors[finite]
+    of = {name: torch.from_numpy(np.ascontiguousarray(vectors[name], "f8")) for name in _NEEDED}
     time = of["TxTime"]
-    span = float(time[-1] - time[0])
     if not bool((time.diff() > 0).all()):
         raise ValueError(f"{path} must have rising times of transmission, got a least step of {time.diff().min():g} s")
-    n, pulses = len(frequency), len(time)
+    frame = LocalFrame(*np.asarray(head("SceneCoordinates/IARP/LLH"), float).tolist())
+    transmitter, receiver, point = (frame.local_m(of[name]) for name in _POSITIONS)
+    bands = (_Frequencies if head.domain == "FX" else _Delays)(samples.shape[-1], of, path)
+    legs = [torch.linalg.vector_norm(place - point, dim=-1) for place in (transmitter, receiver)]
+    reference = legs[0] + legs[1] + LIGHT_M_S * bands.shift_s
+    corners = head.corners_m(frame)
+    antennas = _antennas(transmitter, receiver, reference, point, corners, bands.frequency, head.monostatic)
+    n, pulses = len(bands.frequency), len(time)
+    step = frequency_step_hz(bands.frequency)
     radar = InverseRadar(
-        float(frequency[n // 2]), n * step, (pulses - 1) / span, None, None, float(antennas.reference_m.mean()) / 2
+        carrier_hz=float(bands.frequency[n // 2]),
+        bandwidth_hz=n * step,
+        prf_hz=(pulses - 1) / float(time[-1] - time[0]),
+        reference_range_m=float(antennas.reference_m.mean()) / 2,
     )
+    scale = _scales(vectors)
+    profiles = torch.empty(pulses, n, dtype=dtype)
+    for first in range(0, pulses, block := max(1, _BLOCK // n)):
+        rows = slice(first, first + block)
+        history = torch.from_numpy(_complex(samples[rows]) * scale[rows, None])
+        refuse_non_finite(history, f"{path}: samples")
+        profiles[rows] = bands.profiles(history if head.sign < 0 else history.conj().resolve_conj(), rows).to(dtype)
     aux: dict[str, Any] = {
-        "frequency_hz": frequency,
+        "frequency_hz": bands.frequency,
         **antennas.side_data(),
         "origin_deg_m": torch.tensor([frame.latitude_deg, frame.longitude_deg, frame.height_m], dtype=torch.float64),
         "pulse_time_s": time,
         "scene_reference_m": point,
         "scene_corners_m": corners,
     }
-    return Recording.from_arrays(
-        profiles.contiguous(), radar, dtype=dtype, start_s=float(time[0]), what=str(path), **aux
-    )
+    return Recording.from_arrays(profiles, radar, dtype=dtype, start_s=float(time[0]), what=str(path), **aux)
 
 
-def _scaled(samples: np.ndarray, vectors: np.ndarray) -> Tensor:
-    """Complex samples times the scale of their vector, complex128 (pulse, sample)."""
+def _scales(vectors: np.ndarray) -> np.ndarray:
+    """Factors of the samples of each vector."""
+    names = vectors.dtype.names or ()
+    scale = vectors["AmpSF"].astype("f8") if "AmpSF" in names else np.ones(len(vectors))
+    return scale * (vectors["SIGNAL"] != 0) if "SIGNAL" in names else scale
+
+
+def _complex(samples: np.ndarray) -> np.ndarray:
+    """Samples of any format as complex128."""
     if samples.dtype.names:
-        values = samples["real"].astype("f8") + 1j * samples["imag"].astype("f8")
-    else:
-        values = samples.astype("c16")
-    scale = np.ones(len(vectors))
-    if "AmpSF" in (vectors.dtype.names or ()):
-        scale = scale * vectors["AmpSF"]
-    if "SIGNAL" in (vectors.dtype.names or ()):
-        scale = scale * (vectors["SIGNAL"] != 0)
-    return torch.from_numpy(values * scale[:, None])
+        return samples["real"].astype("f8") + 1j * samples["imag"].astype("f8")
+    return samples.astype("c16")
 
 
-def _from_frequencies(history: Tensor, of: dict[str, Tensor], path: Path) -> tuple[Tensor, Tensor]:
-    """Range profiles and their frequencies from vectors of the domain FX."""
-    n, start, step = history.shape[-1], of["SC0"], of["SCSS"]
-    k = torch.arange(n, dtype=torch.float64)
-    if not bool((step > 0).all() and (start > 0).all()):
-        raise ValueError(
-            f"{path} must have positive SC0 and SCSS, got a least SC0 of {start.min():g} and SCSS {step.min():g}"
-        )
-    f = start[:, None] + step[:, None] * k
-    lit = (f >= (of["FX1"] - step / 2)[:, None]) & (f <= (of["FX2"] + step / 2)[:, None])
-    history = torch.where(lit, history, 0)
-    ends = torch.stack([f[:, 0], f[:, -1]], -1)
-    if float((ends - ends[0]).abs().max()) <= _SAME_STEP * float(step.min()):
-        return range_profiles(history), f[0]
-    wide, low, high = float(step.max()), float(f[:, 0].min()), float(f[:, -1].max())
-    count = int(np.ceil((high - low) / wide)) + 1
-    if count > 4 * n:
-        raise ValueError(
-            f"{path}: the bands of its vectors reach from {low:g} to {high:g} Hz, more than 4 times the band of one; "
-            "split the file into groups of vectors of similar bands"
-        )
-    frequency = low + wide * torch.arange(count, dtype=torch.float64)
-    middle, delay = count // 2, 1 / (count * wide)  # in cells, and delay of a cell in seconds
-    turns = delay * step
-    spread = chirp_z(history, middle * turns, -turns, count, centre=n // 2)
-    cells = torch.arange(count, dtype=torch.float64) - middle
-    shift = (start + n // 2 * step - frequency[middle]) * delay
-    spread = spread * unit_phasor(shift[:, None] * cells, spread.dtype)
-    return spread * (step / wide)[:, None] / count**0.5, frequency
+class _Frequencies:
+    """Range profiles from vectors of the domain FX.
 
+    Args:
+        n: Number of samples of a vector.
+        of: Parameters of the vectors.
+        path: Path of the file, for messages.
 
-def _from_delays(history: Tensor, of: dict[str, Tensor], path: Path) -> tuple[Tensor, Tensor, Tensor]:
-    """Range profiles, their frequencies, and the delay of their middle relative to the reference
-    point in seconds, (pulse,), from vectors of the domain TOA.
-
-    Cell m of a profile lies at SC0 + m SCSS, with the phase of the carrier as in a range profile
-    about the reference point; about its middle n // 2 the carrier turns by f_c times the delay.
+    Attributes:
+        frequency: Frequencies of the profiles in Hz.
+        shift_s: Delay of the middle of the profiles relative to the reference point, in seconds.
     """
-    n, step = history.shape[-1], of["SCSS"]
-    carrier = (of["FX1"] + of["FX2"]) / 2
-    for name, value, scale in (("SCSS", step, step[0] / n), ("FX1 + FX2", carrier, 1 / (n * step[0]))):
-        if not bool(step[0] > 0) or float((value - value[0]).abs().max()) > _SAME_STEP * float(scale):
+
+    def __init__(self, n: int, of: dict[str, Tensor], path: Path) -> None:
+        start, step = self._start, self._step = of["SC0"], of["SCSS"]
+        if not bool((step > 0).all() and (start > 0).all()):
             raise ValueError(
-                f"{path}: vectors of the domain TOA must share one positive SCSS and one FX1 + FX2, got {name} of "
-                f"{float(value.min()):.9g} to {float(value.max()):.9g}"
+                f"{path} must have positive SC0 and SCSS, got a least SC0 of {start.min():g} and SCSS {step.min():g}"
             )
-    shift = of["SC0"] + n // 2 * step
-    shift = torch.where(shift.abs() < _ZERO_SHIFT * step, 0, shift)
-    frequency = carrier[0] + (torch.arange(n, dtype=torch.float64) - n // 2) / (n * step[0])
-    if bool((shift == 0).all()):
-        return history, frequency, shift
-    return history * unit_phasor((carrier[0] * shift)[:, None], history.dtype), frequency, shift
+        self._ends = of["FX1"] - step / 2, of["FX2"] + step / 2
+        self._k = torch.arange(n, dtype=torch.float64)
+        self.shift_s = torch.zeros((), dtype=torch.float64)
+        last = start + (n - 1) * step
+        apart = max(float(v.max() - v.min()) for v in (start, last))
+        self._alike = apart <= _SAME_STEP * float(step.min())
+        if self._alike:
+            self.frequency = start[0] + step[0] * self._k
+            return
+        wide, low, high = float(step.max()), float(start.min()), float(last.max())
+        count = int(np.ceil((high - low) / wide)) + 1
+        if count > 4 * n:
+            raise ValueError(
+                f"{path}: the bands of its vectors reach from {low:g} to {high:g} Hz, more than 4 times the band of "
+                "one; split the file into groups of vectors of similar bands"
+            )
+        self.frequency = low + wide * torch.arange(count, dtype=torch.float64)
+
+    def profiles(self, history: Tensor, rows: slice) -> Tensor:
+        """Range profiles of some vectors.
+
+        Args:
+            history: Their samples, (vector, sample).
+            rows: Numbers of the vectors.
+        """
+        start, step = self._start[rows, None], self._step[rows, None]
+        f = start + step * self._k
+        history = torch.where((f >= self._ends[0][rows, None]) & (f <= self._ends[1][rows, None]), history, 0)
+        if self._alike:
+            return range_profiles(history)
+        n, count = len(self._k), len(self.frequency)
+        wide = self.frequency[1] - self.frequency[0]
+        middle, delay = count // 2, 1 / (count * wide)  # of cells, in seconds
+        turns = (delay * step)[:, 0]
+        found = chirp_z(history, middle * turns, -turns, count, centre=n // 2)
+        cells = torch.arange(count, dtype=torch.float64) - middle
+        shift = (start + n // 2 * step - self.frequency[middle]) * delay
+        return found * unit_phasor(shift * cells, found.dtype) * (step / wide) / count**0.5
+
+
+class _Delays:
+    """Range profiles from vectors of the domain TOA.
+
+    Cell m lies at the delay SC0 + m SCSS and has the phase of the carrier as in a range profile
+    about the reference point; about its middle n // 2 the carrier turns by f_c times the delay.
+
+    Args:
+        n: Number of samples of a vector.
+        of: Parameters of the vectors.
+        path: Path of the file, for messages.
+
+    Attributes:
+        frequency: Frequencies of the profiles in Hz.
+        shift_s: Delay of the middle of the profiles relative to the reference point, in seconds.
+    """
+
+    def __init__(self, n: int, of: dict[str, Tensor], path: Path) -> None:
+        step, carrier = of["SCSS"], (of["FX1"] + of["FX2"]) / 2
+        for name, value, scale in (("SCSS", step, step[0] / n), ("FX1 + FX2", carrier, 1 / (n * step[0]))):
+            if not bool(step[0] > 0) or float((value - value[0]).abs().max()) > _SAME_STEP * float(scale):
+                raise ValueError(
+                    f"{path}: vectors of the domain TOA must share one positive SCSS and one FX1 + FX2, got {name} of "
+                    f"{float(value.min()):.9g} to {float(value.max()):.9g}"
+                )
+        shift = of["SC0"] + n // 2 * step
+        self.shift_s = torch.where(shift.abs() < _ZERO_SHIFT * step, 0, shift)
+        self._turns = carrier[0] * self.shift_s
+        self.frequency = carrier[0] + (torch.arange(n, dtype=torch.float64) - n // 2) / (n * step[0])
+
+    def profiles(self, history: Tensor, rows: slice) -> Tensor:
+        """Range profiles of some vectors.
+
+        Args:
+            history: Their samples, (vector, sample).
+            rows: Numbers of the vectors.
+        """
+        return history * unit_phasor(self._turns[rows, None], history.dtype)
 
 
 def _antennas(
