@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from tests.contract.pretended import DEVICE, pretended_device, to_device, to_host
 from tests.io.scenes import POINT, recorded
 from torchsar.core import Chain, use
 from torchsar.focus import SpotlightImage, TileImage, scene_grid
@@ -75,6 +76,15 @@ def test_the_stage_takes_a_corrected_path():
     other = TileImage(10.0, 11.0, 0.5, grid.centre_m, grid.range_axis_rad, error_db=-40.0)
     used = {"frequency_hz": recording.aux["frequency_hz"], "path_reference_m": recording.aux["path_reference_m"]}
     torch.testing.assert_close(image.data, other(recording.signal, transmitter_m=path, **used).data)
+
+
+def test_the_geometry_follows_the_data_to_a_device():
+    recording = RECORDED[False].to(torch.complex64)
+    stage = SpotlightImage({**recording.aux, "scene_corners_m": CORNERS}, 10.0, 11.0, 0.5, error_db=-40.0)
+    expected = stage(recording.signal).data
+    with pretended_device():
+        found = stage.to(DEVICE)(recording.signal.with_data(to_device(recording.signal.data)))
+    torch.testing.assert_close(to_host(found.data), expected)
 
 
 def test_large_scenes_are_cut_with_a_warning(monkeypatch):

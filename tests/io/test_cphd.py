@@ -88,8 +88,7 @@ def test_a_written_file_passes_the_checks_and_holds_every_bit(tmp_path, bistatic
     with path.open("rb") as file:
         checker = CphdConsistency.from_file(file, thorough=True)
         checker.check()
-        failed = [(name, one) for name, check in checker.failures().items() for one in check["details"]]
-        assert [name for name, one in failed if one["severity"] == "Error" and not one["passed"]] == []
+        assert list(checker.failures()) == []
         file.seek(0)
         samples, _ = sarkit.Reader(file).read_channel("1")
     history = frequency_samples(recording.signal.data).to(torch.complex64)

@@ -189,6 +189,7 @@ def _content(
             "ReferenceSurface": {"Planar": {"uIAX": east, "uIAY": north}},
             "ImageArea": {"X1Y1": [west_m, south_m], "X2Y2": [east_m, north_m]},
             "ImageAreaCornerPoints": _geodetic(frame, corners),
+            "ImageGrid": _grid(area, LIGHT_M_S / (2 * band)),
         },
         "Data": {
             "SignalArrayFormat": "CF8",
@@ -229,6 +230,17 @@ def _content(
             name: {"Offset": at, "Size": size, "dtype": np.dtype("f8" if size == 1 else "3f8")}
             for (name, size), at in zip(_SIZES.items(), offsets, strict=False)
         },
+    }
+
+
+def _grid(area: np.ndarray, spacing_m: float) -> dict[str, Any]:
+    """Grid of an image of the area with the spacing of the resolution, whose lines run east."""
+    counts = [max(1, math.ceil((area[i + 2] - area[i]) / spacing_m)) for i in (0, 1)]
+    first = [round(-area[i] / spacing_m - 0.5) for i in (0, 1)]  # lines before the origin
+    return {
+        "IARPLocation": first,
+        "IAXExtent": {"LineSpacing": spacing_m, "FirstLine": 0, "NumLines": counts[0]},
+        "IAYExtent": {"SampleSpacing": spacing_m, "FirstSample": 0, "NumSamples": counts[1]},
     }
 
 
