@@ -84,7 +84,7 @@ def test_a_written_file_passes_the_checks_and_holds_every_bit(tmp_path, bistatic
     from sarkit.verification import CphdConsistency
 
     recording, path = recorded(bistatic), tmp_path / "written.cphd"
-    write_cphd(recording, path, FRAME)
+    write_cphd(recording, path, FRAME, mode="STRIPMAP" if bistatic else "SPOTLIGHT")
     with path.open("rb") as file:
         checker = CphdConsistency.from_file(file, thorough=True)
         checker.check()

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zarr
 
 from tests.io.scenes import POINT, Built
+from tests.test_scripts import readme_blocks
 from torchsar.cli import main
+from torchsar.io import read_sicd
 
 pytest.importorskip("sarkit", reason="sarkit is not installed (extra `formats`)")
 
@@ -35,3 +38,16 @@ def test_a_recording_without_positions_gives_one_sentence(tmp_path: Path, capsys
     assert main(["run", "spotlight", f"data.file={path}", "--out", str(tmp_path / "out")]) == 2
     said = [line for line in capsys.readouterr().err.splitlines() if line != "torchsar: run spotlight"]
     assert len(said) == 1 and str(path) in said[0] and not (tmp_path / "out").exists()
+
+
+def test_the_example_of_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (extra `geo`)")
+    file = Built(bistatic=True).write(tmp_path / "data.cphd")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(next(block for block in readme_blocks("python") if "def image_of(" in block), names)
+    image = names["image_of"](file)
+    with rasterio.open(tmp_path / "image.tif") as raster:
+        assert raster.read(1).max() == pytest.approx(float(image.data.abs().max()))
+    back = read_sicd(tmp_path / "image.nitf")
+    assert [(axis.n, axis.step) for axis in back.axes] == [(axis.n, axis.step) for axis in image.axes]
