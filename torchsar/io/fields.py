@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +14,20 @@ from torch import Tensor
 from torchsar.core import ArrayFile, StoredArray
 
 _SHORT = 64  # bytes of the longest value that messages show
+
+
+class Described(NamedTuple):
+    """What an archive holds, before its samples are loaded.
+
+    Args:
+        samples: The sample array.
+        radar: Description of the instrument.
+        aux: Side data by name, as for `Recording.from_arrays`.
+    """
+
+    samples: StoredArray
+    radar: Any
+    aux: dict[str, Any]
 
 
 def archive(path: Path, content: str) -> ArrayFile:
@@ -55,11 +70,12 @@ def naming(what: str | Path) -> Iterator[None]:
         raise ValueError(text if text.startswith(str(what)) else f"{what}: {text}") from None
 
 
-def refuse_missing(fields: ArrayFile, keys: tuple[str, ...], kind: str) -> None:
+def refuse_missing(fields: Mapping[str, StoredArray], path: Path, keys: tuple[str, ...], kind: str) -> None:
     """Check that an archive has all keys that one of its kind must have.
 
     Args:
         fields: The fields of the archive.
+        path: Path of the archive, for messages.
         keys: The required keys.
         kind: Kind of the archive, for messages.
 
@@ -69,7 +85,7 @@ def refuse_missing(fields: ArrayFile, keys: tuple[str, ...], kind: str) -> None:
     missing = [key for key in keys if key not in fields]
     if missing:
         raise ValueError(
-            f"{fields.path} lacks the keys {missing}; {kind} must hold {list(keys)}, got the keys {sorted(fields)}"
+            f"{path} lacks the keys {missing}; {kind} must hold {list(keys)}, got the keys {sorted(fields)}"
         )
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchsar.core import ArrayFile, Recording, StoredArray, refuse_non_finite
-from torchsar.io.fields import archive, naming, number, refuse_missing, shown, vector
+from torchsar.core import Recording, StoredArray, refuse_non_finite
+from torchsar.io.fields import Described, archive, naming, number, refuse_missing, shown, vector
 from torchsar.radar import LIGHT_M_S, InverseRadar, range_profiles
 from torchsar.radar.spotlight import frequency_step_hz
 
@@ -63,28 +64,44 @@ def read_inverse(path: str | Path, dtype: torch.dtype = torch.complex64) -> Reco
         ValueError: If the file is not such an archive, or a key is missing or invalid.
     """
     path = Path(path)
-    fields = archive(path, "range profiles or phase history")
-    kind = _kind(fields)
-    samples = _samples(fields[kind], kind)
+    samples, radar, aux = describe_inverse(archive(path, "range profiles or phase history"), path)
     with naming(path):
-        radar, aux = _READERS[kind](fields, samples.shape)
         data = torch.from_numpy(samples.load()).T
-        if kind != "profiles":
+        if aux:  # profiles of a target in flight have none
             refuse_non_finite(data, samples.what)  # the transform would spread them
             data = range_profiles(data.to(torch.complex128))
         return Recording.from_arrays(data.contiguous(), radar, dtype=dtype, what=str(path), **aux)
 
 
-def _kind(fields: ArrayFile) -> str:
+def describe_inverse(fields: Mapping[str, StoredArray], path: Path) -> Described:
+    """Check the fields of an archive for `read_inverse`, without loading the samples.
+
+    Args:
+        fields: The fields by key.
+        path: Path of the archive, for messages.
+
+    Returns:
+        The samples, an InverseRadar, and the side data of frequency samples.
+
+    Raises:
+        ValueError: If a key is missing or invalid.
+    """
+    kind = _kind(fields, path)
+    samples = _samples(fields[kind], kind)
+    with naming(path):
+        return Described(samples, *_READERS[kind](fields, samples.shape))
+
+
+def _kind(fields: Mapping[str, StoredArray], path: Path) -> str:
     """Key of the only sample array in the archive; raise ValueError if keys are missing."""
     found = [kind for kind in _SCHEMAS if kind in fields]
     if len(found) != 1:
         choices = "; ".join(f"{kind} with {', '.join(keys)}" for kind, keys in _SCHEMAS.items())
         raise ValueError(
-            f"{fields.path} must hold exactly one of the sample arrays ({choices}), got {found or 'none'} among "
+            f"{path} must hold exactly one of the sample arrays ({choices}), got {found or 'none'} among "
             f"the keys {sorted(fields)}"
         )
-    refuse_missing(fields, _SCHEMAS[found[0]], f"an archive with {found[0]!r}")
+    refuse_missing(fields, path, _SCHEMAS[found[0]], f"an archive with {found[0]!r}")
     return found[0]
 
 
@@ -98,7 +115,7 @@ def _samples(field: StoredArray, key: str) -> StoredArray:
     return field
 
 
-def _profiles_radar(fields: ArrayFile, shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
+def _profiles_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
     """Radar of range profiles; its bandwidth is c / (2 step), so that a range cell is the step."""
     step, bandwidth = number(fields["range_step_m"]), number(fields["bandwidth_hz"])
     sampled = LIGHT_M_S / (2 * step)
@@ -111,7 +128,7 @@ def _profiles_radar(fields: ArrayFile, shape: tuple[int, ...]) -> tuple[InverseR
     return InverseRadar(carrier, sampled, number(fields["prf_hz"])), {}
 
 
-def _turntable_radar(fields: ArrayFile, shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
+def _turntable_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
     """Radar and side data of a turntable sweep."""
     frequency = _frequency(fields["freq_hz"], shape[0])
     angle = torch.deg2rad(vector(fields["angle_deg"], shape[1]))
@@ -119,7 +136,7 @@ def _turntable_radar(fields: ArrayFile, shape: tuple[int, ...]) -> tuple[Inverse
     return _radar(fields, frequency, shape, turn, 0.0), {"frequency_hz": frequency, "angle_rad": angle}
 
 
-def _spotlight_radar(fields: ArrayFile, shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
+def _spotlight_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
     """Radar and side data of a spotlight phase history."""
     frequency = _frequency(fields["freq_hz"], shape[0])
     position = torch.stack([vector(fields[key], shape[1]) for key in ("x_m", "y_m", "z_m")], -1)
@@ -137,7 +154,7 @@ _READERS = {"profiles": _profiles_radar, "sig": _turntable_radar, "fp": _spotlig
 
 
 def _radar(
-    fields: ArrayFile, frequency: Tensor, shape: tuple[int, ...], turn_rad: float, reference_m: float
+    fields: Mapping[str, StoredArray], frequency: Tensor, shape: tuple[int, ...], turn_rad: float, reference_m: float
 ) -> InverseRadar:
     """Radar of frequency samples whose line of sight turns by turn_rad from first to last pulse."""
     prf = number(fields["prf_hz"]) if "prf_hz" in fields else 1.0

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import ArrayFile, Recording, StoredArray, refuse_non_finite
-from torchsar.io.fields import archive, naming, number, refuse_missing, shown, vector
+from torchsar.core import Recording, StoredArray, refuse_non_finite
+from torchsar.io.fields import Described, archive, naming, number, refuse_missing, shown, vector
 from torchsar.io.inverse import read_inverse
 from torchsar.radar import AntennaPath, InverseRadar, LocalFrame, range_profiles, resample_path
 from torchsar.radar.spotlight import frequency_step_hz
@@ -60,7 +60,28 @@ def read_path(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recordi
         recording = read_inverse(path, dtype)
         antennas = AntennaPath(recording.aux["position_m"], None, 2 * recording.aux["reference_m"])
         return replace(recording, aux={**recording.aux, **antennas.side_data()})
-    refuse_missing(fields, _REQUIRED, "an archive with the history of any path")
+    samples, radar, aux = describe_path(fields, path)
+    with naming(path):
+        data = torch.from_numpy(samples.load()).T
+        refuse_non_finite(data, samples.what)  # the transform would spread them
+        data = range_profiles(data.to(torch.complex128)).contiguous()
+        return Recording.from_arrays(data, radar, dtype=dtype, what=str(path), **aux)
+
+
+def describe_path(fields: Mapping[str, StoredArray], path: Path) -> Described:
+    """Check the fields of an archive with `history` for `read_path`, without loading the samples.
+
+    Args:
+        fields: The fields by key.
+        path: Path of the archive, for messages.
+
+    Returns:
+        The samples, an InverseRadar, and the frequencies and positions.
+
+    Raises:
+        ValueError: If a key is missing or invalid.
+    """
+    refuse_missing(fields, path, _REQUIRED, "an archive with the history of any path")
     samples = fields["history"]
     if samples.dtype.kind != "c" or len(samples.shape) != 2 or min(samples.shape) < 2:
         raise ValueError(
@@ -79,14 +100,10 @@ def read_path(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recordi
         if not reference_m >= 0:
             raise ValueError(f"path_reference_m must be paths of 0 m or more, got a mean of {2 * reference_m:g} m")
         radar = InverseRadar(float(frequency[n // 2]), n * step_hz, _prf_hz(fields, time), None, None, reference_m)
-        data = torch.from_numpy(samples.load()).T
-        refuse_non_finite(data, samples.what)  # the transform would spread them
-        data = range_profiles(data.to(torch.complex128)).contiguous()
-        aux: dict[str, Any] = {"frequency_hz": frequency, **antennas.side_data()}
-        return Recording.from_arrays(data, radar, dtype=dtype, what=str(path), **aux)
+    return Described(samples, radar, {"frequency_hz": frequency, **antennas.side_data()})
 
 
-def _places(fields: ArrayFile, antenna: str, pulses: int, time: Tensor | None) -> Tensor | None:
+def _places(fields: Mapping[str, StoredArray], antenna: str, pulses: int, time: Tensor | None) -> Tensor | None:
     """Positions of an antenna at the pulses, float64 (pulse, 3); None if there are none."""
     if f"{antenna}_m" not in fields:
         return None
@@ -117,7 +134,7 @@ def _finite(field: StoredArray) -> Tensor:
     return value
 
 
-def _prf_hz(fields: ArrayFile, time: Tensor | None) -> float:
+def _prf_hz(fields: Mapping[str, StoredArray], time: Tensor | None) -> float:
     """Pulse repetition frequency, the mean one if it follows from the times of the pulses."""
     if "prf_hz" in fields or time is None:
         return number(fields["prf_hz"]) if "prf_hz" in fields else 1.0

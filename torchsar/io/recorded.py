@@ -6,14 +6,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from torchsar.core import ArrayFile, Recording, StoredArray
-from torchsar.io.fields import archive, naming, number, refuse_missing, shown
+from torchsar.core import Recording, StoredArray
+from torchsar.io.fields import Described, archive, naming, number, refuse_missing, shown
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
 
 # keys of the archive: samples, then numbers
@@ -61,8 +62,26 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
             far from those of any recording.
     """
     path = Path(path)
-    fields = archive(path, "raw stripmap data")
-    refuse_missing(fields, _REQUIRED, "a raw stripmap archive")
+    found = describe_stripmap(archive(path, "raw stripmap data"), path)
+    with naming(path):
+        data = as_complex(found.samples.load())
+        return Recording.from_arrays(data, found.radar, dtype=dtype, what=str(path), **found.aux)
+
+
+def describe_stripmap(fields: Mapping[str, StoredArray], path: Path) -> Described:
+    """Check the fields of an archive for `read_stripmap`, without loading the samples.
+
+    Args:
+        fields: The fields by key.
+        path: Path of the archive, for messages.
+
+    Returns:
+        The samples, a StripmapRadar and the optional side data.
+
+    Raises:
+        ValueError: If a key is missing or invalid, or a number is far from those of any recording.
+    """
+    refuse_missing(fields, path, _REQUIRED, "a raw stripmap archive")
     numbers = {key: number(fields[key], signed=key == "chirp_rate_hz_s") for key in _REQUIRED[1:]}
     c = number(fields["c_m_s"]) if "c_m_s" in fields else LIGHT_M_S
     iq = _samples(fields["iq"])
@@ -72,7 +91,7 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
         if "pilot" in fields:
             _refuse_other_than_tone(fields["pilot"])
         aux: dict[str, Any] = {name: _side(fields[name], iq) for name in _AUX if name in fields}
-        return Recording.from_arrays(_complex(iq.load()), radar, dtype=dtype, what=str(path), **aux)
+    return Described(iq, radar, aux)
 
 
 def _refuse_implausible(number: dict[str, float], c: float) -> None:
@@ -109,7 +128,7 @@ def _radar(number: dict[str, float], c: float, first_cell: int) -> StripmapRadar
     )
 
 
-def _first_cell(fields: ArrayFile) -> int:
+def _first_cell(fields: Mapping[str, StoredArray]) -> int:
     """Index of the first sample, counted from 1."""
     if "first_cell" not in fields:
         return 1
@@ -146,8 +165,15 @@ def _refuse_other_than_tone(pilot: StoredArray) -> None:
         raise ValueError(f"{pilot.what} must be one row of samples, got {pilot.described}")
 
 
-def _complex(iq: np.ndarray) -> np.ndarray:
-    """Samples as complex numbers, of single precision if that holds I and Q exactly."""
+def as_complex(iq: np.ndarray) -> np.ndarray:
+    """Return samples as complex numbers, of single precision if that holds I and Q exactly.
+
+    Args:
+        iq: Complex samples (line, sample), or I and Q, (line, sample, 2), of any real type.
+
+    Returns:
+        The samples, (line, sample).
+    """
     if iq.ndim == 2:
         return iq
     part = np.result_type(iq, np.float32)
