@@ -24,6 +24,9 @@ _COMMANDS = {
     "requires": "show the requirements of the scene of a config on models and methods",
     "trade": "measure the time and the loss of alternative methods, relative to an exact reference",
 }
+_EXCHANGE = {
+    "import": "write recorded data of another format, which a sidecar describes, as a recording (.npz)",
+}
 
 
 def parser() -> argparse.ArgumentParser:
@@ -55,6 +58,12 @@ def parser() -> argparse.ArgumentParser:
     sweep.add_argument("--resume", action="store_true", help="go on with the sweep in the folder, if there is one")
     sweep.add_argument("--workers", type=_positive, metavar="N", help="compute in N processes (extra `cluster`)")
     sweep.add_argument("--cluster", metavar="ADDRESS", help="compute on a running dask scheduler, tcp://host:8786")
+    for name, text in _EXCHANGE.items():
+        commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    one = commands.choices["import"]
+    one.add_argument("file", metavar="FILE", help="HDF5, MATLAB, numpy or flat binary data")
+    one.add_argument("--sidecar", required=True, metavar="YAML", help="what the file holds (README, Your own data)")
+    one.add_argument("--out", type=_place, required=True, metavar="NPZ", help="new file for data.file of a config")
     commands.add_parser("list", help="experiments, systems, stages and data keys")
     return top
 
@@ -100,7 +109,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"torchsar-lab {version('torchsar-lab')}", flush=True)
             return 0
         if options.command != "list":  # before the import of torch, which takes seconds
-            print(f"torchsar: {options.command} {options.config}", file=sys.stderr, flush=True)
+            subject = options.file if options.command in _EXCHANGE else options.config
+            print(f"torchsar: {options.command} {subject}", file=sys.stderr, flush=True)
         with _log_to_stderr(), warnings.catch_warnings(), _short_memory():
             warnings.showwarning = _show_warning
             status = _dispatch(options, "torchsar " + shlex.join(given))
@@ -109,6 +119,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ImportError as error:
         if (error.name or "").startswith("torchsar"):  # a fault of the program, not of the installation
             raise
+        if "torchsar-lab[" in str(error):  # names the extra
+            return _fail(str(error))
         return _fail(f"{error.name or error} is not installed; install the extra: pip install 'torchsar-lab[study]'")
     except ConfigError as error:
         return _fail(str(error))
@@ -139,7 +151,7 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
     if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
         top.error(f"unrecognized arguments: {' '.join(rest)}")
     if options.command is None and not options.version:
-        top.error(f"a command is missing: choose one of {', '.join((*_COMMANDS, 'list'))}")
+        top.error(f"a command is missing: choose one of {', '.join((*_COMMANDS, *_EXCHANGE, 'list'))}")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
@@ -148,6 +160,8 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
 def _dispatch(options: argparse.Namespace, command: str) -> int:
     from torchsar.study.settings.text import experiments, find_config
 
+    if options.command == "import":
+        return _import(options)
     if options.command == "list":  # the experiments, or an unknown name, before the import of torch
         print(experiments(), flush=True)
     else:
@@ -185,6 +199,19 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
 
         print((requires if options.command == "requires" else trade)(loaded, out, options.device))
         print(out)
+    return 0
+
+
+def _import(options: argparse.Namespace) -> int:
+    from torchsar.study.settings.text import read_tree
+
+    sidecar = read_tree(Path(options.sidecar))  # before the import of torch
+    from torchsar.io import import_recording
+
+    try:
+        print(import_recording(options.file, sidecar, options.out, options.sidecar))
+    except (ValueError, FileNotFoundError, FileExistsError) as error:
+        raise ConfigError(str(error)) from error
     return 0
 
 

@@ -7,6 +7,7 @@ from torchsar.io.inverse import read_inverse
 from torchsar.io.path import read_path
 from torchsar.io.recorded import read_stripmap
 from torchsar.io.sicd import read_sicd
+from torchsar.io.sidecar import import_recording
 from torchsar.io.write_cphd import write_cphd
 from torchsar.io.write_sicd import write_sicd
 
@@ -14,6 +15,7 @@ __all__ = [
     "FORMATS",
     "Format",
     "format_of",
+    "import_recording",
     "read",
     "read_cphd",
     "read_history",

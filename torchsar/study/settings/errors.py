@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+
+from torchsar.spelling import did_you_mean as did_you_mean  # for all modules of `study`
 
 
 class ConfigError(ValueError):
     """An error in a config, a command line or an input file; its text is one sentence that names
     the key or the file.
     """
-
-
-def did_you_mean(word: str, accepted: Iterable[str]) -> str:
-    """Return a hint for an unknown word.
-
-    Args:
-        word: The word that is not accepted.
-        accepted: The words that are.
-
-    Returns:
-        "; did you mean ...?" with the most similar accepted word, if there is one, and the list of
-        accepted words.
-    """
-    names = sorted(accepted)
-    near = difflib.get_close_matches(word, names, n=1, cutoff=0.6)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    return f"{hint} (accepted: {', '.join(names) or 'nothing'})"
 
 
 def one_line(error: BaseException) -> str:

@@ -1,0 +1,261 @@
+"""Arrays of numbers in files of many formats, which are read in parts.
+
+HDF5 and MATLAB 7.3 need h5py, MATLAB 5 needs scipy, both of the extra `formats`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchsar.core import ArrayFile
+from torchsar.io.extras import library, reading
+from torchsar.spelling import did_you_mean
+
+Slices = tuple[slice, ...]
+# the signature of HDF5 is at one of these bytes, after data of another program, such as MATLAB
+_HDF5, _HDF5_AT = b"\x89HDF\r\n\x1a\n", (0, 512, 1024, 2048)
+# names of the real and the imaginary part in a compound type, in lower case
+_PARTS = (("r", "i"), ("re", "im"), ("real", "imag"), ("i", "q"))
+
+
+@dataclass(frozen=True)
+class BlockArray:
+    """Array of numbers in a file, of which parts can be read.
+
+    Args:
+        path: Path of the file.
+        kind: Format of the file, for messages.
+        name: Name of the array in the file; empty if it has none.
+        shape: Shape of the array.
+        dtype: Type of its numbers, real or complex.
+        part: Function that reads the part given by one slice per dimension.
+    """
+
+    path: Path
+    kind: str
+    name: str
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    part: Callable[[Slices], np.ndarray]
+
+    @property
+    def what(self) -> str:
+        """Path of the file and name of the array, for messages."""
+        return f"{self.path}: {self.name}" if self.name else str(self.path)
+
+    def read(self, part: Slices = ()) -> np.ndarray:
+        """Read the array or a part of it.
+
+        Args:
+            part: A slice for each of the first dimensions; by default the whole array.
+
+        Returns:
+            The numbers in the byte order of this machine.
+
+        Raises:
+            ValueError: If the file is damaged or cut off.
+        """
+        with reading(self.path, self.kind):
+            return np.asarray(self.part(part)).astype(self.dtype.newbyteorder("="), copy=False)
+
+
+@dataclass(frozen=True)
+class Container:
+    """File with named arrays.
+
+    Args:
+        path: Path of the file.
+        kind: Name of its format, for messages.
+        find: Function that returns an array by name, unchecked, with what can read parts of it.
+            It raises KeyError if there is no such array.
+        names: Function that returns the names of all arrays.
+    """
+
+    path: Path
+    kind: str
+    find: Callable[[str], tuple[Any, Callable[[Slices], np.ndarray]]]
+    names: Callable[[], Iterable[str]]
+
+    def array(self, name: str) -> BlockArray:
+        """Return an array by its name.
+
+        Args:
+            name: Its name, with '/' between the names of groups or structures and that of the
+                array. In HDF5, `group@attribute` is an attribute.
+
+        Returns:
+            The array; nothing but its shape and type was read.
+
+        Raises:
+            ValueError: If there is no such array, or it does not hold numbers.
+        """
+        with reading(self.path, self.kind):
+            try:
+                array, part = self.find(name.strip("/"))
+            except KeyError:
+                hint = did_you_mean(name.strip("/"), self.names())
+                raise ValueError(f"{self.path} ({self.kind}) has no array {name!r}{hint}") from None
+        dtype, shape = getattr(array, "dtype", None), getattr(array, "shape", None)
+        if not isinstance(dtype, np.dtype) or shape is None:
+            raise ValueError(f"{self.path}: {name} must hold numbers, got {type(array).__name__}")
+        fields = dtype.names or ()
+        if len(fields) == 2 and tuple(field.lower() for field in fields) in _PARTS:
+            dtype = complex_type(np.result_type(*(dtype[field] for field in fields)))
+
+            def complex_part(slices: Slices) -> np.ndarray:
+                held = part(slices)
+                return joined(*(held[field] for field in fields))
+
+            return BlockArray(self.path, self.kind, name, tuple(shape), dtype, complex_part)
+        if dtype.kind not in "iufc":
+            raise ValueError(f"{self.path}: {name} must hold numbers, got {dtype}")
+        return BlockArray(self.path, self.kind, name, tuple(shape), dtype, part)
+
+
+def open_container(path: Path, stack: ExitStack) -> Container | None:
+    """Open a file by the format that its first bytes show: HDF5, MATLAB or numpy.
+
+    Args:
+        path: Path of the file.
+        stack: Context that closes the file.
+
+    Returns:
+        The file; None if it is of no such format, such as flat binary data.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is damaged or cut off.
+        ModuleNotFoundError: If the library of the format is not installed.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path} {'is no file' if path.exists() else 'does not exist'}; give the path of a file"
+        )
+    with path.open("rb") as file:
+        start = file.read(max(_HDF5_AT) + len(_HDF5))
+    if start.startswith(b"MATLAB 5.0"):
+        return _matlab(path)
+    if any(start.startswith(_HDF5, at) for at in _HDF5_AT) or start.startswith(b"MATLAB 7.3"):
+        return _hdf5(path, stack, start.startswith(b"MATLAB"))
+    if start.startswith((b"\x93NUMPY", b"PK\x03\x04")):
+        held = ArrayFile(path)
+        return Container(path, "numpy", lambda name: _whole(held[name].load()), lambda: held)
+    return None
+
+
+def flat_array(path: Path, dtype: np.dtype, shape: tuple[int, ...], header_bytes: int = 0) -> BlockArray:
+    """Describe flat binary data: a header, then numbers with the last dimension contiguous.
+
+    Args:
+        path: Path of the file.
+        dtype: Type and byte order of the numbers.
+        shape: Shape of the array.
+        header_bytes: Number of bytes before the first number.
+
+    Returns:
+        The array, mapped into memory part by part.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the size of the file is not that of header and array.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path} {'is no file' if path.exists() else 'does not exist'}; give the path of a file"
+        )
+    held, needed = path.stat().st_size, header_bytes + math.prod(shape) * dtype.itemsize
+    if held != needed:
+        raise ValueError(
+            f"{path} has {held} bytes, and header_bytes {header_bytes} with {dtype.name} of shape {shape} needs "
+            f"{needed}; correct these keys{', or copy the file again if it was cut off' if held < needed else ''}"
+        )
+
+    def part(slices: Slices) -> np.ndarray:  # mapped anew, so that parts that were read need no memory
+        return np.array(np.memmap(path, dtype, "r", header_bytes, shape)[slices])
+
+    return BlockArray(path, "flat binary data", "", shape, dtype, part)
+
+
+def complex_type(dtype: np.dtype) -> np.dtype:
+    """Return the type of complex samples, of single precision if that holds the numbers exactly.
+
+    Args:
+        dtype: Type of the samples, or of their real and imaginary parts.
+
+    Returns:
+        complex64 or complex128.
+    """
+    return np.dtype(np.complex64 if np.result_type(dtype, np.complex64) == np.complex64 else np.complex128)
+
+
+def joined(real: np.ndarray, imag: np.ndarray) -> np.ndarray:
+    """Return complex samples with given real and imaginary parts.
+
+    Args:
+        real: Real parts.
+        imag: Imaginary parts, of the same shape.
+
+    Returns:
+        The samples, of the type that `complex_type` gives.
+    """
+    samples = np.empty(real.shape, complex_type(np.result_type(real, imag)))
+    samples.real, samples.imag = real, imag
+    return samples
+
+
+def _hdf5(path: Path, stack: ExitStack, matlab: bool) -> Container:
+    """A file of h5py; MATLAB stores arrays with their dimensions reversed."""
+    h5py, kind = library("h5py", "formats", f"reading {path}"), "MATLAB 7.3" if matlab else "HDF5"
+    with reading(path, kind):
+        file = stack.enter_context(h5py.File(path, "r"))
+
+    def find(name: str) -> tuple[Any, Callable[[Slices], np.ndarray]]:
+        place, at, attribute = name.partition("@")
+        if at:
+            return _whole(np.asarray(file[place or "/"].attrs[attribute]))
+        held = file[name]
+        if not matlab or not isinstance(held, h5py.Dataset):
+            return held, lambda slices: held[slices]
+        n = held.ndim
+        full = [slice(None)] * n
+        header = np.broadcast_to(np.empty((), held.dtype), held.shape[::-1])
+        return header, lambda slices: held[tuple(reversed([*slices, *full[len(slices) :]]))].T
+
+    def names() -> list[str]:
+        found: list[str] = []
+        file.visititems(lambda name, held: found.append(name) if isinstance(held, h5py.Dataset) else None)
+        return found
+
+    return Container(path, kind, find, names)
+
+
+def _matlab(path: Path) -> Container:
+    """A file of MATLAB 5 to 7, whose variables are read as a whole."""
+    scipy_io = library("scipy.io", "formats", f"reading {path}")
+    with reading(path, "MATLAB 5"):
+        variables = [name for name, *_ in scipy_io.whosmat(path)]
+
+    def find(name: str) -> tuple[Any, Callable[[Slices], np.ndarray]]:
+        first, *rest = name.split("/")
+        if first not in variables:
+            raise KeyError(name)
+        held = scipy_io.loadmat(path, variable_names=[first])[first]
+        for part in rest:
+            if held.dtype.names is None or part not in held.dtype.names or held.size != 1:
+                raise KeyError(name)
+            held = held[part].item()
+        return _whole(held)
+
+    return Container(path, "MATLAB 5", find, lambda: variables)
+
+
+def _whole(array: Any) -> tuple[Any, Callable[[Slices], np.ndarray]]:
+    """An array that has been read, and its parts."""
+    return array, lambda slices: array[slices]

@@ -1,0 +1,415 @@
+"""Import of recorded data in the formats of other programs, which a sidecar describes.
+
+A sidecar is a small YAML file, or a mapping in Python, that says where the samples and the numbers
+of the radar are. The result is an archive (.npz) for `read_stripmap`, `read_inverse` or
+`read_path`.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+import torch
+
+from torchsar.core import Recording, StoredArray
+from torchsar.io.containers import BlockArray, Container, complex_type, flat_array, joined, open_container
+from torchsar.io.extras import write_whole
+from torchsar.io.fields import Described, naming
+from torchsar.io.inverse import describe_inverse
+from torchsar.io.path import describe_path
+from torchsar.io.recorded import describe_stripmap
+from torchsar.spelling import did_you_mean
+
+# bytes of a block of complex samples, large enough for fast reading
+_BLOCK_BYTES = 32 << 20
+
+
+class _Kind(NamedTuple):
+    """Dims of a sample array, its numbers, and its side arrays."""
+
+    dims: tuple[str, str]
+    radar: tuple[str, ...]
+    side: tuple[str, ...]
+    describe: Callable[[Mapping[str, StoredArray], Path], Described]
+
+
+_STRIPMAP = ("fs_hz", "prf_hz", "f0_hz", "chirp_rate_hz_s", "pulse_s", "slant_range_cell1_m", "v_eff_m_s")
+_POSITIONS = ("transmitter_m", "receiver_m")
+_TIMES = ("pulse_time_s", "transmitter_time_s", "receiver_time_s")
+# sample arrays with their keys, as the readers take them
+_KINDS = {
+    "iq": _Kind(
+        ("pulse", "range"),
+        (*_STRIPMAP, "first_cell", "c_m_s"),
+        ("agc_db", "line_number", "pilot"),
+        describe_stripmap,
+    ),
+    "profiles": _Kind(("range", "pulse"), ("range_step_m", "bandwidth_hz", "prf_hz", "f0_hz"), (), describe_inverse),
+    "sig": _Kind(("frequency", "pulse"), ("prf_hz",), ("freq_hz", "angle_deg"), describe_inverse),
+    "fp": _Kind(("frequency", "pulse"), ("prf_hz",), ("freq_hz", "x_m", "y_m", "z_m", "r0_m"), describe_inverse),
+    "history": _Kind(
+        ("frequency", "pulse"),
+        ("prf_hz",),
+        ("freq_hz", *_POSITIONS, "path_reference_m", *_TIMES, "origin_deg_m"),
+        describe_path,
+    ),
+}
+_SYSTEMS = {"stripmap": ("iq",), "isal": ("profiles", "sig", "fp"), "path": ("history", "fp")}
+# side arrays whose length is that of a dim of the samples
+_ALONG = {"freq_hz": "frequency", "pilot": "range"} | dict.fromkeys(
+    ("angle_deg", "x_m", "y_m", "z_m", "r0_m", "agc_db", "line_number", "path_reference_m", "pulse_time_s"), "pulse"
+)
+# factors of other units for each unit of a key
+_UNITS = {
+    "Hz": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "GHz": 1e9, "THz": 1e12},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12},
+    "m": {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
+    "m/s": {"m/s": 1.0, "km/s": 1e3, "km/h": 1 / 3.6},
+    "Hz/s": {"Hz/s": 1.0, "kHz/s": 1e3, "MHz/s": 1e6, "GHz/s": 1e9, "THz/s": 1e12, "kHz/us": 1e9, "MHz/us": 1e12},
+    "deg": {"deg": 1.0, "rad": 180 / math.pi},
+    "dB": {"dB": 1.0},
+}
+# ends of keys with their units, the longest first
+_ENDS = {"_hz_s": "Hz/s", "_m_s": "m/s", "_hz": "Hz", "_deg": "deg", "_db": "dB", "_s": "s", "_m": "m"}
+_WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?) +([A-Za-z/]+)")
+_DTYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float16", "float32", "float64")
+_DTYPES = (*_DTYPES, "complex64", "complex128")
+_FLAT = ("dtype", "byte_order", "header_bytes", "shape")
+_SAMPLES = ("key", "name", "dims", "imag", "conjugate", *_FLAT)
+_ENTRY = ("name", "file", "unit", "transpose", "first", "step", *_FLAT)
+
+
+def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Path, name: str = "sidecar") -> Path:
+    """Write recorded data of another format as an archive for the readers of this package.
+
+    The data are in an HDF5 file, a MATLAB file (5 to 7.3), a numpy file, or in flat binary form.
+    The sidecar has these sections:
+    - `system`: stripmap, isal or path.
+    - `samples`: where the samples are. `key` is the name of the sample array in the archive, which
+      says what the data are: `iq` (stripmap), `profiles`, `sig` or `fp` (isal), `history` or `fp`
+      (path). `name` is the name of the array in the file. `dims` has the names of the dimensions
+      of this array in the order of the file: `pulse` and `range` or, for `sig`, `fp` and `history`,
+      `pulse` and `frequency`, and `iq` for a dimension with real and imaginary part. `imag` is the
+      name of a second array (or flat binary file) with the imaginary part. `conjugate: true` is for
+      data with the phases exp(+2j pi f tau).
+    - `radar`: numbers by the keys that the reader takes, such as `prf_hz`.
+    - `side`: arrays by the keys that the reader takes, such as `freq_hz`.
+    A number or array is given by a number, a list, a text like `9.65 GHz`, the name of an array in
+    the file, or a mapping with `name`, `unit` (of the numbers in the file), `file` (another file,
+    relative to the folder of the data) and `transpose`, or with `first` and `step` of numbers in
+    equal steps. For flat binary files `dtype`, `byte_order` (little or big), `header_bytes` and
+    `shape` take the place of `name`.
+
+    All keys are checked before samples are read. Samples are read and written in blocks of 32 MiB;
+    at most 256 MiB and the side arrays are in memory, but all samples of a MATLAB 5 or a numpy
+    file.
+
+    Args:
+        path: Path of the data.
+        sidecar: Content of the sidecar.
+        out: Path of the new archive, which must not exist.
+        name: Name of the sidecar, for messages.
+
+    Returns:
+        The path of the archive, whose samples are complex64, or complex128 where that is needed to
+        hold them exactly.
+
+    Raises:
+        FileNotFoundError: If a file does not exist.
+        FileExistsError: If `out` exists.
+        ValueError: If the sidecar or a file is invalid, or a sample is not finite. Nothing is
+            written then.
+        ModuleNotFoundError: If the library of the format is not installed.
+    """
+    path, out = Path(path), Path(out)
+    if out.suffix != ".npz":
+        raise ValueError(f"{out}: the name of the new archive must end in .npz")
+    if out.exists() or out.is_symlink():
+        raise FileExistsError(f"{out} exists and is not replaced; move it, or choose another name")
+    with ExitStack() as stack:
+        key, samples, arrays = _Import(path, sidecar, name, stack).planned()
+        write_whole(out, lambda part: _write(part, key, samples, arrays))
+    return out
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """The samples in a file, and how they become complex numbers of two dimensions.
+
+    Args:
+        parts: One array, or those of the real and imaginary parts.
+        dims: Names of the dims of each.
+        order: Names of the two dims of the result.
+        conjugate: Whether the imaginary part changes its sign.
+    """
+
+    parts: Sequence[BlockArray]
+    dims: tuple[str, ...]
+    order: tuple[str, str]
+    conjugate: bool
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        first, second = (self.parts[0].shape[self.dims.index(name)] for name in self.order)
+        return first, second
+
+    @property
+    def dtype(self) -> np.dtype:
+        return complex_type(np.result_type(*(part.dtype for part in self.parts)))
+
+    @property
+    def slow(self) -> str:
+        """The outer one of the two dims in the file."""
+        return next(name for name in self.dims if name != "iq")
+
+    def blocks(self) -> Iterator[np.ndarray]:
+        """Blocks of the samples along the outer dim, (slow, fast), from first to last."""
+        axis, n = self.dims.index(self.slow), self.shape[self.order.index(self.slow)]
+        rows = max(1, _BLOCK_BYTES * n // (math.prod(self.shape) * self.dtype.itemsize))
+        for first in range(0, n, rows):
+            last = min(first + rows, n)
+            block = self._complex([part.read((slice(None),) * axis + (slice(first, last),)) for part in self.parts])
+            block = block.astype(self.dtype, copy=False)
+            if not np.isfinite(block).all():
+                bad = int((~np.isfinite(block)).sum())
+                raise ValueError(
+                    f"{self.parts[0].what}: {bad} samples are NaN or Inf at indices {first} to {last - 1} of the dim "
+                    f"{self.slow!r}; set missing samples to zero"
+                )
+            yield np.conj(block) if self.conjugate else block
+
+    def _complex(self, parts: list[np.ndarray]) -> np.ndarray:
+        if "iq" in self.dims:
+            parts = list(np.moveaxis(parts[0], self.dims.index("iq"), 0))
+        return joined(*parts) if len(parts) == 2 else parts[0]
+
+
+class _Import:
+    """The sections of a sidecar, checked, with the arrays that they name."""
+
+    def __init__(self, path: Path, sidecar: Any, name: str, stack: ExitStack) -> None:
+        self.path, self.name, self.stack = path, name, stack
+        self.opened: dict[Path, Container | None] = {}
+        tree = self._section(sidecar, "", ("system", "samples", "radar", "side"))
+        system = _choice(tree.get("system"), f"{name}: system", _SYSTEMS)
+        self.samples = self._section(tree.get("samples"), "samples", _SAMPLES)
+        keys = _SYSTEMS[system]
+        key = self.samples.get("key", keys[0] if system != "isal" else None)
+        self.key = _choice(key, f"{name}: samples.key", keys)
+        self.kind = _KINDS[self.key]
+        self.tree = {
+            section: self._section(tree.get(section, {}), section, accepted)
+            for section, accepted in (("radar", self.kind.radar), ("side", self.kind.side))
+        }
+
+    def planned(self) -> tuple[str, _Samples, dict[str, np.ndarray]]:
+        """The key of the samples, the samples, and all other arrays by key; all are checked."""
+        samples = self._samples()
+        lengths = dict(zip(samples.order, samples.shape))
+        arrays = {
+            key: self._value(value, key, f"{section}.{key}", lengths)
+            for section, tree in self.tree.items()
+            for key, value in tree.items()
+        }
+        file = Path(self.name)
+        stored = {
+            key: StoredArray(
+                f"{file}: {section}.{key}", arrays[key].shape, arrays[key].dtype, partial(_opened, arrays[key])
+            )
+            for section, tree in self.tree.items()
+            for key in tree
+        }
+        what = f"{file}: samples"
+        stored[self.key] = StoredArray(what, samples.shape, samples.dtype, partial(_opened, np.zeros(())))
+        found = self.kind.describe(stored, file)
+        with naming(file):  # side data that only a recording checks, with one sample per line
+            lines = torch.ones(lengths["pulse"], 1, dtype=torch.complex64)
+            Recording.from_arrays(lines, found.radar, what=self.name, **found.aux)
+        return self.key, samples, arrays
+
+    def _section(self, tree: Any, where: str, accepted: Sequence[str]) -> dict[str, Any]:
+        """A mapping with no other keys than the accepted ones."""
+        place = f"{self.name}: {where}" if where else self.name
+        if not isinstance(tree, Mapping):
+            got = "nothing" if tree is None else repr(tree)
+            raise ValueError(f"{place} must be a mapping with some of the keys {', '.join(accepted)}, got {got}")
+        for key in tree:
+            if key not in accepted:
+                full = f"{where}.{key}" if where else key
+                raise ValueError(f"{self.name}: key {full!r} is not known{did_you_mean(str(key), accepted)}")
+        return dict(tree)
+
+    def _samples(self) -> _Samples:
+        tree, where, order = self.samples, f"{self.name}: samples", self.kind.dims
+        dims = tree.get("dims")
+        allowed = [set(order), {*order, "iq"}]
+        if not isinstance(dims, (list, tuple)) or set(map(str, dims)) not in allowed or len(set(dims)) != len(dims):
+            raise ValueError(
+                f"{where}.dims must be the dims of the array in the order of the file, {order[0]} and {order[1]}, and "
+                f"iq if there is one for real and imaginary part, got {dims!r}"
+            )
+        parts = [self._array(self.path, tree, where)]
+        if "imag" in tree:
+            imag = _kept(tree, "imag", where, str, "the name of an array or file")
+            parts.append(
+                self._array(self.path.parent / imag, tree, where)
+                if "dtype" in tree
+                else self._array(self.path, {"name": imag}, where)
+            )
+        kinds, pair = {part.dtype.kind for part in parts}, "iq" in dims
+        for part in parts:
+            if part.shape != parts[0].shape or len(part.shape) != len(dims) or 0 in part.shape:
+                raise ValueError(f"{part.what} has the shape {part.shape}, and {where}.dims are {list(dims)}")
+        if pair and (parts[0].shape[dims.index("iq")] != 2 or "c" in kinds):
+            raise ValueError(
+                f"{where}.dims: the dim iq must have 2 real numbers, got {parts[0].dtype.name} of shape "
+                f"{parts[0].shape} for the dims {list(dims)}"
+            )
+        if pair + len(parts) != 1 + ("c" not in kinds) or (len(parts) == 2 and "c" in kinds):
+            raise ValueError(
+                f"{where}: samples must be complex, or real with one dim iq or one array imag, got "
+                f"{parts[0].dtype.name} with the dims {list(dims)}{' and imag' if len(parts) == 2 else ''}"
+            )
+        conjugate = _kept(tree, "conjugate", where, bool, "true or false", False)
+        return _Samples(parts, tuple(dims), order, conjugate)
+
+    def _array(self, path: Path, tree: Mapping[str, Any], where: str) -> BlockArray:
+        """The array in a file that `name` or the layout of a flat binary file describes."""
+        if path not in self.opened:
+            self.opened[path] = open_container(path, self.stack)
+        container = self.opened[path]
+        flat = [key for key in _FLAT if key in tree]
+        if container is not None:
+            if flat:
+                raise ValueError(f"{where}.{flat[0]}: {path} is a {container.kind} file; give name instead")
+            held = "the name of an array in the file"
+            with naming(where):
+                return container.array(_kept(tree, "name", where, str, held))
+        if "name" in tree or not flat:
+            raise ValueError(
+                f"{where}: {path} is no HDF5, MATLAB or numpy file; if it is flat binary, give dtype and shape, and no "
+                "name"
+            )
+        dtype = np.dtype(_choice(tree.get("dtype"), f"{where}.dtype", _DTYPES))
+        order = _choice(tree.get("byte_order", "little"), f"{where}.byte_order", ("little", "big"))
+        shape, header = tree.get("shape"), _kept(tree, "header_bytes", where, int, "a number of bytes", 0)
+        whole = isinstance(shape, (list, tuple)) and all(type(n) is int and n > 0 for n in shape)
+        if not shape or not whole or header < 0:
+            raise ValueError(
+                f"{where}: shape must be a list of numbers of at least 1, and header_bytes at least 0, got {shape!r} "
+                f"and {header!r}"
+            )
+        with naming(where):
+            return flat_array(path, dtype.newbyteorder("<" if order == "little" else ">"), tuple(shape), header)
+
+    def _value(self, value: Any, key: str, where: str, lengths: Mapping[str, int]) -> np.ndarray:
+        """The numbers of a key in its unit."""
+        where, own, unit = f"{self.name}: {where}", _unit_of(key), None
+        if isinstance(value, str):
+            match = _WITH_UNIT.fullmatch(value.strip())
+            value, unit = (float(match[1]), match[2]) if match else ({"name": value}, None)
+        if isinstance(value, Mapping):
+            tree = self._section(value, where.removeprefix(f"{self.name}: "), _ENTRY)
+            unit = _kept(tree, "unit", where, str, "a unit", None)
+            along = lengths.get(_ALONG.get(key, ""))
+            array = _steps(tree, where, along) if {"first", "step"} & set(tree) else self._entry(tree, where)
+        else:
+            array = _numbers(value, where, own)
+        if key not in _POSITIONS:  # MATLAB has no numbers and no vectors, only matrices
+            array = array.reshape(-1) if array.size == max(array.shape, default=0) else array
+            array = array.reshape(()) if key in self.kind.radar and array.size == 1 else array
+        return array if unit in (None, own) else array.astype(np.float64) * _factor(unit, own, where)
+
+    def _entry(self, tree: Mapping[str, Any], where: str) -> np.ndarray:
+        file = _kept(tree, "file", where, str, "the name of a file", None)
+        path = self.path if file is None else self.path.parent / file
+        array = self._array(path, tree, where).read()
+        return array.T if _kept(tree, "transpose", where, bool, "true or false", False) else array
+
+
+def _unit_of(key: str) -> str:
+    """Unit of a key; empty for keys without a single unit."""
+    return "" if key == "origin_deg_m" else next((unit for end, unit in _ENDS.items() if key.endswith(end)), "")
+
+
+def _factor(unit: str, own: str, where: str) -> float:
+    """Factor that converts a unit to that of a key."""
+    accepted = _UNITS.get(own, {})
+    if unit not in accepted:
+        expected = f"{own} is expected" if own else "numbers without a unit are expected"
+        raise ValueError(f"{where} has the unit {unit!r}, and {expected}{did_you_mean(unit, accepted)}")
+    return accepted[unit]
+
+
+def _numbers(value: Any, where: str, unit: str) -> np.ndarray:
+    """Numbers that stand in the sidecar."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        array = np.asarray(None)
+    if array.dtype.kind not in "iuf":
+        raise ValueError(
+            f"{where} must be numbers{f' in {unit}' if unit else ''}, a text such as '9.65 GHz', or the name of an "
+            f"array, got {value!r}"
+        )
+    return array
+
+
+def _steps(tree: Mapping[str, Any], where: str, n: int | None) -> np.ndarray:
+    """Numbers in equal steps, as many as a dim of the samples has."""
+    other = sorted(set(tree) - {"first", "step", "unit"})
+    if n is None or other:
+        what = f"{other[0]} is given too" if other else "this key has no length of its own"
+        raise ValueError(f"{where}: first and step cannot be used here, since {what}; give the name of an array")
+    first, step = (_kept(tree, key, where, (int, float), "a number") for key in ("first", "step"))
+    return first + step * np.arange(n, dtype=np.float64)
+
+
+def _kept(tree: Mapping[str, Any], key: str, where: str, kind: Any, accepted: str, default: Any = ...) -> Any:
+    """The value of a key, of a given type."""
+    value = tree.get(key, default)
+    if value is ...:
+        raise ValueError(f"{where} lacks the key {key!r}, {accepted}")
+    if key in tree and (not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool)):
+        raise ValueError(f"{where}.{key} must be {accepted}, got {value!r}")
+    return value
+
+
+def _choice(value: Any, where: str, accepted: Sequence[str] | Mapping[str, Any]) -> str:
+    """One of a few words."""
+    if not isinstance(value, str) or value not in accepted:
+        got = "is missing" if value is None else f"has the value {value!r}"
+        raise ValueError(f"{where} {got}{did_you_mean(str(value), accepted)}")
+    return value
+
+
+def _opened(array: np.ndarray) -> IO[bytes]:
+    """An array in memory as a file in the format .npy."""
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, array, allow_pickle=False)
+    stream.seek(0)
+    return stream
+
+
+def _write(path: Path, key: str, samples: _Samples, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write the archive; the samples are stored in the order of the file they come from."""
+    with zipfile.ZipFile(path, "x") as archive:
+        for name, array in arrays.items():
+            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+        with archive.open(zipfile.ZipInfo(f"{key}.npy"), "w", force_zip64=True) as member:
+            turned = samples.slow != samples.order[0]
+            header = {"descr": samples.dtype.str, "fortran_order": turned, "shape": samples.shape}
+            np.lib.format.write_array_header_2_0(member, header)
+            for block in samples.blocks():
+                member.write(np.ascontiguousarray(block).data)
