@@ -1,6 +1,6 @@
 """Arrays of numbers in files of many formats, which are read in parts.
 
-HDF5 and MATLAB 7.3 need h5py, MATLAB 5 needs scipy, both of the extra `formats`.
+HDF5 and MATLAB 7.3 need h5py, of the extra `formats`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ import numpy as np
 
 from torchsar.core import ArrayFile
 from torchsar.io.extras import library, reading
+from torchsar.io.fields import complex_type, joined
+from torchsar.io.matlab import MatlabFile
 from torchsar.spelling import did_you_mean
 
 Slices = tuple[slice, ...]
@@ -183,33 +185,6 @@ def flat_array(path: Path, dtype: np.dtype, shape: tuple[int, ...], header_bytes
     return BlockArray(path, "flat binary data", "", shape, dtype, part)
 
 
-def complex_type(dtype: np.dtype) -> np.dtype:
-    """Return the type of complex samples, of single precision if that holds the numbers exactly.
-
-    Args:
-        dtype: Type of the samples, or of their real and imaginary parts.
-
-    Returns:
-        complex64 or complex128.
-    """
-    return np.dtype(np.complex64 if np.result_type(dtype, np.complex64) == np.complex64 else np.complex128)
-
-
-def joined(real: np.ndarray, imag: np.ndarray) -> np.ndarray:
-    """Return complex samples with given real and imaginary parts.
-
-    Args:
-        real: Real parts.
-        imag: Imaginary parts, of the same shape.
-
-    Returns:
-        The samples, of the type that `complex_type` gives.
-    """
-    samples = np.empty(real.shape, complex_type(np.result_type(real, imag)))
-    samples.real, samples.imag = real, imag
-    return samples
-
-
 def _hdf5(path: Path, stack: ExitStack, matlab: bool) -> Container:
     """A file of h5py; MATLAB stores arrays with their dimensions reversed."""
     h5py, kind = library("h5py", "formats", f"reading {path}"), "MATLAB 7.3" if matlab else "HDF5"
@@ -238,22 +213,10 @@ def _hdf5(path: Path, stack: ExitStack, matlab: bool) -> Container:
 
 def _matlab(path: Path) -> Container:
     """A file of MATLAB 5 to 7, whose variables are read as a whole."""
-    scipy_io = library("scipy.io", "formats", f"reading {path}")
-    with reading(path, "MATLAB 5"):
-        variables = [name for name, *_ in scipy_io.whosmat(path)]
-
-    def find(name: str) -> tuple[Any, Callable[[Slices], np.ndarray]]:
-        first, *rest = name.split("/")
-        if first not in variables:
-            raise KeyError(name)
-        held = scipy_io.loadmat(path, variable_names=[first])[first]
-        for part in rest:
-            if held.dtype.names is None or part not in held.dtype.names or held.size != 1:
-                raise KeyError(name)
-            held = held[part].item()
-        return _whole(held)
-
-    return Container(path, "MATLAB 5", find, lambda: variables)
+    kind = "MATLAB 5"
+    with reading(path, kind):
+        file = MatlabFile(path)
+    return Container(path, kind, lambda name: _whole(file.load(name)), lambda: file.names)
 
 
 def _whole(array: Any) -> tuple[Any, Callable[[Slices], np.ndarray]]:

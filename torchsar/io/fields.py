@@ -143,3 +143,30 @@ def shown(field: StoredArray) -> str:
     """
     short = not field.shape and field.dtype.itemsize <= _SHORT
     return repr(field.load().item()) if short else field.described
+
+
+def complex_type(dtype: np.dtype) -> np.dtype:
+    """Return the type of complex samples, of single precision if that holds the numbers exactly.
+
+    Args:
+        dtype: Type of the samples, or of their real and imaginary parts.
+
+    Returns:
+        complex64 or complex128.
+    """
+    return np.dtype(np.complex64 if np.result_type(dtype, np.complex64) == np.complex64 else np.complex128)
+
+
+def joined(real: np.ndarray, imag: np.ndarray) -> np.ndarray:
+    """Return complex samples with given real and imaginary parts.
+
+    Args:
+        real: Real parts.
+        imag: Imaginary parts, of the same shape.
+
+    Returns:
+        The samples, of the type that `complex_type` gives.
+    """
+    samples = np.empty(real.shape, complex_type(np.result_type(real, imag)))
+    samples.real, samples.imag = real, imag
+    return samples

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from torchsar.core import Recording, StoredArray
-from torchsar.io.fields import Described, archive, naming, number, refuse_missing, shown
+from torchsar.io.fields import Described, archive, joined, naming, number, refuse_missing, shown
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
 
 # keys of the archive: samples, then numbers
@@ -64,7 +64,8 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
     path = Path(path)
     found = describe_stripmap(archive(path, "raw stripmap data"), path)
     with naming(path):
-        data = as_complex(found.samples.load())
+        iq = found.samples.load()
+        data = iq if iq.ndim == 2 else joined(iq[..., 0], iq[..., 1])
         return Recording.from_arrays(data, found.radar, dtype=dtype, what=str(path), **found.aux)
 
 
@@ -163,18 +164,3 @@ def _refuse_other_than_tone(pilot: StoredArray) -> None:
     """Raise ValueError unless a pilot tone is a single row of samples."""
     if len(pilot.shape) != 1 or 0 in pilot.shape:
         raise ValueError(f"{pilot.what} must be one row of samples, got {pilot.described}")
-
-
-def as_complex(iq: np.ndarray) -> np.ndarray:
-    """Return samples as complex numbers, of single precision if that holds I and Q exactly.
-
-    Args:
-        iq: Complex samples (line, sample), or I and Q, (line, sample, 2), of any real type.
-
-    Returns:
-        The samples, (line, sample).
-    """
-    if iq.ndim == 2:
-        return iq
-    part = np.result_type(iq, np.float32)
-    return np.ascontiguousarray(iq, part).view(np.result_type(part, np.complex64))[..., 0]

@@ -22,9 +22,9 @@ import numpy as np
 import torch
 
 from torchsar.core import Recording, StoredArray
-from torchsar.io.containers import BlockArray, Container, complex_type, flat_array, joined, open_container
+from torchsar.io.containers import BlockArray, Container, flat_array, open_container
 from torchsar.io.extras import write_whole
-from torchsar.io.fields import Described, naming
+from torchsar.io.fields import Described, complex_type, joined, naming
 from torchsar.io.inverse import describe_inverse
 from torchsar.io.path import describe_path
 from torchsar.io.recorded import describe_stripmap
@@ -44,7 +44,6 @@ class _Kind(NamedTuple):
 
 
 _STRIPMAP = ("fs_hz", "prf_hz", "f0_hz", "chirp_rate_hz_s", "pulse_s", "slant_range_cell1_m", "v_eff_m_s")
-_POSITIONS = ("transmitter_m", "receiver_m")
 _TIMES = ("pulse_time_s", "transmitter_time_s", "receiver_time_s")
 # sample arrays with their keys, as the readers take them
 _KINDS = {
@@ -60,7 +59,7 @@ _KINDS = {
     "history": _Kind(
         ("frequency", "pulse"),
         ("prf_hz",),
-        ("freq_hz", *_POSITIONS, "path_reference_m", *_TIMES, "origin_deg_m"),
+        ("freq_hz", "transmitter_m", "receiver_m", "path_reference_m", *_TIMES, "origin_deg_m"),
         describe_path,
     ),
 }
@@ -325,9 +324,9 @@ class _Import:
             array = _steps(tree, where, along) if {"first", "step"} & set(tree) else self._entry(tree, where)
         else:
             array = _numbers(value, where, own)
-        if key not in _POSITIONS:  # MATLAB has no numbers and no vectors, only matrices
-            array = array.reshape(-1) if array.size == max(array.shape, default=0) else array
-            array = array.reshape(()) if key in self.kind.radar and array.size == 1 else array
+        # MATLAB has no numbers and no vectors, only matrices
+        array = array.reshape(-1) if array.size == max(array.shape, default=0) else array
+        array = array.reshape(()) if key in self.kind.radar and array.size == 1 else array
         return array if unit in (None, own) else array.astype(np.float64) * _factor(unit, own, where)
 
     def _entry(self, tree: Mapping[str, Any], where: str) -> np.ndarray:
