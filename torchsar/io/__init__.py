@@ -1,9 +1,11 @@
 """Readers and writers of recorded radar data and of images."""
 
+from torchsar.io.arrays import read_images, write_arrays
 from torchsar.io.cphd import read_cphd
 from torchsar.io.formats import FORMATS, Format, format_of, read, read_history
 from torchsar.io.geotiff import write_geotiff
 from torchsar.io.inverse import read_inverse
+from torchsar.io.netcdf import write_netcdf
 from torchsar.io.path import read_path
 from torchsar.io.recorded import read_stripmap
 from torchsar.io.sicd import read_sicd
@@ -19,11 +21,14 @@ __all__ = [
     "read",
     "read_cphd",
     "read_history",
+    "read_images",
     "read_inverse",
     "read_path",
     "read_sicd",
     "read_stripmap",
+    "write_arrays",
     "write_cphd",
     "write_geotiff",
+    "write_netcdf",
     "write_sicd",
 ]

@@ -67,7 +67,9 @@ class MatlabFile:
         """
         first, *rest = name.split("/")
         offset, size, kind = self._places[first]
-        content = np.memmap(self._path, np.uint8, "r", offset, (size,))
+        with self._path.open("rb") as file:
+            file.seek(offset)
+            content = file.read(size)
         held = _Matrix.parsed(memoryview(_unpacked(content) if kind == _COMPRESSED else content), self._order)
         for field in rest[:_DEEPEST]:
             held = held.field(field)
@@ -167,7 +169,7 @@ def _element(data: memoryview, order: str) -> tuple[tuple[int, memoryview], memo
     return (kind, data[first : first + size]), data[after:]
 
 
-def _unpacked(content: np.ndarray) -> bytes:
+def _unpacked(content: bytes) -> bytes:
     """The content of the element of a compressed variable."""
     try:
         return zlib.decompress(content)[8:]

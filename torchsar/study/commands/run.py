@@ -12,8 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchsar.io import write_arrays
 from torchsar.study.commands.requires import refuse_beyond_limits
-from torchsar.study.output.arrays import write_arrays, write_json
+from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
 from torchsar.study.output.pictures import draw_all
 from torchsar.study.output.progress import Steps, Ticker

@@ -23,8 +23,6 @@ from torchsar.study.trials.batch import Result, image_of
 _SAMPLES, _CELLS, _PART = 24, 6, 0.1
 # dynamic range of images and profiles, so that images out of focus are visible beside sharp ones
 _RANGE_DB = 40.0
-# levels of cuts through responses
-_CUT_DB = (-40.0, 2.0)
 Lines = Mapping[str, tuple[Axis, Tensor]]
 
 

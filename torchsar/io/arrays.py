@@ -1,0 +1,88 @@
+"""Store of the arrays of a run, arrays.zarr."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Axis, Signal
+from torchsar.io.extras import library, reading
+
+
+def write_arrays(
+    path: Path, images: Mapping[str, Signal], truth: Mapping[str, Tensor], estimates: Mapping[str, Mapping[str, Tensor]]
+) -> None:
+    """Write a zarr store of version 3: `METHOD/image` with its axes, `truth/NAME`, and
+    `estimate/METHOD/STAGE.VALUE`.
+
+    Args:
+        path: Folder of the store.
+        images: Images without trials, by path of their group.
+        truth: True values by name.
+        estimates: Estimates by method and name.
+
+    Raises:
+        ModuleNotFoundError: If zarr is not installed (extra `study`).
+    """
+    root = library("zarr", "study", f"writing {path}").open_group(str(path), mode="w", zarr_format=3)
+    for name, signal in images.items():
+        group = root.create_group(name)
+        for axis in signal.axes:
+            _put(group, axis.name, axis.values(), (axis.name,), unit=axis.unit, step=axis.step)
+        _put(group, "image", signal.data, signal.names, unit="1")
+    if truth:
+        group = root.create_group("truth")
+        for name, value in truth.items():
+            _put(group, name, value)
+    if any(estimates.values()):
+        group = root.create_group("estimate")
+        for method, values in estimates.items():
+            inner = group.create_group(method)
+            for name, value in values.items():
+                _put(inner, name, value)
+
+
+def read_images(path: str | Path) -> dict[str, Signal]:
+    """Read the images in the store of a run.
+
+    Args:
+        path: Folder of the store, arrays.zarr in the folder of a run.
+
+    Returns:
+        Images by path of their group, METHOD or CASE/METHOD, with their axes.
+
+    Raises:
+        FileNotFoundError: If there is no such store.
+        ModuleNotFoundError: If zarr is not installed (extra `study`).
+        ValueError: If the store is damaged.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path} does not exist; give the folder of the result of torchsar run")
+    zarr = library("zarr", "study", f"reading {path}")
+    with reading(path, "the arrays of a run"):
+        return dict(_images(zarr, zarr.open_group(str(path), mode="r"), ""))
+
+
+def _images(zarr: Any, group: Any, name: str) -> Iterator[tuple[str, Signal]]:
+    """The images in a group and in the groups below it."""
+    image = group.get("image")
+    if isinstance(image, zarr.Array):
+        held = [(axis, group[axis]) for axis in image.metadata.dimension_names]
+        axes = (Axis(axis, len(x), float(x[0]), float(x.attrs["step"]), str(x.attrs["unit"])) for axis, x in held)
+        yield name, Signal(torch.from_numpy(image[...]), tuple(axes))
+    for below, inner in sorted(group.groups()):
+        yield from _images(zarr, inner, f"{name}/{below}".strip("/"))
+
+
+def _put(group: Any, name: str, value: Tensor, dims: tuple[str, ...] | None = None, **attributes: Any) -> None:
+    data = torch.as_tensor(value).detach().cpu().resolve_conj().numpy()
+    chunks = tuple(min(n, 1024) for n in data.shape)
+    array = group.create_array(
+        name, shape=data.shape, dtype=data.dtype, chunks=chunks or "auto", dimension_names=dims, attributes=attributes
+    )
+    array[...] = data
