@@ -26,6 +26,7 @@ _COMMANDS = {
 }
 _EXCHANGE = {
     "import": "write recorded data of another format, which a sidecar describes, as a recording (.npz)",
+    "export": "write the images of a finished run, or its recording, in another format",
 }
 
 
@@ -64,6 +65,17 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("file", metavar="FILE", help="HDF5, MATLAB, numpy or flat binary data")
     one.add_argument("--sidecar", required=True, metavar="YAML", help="what the file holds (README, Your own data)")
     one.add_argument("--out", type=_place, required=True, metavar="NPZ", help="new file for data.file of a config")
+    one = commands.choices["export"]
+    one.add_argument("file", metavar="RUN_DIR", help="the result folder of torchsar run")
+    one.add_argument("--to", choices=("netcdf", "sicd", "geotiff", "cphd"), required=True, help="the format")
+    one.add_argument("--out", type=_place, required=True, metavar="DIR", help="folder of the new files")
+    one.add_argument(
+        "--origin",
+        type=float,
+        nargs=3,
+        metavar=("LATITUDE", "LONGITUDE", "HEIGHT"),
+        help="origin of local coordinates in degrees and metres, for recordings without `origin_deg_m`",
+    )
     commands.add_parser("list", help="experiments, systems, stages and data keys")
     return top
 
@@ -160,8 +172,11 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
 def _dispatch(options: argparse.Namespace, command: str) -> int:
     from torchsar.study.settings.text import experiments, find_config
 
-    if options.command == "import":
-        return _import(options)
+    if options.command in _EXCHANGE:
+        try:
+            return (_import if options.command == "import" else _export)(options)
+        except (ValueError, FileNotFoundError, FileExistsError) as error:
+            raise ConfigError(str(error)) from error
     if options.command == "list":  # the experiments, or an unknown name, before the import of torch
         print(experiments(), flush=True)
     else:
@@ -208,10 +223,21 @@ def _import(options: argparse.Namespace) -> int:
     sidecar = read_tree(Path(options.sidecar))  # before the import of torch
     from torchsar.io import import_recording
 
-    try:
-        print(import_recording(options.file, sidecar, options.out, options.sidecar))
-    except (ValueError, FileNotFoundError, FileExistsError) as error:
-        raise ConfigError(str(error)) from error
+    print(import_recording(options.file, sidecar, options.out, options.sidecar))
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    config = Path(options.file) / "config.yaml"
+    if not config.is_file():
+        raise ConfigError(f"{config} does not exist; give the folder of the result of torchsar run")
+    from torchsar.radar import LocalFrame
+    from torchsar.study.commands.export import export
+    from torchsar.study.table import load
+
+    origin = None if options.origin is None else LocalFrame(*options.origin)
+    export(Path(options.file), load(config), options.to, options.out, origin)
+    print(options.out)
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from torchsar.io.arrays import read_images, write_arrays
 from torchsar.io.cphd import read_cphd
+from torchsar.io.export import export_images, export_recording
 from torchsar.io.formats import FORMATS, Format, format_of, read, read_history
 from torchsar.io.geotiff import write_geotiff
 from torchsar.io.inverse import read_inverse
@@ -16,6 +17,8 @@ from torchsar.io.write_sicd import write_sicd
 __all__ = [
     "FORMATS",
     "Format",
+    "export_images",
+    "export_recording",
     "format_of",
     "import_recording",
     "read",

@@ -73,7 +73,7 @@ def _images(zarr: Any, group: Any, name: str) -> Iterator[tuple[str, Signal]]:
     image = group.get("image")
     if isinstance(image, zarr.Array):
         held = [(axis, group[axis]) for axis in image.metadata.dimension_names]
-        axes = (Axis(axis, len(x), float(x[0]), float(x.attrs["step"]), str(x.attrs["unit"])) for axis, x in held)
+        axes = (Axis(axis, x.shape[0], float(x[0]), float(x.attrs["step"]), str(x.attrs["unit"])) for axis, x in held)
         yield name, Signal(torch.from_numpy(image[...]), tuple(axes))
     for below, inner in sorted(group.groups()):
         yield from _images(zarr, inner, f"{name}/{below}".strip("/"))

@@ -49,11 +49,20 @@ def _refuse_crsd(path: Path, dtype: torch.dtype) -> Recording:
     )
 
 
+def _refuse_without_sidecar(path: Path, dtype: torch.dtype) -> Recording:
+    raise ValueError(
+        f"{path} must be imported first: torchsar import FILE --sidecar YAML --out RECORDING.npz, where the sidecar "
+        "says what the file holds"
+    )
+
+
 # the content decides, then the ending
 FORMATS = (
     Format("CPHD", (".cphd",), (b"CPHD/",), read_cphd),
     Format("CRSD", (".crsd",), (b"CRSDsar/", b"CRSDtx/", b"CRSDrcv/"), _refuse_crsd),
     Format("SICD", (".nitf", ".ntf", ".sicd"), (b"NITF", b"NSIF"), read_sicd),
+    Format("HDF5", (".h5", ".hdf5"), (b"\x89HDF\r\n\x1a\n",), _refuse_without_sidecar),
+    Format("MATLAB", (".mat",), (b"MATLAB 5.0", b"MATLAB 7.3"), _refuse_without_sidecar),
     Format("numpy archive", (".npz",), (b"PK\x03\x04", b"PK\x05\x06", b"\x93NUMPY"), _read_archive),
 )
 
@@ -83,7 +92,9 @@ def format_of(path: str | Path) -> Format:
     )
     if not matches:
         known = ", ".join(f"{one.name} ({', '.join(one.suffixes)})" for one in FORMATS)
-        raise ValueError(f"{path} is of no known format; files that can be read are {known}")
+        raise ValueError(
+            f"{path} is of no known format; files that can be read are {known}; torchsar import reads others"
+        )
     return matches[0]
 
 

@@ -48,7 +48,8 @@ def read_path(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recordi
     Returns:
         Recording of range profiles with the axes (pulse, range), the centred unitary inverse FFT of
         the samples; range is half the path less its reference. Side data are `frequency_hz`
-        (range,) and those of `AntennaPath.side_data`, float64: positions at every pulse.
+        (range,) and those of `AntennaPath.side_data`, float64: positions at every pulse; and
+        `origin_deg_m` if the archive holds it.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -100,7 +101,8 @@ def describe_path(fields: Mapping[str, StoredArray], path: Path) -> Described:
         if not reference_m >= 0:
             raise ValueError(f"path_reference_m must be paths of 0 m or more, got a mean of {2 * reference_m:g} m")
         radar = InverseRadar(float(frequency[n // 2]), n * step_hz, _prf_hz(fields, time), None, None, reference_m)
-    return Described(samples, radar, {"frequency_hz": frequency, **antennas.side_data()})
+        origin = {"origin_deg_m": vector(fields["origin_deg_m"], 3)} if "origin_deg_m" in fields else {}
+    return Described(samples, radar, {"frequency_hz": frequency, **antennas.side_data(), **origin})
 
 
 def _places(fields: Mapping[str, StoredArray], antenna: str, pulses: int, time: Tensor | None) -> Tensor | None:
