@@ -18,7 +18,7 @@ from scipy.io import savemat
 from tests.io.test_damaged import ARCHIVES, PATH, PROFILES, SPOTLIGHT, STRIPMAP, TURNTABLE, Members
 from torchsar.cli import main
 from torchsar.core import Recording
-from torchsar.io import import_recording, read_inverse, read_stripmap, sidecar
+from torchsar.io import import_recording, read, read_inverse, read_stripmap, sidecar
 from torchsar.study.commands import run
 
 RADAR = {name: value.item() for name, value in STRIPMAP.items() if value.ndim == 0}
@@ -207,9 +207,10 @@ def source(tmp_path: Path) -> Path:
 MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "no system": ({"system": None}, ["system is missing", "accepted: isal, path, stripmap"]),
     "a system without recordings": ({"system": "sal"}, ["system has the value 'sal'", "did you mean 'isal'"]),
-    "a section": ({"sampels": {}}, ["key 'sampels' is not known", "did you mean 'samples'"]),
+    "a section": ({"sampels": {}}, ["radar.yaml: key 'sampels' is not known", "did you mean 'samples'"]),
     "no samples": ({"samples": None}, ["samples must be a mapping", "got nothing"]),
-    "a key of the samples": ({"samples.dim": []}, ["key 'samples.dim' is not known", "did you mean 'dims'"]),
+    "a key of the samples": ({"samples.dim": []}, ["samples: key 'dim' is not known", "did you mean 'dims'"]),
+    "dims that are lists": ({"samples.dims": [["pulse"], "range"]}, ["samples.dims must be", "[['pulse'], 'range']"]),
     "dims": ({"samples.dims": ["line", "range"]}, ["samples.dims must be", "pulse and range", "['line', 'range']"]),
     "no dims": ({"samples.dims": None}, ["samples.dims must be", "got None"]),
     "too few dims": ({"samples.dims": ["pulse", "range"]}, ["(12, 40, 2)", "samples.dims are ['pulse', 'range']"]),
@@ -217,7 +218,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "a name": ({"samples.name": "iq/dat"}, ["has no array 'iq/dat'", "did you mean 'iq/data'"]),
     "no name": ({"samples.name": None}, ["samples.name must be the name of an array", "got None"]),
     "a layout": ({"samples.dtype": "int8"}, ["samples.dtype", "is a numpy file; give name instead"]),
-    "a radar key": ({"radar.prf": 3.0}, ["key 'radar.prf' is not known", "did you mean 'prf_hz'"]),
+    "a radar key": ({"radar.prf": 3.0}, ["radar: key 'prf' is not known", "did you mean 'prf_hz'"]),
     "another unit": ({"radar.prf_hz": "3 m"}, ["radar.prf_hz has the unit 'm', and Hz is expected", "kHz"]),
     "a misspelt unit": ({"radar.prf_hz": "3 Mhz"}, ["radar.prf_hz has the unit 'Mhz'", "did you mean 'MHz'"]),
     "a unit for none": ({"radar.first_cell": "3 Hz"}, ["radar.first_cell has the unit 'Hz'", "without a unit"]),
@@ -374,12 +375,19 @@ def test_images_of_all_formats_are_equal_bit_for_bit(
     assert "hdf5.npz" in capsys.readouterr().out
 
 
+def test_files_that_need_a_sidecar_say_so(tmp_path: Path) -> None:
+    for form in ("hdf5", "matlab 7", "matlab 7.3"):
+        WRITERS[form](tmp_path / "data", {"x": np.ones(3)})
+        with pytest.raises(ValueError, match="must be imported first: torchsar import FILE --sidecar YAML"):
+            read(tmp_path / "data")
+
+
 def test_mistakes_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_numpy(tmp_path / "data.npz", STRIPMAP)
     (tmp_path / "radar.yaml").write_text(yaml.safe_dump(mistaken(tree_of(0), {"radar.prf": 3.0})))
     words = ["import", str(tmp_path / "data.npz"), "--sidecar", str(tmp_path / "radar.yaml")]
     assert main([*words, "--out", str(tmp_path / "out.npz")]) == 2
-    assert "radar.yaml: key 'radar.prf' is not known; did you mean 'prf_hz'?" in capsys.readouterr().err
+    assert "radar.yaml: radar: key 'prf' is not known; did you mean 'prf_hz'?" in capsys.readouterr().err
     assert main([*words[:-1], str(tmp_path / "no.yaml"), "--out", str(tmp_path / "out.npz")]) == 2
     assert "no.yaml" in capsys.readouterr().err
     assert not (tmp_path / "out.npz").exists()

@@ -80,9 +80,9 @@ _UNITS = {
 }
 # ends of keys with their units, the longest first
 _ENDS = {"_hz_s": "Hz/s", "_m_s": "m/s", "_hz": "Hz", "_deg": "deg", "_db": "dB", "_s": "s", "_m": "m"}
-_WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?) +([A-Za-z/]+)")
-_DTYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float16", "float32", "float64")
-_DTYPES = (*_DTYPES, "complex64", "complex128")
+_WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?) *([A-Za-z/]+)")
+_REAL = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float16", "float32", "float64")
+_DTYPES = (*_REAL, "complex64", "complex128")
 _FLAT = ("dtype", "byte_order", "header_bytes", "shape")
 _SAMPLES = ("key", "name", "dims", "imag", "conjugate", *_FLAT)
 _ENTRY = ("name", "file", "unit", "transpose", "first", "step", *_FLAT)
@@ -109,9 +109,9 @@ def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Pa
     equal steps. For flat binary files `dtype`, `byte_order` (little or big), `header_bytes` and
     `shape` take the place of `name`.
 
-    All keys are checked before samples are read. Samples are read and written in blocks of 32 MiB;
-    at most 256 MiB and the side arrays are in memory, but all samples of a MATLAB 5 or a numpy
-    file.
+    All keys are checked before samples are read. Samples are read and written in blocks of 32 MiB
+    (or of one line, if it is longer): less than 256 MiB and the side arrays are in memory at a
+    time. Only from a MATLAB 5 or a numpy file all samples are read at once.
 
     Args:
         path: Path of the data.
@@ -197,38 +197,34 @@ class _Import:
     """The sections of a sidecar, checked, with the arrays that they name."""
 
     def __init__(self, path: Path, sidecar: Any, name: str, stack: ExitStack) -> None:
-        self.path, self.name, self.stack = path, name, stack
+        self.path, self.stack = path, stack
+        self.name = name = str(Path(name))
         self.opened: dict[Path, Container | None] = {}
-        tree = self._section(sidecar, "", ("system", "samples", "radar", "side"))
+        tree = _section(sidecar, name, ("system", "samples", "radar", "side"))
         system = _choice(tree.get("system"), f"{name}: system", _SYSTEMS)
-        self.samples = self._section(tree.get("samples"), "samples", _SAMPLES)
+        self.samples = _section(tree.get("samples"), f"{name}: samples", _SAMPLES)
         keys = _SYSTEMS[system]
         key = self.samples.get("key", keys[0] if system != "isal" else None)
         self.key = _choice(key, f"{name}: samples.key", keys)
         self.kind = _KINDS[self.key]
         self.tree = {
-            section: self._section(tree.get(section, {}), section, accepted)
-            for section, accepted in (("radar", self.kind.radar), ("side", self.kind.side))
+            f"{name}: {section}": _section(
+                {} if tree.get(section) is None else tree[section], f"{name}: {section}", keys
+            )
+            for section, keys in (("radar", self.kind.radar), ("side", self.kind.side))
         }
 
     def planned(self) -> tuple[str, _Samples, dict[str, np.ndarray]]:
         """The key of the samples, the samples, and all other arrays by key; all are checked."""
         samples = self._samples()
         lengths = dict(zip(samples.order, samples.shape))
-        arrays = {
-            key: self._value(value, key, f"{section}.{key}", lengths)
-            for section, tree in self.tree.items()
-            for key, value in tree.items()
-        }
-        file = Path(self.name)
-        stored = {
-            key: StoredArray(
-                f"{file}: {section}.{key}", arrays[key].shape, arrays[key].dtype, partial(_opened, arrays[key])
-            )
-            for section, tree in self.tree.items()
-            for key in tree
-        }
-        what = f"{file}: samples"
+        arrays: dict[str, np.ndarray] = {}
+        stored: dict[str, StoredArray] = {}
+        for section, tree in self.tree.items():
+            for key, value in tree.items():
+                x = arrays[key] = self._value(value, key, f"{section}.{key}", lengths)
+                stored[key] = StoredArray(f"{section}.{key}", x.shape, x.dtype, partial(_opened, x))
+        what, file = f"{self.name}: samples", Path(self.name)
         stored[self.key] = StoredArray(what, samples.shape, samples.dtype, partial(_opened, np.zeros(())))
         found = self.kind.describe(stored, file)
         with naming(file):  # side data that only a recording checks, with one sample per line
@@ -236,23 +232,10 @@ class _Import:
             Recording.from_arrays(lines, found.radar, what=self.name, **found.aux)
         return self.key, samples, arrays
 
-    def _section(self, tree: Any, where: str, accepted: Sequence[str]) -> dict[str, Any]:
-        """A mapping with no other keys than the accepted ones."""
-        place = f"{self.name}: {where}" if where else self.name
-        if not isinstance(tree, Mapping):
-            got = "nothing" if tree is None else repr(tree)
-            raise ValueError(f"{place} must be a mapping with some of the keys {', '.join(accepted)}, got {got}")
-        for key in tree:
-            if key not in accepted:
-                full = f"{where}.{key}" if where else key
-                raise ValueError(f"{self.name}: key {full!r} is not known{did_you_mean(str(key), accepted)}")
-        return dict(tree)
-
     def _samples(self) -> _Samples:
         tree, where, order = self.samples, f"{self.name}: samples", self.kind.dims
         dims = tree.get("dims")
-        allowed = [set(order), {*order, "iq"}]
-        if not isinstance(dims, (list, tuple)) or set(map(str, dims)) not in allowed or len(set(dims)) != len(dims):
+        if not isinstance(dims, (list, tuple)) or sorted(map(str, dims)) not in (sorted(order), sorted((*order, "iq"))):
             raise ValueError(
                 f"{where}.dims must be the dims of the array in the order of the file, {order[0]} and {order[1]}, and "
                 f"iq if there is one for real and imaginary part, got {dims!r}"
@@ -313,12 +296,12 @@ class _Import:
 
     def _value(self, value: Any, key: str, where: str, lengths: Mapping[str, int]) -> np.ndarray:
         """The numbers of a key in its unit."""
-        where, own, unit = f"{self.name}: {where}", _unit_of(key), None
+        own, unit = _unit_of(key), None
         if isinstance(value, str):
             match = _WITH_UNIT.fullmatch(value.strip())
             value, unit = (float(match[1]), match[2]) if match else ({"name": value}, None)
         if isinstance(value, Mapping):
-            tree = self._section(value, where.removeprefix(f"{self.name}: "), _ENTRY)
+            tree = _section(value, where, _ENTRY)
             unit = _kept(tree, "unit", where, str, "a unit", None)
             along = lengths.get(_ALONG.get(key, ""))
             array = _steps(tree, where, along) if {"first", "step"} & set(tree) else self._entry(tree, where)
@@ -334,6 +317,17 @@ class _Import:
         path = self.path if file is None else self.path.parent / file
         array = self._array(path, tree, where).read()
         return array.T if _kept(tree, "transpose", where, bool, "true or false", False) else array
+
+
+def _section(tree: Any, where: str, accepted: Sequence[str]) -> dict[str, Any]:
+    """A mapping with no other keys than the accepted ones."""
+    if not isinstance(tree, Mapping):
+        got = "nothing" if tree is None else repr(tree)
+        raise ValueError(f"{where} must be a mapping with some of the keys {', '.join(accepted)}, got {got}")
+    for key in tree:
+        if key not in accepted:
+            raise ValueError(f"{where}: key {key!r} is not known{did_you_mean(str(key), accepted)}")
+    return dict(tree)
 
 
 def _unit_of(key: str) -> str:
