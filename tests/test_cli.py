@@ -60,12 +60,14 @@ def child_seconds(*arguments: str) -> tuple[float, subprocess.CompletedProcess[s
         (["--help"], 0, "usage: torchsar"),
         (["run", "--help"], 0, "--device"),
         (["--version"], 0, "torchsar-lab "),
-        ([], 2, "a command is missing: choose one of run, sweep, requires, trade, list"),
+        ([], 2, "a command is missing: choose one of run, sweep, requires, trade, import, export, list"),
         (["walk"], 2, "invalid choice: 'walk'"),
         (["requires"], 2, "arguments are required: config\n"),
         (["run", "stripmap_damaged", "--speed"], 2, "unrecognized arguments: --speed"),
         (["run", "nowhere"], 2, "there is no config file 'nowhere'"),
         (["run", "sal_points", "--out", ""], 2, "the name of the folder is empty"),
+        (["import", "a.h5", "--out", "b.npz"], 2, "arguments are required: --sidecar"),
+        (["export", "run", "--to", "png", "--out", "b"], 2, "invalid choice: 'png'"),
     ],
 )
 def test_help_and_usage_errors_answer_at_once(arguments: list[str], status: int, said: str) -> None:
@@ -74,11 +76,12 @@ def test_help_and_usage_errors_answer_at_once(arguments: list[str], status: int,
     assert spent < 0.5
 
 
-@pytest.mark.parametrize("command", ["run", "sweep", "requires", "trade", "list"])
+@pytest.mark.parametrize("command", ["run", "sweep", "requires", "trade", "import", "list"])
 def test_the_first_line_comes_before_anything_heavy_is_imported(command: str, tmp_path: Path) -> None:
     """torch cannot be imported here at all, and the first line is there, in a pipe."""
     program = "import sys; sys.modules['torch'] = None; from torchsar.cli import main; main(sys.argv[1:])"
     words = [command] if command == "list" else [command, str(write_tiny(tmp_path))]
+    words += ["--sidecar", words[-1], "--out", "recording.npz"] if command == "import" else []
     done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, timeout=60)
     assert ("EXPERIMENTS" in done.stdout) if command == "list" else (f"torchsar: {command} " in done.stderr)
 

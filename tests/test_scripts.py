@@ -51,7 +51,7 @@ def test_first_image_is_the_script_of_the_readme_and_runs(printed: Printed, tmp_
 
 
 def test_the_config_of_the_readme_is_accepted(tmp_path: Path) -> None:
-    whole, swept = readme_blocks("yaml")
+    whole, swept, _ = readme_blocks("yaml")
     path = tmp_path / "readme.yaml"
     path.write_text(whole, encoding="utf-8")
     assert list(Bench(load(path)).chains) == ["recommended"]

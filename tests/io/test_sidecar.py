@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tracemalloc
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -20,6 +21,7 @@ from torchsar.cli import main
 from torchsar.core import Recording
 from torchsar.io import import_recording, read, read_inverse, read_stripmap, sidecar
 from torchsar.study.commands import run
+from torchsar.study.settings.text import parse
 
 RADAR = {name: value.item() for name, value in STRIPMAP.items() if value.ndim == 0}
 PAIRS = STRIPMAP["iq"]
@@ -380,6 +382,21 @@ def test_files_that_need_a_sidecar_say_so(tmp_path: Path) -> None:
         WRITERS[form](tmp_path / "data", {"x": np.ones(3)})
         with pytest.raises(ValueError, match="must be imported first: torchsar import FILE --sidecar YAML"):
             read(tmp_path / "data")
+
+
+def test_the_sidecar_of_the_readme(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="the extra `formats` is not installed")
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    (text,) = (block for block in re.findall(r"```yaml\n(.*?)```", readme, re.DOTALL) if "dims:" in block)
+    with h5py.File(tmp_path / "flight.h5", "w") as file:
+        file["raw/iq"] = np.ones((2, 6, 4096), np.int8)
+        file["raw/lines"] = np.arange(4096)
+        file["raw"].attrs["sampling"] = 32.317
+    (tmp_path / "gains.bin").write_bytes(np.full(4096, 20.0, ">f4").tobytes())
+    recording = read(import_recording(tmp_path / "flight.h5", parse(text, "README"), tmp_path / "out.npz"))
+    assert isinstance(recording, Recording) and recording.signal.data.shape == (4096, 6)
+    assert bool((recording.signal.data == 10 * (1 + 1j)).all())
+    assert (recording.radar.sampling_hz, recording.radar.carrier_hz) == (32.317e6, 5.3e9)
 
 
 def test_mistakes_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
