@@ -165,13 +165,8 @@ def flat_array(path: Path, dtype: np.dtype, shape: tuple[int, ...], header_bytes
         The array, mapped into memory part by part.
 
     Raises:
-        FileNotFoundError: If there is no such file.
         ValueError: If the size of the file is not that of header and array.
     """
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{path} {'is no file' if path.exists() else 'does not exist'}; give the path of a file"
-        )
     held, needed = path.stat().st_size, header_bytes + math.prod(shape) * dtype.itemsize
     if held != needed:
         raise ValueError(
@@ -198,8 +193,7 @@ def _hdf5(path: Path, stack: ExitStack, matlab: bool) -> Container:
         held = file[name]
         if not matlab or not isinstance(held, h5py.Dataset):
             return held, lambda slices: held[slices]
-        n = held.ndim
-        full = [slice(None)] * n
+        full = [slice(None)] * held.ndim
         header = np.broadcast_to(np.empty((), held.dtype), held.shape[::-1])
         return header, lambda slices: held[tuple(reversed([*slices, *full[len(slices) :]]))].T
 
