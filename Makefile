@@ -1,4 +1,5 @@
 # make run: the embedded experiment. make test: the tests, in JOBS processes of one thread. Both set up $(VENV) first.
+# make docs: the documentation site, in docs/_build/html; it works without a network.
 # An environment that already has torch keeps it: make run VENV=/path/to/venv
 VENV   ?= .venv
 PYTHON ?= python3
@@ -16,7 +17,7 @@ export OMP_WAIT_POLICY
 PY    := $(VENV)/bin/python
 STAMP := $(VENV)/.torchsar-installed
 
-.PHONY: run test lint install clean
+.PHONY: run test lint docs install clean
 
 run: install
 	$(VENV)/bin/torchsar run $(CONFIG) $(ARGS) --out $(OUT)
@@ -28,6 +29,11 @@ test: install
 lint: install
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/pyright --pythonpath $(PY)
+
+docs: install
+	@$(PY) -c 'import furo, latex2mathml, myst_parser' 2>/dev/null || $(PY) -m pip install -e '.[docs]'
+	$(PY) -m sphinx -W --keep-going -n -q docs docs/_build/html
+	@echo 'the documentation is in docs/_build/html/index.html'
 
 install: $(STAMP)
 
@@ -42,4 +48,4 @@ $(STAMP): pyproject.toml constraints.txt Makefile
 	@touch $(STAMP)
 
 clean:
-	rm -rf out build dist .venv
+	rm -rf out build dist docs/_build docs/reference/api .venv
