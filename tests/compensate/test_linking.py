@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsar.compensate import LinkPhases, autofocus, entropy_fixed_point, link_phases, pga, sca
 from torchsar.compensate.pulse_phase.homogeneous import describe, sparse_gain_nats
-from torchsar.compensate.pulse_phase.linking import _Scene
+from torchsar.compensate.pulse_phase.linking import _grown, _Scene
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 from torchsar.core import Axis, Signal
 from torchsar.metrics.phase import phase_rmse
@@ -87,6 +87,13 @@ def test_no_part_of_a_long_record_slips() -> None:
     found = link_phases(clutter(2, 0.8, 10.0, 0, points=5, n=2 * N))
     assert bool(found.ok.all())
     assert float(phase_rmse(found["phase_rad"], torch.zeros(2, 2 * N)).max()) < 0.1
+
+
+def test_blocks_without_a_neighbour_are_joined() -> None:
+    n = 513  # 19 blocks of 27 pulses
+    data = clutter(1, 0.4, 15.0, 5, n=n)[..., ::6]
+    phase = torch.angle(_grown(_Scene.of(data, torch.ones(1, n, dtype=torch.bool))))
+    assert float(phase_rmse(phase, torch.zeros(1, n, dtype=F64)).max()) < 0.3
 
 
 def test_sharpness_is_not_trusted_in_homogeneous_clutter() -> None:

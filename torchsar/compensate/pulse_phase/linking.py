@@ -182,8 +182,11 @@ def _grown(scene: _Scene) -> Tensor:
     size = -(-n // 2 ** max(0, math.ceil(math.log2(n / _BLOCK))))
     u = _solved(scene.blocks(size))
     while size < n:
+        blocks = u.reshape(trials, -1, size)
+        if blocks.shape[1] % 2:  # the last block has no neighbour: one of absent pulses
+            blocks = torch.cat([blocks, torch.ones_like(blocks[:, :1])], 1)
         size *= 2
-        u = _joined(scene.blocks(size), u.reshape(-1, size))
+        u = _joined(scene.blocks(size), blocks.reshape(-1, size))
     return u.reshape(trials, -1)[:, :n]
 
 
