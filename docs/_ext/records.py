@@ -1,2 +1,207 @@
-def setup(app):
-    return {}
+"""Figures and tables from the records in docs/sweeps, docs/trade and docs/requires.
+
+A page names a record, what to show of it, and its words; every number comes from the record.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from docutils import nodes
+from docutils.parsers.rst import directives
+from matplotlib import rc_context
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+from torchsar import plot
+from torchsar.study.trials.choice import EXACT_DB
+
+# the order of the systems in tables
+SYSTEMS = ("stripmap", "isal", "isal_rotation", "sal", "geo", "geo_ocean", "path")
+
+
+def pairs(text: str) -> dict[str, str]:
+    """Words by name, from "name = words; name = words"."""
+    found = (part.split("=", 1) for part in text.split(";") if part.strip())
+    return {name.strip(): words.strip() for name, words in found}
+
+
+def short(value: float | None) -> str:
+    """A number to three digits."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    return f"{value:.3g}" if 1e-4 <= abs(value) < 1e5 or value == 0 else f"{value:.2e}"
+
+
+def cell(value: float | None) -> str:
+    """A number in a table, with zeros in place of an exponent."""
+    return "-" if value is None or not math.isfinite(value) else np.format_float_positional(float(f"{value:.3g}"), trim="-")
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values of one algorithm or bound over the parameter, with confidence intervals."""
+
+    values: list[float]
+    intervals: list[tuple[float, float]]
+
+
+class Sweep(SphinxDirective):
+    """What a figure and a table of a sweep share: the record and what is shown of it."""
+
+    required_arguments = 1
+    has_content = True
+    option_spec = {
+        "metric": directives.unchanged_required,
+        "of": lambda word: directives.choice(word, ("median", "rmse")),
+        "x": directives.unchanged_required,
+        "xlabel": directives.unchanged_required,
+        "ylabel": directives.unchanged_required,
+        "where": pairs,
+        "show": pairs,
+        "bounds": pairs,
+        "scale": float,
+        "title": directives.unchanged,
+        "log-x": directives.flag,
+    }
+
+    def record(self) -> dict[str, Any]:
+        """The record, on which the page depends."""
+        path = Path(self.env.srcdir) / "sweeps" / f"{self.arguments[0]}.json"
+        self.env.note_dependency(str(path))
+        return json.loads(path.read_text(encoding="utf-8"))
+
+    def fits(self, parameters: Mapping[str, Any]) -> bool:
+        """Whether a point of the grid is one of those that are shown."""
+        return all(str(parameters[key]) == value for key, value in self.options.get("where", {}).items())
+
+    def chosen(self) -> tuple[list[Any], dict[str, Curve], dict[str, Curve]]:
+        """The values of the parameter, and curves of algorithms and of bounds over them, by label."""
+        record, x, scale = self.record(), self.options["x"], self.options.get("scale", 1.0)
+        of = self.options.get("of", "rmse")
+        rows = [p for p in record["points"] if p["metric"] == self.options["metric"] and self.fits(p["parameters"])]
+        lower = [b for b in record["bounds"] if b["metric"] == self.options["metric"] and self.fits(b["parameters"])]
+        values = list(dict.fromkeys(row["parameters"][x] for row in rows))
+        curves = {}
+        for name, label in self.options["show"].items():
+            at = {row["parameters"][x]: row for row in rows if row["algorithm"] == name}
+            if not at:
+                raise self.error(f"{self.arguments[0]}.json has no {self.options['metric']} of {name!r}")
+            found = [scale * at[value][of] if value in at else math.nan for value in values]
+            ends = [tuple(scale * e for e in at[v]["interval"]) if v in at and of == "rmse" else (math.nan,) * 2 for v in values]
+            curves[label] = Curve(found, ends)
+        bounds = {}
+        for name, label in self.options.get("bounds", {}).items():
+            at = {bound["parameters"].get(x): bound["rms"] for bound in lower if bound["bound"] == name}
+            if not at:
+                raise self.error(f"{self.arguments[0]}.json has no bound {name!r} of {self.options['metric']}")
+            found = [scale * at[value] if value in at else math.nan for value in values]
+            bounds[label] = Curve(found, [])
+        return values, curves, bounds
+
+    def origin(self) -> str:
+        """Where the numbers come from, as the end of a caption."""
+        trials = self.record()["made_with"]["trials"]
+        of = "Medians" if self.options.get("of") == "median" else "RMS values"
+        return f"{of} over {trials} trials; record: `docs/sweeps/{self.arguments[0]}.json`."
+
+    def caption(self) -> list[nodes.Node]:
+        """The words of the page and the origin of the numbers, as inline nodes."""
+        text = " ".join(self.content) + " " + self.origin()
+        parsed = self.parse_text_to_nodes(text.strip())
+        return list(parsed[0].children)
+
+
+class SweepFigure(Sweep):
+    """Draw errors over one parameter of a recorded sweep, with bounds."""
+
+    def run(self) -> list[nodes.Node]:
+        values, curves, bounds = self.chosen()
+        part = {
+            "title": self.options.get("title", ""),
+            "x": np.asarray(values) if not isinstance(values[0], str) else values,
+            "series": {label: (np.asarray(c.values), np.asarray(c.intervals)) for label, c in curves.items()},
+            "bounds": {label: np.asarray(c.values) for label, c in bounds.items()},
+        }
+        labels = (self.options["xlabel"], self.options["ylabel"])
+        drawn = plot.error_curves([part], *labels, log_x="log-x" in self.options, log_y=True)[0]
+        drawn.set_size_inches(7.2, 4.4)
+        folder = Path(self.env.srcdir) / "_build" / "drawn"
+        folder.mkdir(parents=True, exist_ok=True)
+        name = f"{self.env.docname.replace('/', '-')}-{self.env.new_serialno('sweep')}.svg"
+        with rc_context({"svg.hashsalt": name}):
+            drawn.savefig(folder / name, metadata={"Date": None})
+        described = f"{self.options['ylabel']} over {self.options['xlabel']}"
+        image = nodes.image(uri=f"/_build/drawn/{name}", alt=described)
+        self.env.images.add_file(self.env.docname, f"_build/drawn/{name}")
+        return [nodes.figure("", image, nodes.caption("", "", *self.caption()))]
+
+
+class SweepTable(Sweep):
+    """A table of errors over one parameter of a recorded sweep, with bounds."""
+
+    def run(self) -> list[nodes.Node]:
+        values, curves, bounds = self.chosen()
+        columns = {**bounds, **curves}
+        rows = ["| " + " | ".join([self.options["xlabel"], *columns]) + " |", "| --- " * (len(columns) + 1) + "|"]
+        for i, value in enumerate(values):
+            first = short(value) if not isinstance(value, str) else value
+            rows.append("| " + " | ".join([first, *(cell(c.values[i]) for c in columns.values())]) + " |")
+        return [*self.parse_text_to_nodes("\n".join(rows)), nodes.paragraph("", "", *self.caption(), classes=["caption"])]
+
+
+class TradeTable(SphinxDirective):
+    """Time and loss of every alternative of one system, and of every step that has some."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        path = Path(self.env.srcdir) / "trade" / f"{self.arguments[0]}.json"
+        self.env.note_dependency(str(path))
+        record = json.loads(path.read_text(encoding="utf-8"))
+        lines = ["| step | alternative | CPU time (ms) | loss | recommended |", "| --- | --- | ---: | --- | --- |"]
+        for choice, alternatives in {record["choice"]: record["alternatives"], **record["others"]}.items():
+            for i, row in enumerate(alternatives):
+                time = "-" if row["cpu_s"] is None else cell(1e3 * row["cpu_s"])
+                exact = {name: "exact" if x <= EXACT_DB else f"{x:.3g}" for name, x in row["loss"].items()}
+                loss = ", ".join(f"{x} (`{name}`)" for name, x in exact.items()) or "failed"
+                first = choice if i == 0 else ""
+                lines.append(f"| {first} | {row['name']} | {time} | {loss} | {'yes' if row['recommended'] else ''} |")
+        limits = ", ".join(f"`{name}` {value:g}" for name, value in record["tolerance"].items())
+        with_ = f"torch {record['machine']['torch']}, threads: {record['machine']['threads']}"
+        note = f"Config `{record['config']}`; largest loss accepted: {limits}; {with_}; record: `docs/trade/{path.name}`."
+        return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
+
+
+class RequiresTable(SphinxDirective):
+    """How well predicted losses agree with measured ones, for all systems."""
+
+    def run(self) -> list[nodes.Node]:
+        lines = ["| system | scenes | predicted losses | acceptable | precision | recall | median error near the tolerance |"]
+        lines.append("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
+        for system in SYSTEMS:
+            path = Path(self.env.srcdir) / "requires" / f"{system}.json"
+            self.env.note_dependency(str(path))
+            r = json.loads(path.read_text(encoding="utf-8"))
+            numbers = (r["scenes"], int(r["rows"]), int(r["acceptable"]))
+            shares = f"{r['precision']:.3f} | {r['recall']:.3f} | {r['median_error']:.2g} dB"
+            lines.append(f"| `{system}` | {' | '.join(map(str, numbers))} | {shares} |")
+        return self.parse_text_to_nodes("\n".join(lines))
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the directives."""
+    for name, directive in {
+        "sweep-figure": SweepFigure,
+        "sweep-table": SweepTable,
+        "trade-table": TradeTable,
+        "requires-table": RequiresTable,
+    }.items():
+        app.add_directive(name, directive)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
