@@ -1,9 +1,7 @@
 """Time and loss of the alternatives of one config per system, kept as small files that tests check
-and the README quotes.
+and the documentation shows.
 
-python scripts/keep_trade.py [docs/trade] [--systems sal geo] [--table]
-
-`--table` prints the first choice of every kept file as a table, without measuring again.
+python scripts/keep_trade.py [docs/trade] [--systems sal geo]
 """
 
 from __future__ import annotations
@@ -13,15 +11,12 @@ import json
 import logging
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from torchsar.core import keep_freed_memory
 from torchsar.study.commands.trade import trade
-from torchsar.study.output.numbers import MISSING
 from torchsar.study.table import load
-from torchsar.study.trials.choice import EXACT_DB
 
 # the config of each system that shows its alternatives
 CONFIGS = {
@@ -79,28 +74,11 @@ def written(tree: dict[str, Any]) -> str:
     return "{\n" + ",\n".join(parts) + "\n}\n"
 
 
-def table(folder: Path) -> Iterator[str]:
-    """A markdown table: the alternatives of the first choice of each system."""
-    yield "| system | choice | alternative | CPU (ms) | loss | recommended |"
-    yield "|---|---|---|---|---|---|"
-    for system in CONFIGS:
-        tree = json.loads((folder / f"{system}.json").read_text(encoding="utf-8"))
-        for i, row in enumerate(tree["alternatives"]):
-            loss = ", ".join(f"{'exact' if x <= EXACT_DB else f'{x:.3g}'} ({name})" for name, x in row["loss"].items())
-            time_ms = MISSING if row["cpu_s"] is None else f"{1e3 * row['cpu_s']:.3g}"
-            about = f"| `{system}` | {tree['choice']}" if i == 0 else "| | "
-            yield f"{about} | {row['name']} | {time_ms} | {loss or 'failed'} | {'yes' if row['recommended'] else ''} |"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, nargs="?", default=Path("docs/trade"))
     parser.add_argument("--systems", nargs="+", choices=list(CONFIGS), default=list(CONFIGS))
-    parser.add_argument("--table", action="store_true")
     options = parser.parse_args()
-    if options.table:
-        print("\n".join(table(options.folder)))
-        return
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     keep_freed_memory()  # as the commands do
     options.folder.mkdir(parents=True, exist_ok=True)

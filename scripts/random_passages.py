@@ -1,4 +1,4 @@
-"""Draw passages of the README, docstrings and error messages at random, for a reader to judge.
+"""Draw passages of the pages, docstrings and error messages at random, for a reader to judge.
 
 Each should be understood at first reading by somebody who knows radar but not this project.
 
@@ -19,15 +19,25 @@ ROOT = Path(__file__).resolve().parents[1]
 LEAST_CHARACTERS = 60
 
 
-def readme() -> Iterator[tuple[str, str]]:
-    """(where, text) of every paragraph of the README that is prose."""
+def pages() -> Iterator[tuple[str, str]]:
+    """(where, text) of every paragraph of the README and of the documentation that is prose."""
+    for path in (
+        ROOT / "README.md",
+        *sorted((ROOT / "docs").glob("[a-z]*/*.md")),
+        *sorted((ROOT / "docs").glob("*.md")),
+    ):
+        yield from paragraphs(path)
+
+
+def paragraphs(path: Path) -> Iterator[tuple[str, str]]:
+    """(where, text) of every paragraph of a page that is prose."""
     code, section = False, ""
-    for part in (ROOT / "README.md").read_text(encoding="utf-8").split("\n\n"):
+    for part in path.read_text(encoding="utf-8").split("\n\n"):
         opens = part.count("```") % 2 == 1
         if part.startswith("#") and not code:
             section = part.splitlines()[0].lstrip("# ")
-        elif not (code or opens or part.startswith(("|", "    ", "![", "```"))):
-            yield f"README.md, section {section!r}", part
+        elif not (code or opens or part.startswith(("|", "    ", "![", "```", "$$", ":::", "---"))):
+            yield f"{path.relative_to(ROOT)}, section {section!r}", part
         code = code ^ opens
 
 
@@ -83,7 +93,7 @@ def passages() -> dict[str, list[tuple[str, str]]]:
     """(where, text) of everything that may be drawn, by kind."""
     files = [(path, ast.parse(path.read_text(encoding="utf-8"))) for path in sorted((ROOT / "torchsar").rglob("*.py"))]
     found = {
-        "README": list(readme()),
+        "page": list(pages()),
         "docstring": [one for path, tree in files for one in docstrings(path, tree)],
         "error": [one for path, tree in files for one in errors(path, tree)],
     }

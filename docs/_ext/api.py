@@ -52,11 +52,13 @@ def names() -> dict[str, list[str]]:
 
 
 def home(qualified: str) -> str:
-    """Module that defines a public name; of a constant, the module from which its package takes it."""
+    """Module that defines a public name; of a constant, the one that its package takes it from."""
     face, name = split(qualified)
     module = getattr(getattr(face, name), "__module__", "")
     if not module.startswith("torchsar."):
-        found = re.search(rf"from (torchsar\.\S+) import (?:\([^)]*?\b{name}\b|[^\n(]*\b{name}\b)", inspect.getsource(face))
+        found = re.search(
+            rf"from (torchsar\.\S+) import (?:\([^)]*?\b{name}\b|[^\n(]*\b{name}\b)", inspect.getsource(face)
+        )
         module = found[1] if found else face.__name__
     return module
 
@@ -94,7 +96,7 @@ def language(lines: list[str]) -> str:
 
 
 def restructured(lines: list[str]) -> Iterator[str]:
-    """A docstring as reStructuredText: marks escaped, lists set off, and indented examples as code."""
+    """A docstring as reStructuredText: marks escaped, lists set off, indented examples as code."""
     before, level, code, bullets = "", 0, None, None
     for number, line in enumerate(lines):
         text, indent = line.lstrip(), len(line) - len(line.lstrip())
@@ -172,7 +174,7 @@ def write(app: Sphinx) -> None:
 
 
 def missing(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nodes.Element) -> nodes.Element | None:
-    """Code in place of a link: names of docstrings that are not public, and types of other packages.
+    """Code in place of a link: names in docstrings that are not public, types of other packages.
 
     Links in pages written by hand must lead somewhere: unless resolved they are reported.
     """

@@ -41,7 +41,11 @@ def short(value: float | None) -> str:
 
 def cell(value: float | None) -> str:
     """A number in a table, with zeros in place of an exponent."""
-    return "-" if value is None or not math.isfinite(value) else np.format_float_positional(float(f"{value:.3g}"), trim="-")
+    return (
+        "-"
+        if value is None or not math.isfinite(value)
+        else np.format_float_positional(float(f"{value:.3g}"), trim="-")
+    )
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ class Sweep(SphinxDirective):
         return all(str(parameters[key]) == value for key, value in self.options.get("where", {}).items())
 
     def chosen(self) -> tuple[list[Any], dict[str, Curve], dict[str, Curve]]:
-        """The values of the parameter, and curves of algorithms and of bounds over them, by label."""
+        """Values of the parameter, and curves of algorithms and of bounds over them, by label."""
         record, x, scale = self.record(), self.options["x"], self.options.get("scale", 1.0)
         of = self.options.get("of", "rmse")
         rows = [p for p in record["points"] if p["metric"] == self.options["metric"] and self.fits(p["parameters"])]
@@ -94,7 +98,10 @@ class Sweep(SphinxDirective):
             if not at:
                 raise self.error(f"{self.arguments[0]}.json has no {self.options['metric']} of {name!r}")
             found = [scale * at[value][of] if value in at else math.nan for value in values]
-            ends = [tuple(scale * e for e in at[v]["interval"]) if v in at and of == "rmse" else (math.nan,) * 2 for v in values]
+            ends = [
+                tuple(scale * e for e in at[v]["interval"]) if v in at and of == "rmse" else (math.nan,) * 2
+                for v in values
+            ]
             curves[label] = Curve(found, ends)
         bounds = {}
         for name, label in self.options.get("bounds", {}).items():
@@ -153,7 +160,10 @@ class SweepTable(Sweep):
         for i, value in enumerate(values):
             first = short(value) if not isinstance(value, str) else value
             rows.append("| " + " | ".join([first, *(cell(c.values[i]) for c in columns.values())]) + " |")
-        return [*self.parse_text_to_nodes("\n".join(rows)), nodes.paragraph("", "", *self.caption(), classes=["caption"])]
+        return [
+            *self.parse_text_to_nodes("\n".join(rows)),
+            nodes.paragraph("", "", *self.caption(), classes=["caption"]),
+        ]
 
 
 class TradeTable(SphinxDirective):
@@ -175,7 +185,9 @@ class TradeTable(SphinxDirective):
                 lines.append(f"| {first} | {row['name']} | {time} | {loss} | {'yes' if row['recommended'] else ''} |")
         limits = ", ".join(f"`{name}` {value:g}" for name, value in record["tolerance"].items())
         with_ = f"torch {record['machine']['torch']}, threads: {record['machine']['threads']}"
-        note = f"Config `{record['config']}`; largest loss accepted: {limits}; {with_}; record: `docs/trade/{path.name}`."
+        note = (
+            f"Config `{record['config']}`; largest loss accepted: {limits}; {with_}; record: `docs/trade/{path.name}`."
+        )
         return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
 
 
@@ -183,7 +195,9 @@ class RequiresTable(SphinxDirective):
     """How well predicted losses agree with measured ones, for all systems."""
 
     def run(self) -> list[nodes.Node]:
-        lines = ["| system | scenes | predicted losses | acceptable | precision | recall | median error near the tolerance |"]
+        lines = [
+            "| system | scenes | predicted losses | acceptable | precision | recall | median error near the tolerance |"
+        ]
         lines.append("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
         for system in SYSTEMS:
             path = Path(self.env.srcdir) / "requires" / f"{system}.json"
