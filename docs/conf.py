@@ -20,6 +20,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "api",  # pages of the public names, and docstrings as reStructuredText
     "mathml",  # formulas without scripts
+    "offline",  # nothing is loaded from a network
     "records",  # figures and tables from docs/sweeps, docs/trade and docs/requires
 ]
 exclude_patterns = ["_build", "sweeps", "trade", "requires"]

@@ -178,6 +178,17 @@ def test_docstrings_become_restructured_text(monkeypatch: pytest.MonkeyPatch) ->
     assert list(api.restructured(lines)) == [*made, "    x = 1", "", "Args:", "    x: It."]
 
 
+def test_what_loads_from_a_network_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sphinx", reason="the extra `docs` is not installed")
+    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+    import importlib
+
+    loads = importlib.import_module("offline").loads
+    bad = '<script src="https://a/b.js"></script><link rel="stylesheet" href="//c/d.css"/> @import url(http://e/f)'
+    assert len(list(loads(bad))) == 3
+    assert not list(loads('<a href="https://a">a</a><img src="b.png"><link rel="canonical" href="https://c">'))
+
+
 def test_the_citation_names_every_paper() -> None:
     yaml = pytest.importorskip("yaml")
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))

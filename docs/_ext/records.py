@@ -48,6 +48,10 @@ def cell(value: float | None) -> str:
     )
 
 
+# statistics of a record, and how a caption names them
+STATISTICS = {"median": "Medians", "rmse": "RMS values", "success_share": "Shares"}
+
+
 @dataclass(frozen=True)
 class Curve:
     """Values of one algorithm or bound over the parameter, with confidence intervals."""
@@ -63,7 +67,7 @@ class Sweep(SphinxDirective):
     has_content = True
     option_spec = {
         "metric": directives.unchanged_required,
-        "of": lambda word: directives.choice(word, ("median", "rmse")),
+        "of": lambda word: directives.choice(word, tuple(STATISTICS)),
         "x": directives.unchanged_required,
         "xlabel": directives.unchanged_required,
         "ylabel": directives.unchanged_required,
@@ -98,10 +102,9 @@ class Sweep(SphinxDirective):
             if not at:
                 raise self.error(f"{self.arguments[0]}.json has no {self.options['metric']} of {name!r}")
             found = [scale * at[value][of] if value in at else math.nan for value in values]
-            ends = [
-                tuple(scale * e for e in at[v]["interval"]) if v in at and of == "rmse" else (math.nan,) * 2
-                for v in values
-            ]
+            nothing = (math.nan, math.nan)  # no interval, as of a median
+            given = [at[value]["interval"] if value in at and of == "rmse" else nothing for value in values]
+            ends = [(scale * low, scale * high) for low, high in given]
             curves[label] = Curve(found, ends)
         bounds = {}
         for name, label in self.options.get("bounds", {}).items():
@@ -114,8 +117,7 @@ class Sweep(SphinxDirective):
 
     def origin(self) -> str:
         """Where the numbers come from, as the end of a caption."""
-        trials = self.record()["made_with"]["trials"]
-        of = "Medians" if self.options.get("of") == "median" else "RMS values"
+        of, trials = STATISTICS[self.options.get("of", "rmse")], self.record()["made_with"]["trials"]
         return f"{of} over {trials} trials; record: `docs/sweeps/{self.arguments[0]}.json`."
 
     def caption(self) -> list[nodes.Node]:
