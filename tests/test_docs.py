@@ -39,6 +39,12 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
+def block_with(page: Path, language: str, words: str) -> str:
+    """The only block of a page that has these words."""
+    (found,) = (block for block in blocks(page, language) if words in block)
+    return found
+
+
 def name(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
 
@@ -98,8 +104,8 @@ def commands() -> list[Any]:
 
 @pytest.mark.parametrize("line", commands())
 def test_a_command_is_accepted(line: str, tmp_path: Path) -> None:
-    (tmp_path / "data.npz").touch()
-    line = re.sub(r"/path/to/\w+\.npz", str(tmp_path / "data.npz"), line)
+    (tmp_path / "data").touch()
+    line = re.sub(r"/path/to/\w+\.(npz|cphd)", str(tmp_path / "data"), line)
     line = line.replace("$(python -c 'print([0.1 + 0.01 * i for i in range(64)])')", "[0.1, 0.2]")
     program, *rest = [word for word in shlex.split(line, comments=True) if not re.match(r"[A-Z_]+=", word)]
     if program == "make":
@@ -109,7 +115,9 @@ def test_a_command_is_accepted(line: str, tmp_path: Path) -> None:
         assert all(option in text for option in rest[1:] if option.startswith("--") and option != "--help")
     elif program == "torchsar":
         options, more = parser().parse_known_args(rest)
-        if options.command != "list":
+        if options.command in ("import", "export"):
+            assert not more
+        elif options.command != "list":
             overrides = [*options.overrides, *more]
             assert not any(word.startswith("-") for word in overrides)
             load(THEIRS.get(options.config, options.config), overrides)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tracemalloc
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -17,6 +16,7 @@ import zarr
 from scipy.io import savemat
 
 from tests.io.test_damaged import ARCHIVES, PATH, PROFILES, SPOTLIGHT, STRIPMAP, TURNTABLE, Members
+from tests.test_docs import DOCS, block_with
 from torchsar.cli import main
 from torchsar.core import Recording
 from torchsar.io import import_recording, read, read_inverse, read_stripmap, sidecar
@@ -384,16 +384,15 @@ def test_files_that_need_a_sidecar_say_so(tmp_path: Path) -> None:
             read(tmp_path / "data")
 
 
-def test_the_sidecar_of_the_readme(tmp_path: Path) -> None:
+def test_the_sidecar_of_the_documentation(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra `formats` is not installed")
-    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    (text,) = (block for block in re.findall(r"```yaml\n(.*?)```", readme, re.DOTALL) if "dims:" in block)
+    text = block_with(DOCS / "how_to" / "own_data.md", "yaml", "dims:")
     with h5py.File(tmp_path / "flight.h5", "w") as file:
         file["raw/iq"] = np.ones((2, 6, 4096), np.int8)
         file["raw/lines"] = np.arange(4096)
         file["raw"].attrs["sampling"] = 32.317
     (tmp_path / "gains.bin").write_bytes(np.full(4096, 20.0, ">f4").tobytes())
-    recording = read(import_recording(tmp_path / "flight.h5", parse(text, "README"), tmp_path / "out.npz"))
+    recording = read(import_recording(tmp_path / "flight.h5", parse(text, "own_data.md"), tmp_path / "out.npz"))
     assert isinstance(recording, Recording) and recording.signal.data.shape == (4096, 6)
     assert bool((recording.signal.data == 10 * (1 + 1j)).all())
     assert (recording.radar.sampling_hz, recording.radar.carrier_hz) == (32.317e6, 5.3e9)

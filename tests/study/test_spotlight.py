@@ -11,7 +11,7 @@ import pytest
 import zarr
 
 from tests.io.scenes import POINT, Built
-from tests.test_scripts import readme_blocks
+from tests.test_docs import DOCS, block_with
 from torchsar.cli import main
 from torchsar.io import read_sicd
 
@@ -40,12 +40,12 @@ def test_a_recording_without_positions_gives_one_sentence(tmp_path: Path, capsys
     assert len(said) == 1 and str(path) in said[0] and not (tmp_path / "out").exists()
 
 
-def test_the_example_of_the_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_example_of_the_documentation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (extra `geo`)")
     file = Built(bistatic=True).write(tmp_path / "data.cphd")
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    exec(next(block for block in readme_blocks("python") if "def image_of(" in block), names)
+    exec(block_with(DOCS / "how_to" / "own_data.md", "python", "def image_of("), names)
     image = names["image_of"](file)
     with rasterio.open(tmp_path / "image.tif") as raster:
         assert raster.read(1).max() == pytest.approx(float(image.data.abs().max()))
