@@ -17,7 +17,7 @@ export OMP_WAIT_POLICY
 PY    := $(VENV)/bin/python
 STAMP := $(VENV)/.torchsar-installed
 
-.PHONY: run test lint docs install clean
+.PHONY: run test lint docs docs-install install clean
 
 run: install
 	$(VENV)/bin/torchsar run $(CONFIG) $(ARGS) --out $(OUT)
@@ -30,8 +30,10 @@ lint: install
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/pyright --pythonpath $(PY)
 
-docs: install
-	@$(PY) -c 'import furo, latex2mathml, myst_parser' 2>/dev/null || $(PY) -m pip install -e '.[docs]'
+docs-install: install
+	@$(PY) -c 'import furo, latex2mathml, myst_parser' 2>/dev/null || $(PY) -m pip install -c constraints.txt -e '.[docs]'
+
+docs: docs-install
 	$(PY) -m sphinx -W --keep-going -n -q docs docs/_build/html
 	@echo 'the documentation is in docs/_build/html/index.html'
 
