@@ -126,24 +126,39 @@ def test_axes_and_images_come_back_exactly(tmp_path: Path) -> None:
         assert found[name].axes == axes and torch.equal(found[name].data, image.data)
 
 
-def test_mistakes_are_one_sentence_and_nothing_is_written(
-    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def strip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of the result of a small run of stripmap data."""
     monkeypatch.setattr(run_command, "draw_all", lambda *_, **__: [])
     write_tiny(tmp_path)
     assert main(["run", str(tmp_path / "tiny.yaml"), "--out", str(tmp_path / "strip")]) == 0
+    return tmp_path / "strip"
+
+
+def refused(run: Path, form: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """What an export says that ends without a file in the folder."""
+    before = sorted(folder.rglob("*"))
+    assert main(["export", str(run), "--to", form, "--out", str(folder / "out")]) == 2
+    assert sorted(folder.rglob("*")) == before
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_mistakes_are_one_sentence_and_nothing_is_written(
+    flown: Path, strip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = refused(tmp_path, "netcdf", tmp_path, capsys)
+    assert "config.yaml does not exist; give the folder of the result of torchsar run" in said
+    assert "has no image for sicd" in refused(strip, "sicd", tmp_path, capsys)
     (tmp_path / "mine" / "calm").mkdir(parents=True)
     (tmp_path / "mine" / "calm" / "recommended.nc").write_text("mine")
-    before = sorted(tmp_path.rglob("*"))
-    for run, form, out, said in [
-        (tmp_path, "netcdf", "out", "config.yaml does not exist; give the folder of the result of torchsar run"),
-        (tmp_path / "strip", "sicd", "out", "has no image for sicd"),
-        (tmp_path / "strip", "cphd", "out", "the recording does not say where on the Earth it lies"),
-        (flown, "sicd", "out", "the recording does not say where on the Earth it lies"),
-    ]:
-        assert main(["export", str(run), "--to", form, "--out", str(tmp_path / out)]) == 2
-        assert said in capsys.readouterr().err.splitlines()[-1]
-        assert sorted(tmp_path.rglob("*")) == before
     assert main(["export", str(flown), "--to", "netcdf", "--out", str(tmp_path / "mine")]) == 2
     assert "torchsar did not write calm/recommended.nc" in capsys.readouterr().err
     assert (tmp_path / "mine" / "calm" / "recommended.nc").read_text() == "mine"
+
+
+def test_data_without_a_place_on_the_earth_are_refused(
+    flown: Path, strip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("sarkit", reason="the extra `formats` is not installed")
+    for run, form in ((strip, "cphd"), (flown, "sicd")):
+        assert "the recording does not say where on the Earth it lies" in refused(run, form, tmp_path, capsys)
