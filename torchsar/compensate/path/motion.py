@@ -55,7 +55,9 @@ class Motion:
     @cached_property
     def _prior(self) -> tuple[Tensor, Tensor]:
         """Basis (pulse, coefficient), and the ridge of its coefficients for both axes across."""
-        basis, power = _spectrum(self.line_of_sight_m)
+        pulses = len(self.line_of_sight_m)
+        basis = cosines(pulses, pulses - _UNSEEN, self.line_of_sight_m.device)
+        power = expected_power((basis.mT @ self.line_of_sight_m).square())
         return basis, self.noise / (2 * torch.cat([power, power]))
 
     @cached_property
@@ -92,15 +94,32 @@ class Motion:
         return ((1 / self._whole + added) * self.noise / 2).sqrt()
 
 
-def _spectrum(motion_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine basis over the pulses, (pulse, coefficient), and the expected power of its
-    coefficients: that of a motion, averaged over neighbours. The lowest are not observable.
+def cosines(pulses: int, count: int, device: torch.device) -> Tensor:
+    """Return an orthonormal basis of motions without constant and linear terms, slow ones first.
+
+    Args:
+        pulses: Number of pulses.
+        count: Number of cosines.
+        device: Device of the result.
+
+    Returns:
+        Cosines of 1, 1.5, 2, ... periods over the pulses, float64 (pulse, cosine).
     """
-    pulses = len(motion_m)
-    order = torch.arange(_UNSEEN, pulses, dtype=torch.float64, device=motion_m.device)
-    time = torch.arange(pulses, dtype=torch.float64, device=motion_m.device) + 0.5
-    basis = torch.cos(torch.outer(time, order) * (math.pi / pulses)) * math.sqrt(2 / pulses)
-    power = (basis.mT @ motion_m).square()
+    order = torch.arange(_UNSEEN, _UNSEEN + count, dtype=torch.float64, device=device)
+    time = torch.arange(pulses, dtype=torch.float64, device=device) + 0.5
+    return torch.cos(torch.outer(time, order) * (math.pi / pulses)) * math.sqrt(2 / pulses)
+
+
+def expected_power(power: Tensor) -> Tensor:
+    """Return the mean over neighbours of the power of each coefficient of `cosines`.
+
+    Args:
+        power: Power of the coefficients, float64 (cosine,).
+
+    Returns:
+        Smooth power, never zero, float64 (cosine,).
+    """
+    order = torch.arange(_UNSEEN, _UNSEEN + len(power), dtype=torch.float64, device=power.device)
     near = (order[:, None] - order).abs() <= order[:, None] * _WIDE + _LEAST_WIDE
     mean = (near * power).sum(-1) / near.sum(-1)
-    return basis, mean.clamp_min(1e-9 * float(mean.max()) + 1e-18)
+    return mean.clamp_min(1e-9 * float(mean.max()) + 1e-18)

@@ -1,0 +1,193 @@
+"""Prominent scatterers of a strip, and their echoes at the pulses that see them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from torchsar.core import unit_phasor
+from torchsar.focus import ImageGrid
+from torchsar.radar import LIGHT_M_S, AntennaPath
+
+# power above the mean of clutter at the same range, by choice: speckle of a million cells exceeds
+# 14 times its mean in half of the images, and 20 times it in one of 500
+_FACTOR = 20.0
+# a scatterer is the strongest one within the first, in resolution cells, and not weaker than a
+# share of the strongest one within the second, whose side lobes it may be, by choice
+_ALONE_CELLS, _LOBE_CELLS, _LOBE_SHARE = (6, 2), (100, 2), 0.01
+# path differences in range cells up to which echoes are separated, and steps of the table of the
+# response, by choice
+_REACH_CELLS, _TABLE = 4.0, 1024
+# samples of a block of echoes, by choice
+_BLOCK = 1 << 21
+
+
+def prominent_places(image: Tensor, grid: ImageGrid, cells: tuple[float, float], most: int) -> Tensor:
+    """Find isolated scatterers that are stronger than clutter.
+
+    Args:
+        image: Image, shape (azimuth, range), complex.
+        grid: Its pixels.
+        cells: Pixels of a resolution cell along either axis.
+        most: Largest number of scatterers; the strongest ones are kept.
+
+    Returns:
+        Positions in metres, float64 (scatterer, 3), the strongest one first.
+    """
+    power = image.real.square() + image.imag.square()
+    # the median of an exponential distribution is ln 2 of its mean; that of the image where a range
+    # has few pixels with samples
+    clutter = power.median(0).values.clamp_min(power.median()) / math.log(2)
+
+    def strongest(cells_near: tuple[int, int]) -> Tensor:
+        half = [
+            max(1, min(round(n * per), (size - 1) // 2))
+            for n, per, size in zip(cells_near, cells, power.shape, strict=True)
+        ]
+        return max_pool2d(power[None], (2 * half[0] + 1, 2 * half[1] + 1), 1, (half[0], half[1]))[0]
+
+    alone = (power == strongest(_ALONE_CELLS)) & (power > _LOBE_SHARE * strongest(_LOBE_CELLS))
+    at = (alone & (power > _FACTOR * clutter)).nonzero()
+    at = at[power[at[:, 0], at[:, 1]].argsort(descending=True)[:most]]
+    log = power.double().clamp_min(torch.finfo(torch.float64).tiny).log()
+    index = torch.stack([_refined(log, at, dim) for dim in range(2)], -1)
+    return grid.origin_m + grid.step_m * (index @ grid.axes)
+
+
+def _refined(log: Tensor, at: Tensor, dim: int) -> Tensor:
+    """Maximum of the parabola through three pixels along one axis, as an index."""
+    step = torch.zeros(2, dtype=torch.int64, device=at.device)
+    step[dim] = 1
+    inside = (at[:, dim] > 0) & (at[:, dim] < log.shape[dim] - 1)
+    left, middle, right = (log[tuple((at + side * step * inside[:, None]).mT)] for side in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    offset = torch.where(bend < 0, (left - right) / (2 * bend), 0.0).clamp(-0.5, 0.5)
+    return at[:, dim] + offset
+
+
+@dataclass(frozen=True, eq=False)
+class Echoes:
+    """Echoes of scatterers along a path, each compressed in range at its place.
+
+    The pulses that see a scatterer follow one another; all scatterers have as many, of which some
+    may not be seen.
+
+    Args:
+        pulses: Numbers of the pulses, int64 (scatterer, seen).
+        seen: True where the pulse sees the scatterer and holds samples, (scatterer, seen).
+        path_m: Path over the scatterer less the reference in metres, float64 (scatterer, seen).
+        slope: Change of half the path by the position of the antennas, which move together, float64
+            (scatterer, seen, 3).
+        samples: Echoes, complex128 (scatterer, seen). The echo of a scatterer at its place, seen
+            from the recorded path, has the same phase at all pulses.
+        frequency_hz: Frequencies in Hz, (frequency,).
+        weights: Weights of the frequencies, whose sum is 1, (frequency,).
+    """
+
+    pulses: Tensor
+    seen: Tensor
+    path_m: Tensor
+    slope: Tensor
+    samples: Tensor
+    frequency_hz: Tensor
+    weights: Tensor
+
+    @staticmethod
+    def of(
+        history: Tensor,
+        frequency_hz: Tensor,
+        weights: Tensor,
+        antennas: AntennaPath,
+        places_m: Tensor,
+        lit: Callable[[Tensor], Tensor],
+    ) -> Echoes:
+        """Compress the echoes of scatterers.
+
+        Args:
+            history: Phase history, shape (pulse, frequency), complex.
+            frequency_hz: Frequencies in Hz, float64 (frequency,).
+            weights: Weights of the frequencies, whose sum is 1, float64 (frequency,).
+            antennas: Path of the antennas.
+            places_m: Positions of the scatterers in metres, float64 (scatterer, 3).
+            lit: Function of positions that returns the pulses that see them, see `TilePlan`.
+
+        Returns:
+            The echoes.
+        """
+        ends = lit(places_m)
+        length = int((ends[:, 1] - ends[:, 0]).amax())
+        first = ends[:, :1].clamp(max=antennas.pulses - length)
+        pulses = first + torch.arange(length, device=ends.device)
+        seen = (pulses >= ends[:, :1]) & (pulses < ends[:, 1:]) & (history != 0).any(-1)[pulses]
+        ways = [place[pulses] - places_m[:, None] for place in antennas.places]
+        legs = [torch.linalg.vector_norm(way, dim=-1, keepdim=True) for way in ways]
+        path = (2 if len(legs) == 1 else 1) * torch.stack(legs).sum(0)[..., 0] - antennas.reference_m[pulses]
+        slope = torch.stack([way / leg for way, leg in zip(ways, legs, strict=True)]).mean(0)
+        samples = torch.empty(path.shape, dtype=torch.complex128, device=history.device)
+        weighted = history * weights.to(history.real.dtype)
+        for some in _blocks(len(path), length * len(frequency_hz)):
+            turns = path[some, :, None] / LIGHT_M_S * frequency_hz
+            samples[some] = (weighted[pulses[some]] * unit_phasor(turns, history.dtype)).sum(-1).to(samples.dtype)
+        return Echoes(pulses, seen, path, slope, samples * seen, frequency_hz, weights)
+
+    @property
+    def wave(self) -> float:
+        """Change of the phase by half the path, in rad per metre, at the middle of the band."""
+        return 4 * math.pi * float(self.weights @ self.frequency_hz) / LIGHT_M_S
+
+    def crossed(self, model: Tensor) -> Tensor:
+        """Return what the echoes hold of the other scatterers.
+
+        Args:
+            model: Echo of each scatterer alone at its own place, complex (scatterer, seen).
+
+        Returns:
+            Sum over the other scatterers at the same range, complex (scatterer, seen).
+        """
+        one, other, at, response = self._pairs
+        found = torch.zeros_like(self.samples)
+        return found.index_add_(0, one, model[other].gather(1, at) * response)
+
+    @cached_property
+    def _pairs(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pairs of scatterers at nearly the same range: the numbers of both, the indices of the
+        pulses of the first among those of the second, and the response there.
+        """
+        cell = LIGHT_M_S / float(self.frequency_hz[-1] - self.frequency_hz[0])
+        reach = _REACH_CELLS * cell
+        first, middle = self.pulses[:, 0], self.path_m.mean(1)
+        near = (middle[:, None] - middle).abs() < 2 * reach
+        near &= (first[:, None] - first).abs() < self.pulses.shape[1]
+        near.fill_diagonal_(False)
+        one, other = near.nonzero(as_tuple=True)
+        at = self.pulses[one] - first[other][:, None]
+        both = (at >= 0) & (at < self.pulses.shape[1])
+        at = at.clamp(0, self.pulses.shape[1] - 1)
+        both &= self.seen[one] & self.seen[other].gather(1, at)
+        off = self.path_m[one] - self.path_m[other].gather(1, at)
+        carrier = float(self.weights @ self.frequency_hz)
+        response = self._response(off / reach) * both
+        return one, other, at, response * unit_phasor(off * (carrier / LIGHT_M_S), torch.complex128)
+
+    def _response(self, share: Tensor) -> Tensor:
+        """Response to path differences, given as shares of the reach, without the carrier."""
+        cell = LIGHT_M_S / float(self.frequency_hz[-1] - self.frequency_hz[0])
+        grid = torch.linspace(0, 1, _TABLE, dtype=torch.float64, device=share.device) * (_REACH_CELLS * cell)
+        off = self.frequency_hz - float(self.weights @ self.frequency_hz)
+        table = torch.cos(torch.outer(grid, off) * (2 * math.pi / LIGHT_M_S)) @ self.weights
+        place = share.abs() * (_TABLE - 1)
+        low = place.long().clamp(max=_TABLE - 2)
+        value = torch.lerp(table[low], table[low + 1], place - low)
+        return torch.where(share.abs() < 1, value, 0.0)
+
+
+def _blocks(count: int, samples: int) -> Iterator[slice]:
+    """Scatterers whose samples take limited memory."""
+    step = max(1, _BLOCK // max(1, samples))
+    return (slice(first, first + step) for first in range(0, count, step))

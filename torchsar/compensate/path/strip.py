@@ -1,0 +1,396 @@
+"""Autofocus of a strip: slow errors of the path from the phases of prominent scatterers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.path.curve import Curve, Solution
+from torchsar.compensate.path.ground import for_each, trials_of
+from torchsar.compensate.path.motion import cosines, expected_power
+from torchsar.compensate.path.scatterers import Echoes, prominent_places
+from torchsar.compensate.pulse_phase.data import or_one, without_line
+from torchsar.compensate.pulse_phase.verdict import LEAST_STREHL
+from torchsar.core import Estimate, checked_samples, cis
+from torchsar.focus import ImageGrid, ProcessedBeam, TilePlan
+from torchsar.focus.spotlight import window_weights
+from torchsar.radar import LIGHT_M_S, AntennaPath, StraightTrack
+from torchsar.radar.antenna_path import refuse_unusable
+from torchsar.radar.spotlight import frequency_samples
+
+# error of the images in dB, by choice: far below the side lobes
+_ERROR_DB = -40.0
+# half periods of the fastest cosine while a scatterer is seen, and most cosines, by choice
+_BENDS, _COSINES = 32, 512
+# most scatterers, by choice
+_SCATTERERS, _FIRST_SCATTERERS = 300, 300
+# rounds of the search by phase increments and of the fit, iterations of a fit, by trial
+_SEARCHES, _FITS, _STEPS = 3, 4, 6
+# change at which the search ends, in fringes; and the fit, in standard deviations, by choice
+_NEAR, _SETTLED = 0.15, 0.3
+# pulses between two phases of an increment, and over which echoes are averaged before, as shares of
+# the pulses that see a scatterer, by trial; the same for the amplitude of an echo
+_LAG, _MEAN, _SMOOTH = 1 / 64, 1 / 64, 1 / 8
+# least share of its mean amplitude at which an echo counts, by choice
+_FADED = 0.2
+# fewest scatterers, and least share of the pulses that see one, by choice
+_LEAST_SCATTERERS, _LEAST_SEEN = 3, 0.95
+# number of standard deviations that may not lower the Strehl ratio below its limit, by choice
+_SPREAD = 1.5
+
+
+def strip_autofocus(
+    profiles: Tensor,
+    frequency_hz: Tensor,
+    antennas: AntennaPath,
+    *,
+    azimuth_m: float,
+    range_m: float,
+    beam_deg: float,
+    centre_m: tuple[float, float] = (0.0, 0.0),
+    range_axis_rad: float = 0.0,
+    height_m: float = 0.0,
+    squint_deg: float = 0.0,
+) -> Estimate:
+    """Estimate the slow errors of the recorded path of a strip.
+
+    The recommended autofocus of strips, in which a beam sees each scatterer for a part of the
+    pulses. Prominent scatterers are found in the image, up to 300. Each gives a phase per pulse
+    while it is seen, which contains the error of the path, and a constant and linear terms by its
+    own phase and place. All phases together give the error of the path in two axes, along the line
+    of sight abeam and across it and the track, as a sum of cosines of up to 16 periods while a
+    scatterer is seen. The steps are:
+
+    1. Increments of the phases over some pulses give a first motion along the line of sight, of any
+       number of fringes. The scatterers are found again in the image with this motion removed.
+    2. The phases themselves give the most probable motion. Its cosines have a Gaussian prior; their
+       variances follow from the motion along the line of sight, and serve for both axes. The echoes
+       of other scatterers at the same range are subtracted, and each scatterer counts as far as its
+       echo exceeds what is left.
+
+    Slow errors are the least certain: over the time that a scatterer is seen they are lines, which
+    displace it. Not observable are a constant and a linear term of the whole strip. Errors along
+    the track are not estimated. Trials have image plans of their own and are processed one after
+    another.
+
+    Args:
+        profiles: Range profiles, the unitary centred inverse FFT of a phase history, shape (...,
+            pulse, range), complex. Pulses that hold only zeros are left out.
+        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (range,).
+        antennas: Recorded path of the antennas, of all trials or of each of them.
+        azimuth_m: Extent of the imaged strip along its azimuth axis in metres.
+        range_m: Extent along its range axis in metres.
+        beam_deg: Width of the beam in degrees, see `ProcessedBeam`.
+        centre_m: Position of the centre in metres along (range axis, azimuth axis).
+        range_axis_rad: Direction of the range axis in rad, from ground coordinate x towards y; the
+            azimuth axis is a quarter turn further.
+        height_m: Height z of the imaged plane in metres.
+        squint_deg: Angle of the middle of the beam ahead of broadside in degrees.
+
+    Returns:
+        `line_of_sight_m` of shape (..., pulse), float64: half the path over the middle of the strip
+        abeam of the antenna in metres, recorded minus true; and `offset_m` of shape (..., pulse,
+        3): the error of the positions in metres, recorded minus true, of both antennas alike, for
+        `CorrectPath`. The standard deviation, of `line_of_sight_m` only, follows from the noise of
+        the phases and the prior, without constant and linear terms over the pulses that see the
+        strip. `quality` is the Strehl ratio predicted from it. `ok` is False unless there are 3
+        prominent scatterers, 95 % of these pulses see one of them, the Strehl ratio for 1.5
+        standard deviations exceeds 0.8, and the last round changed the motion by less than a
+        standard deviation. `info` holds "scatterers", their number, shape (...,).
+
+    Raises:
+        TypeError: If the profiles are not complex, or frequencies are not float64.
+        ValueError: If sizes do not match, values are not finite, an extent is not positive, the
+            beam is not valid (see `ProcessedBeam`), the antenna does not advance, or no pulse sees
+            the strip.
+    """
+    profiles = checked_samples(profiles, "strip_autofocus", "pulse, range")
+    refuse_unusable(frequency_hz=frequency_hz)
+    trials = trials_of("strip_autofocus", profiles, frequency_hz, antennas)
+    numbers = (azimuth_m, range_m, *centre_m, range_axis_rad, height_m)
+    if not (all(map(math.isfinite, numbers)) and azimuth_m > 0 and range_m > 0):
+        raise ValueError(
+            f"strip_autofocus needs finite numbers and positive extents, got azimuth_m={azimuth_m}, range_m={range_m}, "
+            f"centre_m={tuple(centre_m)}, range_axis_rad={range_axis_rad}, height_m={height_m}"
+        )
+    beam = ProcessedBeam(beam_deg, squint_deg)
+    cos, sin = math.cos(range_axis_rad), math.sin(range_axis_rad)
+    axes = torch.tensor([[-sin, cos, 0.0], [cos, sin, 0.0]], dtype=torch.float64, device=profiles.device)
+    middle = torch.tensor([centre_m[1], centre_m[0]], dtype=torch.float64, device=profiles.device) @ axes
+    middle[2] = height_m
+
+    @torch.no_grad()
+    def find(rows: Tensor, one: AntennaPath) -> Estimate:
+        return _judged(_Strip.of(rows, frequency_hz, one, beam, axes, middle, (azimuth_m, range_m)))
+
+    return for_each(find, profiles, antennas, trials)
+
+
+def abeam_m(antennas: AntennaPath, middle_m: Tensor) -> Tensor:
+    """Return the points of the middle of a strip that lie abeam of the antenna.
+
+    The middle is the level line through a point along the straight track of the receiver.
+
+    Args:
+        antennas: Path without leading dimensions.
+        middle_m: The point in metres, float64 (3,).
+
+    Returns:
+        Positions in metres, float64 (pulse, 3).
+    """
+    place = antennas.places[-1]
+    along = StraightTrack.fitted(place).along * place.new_tensor([1.0, 1.0, 0.0])
+    along = along / or_one(torch.linalg.vector_norm(along))
+    return middle_m + ((place - middle_m) @ along)[:, None] * along
+
+
+@dataclass(frozen=True, eq=False)
+class _Strip:
+    """One trial.
+
+    axes: along the line of sight abeam, scaled so that a unit changes half the path by one, and
+    across it and the track, (pulse, 2, 3). grid: pixels of the image in which scatterers are found.
+    judged: pulses that see the strip. motion_m: errors found so far, (pulse, 2).
+    """
+
+    history: Tensor
+    frequency_hz: Tensor
+    weights: Tensor
+    recorded: AntennaPath
+    beam: ProcessedBeam
+    axes: Tensor
+    grid: ImageGrid
+    cells: tuple[float, float]
+    judged: Tensor
+    basis: Tensor
+    motion_m: Tensor
+
+    @staticmethod
+    def of(
+        rows: Tensor,
+        frequency_hz: Tensor,
+        antennas: AntennaPath,
+        beam: ProcessedBeam,
+        ground: Tensor,
+        middle_m: Tensor,
+        extent_m: tuple[float, float],
+    ) -> _Strip:
+        place, pulses = antennas.places[-1], antennas.pulses
+        points = abeam_m(antennas, middle_m)
+        ways = [one - points for one in antennas.places]
+        sight = torch.stack(
+            torch.broadcast_tensors(*(way / torch.linalg.vector_norm(way, dim=-1, keepdim=True) for way in ways))
+        ).mean(0)
+        across = torch.linalg.cross(sight, StraightTrack.fitted(place).along.expand_as(sight), dim=-1)
+        across = across / or_one(torch.linalg.vector_norm(across, dim=-1, keepdim=True))
+        axes = torch.stack([sight / sight.square().sum(-1, keepdim=True), across], 1)
+        # a scatterer outside of the strip is seen together with those in it
+        away = torch.linalg.vector_norm(place - points, dim=-1).mean()
+        footprint = float(away) * (math.tan(math.asin(beam.edges[1])) - math.tan(math.asin(beam.edges[0])))
+        wavelength = LIGHT_M_S / float(frequency_hz.mean())
+        steep = 2 * float((sight @ ground[1]).abs().mean())
+        cells = (
+            wavelength / (len(antennas.places) * beam.band),
+            LIGHT_M_S / (float(frequency_hz[-1] - frequency_hz[0]) * max(steep, 1e-3)),
+        )
+        step = min(cells[0], cells[1] / 2)
+        size = extent_m[0] + footprint, extent_m[1]
+        counts = tuple(max(3, math.ceil(x / step)) for x in size)
+        corner = middle_m - step * sum(n // 2 * axis for n, axis in zip(counts, ground, strict=True))
+        grid = ImageGrid(corner, ground, (counts[0], counts[1]), step)
+        inside = (torch.tensor([[-1, -1], [-1, 1], [1, -1], [1, 1]]).to(ground) * torch.tensor(extent_m).to(ground) / 2) @ ground
+        ends = beam.lit_pulses(place, middle_m + inside)
+        number = torch.arange(pulses, device=rows.device)
+        present = (rows != 0).any(-1)
+        judged = (number >= ends[:, 0].amin()) & (number < ends[:, 1].amax()) & present
+        if not bool((number >= ends[:, 0].amin()).logical_and(number < ends[:, 1].amax()).any()):
+            raise ValueError("no pulse sees the strip within the beam; check its centre, extents and the squint")
+        seen = beam.lit_pulses(place, points[pulses // 2][None])
+        per = max(1, int(seen[0, 1] - seen[0, 0]))
+        count = max(1, min(pulses - 2, _COSINES, math.ceil(_BENDS * pulses / per)))
+        weights = window_weights("hann", len(frequency_hz), rows.device)
+        return _Strip(
+            frequency_samples(rows),
+            frequency_hz,
+            weights / weights.sum(),
+            antennas,
+            beam,
+            axes,
+            grid,
+            (cells[0] / step, cells[1] / step),
+            judged,
+            cosines(pulses, count, rows.device),
+            torch.zeros(pulses, 2, dtype=torch.float64, device=rows.device),
+        )
+
+    @property
+    def fringe_m(self) -> float:
+        """Half a wavelength."""
+        return LIGHT_M_S / (2 * float(self.frequency_hz.mean()))
+
+    @property
+    def offset_m(self) -> Tensor:
+        """Errors of the positions, (pulse, 3)."""
+        return (self.motion_m[:, None] @ self.axes)[:, 0]
+
+    @property
+    def antennas(self) -> AntennaPath:
+        """The path less the errors found so far."""
+        recorded, receiver = self.recorded, self.recorded.receiver_m
+        moved = None if receiver is None else receiver - self.offset_m
+        return AntennaPath(recorded.transmitter_m - self.offset_m, moved, recorded.reference_m)
+
+    def line_free(self, range_m: Tensor) -> Tensor:
+        """Ranges (pulse,) without constant and linear terms over the judged pulses."""
+        return without_line(range_m, self.judged)
+
+    def echoes(self, most: int) -> tuple[Echoes, Curve] | None:
+        """Echoes of the prominent scatterers, and their phases; None if there are too few."""
+        antennas = self.antennas
+        lit = partial(self.beam.lit_pulses, antennas.places[-1])
+        places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
+        plan = TilePlan(self.frequency_hz, *places, self.grid, _ERROR_DB, lit)
+        image = plan.image(self.history * self.weights.to(self.history.real.dtype))
+        found = prominent_places(image, self.grid, self.cells, most)
+        if len(found) < _LEAST_SCATTERERS:
+            return None
+        echoes = Echoes.of(self.history, self.frequency_hz, self.weights, antennas, found, lit)
+        lever = echoes.wave * (echoes.slope[..., None, :] * self.axes[echoes.pulses]).sum(-1)
+        ground = echoes.slope @ self.grid.axes.mT
+        moved = ground - _mean(ground, echoes.seen)
+        own = torch.cat([torch.ones_like(moved[..., :1]), moved / or_one(moved.abs().amax(1, keepdim=True))], -1)
+        return echoes, Curve(self.basis, echoes.pulses, lever, own)
+
+    def with_increments(self) -> _Strip | None:
+        """The strip with the motion that the increments of the phases show."""
+        found = self.echoes(_FIRST_SCATTERERS)
+        if found is None:
+            return None
+        echoes, curve = found
+        seen = echoes.seen.shape[1]
+        lag, near = max(1, round(_LAG * seen)), _odd(_MEAN * seen)
+        smooth = _smooth(echoes.samples, near) * echoes.seen
+        left = (echoes.samples - smooth) * echoes.seen
+        noise = _per_seen(left.abs().square(), echoes.seen) / near
+        turn = smooth[:, lag:] * smooth[:, :-lag].conj()
+        mean = turn.sum(1, keepdim=True)
+        turn = turn * (mean.conj() / or_one(mean.abs()))
+        ratio = turn.abs() / or_one(noise)
+        weight = torch.where(ratio > 1, ratio.square() / (ratio + 0.5), 0.0)
+        half = lag // 2
+        steps = torch.zeros_like(self.basis)
+        steps[half : len(steps) - lag + half] = self.basis[lag:] - self.basis[:-lag]
+        at = slice(half, half + turn.shape[1])
+        of_steps = Curve(steps, echoes.pulses[:, at], curve.lever[:, at, :1], curve.own[:, at, :1])
+        power = torch.full_like(self.basis[:1], self.fringe_m**2 * self.basis.shape[0] / self.basis.shape[1])
+        along = self.basis @ of_steps.solved(turn.angle(), weight, power).coefficient[0]
+        return replace(self, motion_m=self.motion_m + torch.nn.functional.pad(along[:, None], (0, 1)))
+
+    def fitted(self, power: Tensor) -> tuple[_Strip, Solution, Tensor, Echoes] | None:
+        """The strip with the most probable motion, its solution, and the power of its cosines."""
+        found = self.echoes(_SCATTERERS)
+        if found is None:
+            return None
+        echoes, curve = found
+        near = _odd(_SMOOTH * echoes.seen.shape[1])
+        # phases are those along the path less what has been found
+        before = curve.phase(self.motion_m)
+        turned = torch.zeros_like(before)
+        model = torch.zeros_like(echoes.samples)
+        gain, solution = echoes.seen.double(), None
+        for _ in range(_STEPS):
+            alone = (echoes.samples - echoes.crossed(model)) * cis(-turned) * echoes.seen
+            mean = (alone * gain).sum(1, keepdim=True)
+            way = mean / or_one(mean.abs())
+            alone = alone * way.conj()
+            gain = _smooth(alone.real, near).clamp_min(0) * echoes.seen
+            model = way * gain * cis(turned)
+            noise = _per_seen((alone - gain).abs().square() * echoes.seen, echoes.seen)
+            faded = gain < _FADED * gain.amax(1, keepdim=True)
+            weight = torch.where(faded, 0.0, 2 * gain.square() / or_one(noise))
+            phase = torch.where(faded, 0.0, alone.angle())
+            solution = curve.solved(phase + turned + before, weight, power)
+            turned = curve.phase(curve.motion_m(solution.coefficient)) - before + solution.own
+            count = power.shape[1]
+            known = solution.coefficient[0].square() + solution.covariance.diagonal()[:count]
+            power = expected_power(known).expand(2, -1)
+        assert solution is not None
+        return replace(self, motion_m=curve.motion_m(solution.coefficient)), solution, power, echoes
+
+
+def _judged(strip: _Strip) -> Estimate:
+    """The estimate of one trial, and its verdict."""
+    for _ in range(_SEARCHES):
+        after = strip.with_increments()
+        if after is None:
+            return _nothing(strip)
+        change, strip = after.motion_m - strip.motion_m, after
+        if strip.line_free(change[:, 0])[strip.judged].square().mean().sqrt() < _NEAR * strip.fringe_m:
+            break
+    # increments show slow errors best: their spectrum would forbid fast ones
+    size = strip.line_free(strip.motion_m[:, 0])[strip.judged].square().mean()
+    power = torch.full_like(strip.basis[:2], float(size) * strip.basis.shape[0] / strip.basis.shape[1])
+    for _ in range(_FITS):
+        found = strip.fitted(power)
+        if found is None:
+            return _nothing(strip)
+        before, (strip, solution, power, echoes) = strip, found
+        std_m = _std_m(strip, solution)
+        change = strip.line_free((strip.motion_m - before.motion_m)[:, 0])[strip.judged].square().mean()
+        spread = std_m[strip.judged].square().mean()
+        if change < _SETTLED**2 * spread:
+            break
+    seen = torch.zeros_like(strip.judged)
+    seen[echoes.pulses[echoes.seen]] = True
+
+    def strehl(number: float) -> Tensor:
+        return torch.exp(-spread * (number * 2 * math.pi / strip.fringe_m) ** 2)
+
+    covered = seen[strip.judged].double().mean() >= _LEAST_SEEN
+    ok = covered & (strehl(_SPREAD) > LEAST_STREHL) & (change < spread)
+    value = {"line_of_sight_m": strip.line_free(strip.motion_m[:, 0]), "offset_m": strip.offset_m}
+    count = spread.new_tensor(float(len(echoes.seen)))
+    return Estimate(value, strehl(1.0), ok, {"line_of_sight_m": std_m}, {"scatterers": count})
+
+
+def _nothing(strip: _Strip) -> Estimate:
+    """The estimate where there are too few scatterers."""
+    zero = torch.zeros(len(strip.judged), dtype=torch.float64, device=strip.judged.device)
+    none = zero.new_zeros(())
+    value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
+    return Estimate(value, none, none > 0, {"line_of_sight_m": zero + 1}, {"scatterers": none})
+
+
+def _std_m(strip: _Strip, solution: Solution) -> Tensor:
+    """Standard deviation of the line of sight, (pulse,), without a line over the judged pulses."""
+    count = strip.basis.shape[1]
+    free = torch.stack([strip.line_free(cosine) for cosine in strip.basis.mT], -1)
+    return ((free @ solution.covariance[:count, :count]) * free).sum(-1).clamp_min(0).sqrt()
+
+
+def _odd(length: float) -> int:
+    """An odd number near a length."""
+    return 2 * round(length / 2) + 1
+
+
+def _smooth(x: Tensor, length: int) -> Tensor:
+    """Mean over an odd number of neighbours along the last dimension, with the ends repeated."""
+    if x.is_complex():
+        return torch.complex(_smooth(x.real, length), _smooth(x.imag, length))
+    padded = torch.nn.functional.pad(x[:, None], (length // 2, length // 2), mode="replicate")
+    return torch.nn.functional.avg_pool1d(padded, length, 1)[:, 0]
+
+
+def _mean(x: Tensor, seen: Tensor) -> Tensor:
+    """Mean of (scatterer, seen, term) over the pulses that are seen, (scatterer, 1, term)."""
+    return (x * seen[..., None]).sum(1, keepdim=True) / or_one(seen.sum(1).to(x.dtype))[:, None, None]
+
+
+def _per_seen(x: Tensor, seen: Tensor) -> Tensor:
+    """Mean of (scatterer, seen) over the pulses that are seen, (scatterer, 1)."""
+    return (x.sum(1) / or_one(seen.sum(1).to(x.dtype)))[:, None]
