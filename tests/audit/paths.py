@@ -10,8 +10,9 @@ from torch import Tensor
 
 from tests.audit.frame import Batch, Entry, Quantity, World, nothing
 from tests.audit.pulses import PHASES
+from tests.compensate import strips as of_strips
 from tests.compensate.scenes import turned, white
-from torchsar.compensate import PathAutofocus, PathPhase
+from torchsar.compensate import PathAutofocus, PathPhase, StripAutofocus
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_path
 from torchsar.metrics import phase_rmse
@@ -82,6 +83,38 @@ def path_autofocus(data: Signal, **known: Tensor) -> Estimate:
     return PathAutofocus()(data, **(known or {name: aux[name] for name in KNOWN}))
 
 
+def strips(scene: Scene, snr_db: float) -> Callable[[int, int], Batch]:
+    """Draw strips with errors of navigation of 1 mm."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        recording, truth = of_strips.strips(scene, snr_db, trials=trials, seed=seed)
+        known = {name: recording.aux[name] for name in KNOWN}
+        return Batch(recording.signal, {"line_of_sight_m": truth.values["line_of_sight_m"]}, known)
+
+    return draw
+
+
+def strip_signal(x: Tensor) -> Signal:
+    """Profiles of the strip with the axes of the radar."""
+    return Signal(x.to(torch.complex64), of_strips.RADAR.raw_axes(*x.shape[-2:]))
+
+
+def strip_autofocus(data: Signal, **known: Tensor) -> Estimate:
+    """The stage with the recorded paths, or with one path where the data are no recording; values
+    at the pulses that see the strip.
+    """
+    known = known or {name: of_strips.strips()[0].aux[name] for name in KNOWN}
+    found = StripAutofocus(**of_strips.STRIP)(data, **known)
+    seen = of_strips.judged()
+    value, std = ({key: x[..., seen] for key, x in of.items() if x.ndim == 2} for of in (found.value, found.std))
+    return Estimate(value, found.quality, found.ok, std)
+
+
+def abeam(found: Tensor, truth: Tensor) -> Tensor:
+    """`apart` of the pulses that see the strip."""
+    return apart(found, truth[..., of_strips.judged()])
+
+
 def apart(found: Tensor, truth: Tensor) -> Tensor:
     """Rms of the line of sight modulo half a wavelength, without constant and linear terms."""
     radians = 4 * math.pi / RADAR.wavelength_m
@@ -90,6 +123,7 @@ def apart(found: Tensor, truth: Tensor) -> Tensor:
 
 # a residual of 0.47 rad, as for the phases of pulses
 LINE_OF_SIGHT = (Quantity("line_of_sight_m", 0.47 * RADAR.wavelength_m / (4 * math.pi), apart),)
+ABEAM = (Quantity("line_of_sight_m", 0.47 * RADAR.wavelength_m / (4 * math.pi), abeam),)
 
 
 def entries() -> list[Entry]:
@@ -106,7 +140,14 @@ def entries() -> list[Entry]:
         World("clutter", flown(Speckle(800, 20.0, 16.0), 10.0), 10.0),
         World("one point", flown(Points([3.0], [-2.0], random_phase=True), -5.0), -5.0),
     )
+    size = (of_strips.PULSES, of_strips.CELLS)
+    seen = (
+        *nothing(size, strip_signal),
+        *(World("own", strips(of_strips.POINTS, snr), snr) for snr in (-20.0, -10.0, 0.0, 10.0, 20.0, 40.0)),
+        World("one point", strips(Points([3.0], [-2.0], random_phase=True), 0.0), 0.0),
+    )
     return [
+        Entry("compensate.StripAutofocus", strip_autofocus, seen, ABEAM, share=0.05),
         Entry("compensate.PathPhase", phase, worlds, PHASES, share=0.1),
         Entry("compensate.PathAutofocus", path_autofocus, paths, LINE_OF_SIGHT, share=0.1),
     ]

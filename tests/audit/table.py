@@ -20,6 +20,7 @@ SAME = {
     "compensate.autofocus": "compensate.Autofocus",
     "compensate.path_autofocus": "compensate.PathAutofocus",
     "compensate.path_phase": "compensate.PathPhase",
+    "compensate.strip_autofocus": "compensate.StripAutofocus",
     "compensate.phase_polish": "compensate.PhasePolish",
     "compensate.PulseGain": "compensate.pulse_gain",
     "compensate.uneven_rotation": "compensate.UnevenRotation",
@@ -70,10 +71,6 @@ LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
     "the spectra of sparse scenes adapt to phase errors, which neither the bound nor the scatter of the "
     "range cells shows: `ok` is False where a sparse description is more likely": [
         *(("compensate.LinkPhases", "own", snr_db) for snr_db in (20.0, 60.0)),
-    ],
-    "the standard deviation contains the difference from another start, which in a few trials is far "
-    "larger than the error: too cautious, and the rms over trials is probably that of these few": [
-        ("compensate.PathAutofocus", "own", 20.0),
     ],
 }
 

@@ -66,6 +66,7 @@ from torchsar.compensate import (
     SharpestPhase,
     ShiftRange,
     SpectrumCorrelation,
+    StripAutofocus,
     TargetAutofocus,
     UnevenRotation,
 )
@@ -726,6 +727,7 @@ MORE = {
     "CorrectPath": CorrectPath,
     "PathAutofocus": PathAutofocus,
     "PathPhase": PathPhase,
+    "StripAutofocus": lambda: StripAutofocus(100.0, 40.0, 6.0),
     "PulseGain": PulseGain,
     "SharpestPhase": SharpestPhase,
     "SplitSweeps": lambda: SplitSweeps(LADAR, "search"),

@@ -803,6 +803,8 @@ REASONS = {
     "test_path_autofocus.py",
     "compensate.CorrectPath": "subtracts positions",
     "compensate.PathAutofocus": "the stage of compensate.path_autofocus",
+    "compensate.strip_autofocus": "needs a path; tests/compensate/test_strip_autofocus.py",
+    "compensate.StripAutofocus": "the stage of compensate.strip_autofocus",
     "compensate.PathPhase": "the stage of compensate.path_phase",
     "metrics.line_of_sight_bound_m": "works on a scene of scatterers; tests/metrics/test_path_bounds.py",
     "compensate.range_error": "integrates an estimate by integrated_range, which is in the table",

@@ -23,7 +23,15 @@ from torchsar.compensate.envelope import (
     refine_alignment,
     shift_range,
 )
-from torchsar.compensate.path import CorrectPath, PathAutofocus, PathPhase, path_autofocus, path_phase
+from torchsar.compensate.path import (
+    CorrectPath,
+    PathAutofocus,
+    PathPhase,
+    StripAutofocus,
+    path_autofocus,
+    path_phase,
+    strip_autofocus,
+)
 from torchsar.compensate.point import PointDoppler, doppler_at, peak_time_s
 from torchsar.compensate.pulse_phase import (
     Autofocus,
@@ -149,6 +157,7 @@ __all__ = [
     "ShiftRange",
     "Shrinking",
     "SpectrumCorrelation",
+    "StripAutofocus",
     "TargetAutofocus",
     "UnevenRotation",
     "VelocityMinimum",
@@ -203,6 +212,7 @@ __all__ = [
     "sharpest_phase",
     "shift_range",
     "spectrum_correlation",
+    "strip_autofocus",
     "turning_points",
     "uneven_rotation",
     "velocity_objective",

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsar.core import Draws, Recording, Signal, Truth, gathered_checks, per_trial, unit_phasor
 from torchsar.echo.pulsed import echo_spectrum
 from torchsar.echo.stripmap import Impairment, apply_impairments
-from torchsar.radar import AntennaPath, InverseRadar, frequency_samples, range_profiles
+from torchsar.radar import AntennaPath, InverseRadar, StraightTrack, frequency_samples, range_profiles
 from torchsar.scene import PathWorld, Sway
 from torchsar.scene.trials import refuse_other_trials
 
@@ -102,7 +102,8 @@ def simulate_path(
         - `true_transmitter_m`, shape (..., pulse, 3), and `true_receiver_m` unless both share an
           antenna: the true positions;
         - `line_of_sight_m`, shape (..., pulse): half the path over the point (0, 0, 0), recorded
-          minus true;
+          minus true; with a beam, over the point abeam of the receiver on the level line through
+          (0, 0, 0) along its straight track;
         - `azimuth_m`, `range_m`, `height_m` and `amplitude` of the scatterers, shape (..., target);
         - `noise_std`, shape (...,) or (): the standard deviation of the complex noise of a sample;
         - the true values of each impairment, as "<impairment>.<name>".
@@ -163,6 +164,7 @@ class _Flown:
 
     true: AntennaPath
     recorded: AntennaPath
+    strip: bool
 
     @staticmethod
     def of(world: PathWorld, draws: Draws, time_s: Tensor) -> _Flown:
@@ -181,19 +183,26 @@ class _Flown:
             reference = 2 * legs[0] if len(legs) == 1 else legs[0] + legs[1]
         else:
             reference = torch.full_like(time_s, 2 * world.window_range_m)
-        return _Flown(*(AntennaPath(p[0], p[1] if len(p) > 1 else None, reference) for p in (true, recorded)))
+        paths = (AntennaPath(p[0], p[1] if len(p) > 1 else None, reference) for p in (true, recorded))
+        return _Flown(*paths, world.beam is not None)
 
     def truth(self) -> dict[str, Tensor]:
         """True positions and the error of the line of sight."""
         names = ("true_transmitter_m", "true_receiver_m")
         values = dict(zip(names, self.true.places, strict=False))
-        return {**values, "line_of_sight_m": _line_of_sight_m(self.recorded, self.true)}
+        return {**values, "line_of_sight_m": _line_of_sight_m(self.recorded, self.true, self.strip)}
 
 
-def _line_of_sight_m(recorded: AntennaPath, true: AntennaPath) -> Tensor:
-    """Half the path over the point (0, 0, 0), recorded minus true, (..., pulse)."""
-    centre = true.transmitter_m.new_zeros(1, 3)
-    return (recorded.path_m(centre) - true.path_m(centre))[..., 0] / 2
+def _line_of_sight_m(recorded: AntennaPath, true: AntennaPath, strip: bool = False) -> Tensor:
+    """Half the path over the point (0, 0, 0), recorded minus true, (..., pulse); for a strip over
+    the points abeam of the mean path of all trials.
+    """
+    middle = true.transmitter_m.new_zeros(1, 3)
+    if strip:
+        place = true.places[-1].reshape(-1, true.pulses, 3).mean(0)
+        middle = StraightTrack.fitted(place).abeam_m(place, middle[0])
+    before, after = (sum(torch.linalg.vector_norm(x - middle, dim=-1) for x in one.places) for one in (true, recorded))
+    return (after - before) / len(true.places)
 
 
 @dataclass(frozen=True)

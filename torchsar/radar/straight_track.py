@@ -64,6 +64,20 @@ class StraightTrack:
         """
         return (points_m - self.origin_m) @ self.along
 
+    def abeam_m(self, position_m: Tensor, middle_m: Tensor) -> Tensor:
+        """Return the points of the level line through a point along the track that lie abeam.
+
+        Args:
+            position_m: Positions of an antenna in metres, float64 (..., 3).
+            middle_m: The point in metres, such as the middle of a strip, float64 (3,).
+
+        Returns:
+            Positions in metres, float64 (..., 3).
+        """
+        level = self.along * self.along.new_tensor([1.0, 1.0, 0.0])
+        level = level / torch.linalg.vector_norm(level).clamp_min(torch.finfo(level.dtype).tiny)
+        return middle_m + ((position_m - middle_m) @ level)[..., None] * level
+
     def across_m(self, points_m: Tensor) -> Tensor:
         """Return the part of the vectors from the track to points that is perpendicular to it.
 

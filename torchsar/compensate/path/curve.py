@@ -56,15 +56,17 @@ class Curve:
         """Phase by a motion (pulse, axis), float64 (scatterer, seen)."""
         return (self.lever * motion_m[self.pulses]).sum(-1)
 
-    def solved(self, phase: Tensor, weight: Tensor, power: Tensor) -> Solution:
+    def solved(self, phase: Tensor, weight: Tensor, power: Tensor, known: Tensor) -> Solution:
         """Return the most probable motion and terms of the scatterers.
 
-        The motion has independent Gaussian coefficients, and the terms of the scatterers are free.
+        The coefficients of the motion and the terms of the scatterers are independent and Gaussian.
 
         Args:
             phase: Measured phases in rad, float64 (scatterer, seen).
             weight: Inverse variances of their errors, float64 (scatterer, seen).
             power: Expected power of the coefficients in square metres, float64 (axis, cosine).
+            known: Inverse variances of the terms of the scatterers, whose mean is zero, float64
+                (scatterer, term).
 
         Returns:
             The motion.
@@ -72,8 +74,8 @@ class Curve:
         axes, count = power.shape
         pull = weight[..., None] * self.own
         normal = pull.mT @ self.own
-        known = normal.diagonal(dim1=-2, dim2=-1)
-        ridge = torch.where(known > 0, _RIDGE * known, 1.0)
+        told = normal.diagonal(dim1=-2, dim2=-1)
+        ridge = torch.where(told > 0, _RIDGE * told + known, 1.0)
         inverse = torch.linalg.inv(normal + torch.diag_embed(ridge))
         own = (pull.mT @ phase[..., None])[..., 0]
         share = torch.zeros(len(self.basis), axes, axes, dtype=torch.float64, device=phase.device)

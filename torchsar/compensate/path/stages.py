@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchsar.compensate.path.line_of_sight import path_autofocus
 from torchsar.compensate.path.phase import path_phase
+from torchsar.compensate.path.strip import strip_autofocus
 from torchsar.core import Estimate, Signal, Stage
 from torchsar.radar import AntennaPath
 
@@ -18,7 +19,7 @@ class _PathEstimator(Stage):
     # function of profiles, frequencies and antennas, and its further settings
     find: Callable[..., Estimate]
 
-    def __init__(self, **settings: float | None) -> None:
+    def __init__(self, **settings: float | tuple[float, float] | None) -> None:
         super().__init__()
         self.settings = settings
 
@@ -82,6 +83,44 @@ class PathAutofocus(_PathEstimator):
 
     def __init__(self, extent_m: float | None = None, height_m: float = 0.0, rounds: int = 6) -> None:
         super().__init__(extent_m=extent_m, height_m=height_m, rounds=rounds)
+
+
+class StripAutofocus(_PathEstimator):
+    """Slow errors of the recorded path of a strip; see `strip_autofocus`.
+
+    Args:
+        azimuth_m: Extent of the imaged strip along its azimuth axis in metres.
+        range_m: Extent along its range axis in metres.
+        beam_deg: Width of the beam in degrees, see `ProcessedBeam`.
+        centre_m: Position of the centre in metres along (range axis, azimuth axis).
+        range_axis_rad: Direction of the range axis in rad, from ground coordinate x towards y.
+        height_m: Height z of the imaged plane in metres.
+        squint_deg: Angle of the middle of the beam ahead of broadside in degrees.
+    """
+
+    provides = ("line_of_sight_m", "offset_m")
+    neutral = {"line_of_sight_m": 0.0, "offset_m": 0.0}
+    find = staticmethod(strip_autofocus)
+
+    def __init__(
+        self,
+        azimuth_m: float,
+        range_m: float,
+        beam_deg: float,
+        centre_m: tuple[float, float] = (0.0, 0.0),
+        range_axis_rad: float = 0.0,
+        height_m: float = 0.0,
+        squint_deg: float = 0.0,
+    ) -> None:
+        super().__init__(
+            azimuth_m=azimuth_m,
+            range_m=range_m,
+            beam_deg=beam_deg,
+            centre_m=(centre_m[0], centre_m[1]),
+            range_axis_rad=range_axis_rad,
+            height_m=height_m,
+            squint_deg=squint_deg,
+        )
 
 
 class CorrectPath(Stage):

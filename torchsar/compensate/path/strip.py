@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -36,6 +35,9 @@ _NEAR, _SETTLED = 0.15, 0.3
 # pulses between two phases of an increment, and over which echoes are averaged before, as shares of
 # the pulses that see a scatterer, by trial; the same for the amplitude of an echo
 _LAG, _MEAN, _SMOOTH = 1 / 64, 1 / 64, 1 / 8
+# standard deviation of the range of a scatterer in the image, in range cells: by clutter, by trial;
+# and by noise, times the root of its signal-to-noise ratio in the image, with a Hann window
+_PLACED, _PLACED_IN_NOISE = 0.07, 0.7
 # least share of its mean amplitude at which an echo counts, by choice
 _FADED = 0.2
 # fewest scatterers, and least share of the pulses that see one, by choice
@@ -131,24 +133,6 @@ def strip_autofocus(
     return for_each(find, profiles, antennas, trials)
 
 
-def abeam_m(antennas: AntennaPath, middle_m: Tensor) -> Tensor:
-    """Return the points of the middle of a strip that lie abeam of the antenna.
-
-    The middle is the level line through a point along the straight track of the receiver.
-
-    Args:
-        antennas: Path without leading dimensions.
-        middle_m: The point in metres, float64 (3,).
-
-    Returns:
-        Positions in metres, float64 (pulse, 3).
-    """
-    place = antennas.places[-1]
-    along = StraightTrack.fitted(place).along * place.new_tensor([1.0, 1.0, 0.0])
-    along = along / or_one(torch.linalg.vector_norm(along))
-    return middle_m + ((place - middle_m) @ along)[:, None] * along
-
-
 @dataclass(frozen=True, eq=False)
 class _Strip:
     """One trial.
@@ -181,12 +165,13 @@ class _Strip:
         extent_m: tuple[float, float],
     ) -> _Strip:
         place, pulses = antennas.places[-1], antennas.pulses
-        points = abeam_m(antennas, middle_m)
+        track = StraightTrack.fitted(place)
+        points = track.abeam_m(place, middle_m)
         ways = [one - points for one in antennas.places]
         sight = torch.stack(
             torch.broadcast_tensors(*(way / torch.linalg.vector_norm(way, dim=-1, keepdim=True) for way in ways))
         ).mean(0)
-        across = torch.linalg.cross(sight, StraightTrack.fitted(place).along.expand_as(sight), dim=-1)
+        across = torch.linalg.cross(sight, track.along.expand_as(sight), dim=-1)
         across = across / or_one(torch.linalg.vector_norm(across, dim=-1, keepdim=True))
         axes = torch.stack([sight / sight.square().sum(-1, keepdim=True), across], 1)
         # a scatterer outside of the strip is seen together with those in it
@@ -203,12 +188,11 @@ class _Strip:
         counts = tuple(max(3, math.ceil(x / step)) for x in size)
         corner = middle_m - step * sum(n // 2 * axis for n, axis in zip(counts, ground, strict=True))
         grid = ImageGrid(corner, ground, (counts[0], counts[1]), step)
-        inside = (torch.tensor([[-1, -1], [-1, 1], [1, -1], [1, 1]]).to(ground) * torch.tensor(extent_m).to(ground) / 2) @ ground
-        ends = beam.lit_pulses(place, middle_m + inside)
+        sides = ground.new_tensor([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]]) * ground.new_tensor(extent_m)
+        ends = beam.lit_pulses(place, middle_m + sides @ ground)
         number = torch.arange(pulses, device=rows.device)
-        present = (rows != 0).any(-1)
-        judged = (number >= ends[:, 0].amin()) & (number < ends[:, 1].amax()) & present
-        if not bool((number >= ends[:, 0].amin()).logical_and(number < ends[:, 1].amax()).any()):
+        judged = (number >= ends[:, 0].amin()) & (number < ends[:, 1].amax())
+        if not bool(judged.any()):
             raise ValueError("no pulse sees the strip within the beam; check its centre, extents and the squint")
         seen = beam.lit_pulses(place, points[pulses // 2][None])
         per = max(1, int(seen[0, 1] - seen[0, 0]))
@@ -223,7 +207,7 @@ class _Strip:
             axes,
             grid,
             (cells[0] / step, cells[1] / step),
-            judged,
+            judged & (rows != 0).any(-1),
             cosines(pulses, count, rows.device),
             torch.zeros(pulses, 2, dtype=torch.float64, device=rows.device),
         )
@@ -261,9 +245,14 @@ class _Strip:
             return None
         echoes = Echoes.of(self.history, self.frequency_hz, self.weights, antennas, found, lit)
         lever = echoes.wave * (echoes.slope[..., None, :] * self.axes[echoes.pulses]).sum(-1)
+        # half the path by displacements along the slope of the range and across it
         ground = echoes.slope @ self.grid.axes.mT
-        moved = ground - _mean(ground, echoes.seen)
-        own = torch.cat([torch.ones_like(moved[..., :1]), moved / or_one(moved.abs().amax(1, keepdim=True))], -1)
+        mean = _mean(ground, echoes.seen)
+        steep = torch.linalg.vector_norm(mean, dim=-1, keepdim=True)
+        along = mean / or_one(steep)
+        across = torch.stack([-along[..., 1], along[..., 0]], -1)
+        moved = torch.stack([((ground - mean) * way).sum(-1) for way in (along, across)], -1)
+        own = torch.cat([torch.ones_like(moved[..., :1]), echoes.wave * moved], -1)
         return echoes, Curve(self.basis, echoes.pulses, lever, own)
 
     def with_increments(self) -> _Strip | None:
@@ -288,7 +277,8 @@ class _Strip:
         at = slice(half, half + turn.shape[1])
         of_steps = Curve(steps, echoes.pulses[:, at], curve.lever[:, at, :1], curve.own[:, at, :1])
         power = torch.full_like(self.basis[:1], self.fringe_m**2 * self.basis.shape[0] / self.basis.shape[1])
-        along = self.basis @ of_steps.solved(turn.angle(), weight, power).coefficient[0]
+        free = torch.zeros_like(weight[:, :1])
+        along = self.basis @ of_steps.solved(turn.angle(), weight, power, free).coefficient[0]
         return replace(self, motion_m=self.motion_m + torch.nn.functional.pad(along[:, None], (0, 1)))
 
     def fitted(self, power: Tensor) -> tuple[_Strip, Solution, Tensor, Echoes] | None:
@@ -300,6 +290,8 @@ class _Strip:
         near = _odd(_SMOOTH * echoes.seen.shape[1])
         # phases are those along the path less what has been found
         before = curve.phase(self.motion_m)
+        steep = torch.linalg.vector_norm(_mean(echoes.slope @ self.grid.axes.mT, echoes.seen), dim=-1)[:, 0]
+        cell = LIGHT_M_S / (2 * float(self.frequency_hz[-1] - self.frequency_hz[0]))
         turned = torch.zeros_like(before)
         model = torch.zeros_like(echoes.samples)
         gain, solution = echoes.seen.double(), None
@@ -313,8 +305,11 @@ class _Strip:
             noise = _per_seen((alone - gain).abs().square() * echoes.seen, echoes.seen)
             faded = gain < _FADED * gain.amax(1, keepdim=True)
             weight = torch.where(faded, 0.0, 2 * gain.square() / or_one(noise))
-            phase = torch.where(faded, 0.0, alone.angle())
-            solution = curve.solved(phase + turned + before, weight, power)
+            phase = torch.where(faded, 0.0, alone.imag / or_one(gain))
+            # the range of a scatterer is known from the image; its phase and azimuth are free
+            spread = cell**2 * (_PLACED**2 + _PLACED_IN_NOISE**2 / or_one(weight.sum(1) / 2))
+            known = torch.stack([torch.zeros_like(spread), steep.square() / spread, torch.zeros_like(spread)], -1)
+            solution = curve.solved(phase + turned + before, weight, power, known)
             turned = curve.phase(curve.motion_m(solution.coefficient)) - before + solution.own
             count = power.shape[1]
             known = solution.coefficient[0].square() + solution.covariance.diagonal()[:count]

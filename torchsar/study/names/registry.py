@@ -200,6 +200,7 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "autofocus": compensate.TargetAutofocus,
     "path_autofocus": compensate.PathAutofocus,
     "path_phase": compensate.PathPhase,
+    "strip_autofocus": compensate.StripAutofocus,
     "path_correct": compensate.CorrectPath,
     "pulse_phase_correct": compensate.CorrectPulsePhase,
     "segmented_interference": compensate.SegmentedInterference,

@@ -53,7 +53,7 @@ class AnyPath(System):
         "over the same pulses",
         "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
         "corrected minus true, without constant and linear terms; modulo half a wavelength where the path or phases of "
-        "pulses are corrected",
+        "pulses are corrected; for a strip over the middle of the strip abeam, and over the pulses that see the image",
         "image_shift_m": "mean displacement of the named points, which autofocus cannot observe, m",
         "position_error_rms_m": "rms over the named points of the distance of the peak from the true position, without "
         "the common shift of all points, and of more than three without a common rotation and stretch, m",

@@ -34,7 +34,7 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -
     """
     chain, clean = bench.chains[name], bench.config.processor[name].input == "clean"
     left = residual_m(chain, trace, trials, bench.radar.wavelength_m, clean)
-    metrics = {"path_residual_rms_m": left.square().mean(-1).sqrt()}
+    metrics = {"path_residual_rms_m": left.square().nanmean(-1).sqrt()}
     targets: dict[str, Metrics] = {}
     outside: list[str] = []
     if trace.signal.names == IMAGE:
@@ -50,7 +50,8 @@ def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, 
     """Return the error of the line of sight (m) that a chain leaves, (trial, pulse).
 
     It has no constant and linear terms, which shift the image, and rotate and stretch it slightly.
-    Where the chain estimates it or phases of pulses it is known modulo half a wavelength.
+    Where the chain estimates it or phases of pulses it is known modulo half a wavelength. It is NaN
+    for pulses outside of the strip, if the image is that of a strip.
     """
     data = trials.recording.signal.data
     pulses = (trials.count, data.shape[-2])
@@ -59,15 +60,33 @@ def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, 
     phases = [x for key, x in trials.truth.items() if key.endswith(".phase_rad") and not clean]
     radians = 4 * math.pi / wavelength_m
     of_path = [e.value["line_of_sight_m"] for e in trace.estimates.values() if "line_of_sight_m" in e.value]
+    strip = _of_strip(chain, trials, pulses[1])
     if phases or of_path or any("phase_rad" in uses for uses in chain.uses.values()):
         # a recorded range that is too long leaves a positive phase
         whole = radians * true + sum((x.reshape(pulses) for x in phases), torch.zeros_like(true))
         found = estimated_phase(chain, trace, whole)
         found = found + radians * sum((x.reshape(pulses) for x in of_path), torch.zeros_like(true))
-        return residual_phase(found, whole, received(trials)) / radians
-    time = torch.linspace(-1, 1, pulses[1], dtype=torch.float64, device=data.device)
-    slope = (true * time).sum(-1, keepdim=True) / time.square().sum()
-    return -(true - true.mean(-1, keepdim=True) - slope * time)
+        lost = received(trials)
+        left = residual_phase(found, whole, strip.expand(pulses) if lost is None else lost & strip) / radians
+    else:
+        time = torch.arange(pulses[1], dtype=torch.float64, device=data.device)
+        basis = torch.stack([torch.ones_like(time), time / pulses[1]], -1) * strip[:, None]
+        left = (basis @ (torch.linalg.pinv(basis) @ (true * strip).mT)).mT - true
+    return left.masked_fill(~strip, math.nan)
+
+
+def _of_strip(chain: Chain, trials: Trials, pulses: int) -> Tensor:
+    """Pulses that see the imaged strip, (pulse,); all if the image is none of a strip."""
+    every = torch.ones(pulses, dtype=torch.bool, device=trials.recording.signal.data.device)
+    stage = next((one for one in reversed(list(chain.stages.values())) if isinstance(one, PathImage)), None)
+    aux = trials.recording.aux
+    antennas = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
+    lit = None if stage is None else stage.lit(antennas)
+    if stage is None or lit is None:
+        return every
+    ends = lit(stage.grid.pixels_m()[:: stage.grid.counts[0] - 1, :: stage.grid.counts[1] - 1].reshape(-1, 3))
+    number = every.cumsum(0) - 1
+    return (number >= ends[:, 0].amin()) & (number < ends[:, 1].amax())
 
 
 def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
