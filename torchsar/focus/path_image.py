@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from functools import partial
 
 import torch
@@ -110,6 +111,23 @@ class PathImage(Stage):
         """
         return None
 
+    def seen(self, antennas: AntennaPath) -> Tensor:
+        """Return the pulses that see a part of the image.
+
+        Args:
+            antennas: Path of the antennas.
+
+        Returns:
+            True from the first to the last of them, bool (pulse,); for all pulses without a beam.
+        """
+        number = torch.arange(antennas.pulses, device=antennas.reference_m.device)
+        lit = self.lit(antennas)
+        if lit is None:
+            return number >= 0
+        rows, columns = (slice(None, None, max(1, n - 1)) for n in self.grid.counts)
+        ends = lit(self.grid.pixels_m(rows, columns).reshape(-1, 3).to(number.device))
+        return (number >= ends[:, 0].amin()) & (number < ends[:, 1].amax())
+
     def forward(
         self,
         signal: Signal,
@@ -139,6 +157,22 @@ class PathImage(Stage):
             grid = ImageGrid(*places, self.grid.counts, self.grid.step_m)
         antennas = AntennaPath(transmitter_m, receiver_m, path_reference_m)
         return Signal(self.form(history, frequency_hz, antennas, grid), self.axes)
+
+
+def seen_in(stages: Iterable[object], antennas: AntennaPath) -> Tensor:
+    """Return the pulses that see a part of the last image of a chain, see `PathImage.seen`.
+
+    Args:
+        stages: Stages of the chain.
+        antennas: Path of the antennas.
+
+    Returns:
+        bool (pulse,); True for all pulses if no stage forms an image.
+    """
+    seen = torch.ones(antennas.pulses, dtype=torch.bool, device=antennas.reference_m.device)
+    for stage in stages:
+        seen = stage.seen(antennas) if isinstance(stage, PathImage) else seen
+    return seen
 
 
 class TileImage(PathImage):

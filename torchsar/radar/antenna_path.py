@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -53,6 +53,18 @@ class AntennaPath:
                 "leading dimensions that broadcast, got "
                 + ", ".join(f"{name} {tuple(value.shape)}" for name, value in given.items())
             )
+
+    @staticmethod
+    def recorded(aux: Mapping[str, Tensor]) -> AntennaPath:
+        """Return the path in the side data of a recording, see `side_data`.
+
+        Args:
+            aux: Side data by name.
+
+        Returns:
+            The path.
+        """
+        return AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
 
     @property
     def places(self) -> tuple[Tensor, ...]:

@@ -63,10 +63,11 @@ def strip_autofocus(
 
     The recommended autofocus of strips, in which a beam sees each scatterer for a part of the
     pulses. Prominent scatterers are found in the image, up to 300. Each gives a phase per pulse
-    while it is seen, which contains the error of the path, and a constant and linear terms by its
-    own phase and place. All phases together give the error of the path in two axes, along the line
-    of sight abeam and across it and the track, as a sum of cosines of up to 16 periods while a
-    scatterer is seen. The steps are:
+    while it is seen, which contains the error of the path, a constant by its own phase, and terms
+    by its place: its azimuth is free, its range is known from the image to some hundredths of a
+    range cell. All phases together give the error of the path in two axes, along the line of sight
+    abeam and across it and the track, as a sum of cosines of up to 16 periods while a scatterer is
+    seen. The steps are:
 
     1. Increments of the phases over some pulses give a first motion along the line of sight, of any
        number of fringes. The scatterers are found again in the image with this motion removed.
@@ -76,9 +77,9 @@ def strip_autofocus(
        echo exceeds what is left.
 
     Slow errors are the least certain: over the time that a scatterer is seen they are lines, which
-    displace it. Not observable are a constant and a linear term of the whole strip. Errors along
-    the track are not estimated. Trials have image plans of their own and are processed one after
-    another.
+    displace it, and curves, which a displacement in range would cause as well. Not observable are a
+    constant and a linear term of the whole strip. Errors along the track are not estimated. Trials
+    have image plans of their own and are processed one after another.
 
     Args:
         profiles: Range profiles, the unitary centred inverse FFT of a phase history, shape (...,

@@ -116,9 +116,8 @@ class AnyPath(System):
             )
         else:
             clean = bench.recording
-        aux, grid = clean.aux, stage.grid
-        antennas = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
-        geometry = (aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
+        antennas, grid = AntennaPath.recorded(clean.aux), stage.grid
+        geometry = (clean.aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
         # tiles sum the pulses of the recommended method
         plan_of = partial(TilePlan, *geometry, grid, lit=stage.lit(antennas))
         tiles: dict[float, float] = {}

@@ -7,8 +7,10 @@ import math
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.core import Chain, Signal, Trace, per_trial
 from torchsar.focus import PathImage
+from torchsar.focus.path_image import seen_in
 from torchsar.metrics import contrast, entropy, impulse_response, line_of_sight_bound_m, residual_phase
 from torchsar.radar import AntennaPath
 from torchsar.study.systems.isal.judge import estimated_phase, received
@@ -53,40 +55,22 @@ def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, 
     Where the chain estimates it or phases of pulses it is known modulo half a wavelength. It is NaN
     for pulses outside of the strip, if the image is that of a strip.
     """
-    data = trials.recording.signal.data
-    pulses = (trials.count, data.shape[-2])
+    strip = seen_in(chain.stages.values(), AntennaPath.recorded(trials.recording.aux))
+    pulses = (trials.count, len(strip))
     parts = [x for key, x in trials.truth.items() if key.rpartition(".")[2] == "line_of_sight_m" and not clean]
-    true = sum((x.expand(pulses) for x in parts), torch.zeros(pulses, dtype=torch.float64, device=data.device))
+    true = sum((x.expand(pulses) for x in parts), torch.zeros(pulses, dtype=torch.float64, device=strip.device))
     phases = [x for key, x in trials.truth.items() if key.endswith(".phase_rad") and not clean]
     radians = 4 * math.pi / wavelength_m
     of_path = [e.value["line_of_sight_m"] for e in trace.estimates.values() if "line_of_sight_m" in e.value]
-    strip = _of_strip(chain, trials, pulses[1])
     if phases or of_path or any("phase_rad" in uses for uses in chain.uses.values()):
         # a recorded range that is too long leaves a positive phase
         whole = radians * true + sum((x.reshape(pulses) for x in phases), torch.zeros_like(true))
-        found = estimated_phase(chain, trace, whole)
-        found = found + radians * sum((x.reshape(pulses) for x in of_path), torch.zeros_like(true))
-        lost = received(trials)
-        left = residual_phase(found, whole, strip.expand(pulses) if lost is None else lost & strip) / radians
+        found = sum((radians * x.reshape(pulses) for x in of_path), estimated_phase(chain, trace, whole))
+        present = received(trials)
+        left = residual_phase(found, whole, strip.expand(pulses) if present is None else present & strip) / radians
     else:
-        time = torch.arange(pulses[1], dtype=torch.float64, device=data.device)
-        basis = torch.stack([torch.ones_like(time), time / pulses[1]], -1) * strip[:, None]
-        left = (basis @ (torch.linalg.pinv(basis) @ (true * strip).mT)).mT - true
+        left = -without_line(true, strip)
     return left.masked_fill(~strip, math.nan)
-
-
-def _of_strip(chain: Chain, trials: Trials, pulses: int) -> Tensor:
-    """Pulses that see the imaged strip, (pulse,); all if the image is none of a strip."""
-    every = torch.ones(pulses, dtype=torch.bool, device=trials.recording.signal.data.device)
-    stage = next((one for one in reversed(list(chain.stages.values())) if isinstance(one, PathImage)), None)
-    aux = trials.recording.aux
-    antennas = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
-    lit = None if stage is None else stage.lit(antennas)
-    if stage is None or lit is None:
-        return every
-    ends = lit(stage.grid.pixels_m()[:: stage.grid.counts[0] - 1, :: stage.grid.counts[1] - 1].reshape(-1, 3))
-    number = every.cumsum(0) - 1
-    return (number >= ends[:, 0].amin()) & (number < ends[:, 1].amax())
 
 
 def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
@@ -99,7 +83,7 @@ def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
         return {}
     points = torch.stack(torch.broadcast_tensors(*(truth[f"{axis}_m"] for axis in ("range", "azimuth", "height"))), -1)
     aux = batch.trials.clean.aux
-    antennas = AntennaPath(aux["transmitter_m"], aux.get("receiver_m"), aux["path_reference_m"])
+    antennas = AntennaPath.recorded(aux)
     if antennas.pulses * len(aux["frequency_hz"]) * points.shape[-2] > _MOST_WORK or bench.world().beam is not None:
         return {}
     bound = line_of_sight_bound_m(aux["frequency_hz"], antennas, points, truth["amplitude"], std)
