@@ -298,15 +298,15 @@ def test_velocity_is_ok_when_the_search_is_narrower_than_the_minimum(scene: Scen
     assert 0.5 < float(rms / found.std["velocity_m_s"].square().mean().sqrt()) < 1.6
 
 
-def test_velocity_search_focuses_the_group_ten_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The nominal velocity, four others, three about the minimum, and two for its depth."""
+def test_velocity_search_focuses_the_group_thirteen_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The nominal velocity, four others, three to refine, three about the minimum, two for its depth."""
     calls, rows = [], BeamSpectrum.rows
     monkeypatch.setattr(BeamSpectrum, "rows", lambda *args: (calls.append(1), rows(*args))[1])
     doppler = torch.full((2,), 652.0, dtype=torch.float64)
     world = StripmapWorld(Points([0.0], [0.0]), Dwell(0.3), velocity_m_s=7003.0, doppler_hz=doppler, snr_db=20.0)
     signal = simulate(SATELLITE, world, 512, 192, Draws(16, trials=range(2)))[0].signal
     found = EffectiveVelocity(OmegaK(SATELLITE), 30.0, 128)(signal, doppler)
-    assert bool(found.ok.all()) and len(calls) == 10
+    assert bool(found.ok.all()) and len(calls) == 13
 
 
 def test_a_cost_that_is_known_in_the_middle_of_a_grid_is_not_computed_again() -> None:
