@@ -299,7 +299,7 @@ def test_velocity_is_ok_when_the_search_is_narrower_than_the_minimum(scene: Scen
 
 
 def test_velocity_search_focuses_the_group_thirteen_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The nominal velocity, four others, three to refine, three about the minimum, two for depth."""
+    """The nominal velocity, four others, three to refine, three about the minimum, two of depth."""
     calls, rows = [], BeamSpectrum.rows
     monkeypatch.setattr(BeamSpectrum, "rows", lambda *args: (calls.append(1), rows(*args))[1])
     doppler = torch.full((2,), 652.0, dtype=torch.float64)
