@@ -183,8 +183,8 @@ class _Flown:
             reference = 2 * legs[0] if len(legs) == 1 else legs[0] + legs[1]
         else:
             reference = torch.full_like(time_s, 2 * world.window_range_m)
-        paths = (AntennaPath(p[0], p[1] if len(p) > 1 else None, reference) for p in (true, recorded))
-        return _Flown(*paths, world.beam is not None)
+        flown, written = (AntennaPath(p[0], p[1] if len(p) > 1 else None, reference) for p in (true, recorded))
+        return _Flown(flown, written, world.beam is not None)
 
     def truth(self) -> dict[str, Tensor]:
         """True positions and the error of the line of sight."""
@@ -201,8 +201,11 @@ def _line_of_sight_m(recorded: AntennaPath, true: AntennaPath, strip: bool = Fal
     if strip:
         place = true.places[-1].reshape(-1, true.pulses, 3).mean(0)
         middle = StraightTrack.fitted(place).abeam_m(place, middle[0])
-    before, after = (sum(torch.linalg.vector_norm(x - middle, dim=-1) for x in one.places) for one in (true, recorded))
-    return (after - before) / len(true.places)
+    off = [
+        torch.linalg.vector_norm(after - middle, dim=-1) - torch.linalg.vector_norm(before - middle, dim=-1)
+        for after, before in zip(recorded.places, true.places, strict=True)
+    ]
+    return torch.stack(torch.broadcast_tensors(*off)).mean(0)
 
 
 @dataclass(frozen=True)

@@ -331,6 +331,7 @@ def _judged(strip: _Strip) -> Estimate:
     # increments show slow errors best: their spectrum would forbid fast ones
     size = strip.line_free(strip.motion_m[:, 0])[strip.judged].square().mean()
     power = torch.full_like(strip.basis[:2], float(size) * strip.basis.shape[0] / strip.basis.shape[1])
+    change = spread = torch.full_like(size, math.inf)
     for _ in range(_FITS):
         found = strip.fitted(power)
         if found is None:
