@@ -74,8 +74,8 @@ class Curve:
         axes, count = power.shape
         pull = weight[..., None] * self.own
         normal = pull.mT @ self.own
-        told = normal.diagonal(dim1=-2, dim2=-1)
-        ridge = torch.where(told > 0, _RIDGE * told + known, 1.0)
+        seen = normal.diagonal(dim1=-2, dim2=-1)  # zero for a scatterer that no pulse sees
+        ridge = torch.where(seen > 0, _RIDGE * seen + known, 1.0)
         inverse = torch.linalg.inv(normal + torch.diag_embed(ridge))
         own = (pull.mT @ phase[..., None])[..., 0]
         share = torch.zeros(len(self.basis), axes, axes, dtype=torch.float64, device=phase.device)
