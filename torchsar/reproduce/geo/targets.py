@@ -11,7 +11,6 @@ axis c tau / 2, half of the receive path; azimuth is x = v t.
 
 from __future__ import annotations
 
-import argparse
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -76,7 +75,7 @@ PUBLISHED = {
 
 
 @dataclass(frozen=True)
-class Batch:
+class _Batch:
     """Targets, one a trial, and their channels. speeds: name -> (u_r, u_a)."""
 
     speeds: Mapping[str, tuple[float, float]]
@@ -90,7 +89,7 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Product:
+class _Product:
     """Rebuilt spectrum (doppler, range) and image (azimuth, range) of every trial, and how they
     were made. moving: with the velocities of the targets.
     """
@@ -101,7 +100,7 @@ class Product:
     moving: bool
 
 
-def received(world: BistaticWorld, n_pulse: int, n_range: int, trials: int | None = None) -> Signal:
+def _received(world: BistaticWorld, n_pulse: int, n_range: int, trials: int | None = None) -> Signal:
     """Range-compressed channels (channel, pulse, range) without the transmit range."""
     recording, _ = simulate_bistatic(
         RADAR, world, n_pulse, n_range, Draws(1, trials=None if trials is None else range(trials))
@@ -109,27 +108,27 @@ def received(world: BistaticWorld, n_pulse: int, n_range: int, trials: int | Non
     return RemoveTransmitRange(RADAR)(recording.signal)
 
 
-def simulated(speeds: Mapping[str, tuple[float, float]], n_pulse: int, n_range: int) -> Batch:
+def _simulated(speeds: Mapping[str, tuple[float, float]], n_pulse: int, n_range: int) -> _Batch:
     """One target at the middle of the scene in each trial, without noise."""
     u_r, u_a = torch.tensor(list(speeds.values()), dtype=torch.float64).T[..., None]
     world = BistaticWorld(
         MovingPoints(u_r, u_a, torch.zeros_like(u_r), torch.zeros_like(u_r)), BandLimited(INTEGRATION_S)
     )
-    return Batch(speeds, received(world, n_pulse, n_range, len(speeds)))
+    return _Batch(speeds, _received(world, n_pulse, n_range, len(speeds)))
 
 
-def products(batch: Batch, method: str) -> list[Product]:
+def _products(batch: _Batch, method: str) -> list[_Product]:
     """With two and three bands, "conventional" (as if at rest) or "proposed" (with the
     velocities).
     """
     values = batch.values if method == "proposed" else {}
     standing = CorrectMigration(RADAR, Keystone(whole_swath=False))(batch.channels, **values)
-    return [product(standing, bands, values) for bands in (2, 3)]
+    return [_product(standing, bands, values) for bands in (2, 3)]
 
 
-def product(
+def _product(
     standing: Signal, bands: int, values: Mapping[str, Tensor | float], range_m: float | None = None
-) -> Product:
+) -> _Product:
     """From channels without migration.
 
     One filter serves all lines, that of the target: side lobes along range have its history, not
@@ -143,26 +142,26 @@ def product(
     doppler, range_ = spectrum.axes
     motion = PointMotion.of(RADAR, standing.data, **values, range_m=range_m).each(lambda value: value[..., None])
     image = focus_azimuth(spectrum.data.mT, doppler.values(), RADAR, motion, BANDWIDTH_HZ).mT
-    return Product(spectrum, Signal(image, (image_axis(RADAR, doppler), range_)), bands, bool(values))
+    return _Product(spectrum, Signal(image, (image_axis(RADAR, doppler), range_)), bands, bool(values))
 
 
-def brightest(image: Signal) -> Tensor:
+def _brightest(image: Signal) -> Tensor:
     """Azimuth profile of the strongest range line of each trial, (trial, azimuth)."""
     line = image.data.abs().amax(-2).argmax(-1)
     return take(image.data.mT, line, -2)
 
 
-def range_cut(image: Signal) -> Tensor:
+def _range_cut(image: Signal) -> Tensor:
     """Range profile of the strongest azimuth line of each trial, (trial, range)."""
     return take(image.data, image.data.abs().amax(-1).argmax(-1), -2)
 
 
-def measured(batch: Batch, made: Product) -> Tensor:
+def _measured(batch: _Batch, made: _Product) -> Tensor:
     """Numbers named by FIGURES, (trial, figure)."""
-    profile, step = brightest(made.image), made.image.axis("azimuth").step
+    profile, step = _brightest(made.image), made.image.axis("azimuth").step
     own, across = (
         azimuth_response(profile, step),
-        azimuth_response(range_cut(made.image), made.image.axis("range").step / 2),
+        azimuth_response(_range_cut(made.image), made.image.axis("range").step / 2),
     )
     zones = replica_zones(
         RADAR,
@@ -179,24 +178,7 @@ def measured(batch: Batch, made: Product) -> Tensor:
     )
 
 
-def show(batch: Batch, made: Mapping[str, Product], bands: int) -> None:
-    """Table 4 with so many bands."""
-    print(f"{f'Table 4, N = {bands} (m, dB)':28}" + "".join(f"{name:>10}" for name in FIGURES))
-    for method, one in made.items():
-        for name, row in zip(batch.speeds, measured(batch, one), strict=True):
-            print(f"{f'{method} {name}':28}" + "".join(f"{float(x):>10.2f}" for x in row))
-            if name in PUBLISHED[method]:
-                known = PUBLISHED[method][name]
-                print(
-                    f"{'  published':28}"
-                    + "".join(
-                        f"{'-' if x is None else f'{x:.2f}':>10}" for x in (*known[:3], None, None, None, known[3])
-                    )
-                )
-    print()
-
-
-def near(image: Signal, along_m: float, range_m: float, trial: int) -> Signal:
+def _near(image: Signal, along_m: float, range_m: float, trial: int) -> Signal:
     """Surroundings of the peak of one trial, azimuth and range counted from it, range on the axis c
     tau / 2.
     """
@@ -214,7 +196,7 @@ def near(image: Signal, along_m: float, range_m: float, trial: int) -> Signal:
     return Signal(part, tuple(axes))
 
 
-def finer(image: Signal, factor: int = 8) -> Signal:
+def _finer(image: Signal, factor: int = 8) -> Signal:
     """Interpolated by zeros around its spectrum, for contours."""
     data, axes = image.data, []
     for dim, axis in zip((-2, -1), image.axes, strict=True):
@@ -228,7 +210,7 @@ def finer(image: Signal, factor: int = 8) -> Signal:
     return Signal(data, tuple(axes))
 
 
-def spectrum_2d(made: Product, trial: int) -> Signal:
+def _spectrum_2d(made: _Product, trial: int) -> Signal:
     """Rebuilt spectrum of one trial over Doppler (against the centre) and range frequency."""
     doppler, range_ = made.spectrum.axes
     data = torch.fft.fftshift(torch.fft.fft(made.spectrum.data[trial]), dim=-1)
@@ -236,13 +218,13 @@ def spectrum_2d(made: Product, trial: int) -> Signal:
     return Signal(data, (doppler, Axis("range frequency", range_.n, -(range_.n // 2) * step, step, "MHz")))
 
 
-def draw_target(made: Product, trial: int, title: str, path: Path, reach_m: float) -> None:
+def _draw_target(made: _Product, trial: int, title: str, path: Path, reach_m: float) -> None:
     """Spectrum, image to reach_m along azimuth, and azimuth profile of a target."""
-    profile, azimuth = brightest(made.image)[trial], made.image.axis("azimuth")
+    profile, azimuth = _brightest(made.image)[trial], made.image.axis("azimuth")
     curve = (plot.array(azimuth.values()), plot.decibel(profile))
     parts = [
-        {"title": f"{title}: spectrum", "signal": spectrum_2d(made, trial), "lines": {}},
-        {"title": "image about the peak", "signal": finer(near(made.image, reach_m, 30.0, trial)), "lines": {}},
+        {"title": f"{title}: spectrum", "signal": _spectrum_2d(made, trial), "lines": {}},
+        {"title": "image about the peak", "signal": _finer(_near(made.image, reach_m, 30.0, trial)), "lines": {}},
         {
             "series": {"": curve},
             "xlabel": "azimuth (m)",
@@ -254,7 +236,7 @@ def draw_target(made: Product, trial: int, title: str, path: Path, reach_m: floa
     plot.save(plot.overlays(parts, dynamic_range_db=50), path, columns=3)
 
 
-def draw_single(batch: Batch, by_method: Mapping[str, Product], trials: Sequence[int], out: Path) -> None:
+def _draw_single(batch: _Batch, by_method: Mapping[str, _Product], trials: Sequence[int], out: Path) -> None:
     """Of the targets of these numbers in the batch, figures 5 to 7 (conventional) and 14, 15
     (proposed), their contours in one picture.
     """
@@ -267,50 +249,50 @@ def draw_single(batch: Batch, by_method: Mapping[str, Product], trials: Sequence
             u_r, u_a = batch.speeds[names[trial]]
             title = f"({u_r:g}, {u_a:g}) m/s, {method}"
             blurred = method == "conventional" and u_a != 0
-            draw_target(made, trial, title, out / f"figure_{figure:02}.png", 60.0 if blurred else 15.0)
-            contours[f"{figure}: {title}"] = finer(near(made.image, 60.0 if blurred else 6.0, 15.0, trial))
+            _draw_target(made, trial, title, out / f"figure_{figure:02}.png", 60.0 if blurred else 15.0)
+            contours[f"{figure}: {title}"] = _finer(_near(made.image, 60.0 if blurred else 6.0, 15.0, trial))
     plot.save(plot.contours(contours), out / "contours.png")
 
 
-def draw_scene(n_pulse: int, n_range: int, out: Path) -> None:
+def _draw_scene(n_pulse: int, n_range: int, out: Path) -> None:
     """Figure 16: four targets in one scene, and each with its own velocities."""
     azimuth, range_ = zip(*POSITIONS.values(), strict=True)
     u_r, u_a = zip(*(SPEEDS[name] for name in POSITIONS), strict=True)
     world = BistaticWorld(MovingPoints(u_r, u_a, azimuth, range_), BandLimited(INTEGRATION_S))
-    data = received(world, n_pulse, n_range)
+    data = _received(world, n_pulse, n_range)
     at_rest = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(CorrectMigration(RADAR)(data)))
     lines = {name: (np.full(2, x), np.array([-115.0, 115.0])) for name, (x, _) in POSITIONS.items()}
     part = {
         "title": "four targets as if at rest; lines: true azimuth",
-        "signal": transposed(relative(at_rest)),
+        "signal": _transposed(_relative(at_rest)),
         "lines": lines,
     }
     plot.save(plot.overlays([part], dynamic_range_db=50), out / "figure_16.png", columns=1)
     plot.save(
-        plot.contours({name: own_image(data, name) for name in POSITIONS}), out / "figure_16_contours.png", columns=4
+        plot.contours({name: _own_image(data, name) for name in POSITIONS}), out / "figure_16_contours.png", columns=4
     )
 
 
-def own_image(data: Signal, name: str) -> Signal:
+def _own_image(data: Signal, name: str) -> Signal:
     """A target of the scene, found where it appears, focused with its velocities and position."""
     (u_r, u_a), (y0, beyond) = SPEEDS[name], POSITIONS[name]
     values, range_m = {"u_r_m_s": u_r, "u_a_m_s": u_a, "y0_m": y0}, RADAR.reference_range_m + beyond
     standing = CorrectMigration(RADAR, Keystone(whole_swath=False), range_m=range_m)(data, **values)
-    image = product(standing, 2, values, range_m).image
+    image = _product(standing, 2, values, range_m).image
     shown = RADAR.speed_m_s * float(PointMotion.of(RADAR, data.data, **values, range_m=range_m).image_s)
     part = image.crop(
-        azimuth=around(image.axis("azimuth"), shown, 20.0), range=around(image.axis("range"), range_m, 40.0)
+        azimuth=_around(image.axis("azimuth"), shown, 20.0), range=_around(image.axis("range"), range_m, 40.0)
     )
-    return finer(near(part.with_data(part.data[None]), 6.0, 15.0, 0))
+    return _finer(_near(part.with_data(part.data[None]), 6.0, 15.0, 0))
 
 
-def around(axis: Axis, position: float, reach: float) -> tuple[int, int]:
+def _around(axis: Axis, position: float, reach: float) -> tuple[int, int]:
     """First sample, and the one behind the last, within reach of a position."""
     first, last = (round(float(axis.index_of(position + side))) for side in (-reach, reach))
     return max(first, 0), min(last, axis.n)
 
 
-def relative(image: Signal) -> Signal:
+def _relative(image: Signal) -> Signal:
     """Range from the reference on the axis c tau / 2."""
     azimuth, range_ = image.axes
     return Signal(
@@ -319,36 +301,6 @@ def relative(image: Signal) -> Signal:
     )
 
 
-def transposed(image: Signal) -> Signal:
+def _transposed(image: Signal) -> Signal:
     """Azimuth horizontal."""
     return Signal(image.data.mT, image.axes[::-1])
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("geo_targets"), help="folder of the figures")
-    parser.add_argument(
-        "--small",
-        action="store_true",
-        help="records of 6 s with one replica to either side, short lines, one target drawn",
-    )
-    options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-
-    n_pulse, n_range = (1080, 48) if options.small else (1800, 96)
-    batch = simulated(SPEEDS, n_pulse, n_range)
-    made = {method: products(batch, method) for method in PUBLISHED}
-    two, three = ({method: both[i] for method, both in made.items()} for i in range(2))
-    show(batch, two, 2)
-    show(batch, three, 3)
-    print(
-        "theory: azimuth 0.886 lambda R0 / (v T) = "
-        f"{0.886 * RADAR.wavelength_m * RADAR.reference_range_m / (RADAR.speed_m_s * INTEGRATION_S):.3f} "
-        "m at rest, range 2.66 m, PSLR -13.26 dB"
-    )
-    draw_single(batch, two, (2,) if options.small else (0, 1, 2), options.out)
-    draw_scene(n_pulse, n_range, options.out)
-
-
-if __name__ == "__main__":
-    main()

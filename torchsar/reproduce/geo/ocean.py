@@ -11,7 +11,6 @@ source prints azimuth on x = (V_R - u_a) t of each target.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +47,7 @@ SCR_DB, CNR_DB = 10.0, 30.0
 
 
 @dataclass(frozen=True)
-class Setting:
+class _Setting:
     """How large the scene is, and how the flow is set for it."""
 
     ships: Mapping[str, Ship]
@@ -59,14 +58,14 @@ class Setting:
     flow: ImageMovers
 
 
-def whole() -> Setting:
+def _whole() -> _Setting:
     """As published."""
-    return Setting(SHIPS, 2160, 512, 4.5, SCR_DB, ImageMovers(RADAR))
+    return _Setting(SHIPS, 2160, 512, 4.5, SCR_DB, ImageMovers(RADAR))
 
 
-def small() -> Setting:
+def _small() -> _Setting:
     """One ship, in seconds."""
-    return Setting(
+    return _Setting(
         SMALL,
         540,
         120,
@@ -76,7 +75,7 @@ def small() -> Setting:
     )
 
 
-def received(setting: Setting, seed: int) -> Signal:
+def _received(setting: _Setting, seed: int) -> Signal:
     """Channels (channel, pulse, range) without the transmit range, the sea of unit power."""
     ships = {
         name: Ship(
@@ -96,7 +95,7 @@ def received(setting: Setting, seed: int) -> Signal:
     return RemoveTransmitRange(RADAR)(recording.signal)
 
 
-def nearest(ship: Ship, bodies: list[Body]) -> Body | None:
+def _nearest(ship: Ship, bodies: list[Body]) -> Body | None:
     """What was found nearest to the middle of a ship, within 50 m."""
     away = [
         (
@@ -112,7 +111,7 @@ def nearest(ship: Ship, bodies: list[Body]) -> Body | None:
     return bodies[min(away)[1]] if away and min(away)[0] < 50 else None
 
 
-def predicted(motion: PointMotion) -> tuple[float, float]:
+def _predicted(motion: PointMotion) -> tuple[float, float]:
     """Displacement and distance of the first false target of a motion, on the axis of the
     source.
     """
@@ -120,35 +119,14 @@ def predicted(motion: PointMotion) -> tuple[float, float]:
     return v * float(motion.image_s) - float(motion.y0_m), RADAR.prf_hz * RADAR.wavelength_m * float(motion.range_m) / v
 
 
-def show(setting: Setting, made: SceneImage) -> None:
-    """What was found of each ship, and what the source prints."""
-    print(f"{'':18}{'u_r':>9}{'u_a':>9}{'azimuth':>9}{'range':>9}{'shift':>9}{'replica':>9}")
-    for name, ship in setting.ships.items():
-        like = torch.zeros((), dtype=torch.float64)
-        true = PointMotion.of(
-            RADAR, like, ship.u_r_m_s, ship.u_a_m_s, ship.azimuth_m, RADAR.reference_range_m + ship.range_m
-        )
-        rows = {name: true, "  found": None if (body := nearest(ship, made.bodies)) is None else body.motion}
-        for title, motion in rows.items():
-            values = (
-                []
-                if motion is None
-                else [float(getattr(motion, key)) for key in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")]
-            )
-            values += [] if motion is None or not ship.u_r_m_s else predicted(motion)
-            print(f"{title:18}" + ("".join(f"{value:>9.2f}" for value in values) or "  nothing"))
-        if name in PUBLISHED and len(setting.ships) > 1:
-            print(f"{'  published':54}" + "".join(f"{value:>9.2f}" for value in PUBLISHED[name]))
-
-
-def levelled(image: Signal) -> Signal:
+def _levelled(image: Signal) -> Signal:
     """Blocks over their median, from -10 to 25 dB."""
     view = plot.quicklook(image, 300)
     level = view.data.abs() / view.data.abs().median()
     return view.with_data(level.clamp(10**-0.5, 10**1.25).to(torch.complex64))
 
 
-def draw(setting: Setting, made: SceneImage, path: Path) -> None:
+def _draw(setting: _Setting, made: SceneImage, path: Path) -> None:
     """Images focused for targets at rest, without the moving targets, and with these at their
     positions; outlines about the true positions.
     """
@@ -165,29 +143,10 @@ def draw(setting: Setting, made: SceneImage, path: Path) -> None:
     named = {"everything at rest": made.conventional, "without movers": made.rest, "fused": made.fused}
     figure = plot.overlays(
         [
-            {"title": title, "signal": levelled(image), "lines": {"true position": (joined[0], joined[1])}}
+            {"title": title, "signal": _levelled(image), "lines": {"true position": (joined[0], joined[1])}}
             for title, image in named.items()
         ],
         35.0,
     )
     plot.save(figure, path, columns=3)
     print(f"wrote {path}")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", default="geo_ocean", help="folder for the figure")
-    parser.add_argument("--seed", type=int, default=1, help="of sea, ships and noise")
-    parser.add_argument("--small", action="store_true", help="one ship on a small sea, for tests")
-    options = parser.parse_args()
-    setting = small() if options.small else whole()
-    out = Path(options.out)
-    out.mkdir(parents=True, exist_ok=True)
-    with torch.no_grad():
-        made = setting.flow(received(setting, options.seed))
-    show(setting, made)
-    draw(setting, made, out / "figure_18.png")
-
-
-if __name__ == "__main__":
-    main()

@@ -24,7 +24,6 @@ the image is zero-padded or finely gridded in Doppler, which the paper does not 
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -54,7 +53,7 @@ Finder = Callable[[Signal, InverseRadar], Estimate]
 
 
 @dataclass(frozen=True)
-class Target:
+class _Target:
     """A satellite and how its echo is sampled."""
 
     prf_hz: float
@@ -81,18 +80,18 @@ class Target:
         return recording.signal, truth
 
 
-SMALL = Target(125e3, 2500, 64, 0.12, 120, TIP_M / 4)
-FULL = Target(500e3, 10000, 128, 0.06, 600, TIP_M)
-TINY = Target(50e3, 1000, 32, 0.24, 60, TIP_M / 10)
+SMALL = _Target(125e3, 2500, 64, 0.12, 120, TIP_M / 4)
+FULL = _Target(500e3, 10000, 128, 0.06, 600, TIP_M)
+TINY = _Target(50e3, 1000, 32, 0.24, 60, TIP_M / 10)
 
 
-def recommended(signal: Signal, radar: InverseRadar) -> Estimate:
+def _recommended(signal: Signal, radar: InverseRadar) -> Estimate:
     return uneven_rotation(
         signal.data, wavelength_m=radar.wavelength_m, prf_hz=radar.prf_hz, range_m=signal.axis("range").values()
     )
 
 
-def genetic(oversampling: float, generations: int) -> Finder:
+def _genetic(oversampling: float, generations: int) -> Finder:
     """All trials of a batch at once, each with random numbers of its own."""
 
     def find(signal: Signal, radar: InverseRadar) -> Estimate:
@@ -107,7 +106,7 @@ def genetic(oversampling: float, generations: int) -> Finder:
     return find
 
 
-def errors(find: Finder, target: Target, snr_db: float, seed: int, trials: int) -> dict[str, Tensor]:
+def _errors(find: Finder, target: _Target, snr_db: float, seed: int, trials: int) -> dict[str, Tensor]:
     """Relative errors (trial,) in %, by name."""
     parts = []
     for first in range(0, trials, BATCH):
@@ -117,7 +116,7 @@ def errors(find: Finder, target: Target, snr_db: float, seed: int, trials: int) 
     return {name: torch.cat([part[name] for part in parts]) for name in TRUE}
 
 
-def bounds(target: Target, snr_db: float, seed: int, trials: int) -> dict[str, Tensor]:
+def _bounds(target: _Target, snr_db: float, seed: int, trials: int) -> dict[str, Tensor]:
     """Cramer-Rao bounds in %, root of the mean square over scenes."""
     _, truth = target.simulated(snr_db, seed, range(min(trials, BATCH)))
     positions = (
@@ -130,36 +129,7 @@ def bounds(target: Target, snr_db: float, seed: int, trials: int) -> dict[str, T
     return {name: 100 * least[name].square().mean().sqrt() / TRUE[name] for name in TRUE}
 
 
-def head() -> None:
-    print(f"{'error (%), mean +- std':30}{'trials':>8}" + "".join(f"{name:>20}" for name in NAMES.values()))
-
-
-def rows(snr_db: float, found: Mapping[tuple[str, float], Mapping[str, Tensor]], least: Mapping[str, Tensor]) -> None:
-    """Table 3, one SNR: mean and standard deviation of every error, and the bound."""
-    for (method, at), error in found.items():
-        if at == snr_db:
-            cells = [f"{float(e.mean()):.3f} +- {float(e.std()):.3f}" for e in error.values()]
-            print(f"{f'{at:g} dB, {method}':30}{len(error['k1_per_s']):>8}" + "".join(f"{cell:>20}" for cell in cells))
-    print(
-        f"{f'{snr_db:g} dB, bound':30}{'':8}" + "".join(f"{float(bound):>20.3f}" for bound in least.values()),
-        flush=True,
-    )
-
-
-def rates(found: Mapping[tuple[str, float], Mapping[str, Tensor]], least: Mapping[float, Mapping[str, Tensor]]) -> None:
-    """Rms errors of the rate, each method in a column, beside the published ones."""
-    methods = list(dict.fromkeys(method for method, _ in found))
-    print(f"\n{'rms error of Om (%)':30}" + "".join(f"{name:>16}" for name in ("bound", *methods, "published, GA")))
-    for snr, bound in least.items():
-        own = [float(found[method, snr]["omega_rad_s"].square().mean().sqrt()) for method in methods]
-        print(
-            f"{f'{snr:g} dB, rate':30}"
-            + "".join(f"{value:>16.3f}" for value in (float(bound["omega_rad_s"]), *own))
-            + f"{PUBLISHED_TIP.get(snr, '-'):>16}"
-        )
-
-
-def draw_errors(
+def _draw_errors(
     found: Mapping[tuple[str, float], Mapping[str, Tensor]], least: Mapping[float, Mapping[str, Tensor]], out: Path
 ) -> None:
     """Figure 13: estimates over truth with their standard deviations; and rms errors beside the
@@ -168,7 +138,7 @@ def draw_errors(
     methods, snr = list(dict.fromkeys(method for method, _ in found)), list(least)
     estimates, rms = [], []
     for name, title in NAMES.items():
-        spreads = {method: torch.stack([spread(found[method, at][name]) for at in snr]) for method in methods}
+        spreads = {method: torch.stack([_spread(found[method, at][name]) for at in snr]) for method in methods}
         part = {"title": title, "x": plot.array(torch.tensor(snr))}
         seen = {method: (plot.array(v[:, 0]), plot.array(v[:, 1:3])) for method, v in spreads.items()}
         error = {method: (plot.array(v[:, 3]), plot.array(v[:, 4:])) for method, v in spreads.items()}
@@ -186,7 +156,7 @@ def draw_errors(
     plot.save(plot.error_curves(rms, "SNR (dB)", "rms error (%)", log_y=True), out / "errors.png")
 
 
-def spread(error: Tensor) -> Tensor:
+def _spread(error: Tensor) -> Tensor:
     """Of errors in %: mean of the estimate over the truth, and the same less and plus a standard
     deviation; rms error, and the same less and plus its own standard deviation.
     """
@@ -195,7 +165,7 @@ def spread(error: Tensor) -> Tensor:
     return torch.stack([1 + mean / 100, 1 + (mean - std) / 100, 1 + (mean + std) / 100, rms, rms - own, rms + own])
 
 
-def full_target(target: Target, search: Finder, seed: int, scenes: int, out: Path) -> None:
+def _full_target(target: _Target, search: Finder, seed: int, scenes: int, out: Path) -> None:
     """Table 4 and figures 14 to 17."""
     print(
         f"\n{'tip of the full target':30}{'scenes':>8}{'bound (%)':>16}{'recommended (%)':>18}{'GA (%)':>16}"
@@ -204,23 +174,23 @@ def full_target(target: Target, search: Finder, seed: int, scenes: int, out: Pat
     shown = {}
     for snr in SNR_DB:
         signal, truth = target.simulated(snr, seed, range(scenes))
-        found = recommended(signal, target.radar)
-        image = focused(signal, target.radar, found, 0)
+        found = _recommended(signal, target.radar)
+        image = _focused(signal, target.radar, found, 0)
         shown[f"{snr:g} dB"] = image
-        bound = float(bounds(target, snr, seed, scenes)["omega_rad_s"])
+        bound = float(_bounds(target, snr, seed, scenes)["omega_rad_s"])
         own, searched = (
             100 * float((TRUE["omega_rad_s"] / each["omega_rad_s"] - 1).square().mean().sqrt())
             for each in (found, search(signal, target.radar))
         )
         print(
             f"{f'{snr:g} dB':30}{scenes:>8}{bound:>16.3f}{own:>18.3f}{searched:>16.3f}"
-            f"{PUBLISHED_TIP.get(snr, '-'):>20}{tip(image, truth):>20.4f}{float(found.ok.double().mean()):>9.2f}",
+            f"{PUBLISHED_TIP.get(snr, '-'):>20}{_tip(image, truth):>20.4f}{float(found.ok.double().mean()):>9.2f}",
             flush=True,
         )
     plot.save(plot.images(shown, 45, percentile=100), out / "figure_14_17.png")
 
 
-def focused(signal: Signal, radar: InverseRadar, found: Estimate, trial: int) -> Signal:
+def _focused(signal: Signal, radar: InverseRadar, found: Estimate, trial: int) -> Signal:
     """Image of one trial in metres."""
     one = signal.with_data(signal.data[trial])
     omega, k, yc = (found[name][trial] for name in ("omega_rad_s", "warp_k", "yc_m"))
@@ -230,51 +200,10 @@ def focused(signal: Signal, radar: InverseRadar, found: Estimate, trial: int) ->
     return Signal(image.data, (Axis("azimuth", doppler.n, doppler.start * scale, doppler.step * scale, "m"), range_))
 
 
-def tip(image: Signal, truth: Truth) -> float:
+def _tip(image: Signal, truth: Truth) -> float:
     """Cross range (m) of the brightest scatterer at the far end of the panel of positive cross
     range, in the first scene.
     """
     x, y, level = (truth.values[name][0] for name in ("cross_range_m", "range_m", "amplitude"))
     which = int(torch.where(x > 0.999 * x.max(), level.abs(), 0).argmax())
     return float(impulse_response(image, (x[which], y[which]), search_m=0.1 * float(x[which]))["position_azimuth_m"])
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("rotation_snr"), help="folder of the figures")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--trials", type=int, default=100, help="scenes per SNR of the recommended estimator")
-    parser.add_argument(
-        "--genetic-trials", type=int, default=4, help="scenes per SNR of the genetic algorithm, 870 images each"
-    )
-    parser.add_argument("--scenes", type=int, default=4, help="of the full target")
-    parser.add_argument(
-        "--small", action="store_true", help="three scenes of a tiny target, a genetic algorithm of one generation"
-    )
-    options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-
-    trials, few, scenes = (3, 2, 2) if options.small else (options.trials, options.genetic_trials, options.scenes)
-    target, full = (TINY, TINY) if options.small else (SMALL, FULL)
-    generations = 1 if options.small else 30
-    methods = {
-        "recommended": (recommended, trials),
-        "GA, 1 line": (genetic(1.0, generations), few),
-        "GA, 4 lines": (genetic(4.0, generations), few),
-    }
-    found: dict[tuple[str, float], dict[str, Tensor]] = {}
-    least: dict[float, dict[str, Tensor]] = {}
-    head()
-    for snr in SNR_DB:
-        found |= {
-            (name, snr): errors(find, target, snr, options.seed, count) for name, (find, count) in methods.items()
-        }
-        least[snr] = bounds(target, snr, options.seed, trials)
-        rows(snr, found, least[snr])
-    rates(found, least)
-    draw_errors(found, least, options.out)
-    full_target(full, genetic(1.0, 1 if options.small else 5), options.seed, scenes, options.out)
-
-
-if __name__ == "__main__":
-    main()

@@ -11,7 +11,6 @@ expected ones, and the positions of both panel tips in the image that is scaled 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -27,14 +26,12 @@ from torchsar.compensate import (
     coarse_rotation,
     correct_pulse_phase,
     descend_rotation,
-    uneven_rotation,
 )
-from torchsar.core import Axis, Draws, Estimate, Signal, Truth
-from torchsar.echo import simulate_turntable
-from torchsar.focus import MatchedFourier, RangePhase, mean_rate
-from torchsar.metrics import contrast, entropy, impulse_response
-from torchsar.radar import LIGHT_M_S, InverseRadar
-from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
+from torchsar.core import Axis, Estimate, Signal, Truth
+from torchsar.focus import MatchedFourier, RangePhase
+from torchsar.metrics import impulse_response
+from torchsar.radar import InverseRadar
+from torchsar.scene import PolynomialRotation
 
 ROTATION = PolynomialRotation(0.02, (10.0, 1000.0))
 TIP_M = 6.43
@@ -60,20 +57,20 @@ FIGURES = {
 }
 
 
-def second_order(signal: Signal, radar: InverseRadar) -> Estimate:
+def _second_order(signal: Signal, radar: InverseRadar) -> Estimate:
     """The second-order method, azimuth only: its one number from short sections, then by least
     entropy. It is not k1 of the target but about k1 + k2 T / 2.
     """
     figure = ImageEntropy.of(signal, radar, EntropyObjective(order=2, range_term=False))
-    start = coarse_rotation(signal.data, order=2, **known_of(signal, radar))
+    start = coarse_rotation(signal.data, order=2, **_known_of(signal, radar))
     return descend_rotation(figure, figure.start(0.0, start["warp_k"]))
 
 
-def known_of(signal: Signal, radar: InverseRadar) -> dict:
+def _known_of(signal: Signal, radar: InverseRadar) -> dict:
     return {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
 
 
-def images(signal: Signal, radar: InverseRadar, estimate: Estimate, atoms: int) -> dict[str, Signal]:
+def _images(signal: Signal, radar: InverseRadar, estimate: Estimate, atoms: int) -> dict[str, Signal]:
     """The image of every method, on one Doppler axis (Hz)."""
     focus, flat = MatchedFourier(radar), RangePhase(radar)
     rotation = {name: estimate[name] for name in ("omega_rad_s", "warp_k", "yc_m")}
@@ -84,20 +81,20 @@ def images(signal: Signal, radar: InverseRadar, estimate: Estimate, atoms: int) 
         "no compensation": uncompensated,
         "chirplets (ACL)": uncompensated.with_data(chirplets),
         "uniform autofocus": focus(signal.with_data(uniform)),
-        "SM, order 2": focus(signal, second_order(signal, radar)["warp_k"]),
+        "SM, order 2": focus(signal, _second_order(signal, radar)["warp_k"]),
         "order 3, azimuth": focus(signal, rotation["warp_k"]),
         "order 3, two-dimensional": focus(flat(signal, **rotation), rotation["warp_k"]),
     }
 
 
-def scaled(image: Signal, radar: InverseRadar, rate_rad_s: Tensor) -> Signal:
+def _scaled(image: Signal, radar: InverseRadar, rate_rad_s: Tensor) -> Signal:
     """Doppler at the mean rate as cross range (m)."""
     doppler, range_ = image.axes
     scale = radar.wavelength_m / (2 * float(rate_rad_s))
     return Signal(image.data, (Axis("azimuth", doppler.n, doppler.start * scale, doppler.step * scale, "m"), range_))
 
 
-def cropped(image: Signal, azimuth: tuple[float, float], range_m: tuple[float, float], half_width_m: float) -> Signal:
+def _cropped(image: Signal, azimuth: tuple[float, float], range_m: tuple[float, float], half_width_m: float) -> Signal:
     edges_m = ([half_width_m * edge for edge in azimuth], range_m)
     bounds = {}
     for axis, edges in zip(image.axes, edges_m, strict=True):
@@ -106,45 +103,45 @@ def cropped(image: Signal, azimuth: tuple[float, float], range_m: tuple[float, f
     return image.crop(**bounds)
 
 
-def draw_target(truth: Truth, path: Path) -> None:
+def _draw_target(truth: Truth, path: Path) -> None:
     """Figure 4: the scatterers."""
     x, y, a = (plot.array(truth.values[name]) for name in ("cross_range_m", "range_m", "amplitude"))
     plot.save(plot.scatterers(y, x, abs(a), "range (m)", "cross range (m)", f"{len(x)} scatterers"), path)
 
 
-def over_peak(image: Signal) -> Signal:
+def _over_peak(image: Signal) -> Signal:
     return image.with_data(image.data / image.data.abs().max())
 
 
-def draw_images(shown: Mapping[str, Signal], half_width_m: float, out: Path) -> None:
+def _draw_images(shown: Mapping[str, Signal], half_width_m: float, out: Path) -> None:
     """Figures 5 to 8: every method and two regions of it, in dB of its peak.
 
     Figure 9: the best image alone, in metres. And all methods together, each over its peak.
     """
     for name, file in FIGURES.items():
         parts = {
-            region: cropped(shown[name], *edges, half_width_m) for region, edges in ({name: WHOLE} | REGIONS).items()
+            region: _cropped(shown[name], *edges, half_width_m) for region, edges in ({name: WHOLE} | REGIONS).items()
         }
         plot.save(plot.images(parts, 40, percentile=100), out / file, columns=3)
     compared = [
-        cropped(shown[name], *edges, half_width_m)
+        _cropped(shown[name], *edges, half_width_m)
         for edges in (WHOLE, REGIONS["A, tip of a panel"])
         for name in FIGURES
     ]
     titles = [*FIGURES, *(f"{name}: tip of a panel" for name in FIGURES)]
     plot.save(
         plot.images(
-            {title: over_peak(image) for title, image in zip(titles, compared, strict=True)},
+            {title: _over_peak(image) for title, image in zip(titles, compared, strict=True)},
             40,
             percentile=100,
         ),
         out / "methods.png",
     )
-    best = cropped(shown["order 3, two-dimensional"], *WHOLE, half_width_m)
+    best = _cropped(shown["order 3, two-dimensional"], *WHOLE, half_width_m)
     plot.save(plot.image(best, 40, "scaled to metres", percentile=100), out / "figure_09.png")
 
 
-def tips(image: Signal, truth: Truth) -> dict[float, float]:
+def _tips(image: Signal, truth: Truth) -> dict[float, float]:
     """Cross range (m) at which the brightest scatterer of each tip is seen, by its true one."""
     x, y, level = (truth.values[name] for name in ("cross_range_m", "range_m", "amplitude"))
     found = {}
@@ -154,62 +151,3 @@ def tips(image: Signal, truth: Truth) -> dict[float, float]:
             impulse_response(image, (x[which], y[which]), search_m=0.1)["position_azimuth_m"]
         )
     return found
-
-
-def table(raw: Mapping[str, Signal], target: str) -> None:
-    """Entropy and contrast of every image, beside expected ones."""
-    print(f"{target + ' target':26}{'entropy':>10}{'contrast':>10}{'expected':>10}{'expected':>10}")
-    for name, image in raw.items():
-        known = EXPECTED.get(name) if target == "mid" else None
-        print(
-            f"{name:26}{float(entropy(image)):>10.3f}{float(contrast(image)):>10.2f}"
-            + "".join(f"{'-' if value is None else value:>10}" for value in known or (None, None))
-        )
-
-
-def report(estimate: Estimate, image: Signal, truth: Truth) -> None:
-    for name, unit, value in (("omega_rad_s", "rad/s", 0.02), ("k1_per_s", "1/s", 10.0), ("k2_per_s2", "1/s2", 1000.0)):
-        print(f"{name:14}{float(estimate[name]):>12.6g} +- {float(estimate.std[name]):.2g} {unit}, truth {value:g}")
-    print(
-        "ok" if bool(estimate.ok) else "NOT ok",
-        "; tips:",
-        ", ".join(f"{seen:.3f} m for {true:.3f} m" for true, seen in tips(image, truth).items()),
-    )
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("rotation_satellite"), help="folder of the figures")
-    parser.add_argument(
-        "--target",
-        choices=TARGETS,
-        default="full",
-        help="how finely the satellite is sampled; the expected figures are of mid",
-    )
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--snr-db", type=float, default=20.0, help="mean power of all samples over the variance of the noise"
-    )
-    parser.add_argument("--small", action="store_true", help="a tiny target, few chirplets")
-    options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-
-    target = "tiny" if options.small else options.target
-    prf_hz, n_pulse, n_range, cell_m, count = TARGETS[target]
-    radar = InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * cell_m), prf_hz)
-    satellite = Satellite(count, half_width_m=TIP_M * prf_hz / 500e3)
-    world = TurntableWorld(satellite, rotation=ROTATION, snr_db=options.snr_db)
-    recording, truth = simulate_turntable(radar, world, n_pulse, n_range, Draws(options.seed))
-    signal = recording.signal
-    estimate = uneven_rotation(signal.data, **known_of(signal, radar))
-    raw = images(signal, radar, estimate, atoms=4 if options.small else 16)
-    table(raw, target)
-    rate = mean_rate(estimate["omega_rad_s"], estimate["warp_k"], n_pulse / prf_hz)
-    shown = {name: scaled(image, radar, rate) for name, image in raw.items()}
-    report(estimate, shown["order 3, two-dimensional"], truth)
-    draw_target(truth, options.out / "figure_04.png")
-    draw_images(shown, satellite.half_width_m, options.out)
-
-
-if __name__ == "__main__":
-    main()

@@ -11,7 +11,6 @@ reconstructed.
 
 from __future__ import annotations
 
-import argparse
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -30,8 +29,6 @@ from torchsar.multichannel import (
     MinimumMeanSquare,
     PointMotion,
     Reconstruct,
-    condition_number,
-    noise_gain_db,
 )
 from torchsar.multichannel.response import Rebuild
 from torchsar.multichannel.velocity.sir import Intensity, signal_intensity
@@ -56,15 +53,10 @@ EXPECTED_SIR = {
     "pattern": (7.3, 4.4, 11.6),
 }  # dB, peak of Gamma1, Gamma2, Gamma over their value at 0 m/s
 PUBLISHED_MFTA = {"band-limited": "below -60 dB", "pattern": "below -25 dB"}
-EXPECTED_PRF = (125.0, 160.0, 170.0, 180.0, 185.0, 187.0, 190.0, 195.0, 200.0, 250.0)
-EXPECTED_CONDITION = {  # at EXPECTED_PRF, condition number and noise gain (dB)
-    3: ((1, 2.7, 4.3, 10.2, 30.6, 153, 30.6, 10.2, 6.1, 1), (0, 2.6, 5.5, 12.2, 21.6, 35.5, 21.6, 12.2, 8.0, 0)),
-    2: ((1, 1.31, 1.37, 1.41, 1.41, 1.41, 1.41, 1.41, 1.39, 1), (0, 0.3, 0.4, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0)),
-}
 
 
 @dataclass(frozen=True)
-class Method:
+class _Method:
     """How bands are separated.
 
     Args:
@@ -77,11 +69,11 @@ class Method:
 
 
 METHODS = {
-    "conventional, N = 3": Method(LeastSquares(3), False),
-    "conventional, N = 2": Method(LeastSquares(2), False),
-    "proposed, N = 3": Method(LeastSquares(3), True),
-    "proposed, N = 2": Method(LeastSquares(2), True),
-    "proposed, MMSE, N = 5": Method(MinimumMeanSquare(5), True),
+    "conventional, N = 3": _Method(LeastSquares(3), False),
+    "conventional, N = 2": _Method(LeastSquares(2), False),
+    "proposed, N = 3": _Method(LeastSquares(3), True),
+    "proposed, N = 2": _Method(LeastSquares(2), True),
+    "proposed, MMSE, N = 5": _Method(MinimumMeanSquare(5), True),
 }
 EXPECTED_MFTA = {  # (gate, method) -> at (2, 10, 20) m/s for conventional, (0, 10, 20) for proposed
     ("band-limited", "conventional, N = 3"): (-17.7, -6.3, -1.1),
@@ -97,7 +89,7 @@ EXPECTED_MFTA = {  # (gate, method) -> at (2, 10, 20) m/s for conventional, (0, 
 }
 
 
-def simulated(u_r_m_s: Tensor, gate: Gate, seconds: float) -> Signal:
+def _simulated(u_r_m_s: Tensor, gate: Gate, seconds: float) -> Signal:
     """Channels (trial, channel, pulse) of one target a trial."""
     at_rest = torch.zeros(len(u_r_m_s), 1, dtype=torch.float64)
     world = BistaticWorld(MovingPoints(u_r_m_s[:, None], at_rest, at_rest, at_rest), gate)
@@ -105,16 +97,16 @@ def simulated(u_r_m_s: Tensor, gate: Gate, seconds: float) -> Signal:
     return simulate_bistatic(RADAR, world, round(seconds * RADAR.prf_hz), None, draws, dtype=torch.complex128)[0].signal
 
 
-def spectrum(data: Signal, rebuild: Rebuild, u_r_m_s: Tensor | float) -> Signal:
+def _spectrum(data: Signal, rebuild: Rebuild, u_r_m_s: Tensor | float) -> Signal:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what a poor condition does is the subject of this script
         return Reconstruct(RADAR, rebuild)(data, u_r_m_s)
 
 
-def replicas_db(data: Signal, u_r_m_s: Tensor, method: Method, gate: Gate) -> Tensor:
+def _replicas_db(data: Signal, u_r_m_s: Tensor, method: _Method, gate: Gate) -> Tensor:
     """MFTA within three pulse rates, (trial,)."""
     assumed = u_r_m_s if method.moving else torch.zeros_like(u_r_m_s)
-    image = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(spectrum(data, method.rebuild, assumed), assumed)
+    image = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(_spectrum(data, method.rebuild, assumed), assumed)
     seen = INTEGRATION_S if isinstance(gate, BandLimited) else None
     zones = replica_zones(
         RADAR, method.rebuild.bands, u_r_m_s, integration_s=seen, focused_at=(assumed, 0.0), orders=(1, 2, 3)
@@ -122,26 +114,16 @@ def replicas_db(data: Signal, u_r_m_s: Tensor, method: Method, gate: Gate) -> Te
     return replica_level(image.data, image.axis("azimuth").step, zones)["mfta_db"]
 
 
-def false_targets(speeds: Tensor) -> dict[str, dict[str, Tensor]]:
+def _false_targets(speeds: Tensor) -> dict[str, dict[str, Tensor]]:
     """MFTA (dB) by gate and method over u_r, (speed,)."""
     found = {}
     for name, gate in GATES.items():
-        data = simulated(speeds, gate, RECORD_S)
-        found[name] = {label: replicas_db(data, speeds, method, gate) for label, method in METHODS.items()}
+        data = _simulated(speeds, gate, RECORD_S)
+        found[name] = {label: _replicas_db(data, speeds, method, gate) for label, method in METHODS.items()}
     return found
 
 
-def show_false_targets(speeds: Tensor, found: Mapping[str, Mapping[str, Tensor]]) -> None:
-    print(f"{'MFTA (dB) over u_r (m/s)':36}" + "".join(f"{float(u):>8g}" for u in speeds))
-    for gate, methods in found.items():
-        for label, levels in methods.items():
-            print(f"{f'{gate}: {label}':36}" + "".join(f"{float(level):>8.1f}" for level in levels))
-            known = zip((0 if label.startswith("proposed") else 2, 10, 20), EXPECTED_MFTA[gate, label], strict=True)
-            print(f"{'  expected':36}" + "".join(f"   {level:g} at {u:g} m/s" for u, level in known))
-        print(f"{'  published, proposed':36}   {PUBLISHED_MFTA[gate]}")
-
-
-def draw_false_targets(speeds: Tensor, found: Mapping[str, Mapping[str, Tensor]], out: Path) -> None:
+def _draw_false_targets(speeds: Tensor, found: Mapping[str, Mapping[str, Tensor]], out: Path) -> None:
     """Figure 17."""
     parts = []
     for gate, methods in found.items():
@@ -152,14 +134,14 @@ def draw_false_targets(speeds: Tensor, found: Mapping[str, Mapping[str, Tensor]]
     plot.save(plot.panels(parts), out / "figure_17.png")
 
 
-def draw_spectra(data: Mapping[str, Signal], out: Path) -> None:
+def _draw_spectra(data: Mapping[str, Signal], out: Path) -> None:
     """Figures 10 and 11: spectra of a target of 10 m/s rebuilt with guesses of its velocity, over
     Doppler from zero; dashed: the processed band about the guess.
     """
     for figure, signal in zip((10, 11), data.values(), strict=True):
         parts = []
         for guess in GUESSES_M_S:
-            rebuilt = spectrum(signal, LeastSquares(3), guess)
+            rebuilt = _spectrum(signal, LeastSquares(3), guess)
             centre = guess / RADAR.wavelength_m
             curve = (plot.array(rebuilt.axis("doppler").values() + centre), plot.decibel(rebuilt.data[0]))
             edges = {"processed band": centre - BANDWIDTH_HZ / 2, "its end": centre + BANDWIDTH_HZ / 2}
@@ -176,25 +158,25 @@ def draw_spectra(data: Mapping[str, Signal], out: Path) -> None:
         plot.save(plot.panels(parts), out / f"figure_{figure}.png", columns=3)
 
 
-def intensity(signal: Signal, guesses: Tensor) -> Intensity:
+def _intensity(signal: Signal, guesses: Tensor) -> Intensity:
     """Of one trial, over guesses of u_r."""
     data = signal.data[0, None, ..., None].expand(len(guesses), -1, -1, -1)
     return signal_intensity(data, RADAR, PointMotion.of(RADAR, data, guesses), LeastSquares(3), BANDWIDTH_HZ)
 
 
-def ratios_db(found: Intensity) -> dict[str, Tensor]:
+def _ratios_db(found: Intensity) -> dict[str, Tensor]:
     return {
         name: 10 * torch.log10(ratio)
         for name, ratio in (("Gamma1", found.power_ratio), ("Gamma2", found.amplitude_ratio), ("Gamma", found.ratio))
     }
 
 
-def draw_ratios(data: Mapping[str, Signal], guesses: Tensor, out: Path) -> None:
+def _draw_ratios(data: Mapping[str, Signal], guesses: Tensor, out: Path) -> None:
     """Figure 12, and where the curves peak."""
     parts = []
     print(f"\n{'intensity ratio':26}{'peak (m/s)':>12}{'over 0 m/s (dB)':>18}{'expected (dB)':>18}")
     for gate, signal in data.items():
-        curves = ratios_db(intensity(signal, guesses))
+        curves = _ratios_db(_intensity(signal, guesses))
         for (name, curve), known in zip(curves.items(), EXPECTED_SIR[gate], strict=True):
             print(
                 f"{f'{gate}: {name}':26}{float(guesses[curve.argmax()]):>12.2f}"
@@ -209,79 +191,3 @@ def draw_ratios(data: Mapping[str, Signal], guesses: Tensor, out: Path) -> None:
         "further out alias into these and lower the band-limited peaks by as much as shown"
     )
     plot.save(plot.panels(parts), out / "figure_12.png")
-
-
-def conditions(radar: BistaticRadar, rates: Tensor, bands: int) -> tuple[Tensor, Tensor]:
-    """Condition number and noise gain (dB) of least squares for points at rest over pulse rates."""
-    radars = [replace(radar, prf_hz=float(prf)) for prf in rates]
-    at_rest = PointMotion.of(radar, torch.zeros((), dtype=torch.float64))
-    return torch.stack([condition_number(r, at_rest, bands) for r in radars]), torch.stack(
-        [noise_gain_db(r, at_rest, LeastSquares(bands)) for r in radars]
-    )
-
-
-def show_conditions() -> None:
-    rates = torch.tensor(EXPECTED_PRF, dtype=torch.float64)
-    print(f"\n{'pulse rate (Hz)':30}" + "".join(f"{prf:>8g}" for prf in EXPECTED_PRF))
-    for bands, known in EXPECTED_CONDITION.items():
-        for name, values, expected in zip(
-            ("condition", "noise gain (dB)"), conditions(RADAR, rates, bands), known, strict=True
-        ):
-            print(f"{f'N = {bands}, {name}':30}" + "".join(f"{float(x) + 0.0:>8.2f}" for x in values))
-            print(f"{'  expected':30}" + "".join(f"{x:>8g}" for x in expected))
-        print(
-            f"{f'N = {bands}, uneven, condition':30}"
-            + "".join(f"{float(x):>8.2f}" for x in conditions(UNEVEN, rates, bands)[0])
-        )
-    print(
-        "uneven: channels at -0.8, 0, 0.75 m; expected at 180 Hz: 5.8 with N = 3, 1.39 with "
-        "N = 2; their outer two sample the same positions at 300 / 1.55 = 193.5 Hz"
-    )
-
-
-def draw_conditions(rates: Tensor, out: Path) -> None:
-    """Condition and noise gain over the pulse rate; even channels sample the same positions twice
-    at 187.5 Hz.
-    """
-    cases = {
-        f"N = {bands}, {name}": conditions(radar, rates, bands)
-        for bands in (3, 2)
-        for name, radar in (("even", RADAR), ("uneven", UNEVEN))
-    }
-    labels = (
-        ("condition number (dB)", lambda pair: 20 * torch.log10(pair[0])),
-        ("noise gain (dB)", lambda pair: pair[1]),
-    )
-    parts = []
-    for label, of in labels:
-        series = {name: (plot.array(rates), plot.array(of(pair))) for name, pair in cases.items()}
-        parts.append({"series": series, "xlabel": "pulse rate (Hz)", "ylabel": label, "ylim": (-2.0, 60.0)})
-    plot.save(plot.panels(parts), out / "condition.png")
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("geo_reconstruction"), help="folder of the figures")
-    parser.add_argument("--small", action="store_true", help="few velocities and pulse rates")
-    options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-
-    shown = torch.tensor([-20.0, -10.0, -2.0, 0.0, 2.0, 10.0, 20.0], dtype=torch.float64)
-    speeds = shown if options.small else torch.linspace(-20, 20, 41, dtype=torch.float64)
-    found = false_targets(speeds)
-    at = [int((speeds == u).nonzero()) for u in shown]
-    show_false_targets(
-        shown, {gate: {method: levels[at] for method, levels in methods.items()} for gate, methods in found.items()}
-    )
-    draw_false_targets(speeds, found, options.out)
-
-    moving = torch.tensor([TRUE_M_S], dtype=torch.float64)
-    data = {name: simulated(moving, gate, 8.0 if name == "band-limited" else RECORD_S) for name, gate in GATES.items()}
-    draw_spectra(data, options.out)
-    draw_ratios(data, torch.linspace(0, 20, 41 if options.small else 201, dtype=torch.float64), options.out)
-    show_conditions()
-    draw_conditions(torch.arange(120.0, 250.1, 5.0 if options.small else 0.5, dtype=torch.float64), options.out)
-
-
-if __name__ == "__main__":
-    main()
