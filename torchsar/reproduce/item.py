@@ -27,8 +27,8 @@ class Check:
         ours: Our number, or the numbers behind our answer in words.
         std: Standard deviation of our number: 0 without random numbers, None after a single draw
             and of statements.
-        tolerance: Largest difference that counts as reproduced, on top of two standard deviations;
-            None for statements.
+        tolerance: Largest difference that counts as reproduced (see `verdict`); None for
+            statements.
         verdict: `REPRODUCED`, `BETTER` or `NOT_REPRODUCED`.
     """
 
@@ -47,7 +47,8 @@ def verdict(published: float, ours: float, std: float, tolerance: float, better:
         published: Published number.
         ours: Our number; a number that is not finite is not a reproduction.
         std: Standard deviation of our number.
-        tolerance: Largest difference that counts as reproduced, on top of two standard deviations.
+        tolerance: Largest difference that counts as reproduced. Two standard deviations come on top
+            of it, but no more than the tolerance again, so that a poor estimate proves nothing.
         better: "lower" or "higher" where a number beyond the published one is an improvement.
 
     Returns:
@@ -55,7 +56,7 @@ def verdict(published: float, ours: float, std: float, tolerance: float, better:
         `NOT_REPRODUCED`.
     """
     gap = ours - published
-    if abs(gap) <= tolerance + 2 * std:
+    if abs(gap) <= tolerance + min(2 * std, tolerance):
         return REPRODUCED
     improved = (better == "lower" and gap < 0) or (better == "higher" and gap > 0)
     return BETTER if improved and math.isfinite(gap) else NOT_REPRODUCED
@@ -70,7 +71,7 @@ def number(
         name: What is compared, with its unit.
         published: Published number.
         ours: Our number, or one number per random draw, whose mean is compared.
-        tolerance: Largest difference that counts as reproduced, on top of two standard deviations.
+        tolerance: Largest difference that counts as reproduced (see `verdict`).
         better: "lower" or "higher" where a number beyond the published one is an improvement.
         std: Standard deviation of a single number; that of a mean follows from the draws.
 

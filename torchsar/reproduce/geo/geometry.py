@@ -1,11 +1,9 @@
-"""Effects of orbit, pulse rate and velocities in a GEO spaceborne-airborne bistatic radar: figures
-2 to 4 and 8 of Remote Sens. 2020, 12, 1703.
+"""Effects of pulse rate and velocities in a GEO spaceborne-airborne bistatic radar: figures 2 to 4
+and 8 of Remote Sens. 2020, 12, 1703.
 
-    python scripts/geo_geometry.py [--out geo_geometry] [--small]
-
-The pulse rate of the satellite must leave a swath free of its own pulses, and the range to it
-changes slowly over its orbit. In the channels of the receiver a moving target causes a delay, which
-depends on its along-track speed, and a phase, which depends on its slant-range speed.
+The pulse rate of the satellite must leave a swath free of its own pulses. In the channels of the
+receiver a moving target causes a delay, which depends on its along-track speed, and a phase, which
+depends on its slant-range speed.
 """
 
 from __future__ import annotations
@@ -19,31 +17,18 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.multichannel import PointMotion
 from torchsar.multichannel.response import doppler_centre_hz, shared_response
-from torchsar.radar import (
-    BistaticRadar,
-    LinearFM,
-    Orbit,
-    TimingDiagram,
-    receive_range,
-    timing_diagram,
-)
+from torchsar.radar import TimingDiagram, receive_range, timing_diagram
 from torchsar.radar.timing import off_nadir_ground_m
+from torchsar.reproduce.geo.sensor import HEIGHT_M, INTEGRATION_S, OFF_NADIR_DEG, RADAR
+from torchsar.reproduce.item import Check, Item, number, statement
 
-RADAR = BistaticRadar(
-    1.25e9,
-    LinearFM(50e6, 10e-6),
-    sampling_hz=60e6,
-    prf_hz=180.0,
-    speed_m_s=300.0,
-    reference_range_m=5000.0,
-    wave_speed_m_s=3e8,
-)
-HEIGHT_M, OFF_NADIR_DEG, SWATH_M, INTEGRATION_S = 36_500e3, 7.0, 500e3, 4.5
-ORBIT = Orbit.at_height(HEIGHT_M, inclination_deg=60.0, raan_deg=195.5, argument_of_perigee_deg=270.0)
-PULSE_S, GUARD_S, NADIR_S = 10e-6, 50e-6, 200e-6  # the paper gives none of them
+# width of the swath of figure 2 (m)
+SWATH_M = 500e3
+# chosen: pulse length, guard time, length of the nadir echo (s)
+PULSE_S, GUARD_S, NADIR_S = 10e-6, 50e-6, 200e-6
 LEFT_K1_M_S = -243.0  # of the transmit range, where it stays in the data
+# pulse rates within the published span (Hz)
 RATES = (160.0, 168.0, 180.0, 188.0, 196.0)
-SPEEDS = (0.0, 5.0, 10.0, 15.0, 20.0)
 
 
 def _timing(small: bool) -> TimingDiagram:
@@ -71,7 +56,7 @@ def _nearest_swaths(diagram: TimingDiagram) -> dict[float, float]:
     }
 
 
-def _draw_timing(diagram: TimingDiagram, out: Path) -> None:
+def _draw_timing(diagram: TimingDiagram, path: Path) -> None:
     """Figure 2: what is lost to nadir echoes (1) and to transmitted pulses (2); white lines: the
     nearest clear swath at every second pulse rate.
     """
@@ -101,7 +86,7 @@ def _draw_timing(diagram: TimingDiagram, out: Path) -> None:
                 color="white",
                 linewidth=1.0,
             )
-    plot.save(figure, out / "figure_02.png")
+    plot.save(figure, path)
 
 
 def _motion(u_r: Tensor | float, u_a: Tensor | float) -> PointMotion:
@@ -160,7 +145,7 @@ def _worst_phase_rad(u_r: Tensor | float, u_a: Tensor | float) -> Tensor:
     return 2 * math.pi / RADAR.wavelength_m * (moving + point.u_r_m_s * time - at_rest).abs().amax(-1)
 
 
-def _draw_errors(speed: Tensor, out: Path) -> None:
+def _draw_errors(speed: Tensor, path: Path) -> None:
     """Figure 8: phase errors within the integration time, and phases of the channels."""
     x = plot.array(speed)
     imbalance = _phase_shift_rad(_motion(speed, 0.0))
@@ -180,4 +165,56 @@ def _draw_errors(speed: Tensor, out: Path) -> None:
         },
         {"series": channels, "xlabel": "u_r (m/s)", "ylabel": "phase (rad)", "title": "imbalance of channels by u_r"},
     ]
-    plot.save(plot.panels(parts), out / "figure_08.png", columns=3)
+    plot.save(plot.panels(parts), path, columns=3)
+
+
+def _speeds(small: bool) -> Tensor:
+    """0 to 20 m/s; the reduced form is the full one."""
+    return torch.linspace(0, 20, 41, dtype=torch.float64)
+
+
+def _figure_2(diagram: TimingDiagram, path: Path) -> list[Check]:
+    _draw_timing(diagram, path)
+    swaths = _nearest_swaths(diagram)
+    ours = ", ".join(f"{prf:g} Hz: {swaths[prf] / 1e3:+.0f} km" for prf in RATES if prf in swaths)
+    holds = all(prf in swaths for prf in RATES)
+    told = "pulse rates of 160 to 200 Hz, such as 180 Hz, leave 500 km clear"
+    return [statement("clear swath, and its middle from 7 degrees off nadir", told, holds, ours)]
+
+
+def _figure_3(speed: Tensor, path: Path) -> list[Check]:
+    point = _motion(0.0, speed)
+    _draw_parameters(speed, point, "u_a", path)
+    velocity, shift = point.effective_m_s, float(_phase_shift_rad(point)[:, 2].abs().max())
+    return [
+        number("relative velocity at rest (m/s)", 300.0, float(velocity[0]), 0.5),
+        number("relative velocity at 20 m/s along track (m/s)", 280.0, float(velocity[-1]), 0.5),
+        statement("phase shift", "independent of the along-track velocity", shift < 1e-3, f"at most {shift:.1g} rad"),
+    ]
+
+
+def _figure_4(speed: Tensor, path: Path) -> list[Check]:
+    point = _motion(speed, 0.0)
+    _draw_parameters(speed, point, "u_r", path)
+    change = 100 * float((_delay_s(point)[-1, 2] / _delay_s(point)[0, 2] - 1).abs())
+    shift = float(_phase_shift_rad(point)[-1, 2])
+    ours = f"at 20 m/s the delay changes by {change:.2f} %, the phase by {shift:.2f} rad"
+    told = "a small effect on velocity and delay, a clear one on the phase"
+    return [statement("slant-range velocity", told, change < 1 < abs(shift), ours)]
+
+
+def _figure_8(speed: Tensor, path: Path) -> list[Check]:
+    _draw_errors(speed, path)
+    along, across = (float(_worst_phase_rad(*u)) for u in ((0.0, 10.0), (10.0, 0.0)))
+    imbalance = float(_phase_shift_rad(_motion(10.0, 0.0))[2].abs())
+    ours = f"at 10 m/s {along:.1f} rad along track, {across:.2f} rad in slant range; imbalance {imbalance:.2f} rad"
+    told = "larger by the along-track velocity; the slant-range velocity unbalances the channels"
+    return [statement("phase errors", told, along > across and imbalance > 0.5, ours)]
+
+
+ITEMS = (
+    Item("Figure 2", "timing diagram: pulse rates that leave a swath clear", of=_timing, make=_figure_2),
+    Item("Figure 3", "effects of the along-track velocity on the channels", of=_speeds, make=_figure_3),
+    Item("Figure 4", "effects of the slant-range velocity on the channels", of=_speeds, make=_figure_4),
+    Item("Figure 8", "phase errors by the velocity of the target", of=_speeds, make=_figure_8),
+)

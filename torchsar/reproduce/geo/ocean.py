@@ -1,8 +1,6 @@
 """Moving ships on a sea before a GEO spaceborne-airborne bistatic radar: figure 18 of Remote Sens.
 2020, 12, 1703.
 
-    python scripts/geo_ocean.py [--out geo_ocean] [--seed 1] [--small]
-
 Ship 1 rests, ship 2 closes at 10 m/s, ship 3 closes at 10 m/s and moves along track at 10 m/s. In
 an image focused for targets at rest, approaching ships are displaced and repeated; the method of
 figure 13 detects moving targets, removes their echoes, and images them at their true positions. The
@@ -12,7 +10,7 @@ source prints azimuth on x = (V_R - u_a) t of each target.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,27 +20,24 @@ from torchsar import plot
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_bistatic
 from torchsar.multichannel import Body, Detector, Extraction, ImageMovers, PointMotion, RemoveTransmitRange, SceneImage
-from torchsar.radar import BistaticRadar, LinearFM
+from torchsar.reproduce.geo.sensor import RADAR as SENSOR
+from torchsar.reproduce.geo.sensor import TRANSMIT_RANGE
+from torchsar.reproduce.item import Check, Item, number, statement
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, KSea, Ship
 
-RADAR = BistaticRadar(
-    1.25e9,
-    LinearFM(50e6, 10e-6),
-    sampling_hz=60e6,
-    prf_hz=180.0,
-    speed_m_s=300.0,
-    reference_range_m=5700.0,
-    transmit_range=(-243.0, 0.02, 5e-7),
-    wave_speed_m_s=3e8,
-)
-# displacement and distance of the false target, m
+# the middle of the swath of figure 18, with the range to the satellite in the echo
+RADAR = replace(SENSOR, reference_range_m=5700.0, transmit_range=TRANSMIT_RANGE)
+# displacement and distance of the false target (m)
 PUBLISHED = {"ship 2": (216.3, 934.58), "ship 3": (167.6, 723.99)}
+# velocities and ranges as published; places along track are chosen
 SHIPS = {
     "ship 1": Ship(0.0, 0.0, -300.0, 0.0),
     "ship 2": Ship(10.0, 0.0, 0.0, 790.0),
     "ship 3": Ship(10.0, 10.0, 100.0, -840.0),
 }
+# for the reduced form
 SMALL = {"ship 2": Ship(10.0, 0.0, 0.0, 0.0, length_m=40.0, range_cells=2, count=6)}
+# chosen: of a ship in its line, and of the sea
 SCR_DB, CNR_DB = 10.0, 30.0
 
 
@@ -75,7 +70,7 @@ def _small() -> _Setting:
     )
 
 
-def _received(setting: _Setting, seed: int) -> Signal:
+def _received(setting: _Setting) -> Signal:
     """Channels (channel, pulse, range) without the transmit range, the sea of unit power."""
     ships = {
         name: Ship(
@@ -91,7 +86,7 @@ def _received(setting: _Setting, seed: int) -> Signal:
         for name, ship in setting.ships.items()
     }
     world = BistaticWorld(Fleet(ships), BandLimited(setting.gate_s), KSea(shape=1.5), snr_db=CNR_DB)
-    recording, _ = simulate_bistatic(RADAR, world, setting.pulses, setting.lines, Draws(seed))
+    recording, _ = simulate_bistatic(RADAR, world, setting.pulses, setting.lines, Draws(1))
     return RemoveTransmitRange(RADAR)(recording.signal)
 
 
@@ -149,4 +144,37 @@ def _draw(setting: _Setting, made: SceneImage, path: Path) -> None:
         35.0,
     )
     plot.save(figure, path, columns=3)
-    print(f"wrote {path}")
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A scene and its image."""
+
+    setting: _Setting
+    made: SceneImage
+
+
+def _sea(small: bool) -> _Seen:
+    setting = _small() if small else _whole()
+    return _Seen(setting, setting.flow(_received(setting)))
+
+
+def _figure_18(seen: _Seen, path: Path) -> list[Check]:
+    """What the motion that was found of each ship says; true and found velocities in words."""
+    _draw(seen.setting, seen.made, path)
+    checks = []
+    for name, ship in seen.setting.ships.items():
+        body = _nearest(ship, seen.made.bodies)
+        if not ship.u_r_m_s:
+            continue
+        found = "nothing" if body is None else f"{float(body.motion.u_r_m_s):.2f}, {float(body.motion.u_a_m_s):.2f} m/s"
+        close = body is not None and abs(float(body.motion.u_r_m_s) - ship.u_r_m_s) < 0.5
+        checks.append(statement(f"{name} at {ship.u_r_m_s:g}, {ship.u_a_m_s:g} m/s", "focused", close, found))
+        if body is not None and len(seen.setting.ships) > 1:
+            words = ("displacement (m)", "distance of the false target (m)")
+            rows = zip(words, PUBLISHED[name], _predicted(body.motion), strict=True)
+            checks += [number(f"{name}: {what}", theirs, [ours], 0.02 * theirs) for what, theirs, ours in rows]
+    return checks
+
+
+ITEMS = (Item("Figure 18", "moving ships on a sea", of=_sea, make=_figure_18),)
