@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ def made_with(small: bool, seconds: float) -> dict[str, Any]:
     }
 
 
+@cache
 def commit() -> str | None:
     """Return the commit of the source tree that the package is in.
 
