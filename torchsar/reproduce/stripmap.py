@@ -110,7 +110,7 @@ def _uneven(small: bool) -> Recording:
     draws = Draws(1)
     azimuth, range_ = (width * draws.uniform(name, (MANY,)) for name, width in (("along", 2400.0), ("across", 300.0)))
     level = draws.uniform("level", (MANY,)) ** 4
-    points = Points(azimuth_m=azimuth - 1200.0, range_m=range_ - 150.0, amplitude=level, random_phase=True)
+    points = Points((azimuth - 1200.0).tolist(), (range_ - 150.0).tolist(), level.tolist(), random_phase=True)
     return _simulated(points, DOPPLER_HZ)
 
 

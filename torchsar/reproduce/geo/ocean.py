@@ -168,7 +168,7 @@ def _figure_18(seen: _Seen, path: Path) -> list[Check]:
         if not ship.u_r_m_s:
             continue
         found = "nothing" if body is None else f"{float(body.motion.u_r_m_s):.2f}, {float(body.motion.u_a_m_s):.2f} m/s"
-        close = body is not None and abs(float(body.motion.u_r_m_s) - ship.u_r_m_s) < 0.5
+        close = body is not None and abs(float(body.motion.u_r_m_s - ship.u_r_m_s)) < 0.5
         checks.append(statement(f"{name} at {ship.u_r_m_s:g}, {ship.u_a_m_s:g} m/s", "focused", close, found))
         if body is not None and len(seen.setting.ships) > 1:
             words = ("displacement (m)", "distance of the false target (m)")

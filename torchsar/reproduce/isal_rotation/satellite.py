@@ -69,13 +69,15 @@ class _Seen:
 def _satellite(small: bool) -> _Seen:
     prf_hz, n_pulse, n_range, cell_m, count, atoms = SIZES[small]
     radar = InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * cell_m), prf_hz)
-    satellite = Satellite(count, half_width_m=TIP_M * prf_hz / 500e3)
-    world = TurntableWorld(satellite, rotation=ROTATION, snr_db=SNR_DB)
+    half_width_m = TIP_M * prf_hz / 500e3
+    world = TurntableWorld(Satellite(count, half_width_m), rotation=ROTATION, snr_db=SNR_DB)
     recording, truth = simulate_turntable(radar, world, n_pulse, n_range, Draws(1))
     estimate = uneven_rotation(recording.signal.data, **_known_of(recording.signal, radar))
     rate = mean_rate(estimate["omega_rad_s"], estimate["warp_k"], n_pulse / prf_hz)
     made = _images(recording.signal, radar, estimate, atoms)
-    return _Seen({name: _scaled(x, radar, rate) for name, x in made.items()}, estimate, truth, satellite.half_width_m)
+    return _Seen(
+        {name: _scaled(x, radar, rate) for name, x in made.items()}, estimate, truth, float(satellite.half_width_m)
+    )
 
 
 def _second_order(signal: Signal, radar: InverseRadar) -> Estimate:

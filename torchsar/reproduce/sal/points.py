@@ -35,7 +35,8 @@ RADAR = TriangularLadar(
 )
 # not published: an azimuth aperture of 0.342 m, for the published 6.0 mm; places and motion
 BEAM_RAD = 114e-6
-SCENE = Points(azimuth_m=[-0.06, 0.0, 0.06], range_m=[1.0, 1.5, 2.0], amplitude=[0.7, 1.0, 0.7])
+PLACES_M = ((-0.06, 1.0), (0.0, 1.5), (0.06, 2.0))
+SCENE = Points(*zip(*PLACES_M, strict=True), amplitude=[0.7, 1.0, 0.7])
 MOTION = (
     Polynomial((0.35, 10.0)),
     Sinusoid(160e-6, 100.0, math.degrees(0.3)),
@@ -278,9 +279,9 @@ def _figure_8(seen: _Seen, path: Path) -> list[Check]:
     before, after = (
         _near(finer_in_range(finer_in_range(seen.traces[name].signal))) for name in ("uncompensated", "segmented")
     )
-    points = {f"point at {r:g} m": _around(after, x, r) for x, r in zip(SCENE.azimuth_m, SCENE.range_m, strict=True)}
+    points = {f"point at {r:g} m": _around(after, x, r) for x, r in PLACES_M}
     plot.save(plot.contours({"no compensation": before, "segmented interference": after, **points}), path, columns=3)
-    levels = [_response(image, x, r)["pslr_azimuth_db"] for x, r in zip(SCENE.azimuth_m, SCENE.range_m, strict=True)]
+    levels = [_response(image, x, r)["pslr_azimuth_db"] for x, r in PLACES_M]
     ours = "PSLR in azimuth " + ", ".join(f"{level:.2f}" for level in levels) + " dB"
     return [statement("contours", "all three points are focused", max(levels) < -12, ours)]
 
