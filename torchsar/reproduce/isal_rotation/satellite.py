@@ -75,9 +75,7 @@ def _satellite(small: bool) -> _Seen:
     estimate = uneven_rotation(recording.signal.data, **_known_of(recording.signal, radar))
     rate = mean_rate(estimate["omega_rad_s"], estimate["warp_k"], n_pulse / prf_hz)
     made = _images(recording.signal, radar, estimate, atoms)
-    return _Seen(
-        {name: _scaled(x, radar, rate) for name, x in made.items()}, estimate, truth, float(satellite.half_width_m)
-    )
+    return _Seen({name: _scaled(x, radar, rate) for name, x in made.items()}, estimate, truth, half_width_m)
 
 
 def _second_order(signal: Signal, radar: InverseRadar) -> Estimate:
