@@ -47,8 +47,8 @@ def verdict(published: float, ours: float, std: float, tolerance: float, better:
         published: Published number.
         ours: Our number; a number that is not finite is not a reproduction.
         std: Standard deviation of our number.
-        tolerance: Largest difference that counts as reproduced. Two standard deviations come on top
-            of it, but no more than the tolerance again, so that a poor estimate proves nothing.
+        tolerance: Largest difference that counts as reproduced. The standard deviation does not
+            widen it, and must not exceed it, so that a poor estimate proves nothing.
         better: "lower" or "higher" where a number beyond the published one is an improvement.
 
     Returns:
@@ -56,7 +56,7 @@ def verdict(published: float, ours: float, std: float, tolerance: float, better:
         `NOT_REPRODUCED`.
     """
     gap = ours - published
-    if abs(gap) <= tolerance + min(2 * std, tolerance):
+    if abs(gap) <= tolerance and std <= tolerance:
         return REPRODUCED
     improved = (better == "lower" and gap < 0) or (better == "higher" and gap > 0)
     return BETTER if improved and math.isfinite(gap) else NOT_REPRODUCED

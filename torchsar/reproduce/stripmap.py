@@ -106,11 +106,11 @@ def _wrapped(small: bool) -> _Strip:
 
 
 def _uneven(small: bool) -> Recording:
-    """Points at random places; the reduced form is the full one."""
+    """Points at random places, wherever the beam looks; the reduced form is the full one."""
     draws = Draws(1)
-    azimuth, range_ = (width * draws.uniform(name, (MANY,)) for name, width in (("along", 2400.0), ("across", 300.0)))
+    azimuth, range_ = (width * draws.uniform(name, (MANY,)) for name, width in (("along", 5400.0), ("across", 300.0)))
     level = draws.uniform("level", (MANY,)) ** 4
-    points = Points((azimuth - 1200.0).tolist(), (range_ - 150.0).tolist(), level.tolist(), random_phase=True)
+    points = Points((azimuth - 2700.0).tolist(), (range_ - 150.0).tolist(), level.tolist(), random_phase=True)
     return _simulated(points, DOPPLER_HZ)
 
 

@@ -222,7 +222,7 @@ class _Deviations:
 
 def _deviations(small: bool) -> _Deviations:
     """A tiny satellite and few deviations in the reduced form."""
-    yc = torch.linspace(-3, 3, 3 if small else 7, dtype=torch.float64)
+    yc = torch.linspace(-3, 3, 2 if small else 7, dtype=torch.float64)
     size = (_instrument(0.24, 50e3), 1000, 32, 60) if small else (_instrument(0.24, 500e3), 10000, 32, 300)
     return _Deviations(yc, _whole_image(yc, *size, SNR_DB))
 

@@ -161,8 +161,14 @@ def _figure_7(seen: _Seen, path: Path) -> list[Check]:
 
 
 def _figure_8(seen: _Seen, path: Path) -> list[Check]:
-    """The recommended estimator, which gets nothing but the data."""
+    """The recommended estimator, which gets nothing but the data; and all methods in one picture."""
     _draw(seen, "order 3, two-dimensional", path)
+    shown = {}
+    for suffix, edges in (("", WHOLE), (": tip of a panel", REGIONS["A, tip of a panel"])):
+        for name in SHOWN:
+            image = _cropped(seen.shown[name], *edges, seen.half_width_m)
+            shown[name + suffix] = image.with_data(image.data / image.data.abs().max())
+    plot.save(plot.images(shown, 40, percentile=100), path.with_stem(f"{path.stem}_methods"))
     return [
         falling("entropy (nats)", seen.entropies("SM, order 2", "order 3, azimuth", "order 3, two-dimensional")),
         *(

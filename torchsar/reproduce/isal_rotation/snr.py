@@ -94,7 +94,7 @@ def _recommended(signal: Signal, radar: InverseRadar) -> Estimate:
     )
 
 
-def _genetic(oversampling: float, generations: int) -> Finder:
+def _genetic(oversampling: float, generations: int, population: int = 30) -> Finder:
     """All trials of a batch at once, each with random numbers of its own."""
 
     def find(signal: Signal, radar: InverseRadar) -> Estimate:
@@ -103,6 +103,7 @@ def _genetic(oversampling: float, generations: int) -> Finder:
             LOW,
             HIGH,
             draws=Draws(1, trials=range(len(signal.data))),
+            population=population,
             generations=generations,
         )
 
@@ -196,12 +197,12 @@ class _Errors:
 
 
 def _small_target(small: bool) -> _Errors:
-    """Three scenes of a tiny target at two SNR in the reduced form, and one generation."""
-    target, trials, few, generations = (TINY, 3, 2, 1) if small else (SMALL, TRIALS, GENETIC, 30)
+    """Two scenes of a tiny target at two SNR in the reduced form, and a generation of six."""
+    target, trials, few, search = (TINY, 2, 2, (1, 6)) if small else (SMALL, TRIALS, GENETIC, (30,))
     methods = {
         "recommended": (_recommended, trials),
-        "GA, 1 line": (_genetic(1.0, generations), few),
-        "GA, 4 lines": (_genetic(4.0, generations), few),
+        "GA, 1 line": (_genetic(1.0, *search), few),
+        "GA, 4 lines": (_genetic(4.0, *search), few),
     }
     at = (SNR_DB[0], SNR_DB[-1]) if small else SNR_DB
     found = {(name, snr): _errors(find, target, snr, 1, n) for snr in at for name, (find, n) in methods.items()}
@@ -241,8 +242,8 @@ class _Tips:
 
 
 def _full_target(small: bool) -> _Tips:
-    """The tiny target, two scenes and one generation in the reduced form."""
-    target, scenes, search = (TINY, 2, _genetic(1.0, 1)) if small else (FULL, SCENES, _genetic(1.0, 5))
+    """One scene of the tiny target and a generation of six in the reduced form."""
+    target, scenes, search = (TINY, 1, _genetic(1.0, 1, 6)) if small else (FULL, SCENES, _genetic(1.0, 5))
     tips = _Tips({}, {}, {}, {}, {})
     for snr in SNR_DB:
         signal, truth = target.simulated(snr, 1, range(scenes))
