@@ -80,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
     one = commands.add_parser("reproduce", help=_REPRODUCE, description=_REPRODUCE[0].upper() + _REPRODUCE[1:] + ".")
     one.add_argument("paper", nargs="?", metavar="PAPER", help="sal, geo, isal, isal_rotation or stripmap; all without")
     one.add_argument("item", nargs="?", metavar="ITEM", help="such as table2 or figure5; all without")
-    one.add_argument("--small", action="store_true", help="the reduced form, which takes a minute in all")
+    one.add_argument("--small", action="store_true", help="the reduced form, which takes minutes in all")
     one.add_argument(
         "--out", type=_place, default=Path("out") / "reproduce", metavar="DIR", help="folder of records and pictures"
     )

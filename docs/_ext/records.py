@@ -248,14 +248,16 @@ class ReproducedTable(SphinxDirective):
 
 
 class ReproducedCounts(SphinxDirective):
-    """How many figures and tables of every paper have which verdict."""
+    """How many figures and tables of every paper have which verdict; a reduced form has none."""
 
     def run(self) -> list[nodes.Node]:
-        words = ("reproduced", "better", "not reproduced", "diagram", "photograph")
+        words = ("reproduced", "better", "not reproduced", "reduced form only", "diagram", "photograph")
         lines = [f"| paper | {' | '.join(words)} |", f"| --- {'| ---: ' * len(words)}|"]
         for path in sorted((Path(self.env.srcdir) / "reproduce").glob("*.json")):
             self.env.note_dependency(str(path))
-            verdicts = [one["verdict"] for one in json.loads(path.read_text(encoding="utf-8"))["items"]]
+            items = json.loads(path.read_text(encoding="utf-8"))["items"]
+            reduced = [bool(one["made"]) and one["made"]["form"] == "reduced" for one in items]
+            verdicts = [words[3] if few else one["verdict"] for one, few in zip(items, reduced, strict=True)]
             lines.append(f"| `{path.stem}` | {' | '.join(str(verdicts.count(word)) for word in words)} |")
         return self.parse_text_to_nodes("\n".join(lines))
 

@@ -184,9 +184,9 @@ PAPER = Paper(
             "table",
             _cases,
             _table_1,
-            "random phases of pi rms are as good as uniform, like those of 2 pi, so that rows 3 and 4 must agree for "
-            "polluted images and PGA; the published rows differ, by noise, another target or processing that the "
-            "paper does not report",
+            "polluted images depend on the target most, whose coordinates are not published; and random phases of pi "
+            "rms are as good as uniform, like those of 2 pi, so that rows 3 and 4 must agree for polluted images and "
+            "PGA, which the published rows do not",
         ),
     ),
 )

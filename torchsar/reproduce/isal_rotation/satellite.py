@@ -161,7 +161,7 @@ def _figure_7(seen: _Seen, path: Path) -> list[Check]:
 
 
 def _figure_8(seen: _Seen, path: Path) -> list[Check]:
-    """The recommended estimator, which gets nothing but the data; and all methods in one picture."""
+    """The recommended estimator, which gets the data alone; and all methods in one picture."""
     _draw(seen, "order 3, two-dimensional", path)
     shown = {}
     for suffix, edges in (("", WHOLE), (": tip of a panel", REGIONS["A, tip of a panel"])):
