@@ -235,6 +235,7 @@ def _figure_1(seen: _Deviations, path: Path) -> list[Check]:
     return [statement("deviation", "ignored, it biases the rotation", ignored > 0.1 > 5 * estimated, ours)]
 
 
+# figures and tables, by their numbers
 ITEMS = (
     Item("Figure 1", "estimated rotation over the range centre deviation", of=_deviations, make=_figure_1),
     Item(

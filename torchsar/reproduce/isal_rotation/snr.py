@@ -282,6 +282,7 @@ BOX = (
     "with one line per Doppler cell the least entropy lies beside the true rotation, so that a search of it does not "
     "improve with the SNR; the published trend comes out with a finer grid, which the paper does not state"
 )
+# figures and tables, by their numbers
 ITEMS = (
     Item("Figure 13", "estimates of the rotation over SNR", of=_small_target, make=_figure_13, why=BOX),
     *(

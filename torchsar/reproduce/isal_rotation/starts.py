@@ -22,6 +22,7 @@ from torchsar.reproduce.isal_rotation.satellite import ROTATION, SIZES, SNR_DB, 
 from torchsar.reproduce.item import Check, Item, statement
 from torchsar.scene import Satellite, TurntableWorld
 
+# rate, k1 and k2 of the text (rad/s, 1/s, 1/s2)
 TRUTH = torch.tensor([0.02, 10.0, 1000.0], dtype=torch.float64)
 NAMES = ("omega_rad_s", "k1_per_s", "k2_per_s2")
 # starts over the truth, and largest relative error of an estimate that is close to it
@@ -108,6 +109,7 @@ LOST = (
     "the entropy is so flat in the rate that an undamped step from the truth itself is too long; with a line search "
     "all three starts reach the same minimum"
 )
+# figures and tables, by their numbers
 ITEMS = (
     *(
         Item(
