@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import SHARED
 from torchsar.reproduce import NOT_REPRODUCED, PAPERS, Item, Paper, paper
 from torchsar.reproduce.item import KINDS, SHOWN
 
 ROOT = Path(__file__).resolve().parents[2]
-TEXTS = ROOT.parent / "shared" / "papers"
+TEXTS = SHARED.parent / "papers"
 RECORDS = ROOT / "docs" / "reproduce"
 # texts of the papers, and how each numbers its figures and tables
 SOURCES = {

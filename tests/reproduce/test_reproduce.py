@@ -75,7 +75,8 @@ EXPECTED = {
     "sal": {"Figure 15", "Table 6"},
     "geo": {"Figure 16", "Figure 17", "Table 4"},  # figure 16: P1 is 0.92 m wide in short lines
     "isal": {"Figure 2", "Table 1"},
-    "isal_rotation": {"Figure 4", "Figure 19", "Table 1", "Table 4"},
+    # figure 13 and Tables 3 and 4: a search of six images does not improve with the SNR
+    "isal_rotation": {"Figure 4", "Figure 13", "Figure 19", "Table 1", "Table 3", "Table 4"},
     "stripmap": {"Figure 1", "Figure 10", "Figure 11"},
 }
 
