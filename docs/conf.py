@@ -21,9 +21,9 @@ extensions = [
     "api",  # pages of the public names, and docstrings as reStructuredText
     "mathml",  # formulas without scripts
     "offline",  # nothing is loaded from a network
-    "records",  # figures and tables from docs/sweeps, docs/trade and docs/requires
+    "records",  # figures and tables from docs/sweeps, docs/trade, docs/requires and docs/reproduce
 ]
-exclude_patterns = ["_build", "sweeps", "trade", "requires"]
+exclude_patterns = ["_build", "sweeps", "trade", "requires", "reproduce"]
 nitpicky = True
 suppress_warnings = ["ref.python"]  # a type such as `bytes` that is also the name of two attributes
 default_role = "py:obj"  # of docstrings: a name in backticks is a link where it is public

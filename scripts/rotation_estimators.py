@@ -1,6 +1,6 @@
 """Every estimator of uneven rotation on the same data: evaluations, CPU time and error.
 
-Table 2, figures 10 to 12 and the times of Remote Sens. 2025, 17, 3447.
+The times are beside those of Remote Sens. 2025, 17, 3447.
 
     python scripts/rotation_estimators.py [--out rotation_estimators] [--seed 1] [--snr-db 20]
     [--genetic-seeds 5] [--small]
@@ -37,9 +37,8 @@ from torchsar.compensate import (
     search_rotation,
     uneven_rotation,
 )
-from torchsar.core import Axis, Draws, Estimate, Signal
+from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_turntable
-from torchsar.focus import MatchedFourier, RangePhase
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
@@ -249,26 +248,6 @@ def draw(bench: Bench, path: Path) -> None:
     )
 
 
-def draw_starts(bench: Bench, path: Path) -> None:
-    """Figures 10 to 12: images after compensation with what Newton's method finds from its starts.
-
-    Above the middle of the target, below a part of it. Drawn in Doppler, since a wrong rate gives a
-    wrong scale.
-    """
-    whole, parts = {}, {}
-    for figure, factor in ((10, 0.9), (11, 1.0), (12, 1.1)):
-        found = bench.runs[f"Newton x{factor:g} raw"].found
-        omega, k, yc = (found[name] for name in ("omega_rad_s", "warp_k", "yc_m"))
-        image = MatchedFourier(bench.radar)(RangePhase(bench.radar)(bench.signal, omega, k, yc), k)
-        doppler, range_ = image.axes
-        axis = Axis("Doppler", doppler.n, 1e-3 * doppler.start, 1e-3 * doppler.step, "kHz")
-        half = -0.25 * axis.start  # a quarter of the band
-        image = Signal(image.data, (axis, range_))
-        whole[f"figure {figure}a: start x{factor:g}"] = plot.within(image, {"Doppler": (-half, half)})
-        parts[f"figure {figure}b: part"] = plot.within(image, {"Doppler": (0.3 * half, 0.5 * half)})
-    plot.save(plot.images(whole | parts, 40, percentile=100), path, columns=3)
-
-
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("rotation_estimators"), help="folder of the figure")
@@ -291,7 +270,6 @@ def main(arguments: list[str] | None = None) -> None:
     )  # 162, 870 and 888 evaluations
     ratios(bench, on_grid(bench, (1, 2, 2) if options.small else PART))
     draw(bench, options.out / "time_and_error.png")
-    draw_starts(bench, options.out / "figure_10_12.png")
 
 
 if __name__ == "__main__":

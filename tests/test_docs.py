@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from torchsar.cli import parser
+from torchsar.reproduce import paper
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
@@ -117,6 +118,8 @@ def test_a_command_is_accepted(line: str, tmp_path: Path) -> None:
         options, more = parser().parse_known_args(rest)
         if options.command in ("import", "export"):
             assert not more
+        elif options.command == "reproduce":
+            assert not more and (options.item is None or paper(options.paper).find(options.item))
         elif options.command != "list":
             overrides = [*options.overrides, *more]
             assert not any(word.startswith("-") for word in overrides)

@@ -28,6 +28,7 @@ _EXCHANGE = {
     "import": "write recorded data of another format, which a sidecar describes, as a recording (.npz)",
     "export": "write the images of a finished run, or its recording, in another format",
 }
+_REPRODUCE = "make the figures and tables of the papers, and compare them with what was published"
 
 
 def parser() -> argparse.ArgumentParser:
@@ -76,6 +77,13 @@ def parser() -> argparse.ArgumentParser:
         metavar=("LATITUDE", "LONGITUDE", "HEIGHT"),
         help="origin of local coordinates in degrees and metres, for recordings without `origin_deg_m`",
     )
+    one = commands.add_parser("reproduce", help=_REPRODUCE, description=_REPRODUCE[0].upper() + _REPRODUCE[1:] + ".")
+    one.add_argument("paper", nargs="?", metavar="PAPER", help="sal, geo, isal, isal_rotation or stripmap; all without")
+    one.add_argument("item", nargs="?", metavar="ITEM", help="such as table2 or figure5; all without")
+    one.add_argument("--small", action="store_true", help="the reduced form, which takes minutes in all")
+    one.add_argument(
+        "--out", type=_place, default=Path("out") / "reproduce", metavar="DIR", help="folder of records and pictures"
+    )
     commands.add_parser("list", help="experiments, systems, stages and data keys")
     return top
 
@@ -120,7 +128,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             print(f"torchsar-lab {version('torchsar-lab')}", flush=True)
             return 0
-        if options.command != "list":  # before the import of torch, which takes seconds
+        if options.command == "reproduce":
+            print(f"torchsar: reproduce {options.paper or 'all papers'}", file=sys.stderr, flush=True)
+        elif options.command != "list":  # before the import of torch, which takes seconds
             subject = options.file if options.command in _EXCHANGE else options.config
             print(f"torchsar: {options.command} {subject}", file=sys.stderr, flush=True)
         with _log_to_stderr(), warnings.catch_warnings(), _short_memory():
@@ -163,7 +173,7 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
     if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
         top.error(f"unrecognized arguments: {' '.join(rest)}")
     if options.command is None and not options.version:
-        top.error(f"a command is missing: choose one of {', '.join((*_COMMANDS, *_EXCHANGE, 'list'))}")
+        top.error(f"a command is missing: choose one of {', '.join((*_COMMANDS, *_EXCHANGE, 'reproduce', 'list'))}")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
@@ -172,9 +182,10 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
 def _dispatch(options: argparse.Namespace, command: str) -> int:
     from torchsar.study.settings.text import experiments, find_config
 
-    if options.command in _EXCHANGE:
+    actions = {"import": _import, "export": _export, "reproduce": _reproduce}
+    if options.command in actions:
         try:
-            return (_import if options.command == "import" else _export)(options)
+            return actions[options.command](options)
         except (ValueError, FileNotFoundError, FileExistsError) as error:
             raise ConfigError(str(error)) from error
     if options.command == "list":  # the experiments, or an unknown name, before the import of torch
@@ -238,6 +249,19 @@ def _export(options: argparse.Namespace) -> int:
     origin = None if options.origin is None else LocalFrame(*options.origin)
     export(Path(options.file), load(config), options.to, options.out, origin)
     print(options.out)
+    return 0
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    import torch
+
+    from torchsar.core import keep_freed_memory
+    from torchsar.reproduce import reproduce
+
+    keep_freed_memory()
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    print(reproduce(options.paper, options.item, options.out, options.small))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Figures and tables from the records in docs/sweeps, docs/trade and docs/requires.
+"""Figures and tables from the records in docs/sweeps, docs/trade, docs/requires and docs/reproduce.
 
 A page names a record, what to show of it, and its words; every number comes from the record.
 """
@@ -211,6 +211,57 @@ class RequiresTable(SphinxDirective):
         return self.parse_text_to_nodes("\n".join(lines))
 
 
+class ReproducedTable(SphinxDirective):
+    """Figures and tables of one paper: published, ours, verdict."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        path = Path(self.env.srcdir) / "reproduce" / f"{self.arguments[0]}.json"
+        self.env.note_dependency(str(path))
+        record = json.loads(path.read_text(encoding="utf-8"))
+        lines = ["| item | compared | published | ours | verdict |", "| --- | --- | --- | --- | --- |"]
+        for found in record["items"]:
+            lines += self.rows(found)
+        made = {json.dumps({**one["made"], "seconds": None}): one["made"] for one in record["items"] if one["made"]}
+        notes = []
+        for one in made.values():
+            labels = [
+                x["item"] for x in record["items"] if x["made"] and {**x["made"], "seconds": one["seconds"]} == one
+            ]
+            versions = ", ".join(f"{name} {version}" for name, version in one["versions"].items())
+            where = f"{one['date']}, commit `{one['commit']}`, {one['machine']}, {versions}"
+            notes.append(f"{one['form'].capitalize()} form, {where}: {', '.join(labels)}.")
+        source = f"{record['source']}. Record: `docs/reproduce/{path.name}`."
+        return self.parse_text_to_nodes("\n\n".join([source, "\n".join(lines), *notes]))
+
+    def rows(self, found: dict[str, Any]) -> list[str]:
+        """A row for the item, and one for each comparison."""
+        form = " (reduced form)" if found["made"] and found["made"]["form"] == "reduced" else ""
+        why = f": {found['why']}" if found["why"] else ""
+        lines = [f"| **{found['item']}** | *{found['subject']}*{why} | | | **{found['verdict']}**{form} |"]
+        for check in found["checks"]:
+            published, ours = (x if isinstance(x, str) else short(x) for x in (check["published"], check["ours"]))
+            std = "" if not check["std"] else f" ± {check['std']:.2g}"
+            lines.append(f"| | {check['name']} | {published} | {ours}{std} | {check['verdict']} |")
+        return [line.replace("\n", " ") for line in lines]
+
+
+class ReproducedCounts(SphinxDirective):
+    """How many figures and tables of every paper have which verdict; a reduced form has none."""
+
+    def run(self) -> list[nodes.Node]:
+        words = ("reproduced", "better", "not reproduced", "reduced form only", "diagram", "photograph")
+        lines = [f"| paper | {' | '.join(words)} |", f"| --- {'| ---: ' * len(words)}|"]
+        for path in sorted((Path(self.env.srcdir) / "reproduce").glob("*.json")):
+            self.env.note_dependency(str(path))
+            items = json.loads(path.read_text(encoding="utf-8"))["items"]
+            reduced = [bool(one["made"]) and one["made"]["form"] == "reduced" for one in items]
+            verdicts = [words[3] if few else one["verdict"] for one, few in zip(items, reduced, strict=True)]
+            lines.append(f"| `{path.stem}` | {' | '.join(str(verdicts.count(word)) for word in words)} |")
+        return self.parse_text_to_nodes("\n".join(lines))
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directives."""
     for name, directive in {
@@ -218,6 +269,8 @@ def setup(app: Sphinx) -> dict[str, Any]:
         "sweep-table": SweepTable,
         "trade-table": TradeTable,
         "requires-table": RequiresTable,
+        "reproduced-table": ReproducedTable,
+        "reproduced-counts": ReproducedCounts,
     }.items():
         app.add_directive(name, directive)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,8 +1,6 @@
 """Moving ships on a sea before a GEO spaceborne-airborne bistatic radar: figure 18 of Remote Sens.
 2020, 12, 1703.
 
-    python scripts/geo_ocean.py [--out geo_ocean] [--seed 1] [--small]
-
 Ship 1 rests, ship 2 closes at 10 m/s, ship 3 closes at 10 m/s and moves along track at 10 m/s. In
 an image focused for targets at rest, approaching ships are displaced and repeated; the method of
 figure 13 detects moving targets, removes their echoes, and images them at their true positions. The
@@ -11,9 +9,8 @@ source prints azimuth on x = (V_R - u_a) t of each target.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,32 +20,29 @@ from torchsar import plot
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_bistatic
 from torchsar.multichannel import Body, Detector, Extraction, ImageMovers, PointMotion, RemoveTransmitRange, SceneImage
-from torchsar.radar import BistaticRadar, LinearFM
+from torchsar.reproduce.geo.sensor import RADAR as SENSOR
+from torchsar.reproduce.geo.sensor import TRANSMIT_RANGE
+from torchsar.reproduce.item import Check, Item, number, statement
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, KSea, Ship
 
-RADAR = BistaticRadar(
-    1.25e9,
-    LinearFM(50e6, 10e-6),
-    sampling_hz=60e6,
-    prf_hz=180.0,
-    speed_m_s=300.0,
-    reference_range_m=5700.0,
-    transmit_range=(-243.0, 0.02, 5e-7),
-    wave_speed_m_s=3e8,
-)
-# displacement and distance of the false target, m
+# the middle of the swath of figure 18, with the range to the satellite in the echo
+RADAR = replace(SENSOR, reference_range_m=5700.0, transmit_range=TRANSMIT_RANGE)
+# displacement and distance of the false target (m)
 PUBLISHED = {"ship 2": (216.3, 934.58), "ship 3": (167.6, 723.99)}
+# velocities and ranges as published; places along track are chosen
 SHIPS = {
     "ship 1": Ship(0.0, 0.0, -300.0, 0.0),
     "ship 2": Ship(10.0, 0.0, 0.0, 790.0),
     "ship 3": Ship(10.0, 10.0, 100.0, -840.0),
 }
+# for the reduced form
 SMALL = {"ship 2": Ship(10.0, 0.0, 0.0, 0.0, length_m=40.0, range_cells=2, count=6)}
+# chosen: of a ship in its line, and of the sea
 SCR_DB, CNR_DB = 10.0, 30.0
 
 
 @dataclass(frozen=True)
-class Setting:
+class _Setting:
     """How large the scene is, and how the flow is set for it."""
 
     ships: Mapping[str, Ship]
@@ -59,14 +53,14 @@ class Setting:
     flow: ImageMovers
 
 
-def whole() -> Setting:
+def _whole() -> _Setting:
     """As published."""
-    return Setting(SHIPS, 2160, 512, 4.5, SCR_DB, ImageMovers(RADAR))
+    return _Setting(SHIPS, 2160, 512, 4.5, SCR_DB, ImageMovers(RADAR))
 
 
-def small() -> Setting:
+def _small() -> _Setting:
     """One ship, in seconds."""
-    return Setting(
+    return _Setting(
         SMALL,
         540,
         120,
@@ -76,7 +70,7 @@ def small() -> Setting:
     )
 
 
-def received(setting: Setting, seed: int) -> Signal:
+def _received(setting: _Setting) -> Signal:
     """Channels (channel, pulse, range) without the transmit range, the sea of unit power."""
     ships = {
         name: Ship(
@@ -92,11 +86,11 @@ def received(setting: Setting, seed: int) -> Signal:
         for name, ship in setting.ships.items()
     }
     world = BistaticWorld(Fleet(ships), BandLimited(setting.gate_s), KSea(shape=1.5), snr_db=CNR_DB)
-    recording, _ = simulate_bistatic(RADAR, world, setting.pulses, setting.lines, Draws(seed))
+    recording, _ = simulate_bistatic(RADAR, world, setting.pulses, setting.lines, Draws(1))
     return RemoveTransmitRange(RADAR)(recording.signal)
 
 
-def nearest(ship: Ship, bodies: list[Body]) -> Body | None:
+def _nearest(ship: Ship, bodies: list[Body]) -> Body | None:
     """What was found nearest to the middle of a ship, within 50 m."""
     away = [
         (
@@ -112,7 +106,7 @@ def nearest(ship: Ship, bodies: list[Body]) -> Body | None:
     return bodies[min(away)[1]] if away and min(away)[0] < 50 else None
 
 
-def predicted(motion: PointMotion) -> tuple[float, float]:
+def _predicted(motion: PointMotion) -> tuple[float, float]:
     """Displacement and distance of the first false target of a motion, on the axis of the
     source.
     """
@@ -120,35 +114,14 @@ def predicted(motion: PointMotion) -> tuple[float, float]:
     return v * float(motion.image_s) - float(motion.y0_m), RADAR.prf_hz * RADAR.wavelength_m * float(motion.range_m) / v
 
 
-def show(setting: Setting, made: SceneImage) -> None:
-    """What was found of each ship, and what the source prints."""
-    print(f"{'':18}{'u_r':>9}{'u_a':>9}{'azimuth':>9}{'range':>9}{'shift':>9}{'replica':>9}")
-    for name, ship in setting.ships.items():
-        like = torch.zeros((), dtype=torch.float64)
-        true = PointMotion.of(
-            RADAR, like, ship.u_r_m_s, ship.u_a_m_s, ship.azimuth_m, RADAR.reference_range_m + ship.range_m
-        )
-        rows = {name: true, "  found": None if (body := nearest(ship, made.bodies)) is None else body.motion}
-        for title, motion in rows.items():
-            values = (
-                []
-                if motion is None
-                else [float(getattr(motion, key)) for key in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")]
-            )
-            values += [] if motion is None or not ship.u_r_m_s else predicted(motion)
-            print(f"{title:18}" + ("".join(f"{value:>9.2f}" for value in values) or "  nothing"))
-        if name in PUBLISHED and len(setting.ships) > 1:
-            print(f"{'  published':54}" + "".join(f"{value:>9.2f}" for value in PUBLISHED[name]))
-
-
-def levelled(image: Signal) -> Signal:
+def _levelled(image: Signal) -> Signal:
     """Blocks over their median, from -10 to 25 dB."""
     view = plot.quicklook(image, 300)
     level = view.data.abs() / view.data.abs().median()
     return view.with_data(level.clamp(10**-0.5, 10**1.25).to(torch.complex64))
 
 
-def draw(setting: Setting, made: SceneImage, path: Path) -> None:
+def _draw(setting: _Setting, made: SceneImage, path: Path) -> None:
     """Images focused for targets at rest, without the moving targets, and with these at their
     positions; outlines about the true positions.
     """
@@ -165,29 +138,43 @@ def draw(setting: Setting, made: SceneImage, path: Path) -> None:
     named = {"everything at rest": made.conventional, "without movers": made.rest, "fused": made.fused}
     figure = plot.overlays(
         [
-            {"title": title, "signal": levelled(image), "lines": {"true position": (joined[0], joined[1])}}
+            {"title": title, "signal": _levelled(image), "lines": {"true position": (joined[0], joined[1])}}
             for title, image in named.items()
         ],
         35.0,
     )
     plot.save(figure, path, columns=3)
-    print(f"wrote {path}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", default="geo_ocean", help="folder for the figure")
-    parser.add_argument("--seed", type=int, default=1, help="of sea, ships and noise")
-    parser.add_argument("--small", action="store_true", help="one ship on a small sea, for tests")
-    options = parser.parse_args()
-    setting = small() if options.small else whole()
-    out = Path(options.out)
-    out.mkdir(parents=True, exist_ok=True)
-    with torch.no_grad():
-        made = setting.flow(received(setting, options.seed))
-    show(setting, made)
-    draw(setting, made, out / "figure_18.png")
+@dataclass(frozen=True)
+class _Seen:
+    """A scene and its image."""
+
+    setting: _Setting
+    made: SceneImage
 
 
-if __name__ == "__main__":
-    main()
+def _sea(small: bool) -> _Seen:
+    setting = _small() if small else _whole()
+    return _Seen(setting, setting.flow(_received(setting)))
+
+
+def _figure_18(seen: _Seen, path: Path) -> list[Check]:
+    """What the motion that was found of each ship says; true and found velocities in words."""
+    _draw(seen.setting, seen.made, path)
+    checks = []
+    for name, ship in seen.setting.ships.items():
+        body = _nearest(ship, seen.made.bodies)
+        if not ship.u_r_m_s:
+            continue
+        found = "nothing" if body is None else f"{float(body.motion.u_r_m_s):.2f}, {float(body.motion.u_a_m_s):.2f} m/s"
+        close = body is not None and abs(float(body.motion.u_r_m_s - ship.u_r_m_s)) < 0.5
+        checks.append(statement(f"{name} at {ship.u_r_m_s:g}, {ship.u_a_m_s:g} m/s", "focused", close, found))
+        if body is not None and len(seen.setting.ships) > 1:
+            words = ("displacement (m)", "distance of the false target (m)")
+            rows = zip(words, PUBLISHED[name], _predicted(body.motion), strict=True)
+            checks += [number(f"{name}: {what}", theirs, [ours], 0.02 * theirs) for what, theirs, ours in rows]
+    return checks
+
+
+ITEMS = (Item("Figure 18", "moving ships on a sea", of=_sea, make=_figure_18),)

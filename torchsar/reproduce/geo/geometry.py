@@ -1,0 +1,220 @@
+"""Effects of pulse rate and velocities in a GEO spaceborne-airborne bistatic radar: figures 2 to 4
+and 8 of Remote Sens. 2020, 12, 1703.
+
+The pulse rate of the satellite must leave a swath free of its own pulses. In the channels of the
+receiver a moving target causes a delay, which depends on its along-track speed, and a phase, which
+depends on its slant-range speed.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchsar import plot
+from torchsar.multichannel import PointMotion
+from torchsar.multichannel.response import doppler_centre_hz, shared_response
+from torchsar.radar import TimingDiagram, receive_range, timing_diagram
+from torchsar.radar.timing import off_nadir_ground_m
+from torchsar.reproduce.geo.sensor import HEIGHT_M, INTEGRATION_S, OFF_NADIR_DEG, RADAR
+from torchsar.reproduce.item import Check, Item, number, statement
+
+# width of the swath of figure 2 (m)
+SWATH_M = 500e3
+# chosen: pulse length, guard time, length of the nadir echo (s)
+PULSE_S, GUARD_S, NADIR_S = 10e-6, 50e-6, 200e-6
+LEFT_K1_M_S = -243.0  # of the transmit range, where it stays in the data
+# pulse rates within the published span (Hz)
+RATES = (160.0, 168.0, 180.0, 188.0, 196.0)
+
+
+def _timing(small: bool) -> TimingDiagram:
+    """Pulse rates of 160 to 200 Hz over the ground about the middle of the swath."""
+    step_hz, step_m = (0.5, 20e3) if small else (0.025, 5e3)
+    return timing_diagram(
+        HEIGHT_M,
+        torch.arange(160.0, 200.0, step_hz, dtype=torch.float64),
+        torch.arange(4600e3, 6200e3, step_m, dtype=torch.float64),
+        PULSE_S,
+        GUARD_S,
+        NADIR_S,
+    )
+
+
+def _nearest_swaths(diagram: TimingDiagram) -> dict[float, float]:
+    """By pulse rate (Hz) that has one, how far from 7 degrees off nadir the middle of the nearest
+    clear swath lies (m).
+    """
+    middles = diagram.ground_m + SWATH_M / 2 - off_nadir_ground_m(HEIGHT_M, OFF_NADIR_DEG)
+    fits = diagram.swath_fits(SWATH_M)
+    nearest = middles[torch.where(fits, middles.abs(), torch.inf).argmin(-1)]
+    return {
+        float(prf): float(near) for prf, near, fit in zip(diagram.prf_hz, nearest, fits.any(-1), strict=True) if fit
+    }
+
+
+def _draw_timing(diagram: TimingDiagram, path: Path) -> None:
+    """Figure 2: what is lost to nadir echoes (1) and to transmitted pulses (2); white lines: the
+    nearest clear swath at every second pulse rate.
+    """
+    lost = torch.maximum(diagram.nadir.double(), 2 * diagram.transmit.double())
+    title = f"clear swaths of {SWATH_M / 1e3:g} km nearest to {OFF_NADIR_DEG:g} degrees off nadir (white)"
+    part = {
+        "title": title,
+        "x": plot.array(diagram.prf_hz),
+        "y": plot.array(diagram.ground_m / 1e3),
+        "z": plot.array(lost.mT),
+    }
+    (figure,) = plot.heat_map(
+        [part],
+        "pulse rate (Hz)",
+        "ground from nadir (km)",
+        "0 clear, 1 nadir echo, 2 transmitted pulse",
+        limits=(0.0, 2.0),
+    )
+    first, step = (float(x) for x in (diagram.ground_m[0], diagram.ground_m[1] - diagram.ground_m[0]))
+    for prf, away in _nearest_swaths(diagram).items():
+        middle = off_nadir_ground_m(HEIGHT_M, OFF_NADIR_DEG) + away - first
+        if prf % 2 < 1e-9:
+            column = int((diagram.prf_hz == prf).nonzero())
+            figure.axes[0].plot(
+                [column, column],
+                [(middle - SWATH_M / 2) / step, (middle + SWATH_M / 2) / step],
+                color="white",
+                linewidth=1.0,
+            )
+    plot.save(figure, path)
+
+
+def _motion(u_r: Tensor | float, u_a: Tensor | float) -> PointMotion:
+    return PointMotion.of(RADAR, torch.zeros(()), u_r, u_a)
+
+
+def _phase_shift_rad(point: PointMotion, left_k1_m_s: float = 0.0) -> Tensor:
+    """Phase of each channel at zero Doppler against the reference, the constant factor of Eq.
+
+    (34), (..., channel).
+    """
+    at_centre = torch.angle(shared_response(RADAR, point, 1, 1, torch.complex128, left_k1_m_s))[..., 0]
+    return at_centre + 2 * math.pi * doppler_centre_hz(RADAR, point, left_k1_m_s)[..., None] * _delay_s(point)
+
+
+def _delay_s(point: PointMotion) -> Tensor:
+    """Delay of each channel against the reference, dx_m / v_e, (..., channel)."""
+    return RADAR.channels_at() / point.effective_m_s[..., None]
+
+
+def _draw_parameters(speed: Tensor, point: PointMotion, name: str, path: Path) -> None:
+    """Figures 3 and 4: v_e, and delay and phase of channel 3."""
+    x, label = plot.array(speed), f"{name} (m/s)"
+    shifts = {
+        "transmit range removed": _phase_shift_rad(point)[:, 2],
+        f"k1 = {LEFT_K1_M_S:g} m/s left in": _phase_shift_rad(point, LEFT_K1_M_S)[:, 2],
+    }
+    shifts = {key: value - value[speed.abs().argmin()] for key, value in shifts.items()}
+    values = [
+        ({"": point.effective_m_s}, "v_e (m/s)", "relative sensor velocity"),
+        ({"": 1e3 * _delay_s(point)[:, 2]}, "delay (ms)", "azimuth delay"),
+        (shifts, "phase (rad)", "phase shift against 0 m/s"),
+    ]
+    parts = [
+        {
+            "series": {key: (x, plot.array(y)) for key, y in series.items()},
+            "xlabel": label,
+            "ylabel": unit,
+            "title": title,
+        }
+        for series, unit, title in values
+    ]
+    plot.save(plot.panels(parts), path, columns=3)
+
+
+def _worst_phase_rad(u_r: Tensor | float, u_a: Tensor | float) -> Tensor:
+    """Largest phase within the integration time by which a filter for points at rest misses a
+    moving one that it puts where it appears.
+    """
+    time = torch.linspace(-INTEGRATION_S / 2, INTEGRATION_S / 2, 201, dtype=torch.float64)
+    point = _motion(u_r, u_a).each(lambda value: value[..., None])
+    moving, at_rest = (
+        receive_range(time, r, a, 0.0, RADAR.reference_range_m, RADAR.speed_m_s, 0.0)
+        for r, a in ((point.u_r_m_s, point.u_a_m_s), (0.0, 0.0))
+    )
+    return 2 * math.pi / RADAR.wavelength_m * (moving + point.u_r_m_s * time - at_rest).abs().amax(-1)
+
+
+def _draw_errors(speed: Tensor, path: Path) -> None:
+    """Figure 8: phase errors within the integration time, and phases of the channels."""
+    x = plot.array(speed)
+    imbalance = _phase_shift_rad(_motion(speed, 0.0))
+    channels = {f"channel {m + 1}": (x, plot.array(imbalance[:, m])) for m in range(RADAR.channels)}
+    parts = [
+        {
+            "series": {"": (x, plot.array(_worst_phase_rad(0.0, speed)))},
+            "xlabel": "u_a (m/s)",
+            "ylabel": "phase (rad)",
+            "title": "largest error by u_a",
+        },
+        {
+            "series": {"": (x, plot.array(_worst_phase_rad(speed, 0.0)))},
+            "xlabel": "u_r (m/s)",
+            "ylabel": "phase (rad)",
+            "title": "largest error by u_r",
+        },
+        {"series": channels, "xlabel": "u_r (m/s)", "ylabel": "phase (rad)", "title": "imbalance of channels by u_r"},
+    ]
+    plot.save(plot.panels(parts), path, columns=3)
+
+
+def _speeds(small: bool) -> Tensor:
+    """0 to 20 m/s; the reduced form is the full one."""
+    return torch.linspace(0, 20, 41, dtype=torch.float64)
+
+
+def _figure_2(diagram: TimingDiagram, path: Path) -> list[Check]:
+    _draw_timing(diagram, path)
+    swaths = _nearest_swaths(diagram)
+    ours = ", ".join(f"{prf:g} Hz: {swaths[prf] / 1e3:+.0f} km" for prf in RATES if prf in swaths)
+    holds = all(prf in swaths for prf in RATES)
+    told = "pulse rates of 160 to 200 Hz, such as 180 Hz, leave 500 km clear"
+    return [statement("clear swath, and its middle from 7 degrees off nadir", told, holds, ours)]
+
+
+def _figure_3(speed: Tensor, path: Path) -> list[Check]:
+    point = _motion(0.0, speed)
+    _draw_parameters(speed, point, "u_a", path)
+    velocity, shift = point.effective_m_s, float(_phase_shift_rad(point)[:, 2].abs().max())
+    return [
+        number("relative velocity at rest (m/s)", 300.0, float(velocity[0]), 0.5),
+        number("relative velocity at 20 m/s along track (m/s)", 280.0, float(velocity[-1]), 0.5),
+        statement("phase shift", "independent of the along-track velocity", shift < 1e-3, f"at most {shift:.1g} rad"),
+    ]
+
+
+def _figure_4(speed: Tensor, path: Path) -> list[Check]:
+    point = _motion(speed, 0.0)
+    _draw_parameters(speed, point, "u_r", path)
+    change = 100 * float((_delay_s(point)[-1, 2] / _delay_s(point)[0, 2] - 1).abs())
+    shift = float(_phase_shift_rad(point)[-1, 2])
+    ours = f"at 20 m/s the delay changes by {change:.2f} %, the phase by {shift:.2f} rad"
+    told = "a small effect on velocity and delay, a clear one on the phase"
+    return [statement("slant-range velocity", told, change < 1 < abs(shift), ours)]
+
+
+def _figure_8(speed: Tensor, path: Path) -> list[Check]:
+    _draw_errors(speed, path)
+    along, across = (float(_worst_phase_rad(*u)) for u in ((0.0, 10.0), (10.0, 0.0)))
+    imbalance = float(_phase_shift_rad(_motion(10.0, 0.0))[2].abs())
+    ours = f"at 10 m/s {along:.1f} rad along track, {across:.2f} rad in slant range; imbalance {imbalance:.2f} rad"
+    told = "larger by the along-track velocity; the slant-range velocity unbalances the channels"
+    return [statement("phase errors", told, along > across and imbalance > 0.5, ours)]
+
+
+ITEMS = (
+    Item("Figure 2", "timing diagram: pulse rates that leave a swath clear", of=_timing, make=_figure_2),
+    Item("Figure 3", "effects of the along-track velocity on the channels", of=_speeds, make=_figure_3),
+    Item("Figure 4", "effects of the slant-range velocity on the channels", of=_speeds, make=_figure_4),
+    Item("Figure 8", "phase errors by the velocity of the target", of=_speeds, make=_figure_8),
+)

@@ -1,0 +1,315 @@
+"""Three points seen by a moving triangular-sweep ladar: figures 2 and 4 to 9 and Tables 1 and 2 of
+Remote Sens. 2024, 16, 793.
+
+Micrometres of radial motion defocus an image in azimuth, and decimetres per second shift the beat
+frequencies by several range cells. The radial velocity is estimated from the up and the down half
+of each triangle. Its integral is the range error, which is removed before the image is focused.
+Nothing here is random.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchsar import plot
+from torchsar.compensate import CompensateMotion, CorrectPulsePhase, RadialMotion, SegmentedInterference
+from torchsar.core import Chain, Draws, Signal, Trace, Truth, use
+from torchsar.echo import simulate_ladar, simulate_ladar_record
+from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
+from torchsar.metrics import impulse_response
+from torchsar.metrics.cuts import impulse_cuts
+from torchsar.metrics.radial_motion import Course, course_of, finer_in_range
+from torchsar.radar import LIGHT_M_S, TriangularLadar
+from torchsar.reproduce.item import Check, Item, number, statement
+from torchsar.scene import LadarWorld, Points, Polynomial, QuadraticInSweep, Sinusoid
+
+# of Table 1; the sampling is chosen
+RADAR = TriangularLadar(
+    LIGHT_M_S / 1.55e-6, bandwidth_hz=5e9, period_s=16e-6, sample_rate_hz=64e6, speed_m_s=60.0, reference_range_m=3000.0
+)
+# not published: an azimuth aperture of 0.342 m, for the published 6.0 mm; places and motion
+BEAM_RAD = 114e-6
+PLACES_M = ((-0.06, 1.0), (0.0, 1.5), (0.06, 2.0))
+SCENE = Points(*zip(*PLACES_M, strict=True), amplitude=[0.7, 1.0, 0.7])
+MOTION = (
+    Polynomial((0.35, 10.0)),
+    Sinusoid(160e-6, 100.0, math.degrees(0.3)),
+    Sinusoid(10e-6, 330.0, math.degrees(1.0)),
+)  # 0.35 m/s and 20 m/s^2
+# extent of side lobes for the ISLR, which the paper does not give: a sinc has -12.84 dB with two
+# nulls and -11.54 dB with three
+NULLS = 2
+# half of this difference (dB)
+ISLR_DB = 0.7
+# what is measured of an impulse response, and its name in words; widths in range are cells c / 2B,
+# 1 / 0.886 of -3 dB widths
+NAMES = {
+    "irw_range_m": "width in range (m)",
+    "pslr_range_db": "PSLR in range (dB)",
+    "islr_range_db": "ISLR in range (dB)",
+    "irw_azimuth_m": "width in azimuth (m)",
+    "pslr_azimuth_db": "PSLR in azimuth (dB)",
+    "islr_azimuth_db": "ISLR in azimuth (dB)",
+}
+# published numbers of Table 2, in this order, and tolerances
+TABLE_2 = (0.030, -13.23, -12.26, 0.006, -12.49, -11.98)
+WITHIN = (0.0005, 0.15, ISLR_DB, 0.0005, 0.15, ISLR_DB)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What every method made of the echoes, and the image without motion."""
+
+    traces: dict[str, Trace]
+    courses: dict[str, Course]
+    truth: Truth
+    ideal: Signal
+
+
+def _three_points(small: bool) -> _Seen:
+    """The reduced form is the full one."""
+    world = LadarWorld(SCENE, MOTION, fidelity=QuadraticInSweep())
+    recording, truth = simulate_ladar(RADAR, world, 512, Draws(1))
+    chains = _methods(RADAR)
+    traces = {name: chain.trace(recording) for name, chain in chains.items()}
+    courses = {name: course_of(chain, traces[name], truth.values, RADAR, clean=False) for name, chain in chains.items()}
+    return _Seen(traces, courses, truth, chains["uncompensated"](truth.clean))
+
+
+def _methods(radar: TriangularLadar) -> dict[str, Chain]:
+    """No compensation, the paper's, and the recommended one: they share what comes before and
+    after.
+    """
+    compress, deramp, image = (
+        CompressSweeps(radar),
+        DerampAzimuth(radar),
+        AzimuthMatchedFilter(radar, beam_rad=BEAM_RAD),
+    )
+    compensate = use(CompensateMotion(radar), velocity_m_s="motion")
+    segmented = SegmentedInterference(radar, hann=True)
+    polished = RadialMotion(radar, window_m=(0.0, 3.0))
+    correct = use(CorrectPulsePhase(), phase_rad="motion")
+    return {
+        "uncompensated": Chain(compress=compress, deramp=deramp, image=image),
+        "segmented": Chain(motion=segmented, compensate=compensate, compress=compress, deramp=deramp, image=image),
+        "recommended": Chain(
+            motion=polished, compensate=compensate, compress=compress, deramp=deramp, correct=correct, image=image
+        ),
+    }
+
+
+def _figure_2(draws: Draws, path: Path) -> list[Check]:
+    """The triangle and its echo, and the dechirped beat at rest and in motion.
+
+    50 MHz instead of 5 GHz, so that the delay can be seen.
+    """
+    radar, range_m = replace(RADAR, bandwidth_hz=50e6), 150.0
+    time_s = torch.linspace(0, 3 * radar.period_s, 1500, dtype=torch.float64)
+    us, sent, echo = (
+        plot.array(1e6 * time_s),
+        *(1e-6 * _triangle_hz(time_s - delay, radar) for delay in (0, 2 * range_m / radar.wave_speed_m_s)),
+    )
+    swept = {"local oscillator": (us, plot.array(sent)), "echo of 150 m beyond the reference": (us, plot.array(echo))}
+    beats: dict[str, list[float]] = {}
+    parts: list[dict] = [
+        {"series": swept, "xlabel": "time (us)", "ylabel": "frequency (MHz)", "title": "sweeps", "ylim": (-28.0, 40.0)}
+    ]
+    for title, speed in (("dechirped, at rest", 0.0), ("dechirped, receding at 2 m/s", 2.0)):
+        record, _ = simulate_ladar_record(
+            radar, LadarWorld(Points([0.0], [range_m]), [Polynomial((speed,))], snr_db=30.0), 3, draws
+        )
+        spectrum = plot.short_time_spectrum(record.signal.data.flatten(), radar.sample_rate_hz)
+        theory = {"theory": (us, plot.array(sent - echo + 1e-6 * radar.doppler_hz(speed)))}
+        parts.append({"title": title, "signal": spectrum, "lines": theory, "ylim": (-15.0, 20.0)})
+        beats[title] = [_beat_mhz(spectrum, 1e6 * share * radar.period_s) for share in (0.25, 0.75)]
+    plot.save(plot.overlays(parts), path, columns=3)
+    rest, moving = beats.values()
+    shifts = [after - before for before, after in zip(rest, moving, strict=True)]
+    expected = 1e-6 * float(radar.doppler_hz(2.0))
+    ours = f"beats {rest[0]:.1f} and {rest[1]:.1f} MHz at rest, shifts of {shifts[0]:.1f} and {shifts[1]:.1f} MHz"
+    holds = abs(sum(rest)) < 1 and all(abs(shift - expected) < 1 for shift in shifts)
+    return [statement("beats", "opposite in both sweeps, and shifted alike by the radial velocity", holds, ours)]
+
+
+def _beat_mhz(spectrum: Signal, at_us: float) -> float:
+    """Strongest frequency at a time."""
+    column = spectrum.data[:, int(spectrum.axis("time").index_of(at_us).round())]
+    return float(spectrum.axis("frequency").values()[int(column.argmax())])
+
+
+def _triangle_hz(time_s: Tensor, radar: TriangularLadar) -> Tensor:
+    """Frequency of the triangle that starts at time zero, from the middle of its band."""
+    return radar.bandwidth_hz * (0.5 - (2 * torch.remainder(time_s / radar.period_s, 1) - 1).abs())
+
+
+def _over_peak(signal: Signal) -> Signal:
+    return signal.with_data(signal.data / signal.data.abs().max())
+
+
+def _near(signal: Signal) -> Signal:
+    """The relative ranges of all points."""
+    return _within(signal, 0.7, 2.3)
+
+
+def _within(signal: Signal, low_m: float, high_m: float) -> Signal:
+    first, last = (round(float(signal.axis("range").index_of(edge))) for edge in (low_m, high_m))
+    return signal.crop(range=(first, last))
+
+
+def _around(image: Signal, azimuth_m: float, range_m: float) -> Signal:
+    """Four cells to either side of a point."""
+    bounds = {}
+    for axis, position, reach in zip(image.axes, (azimuth_m, range_m), (0.024, 0.12), strict=True):
+        first, last = (round(float(axis.index_of(position + side))) for side in (-reach, reach))
+        bounds[axis.name] = (max(first, 0), min(last, axis.n))
+    return image.crop(**bounds)
+
+
+def _draw_motion(courses: Mapping[str, Course], truth: Truth, path: Path) -> None:
+    """Figure 6: velocity and range error, true and estimated, and the error of the estimate."""
+    found, true = courses["segmented"], truth.values["range_error_up_m"] - truth.values["range_error_up_m"][0]
+    velocity = {"segmented": found.velocity_m_s, "true": truth.values["velocity_m_s"]}
+    motion = {"segmented": 1e3 * (true + found.error_m - found.error_m[0]), "true": 1e3 * true}
+    error = {name: 1e9 * (courses[name].error_m - courses[name].error_m[0]) for name in ("segmented", "recommended")}
+    ms, parts = plot.array(1e3 * found.pulse.values()), []
+    for title, unit, lines in (
+        ("radial velocity", "m/s", velocity),
+        ("range error", "mm", motion),
+        ("estimated minus true range error", "nm", error),
+    ):
+        parts.append(
+            {
+                "series": {name: (ms, plot.array(y)) for name, y in lines.items()},
+                "xlabel": "slow time (ms)",
+                "ylabel": unit,
+                "title": title,
+            }
+        )
+    plot.save(plot.panels(parts), path, columns=3)
+
+
+def _draw_slices(image: Signal, ideal: Signal, path: Path) -> None:
+    """Figure 9: the response of the middle point, and that without motion."""
+    cuts = {
+        name: impulse_cuts(finer_in_range(one), (0.0, 1.5))
+        for name, one in (("without motion", ideal), ("segmented", image))
+    }
+    parts = []
+    for axis in ("range", "azimuth"):
+        series = {name: (plot.array(cut[axis][0]), plot.decibel(cut[axis][1])) for name, cut in cuts.items()}
+        parts.append(
+            {"series": series, "xlabel": f"{axis} from the peak (m)", "ylabel": "amplitude (dB)", "ylim": (-40.0, 1.0)}
+        )
+    plot.save(plot.panels(parts), path)
+
+
+def _response(image: Signal, azimuth_m: float = 0.0, range_m: float = 1.5) -> dict[str, float]:
+    """Impulse response of a point, with widths in range as cells."""
+    found = impulse_response(image, (azimuth_m, range_m), sidelobe_nulls=NULLS, search_m=0.2, centre_turns=(None, 0.0))
+    values = {name: float(found[name]) for name in NAMES}
+    return {**values, "irw_range_m": values["irw_range_m"] / 0.886}
+
+
+def _migration_cells(trace: Trace) -> float:
+    """Range cells over which the middle point moves in the range profiles."""
+    profiles = _within(trace.outputs["compress"], 1.2, 1.8)
+    peak = profiles.data.abs().argmax(-1)
+    return float(peak.max() - peak.min()) * profiles.axis("range").step / RADAR.range_step_m
+
+
+def _focus(seen: _Seen, method: str, path: Path) -> tuple[float, float]:
+    """Draw range profiles and image; return the migration (cells) and the PSLR in azimuth (dB)."""
+    trace = seen.traces[method]
+    shown = {
+        f"range profiles, {method}": _over_peak(_near(trace.outputs["compress"])),
+        f"image, {method}": _over_peak(_near(trace.signal)),
+    }
+    plot.save(plot.images(shown, dynamic_range_db=40, percentile=100), path)
+    return _migration_cells(trace), _response(trace.signal)["pslr_azimuth_db"]
+
+
+def _frequencies(small: bool) -> Draws:
+    """The reduced form is the full one."""
+    return Draws(1)
+
+
+def _table_1(seen: _Seen, path: Path) -> list[Check]:
+    rows = {
+        "wavelength (um)": (1.55, 1e6 * RADAR.wave_speed_m_s / RADAR.carrier_hz),
+        "bandwidth (GHz)": (5.0, 1e-9 * RADAR.bandwidth_hz),
+        "period of the triangle (us)": (16.0, 1e6 * RADAR.period_s),
+        "speed (m/s)": (60.0, RADAR.speed_m_s),
+        "height (m), our reference range": (3000.0, RADAR.reference_range_m),
+    }
+    return [number(name, published, ours, 1e-3 * published) for name, (published, ours) in rows.items()]
+
+
+def _figure_4(seen: _Seen, path: Path) -> list[Check]:
+    x, y, level = (plot.array(torch.as_tensor(v)) for v in (SCENE.azimuth_m, SCENE.range_m, SCENE.amplitude))
+    plot.save(plot.scatterers(y, x, level, "relative range (m)", "azimuth (m)", "three points", "auto"), path)
+    return [number("points", 3, len(x), 0)]
+
+
+def _figure_5(seen: _Seen, path: Path) -> list[Check]:
+    cells, level = _focus(seen, "uncompensated", path)
+    ours = f"{cells:.1f} range cells; PSLR in azimuth {level:.1f} dB"
+    return [statement("no compensation", "bent range profiles, defocused points", cells > 2 and level > -6, ours)]
+
+
+def _figure_6(seen: _Seen, path: Path) -> list[Check]:
+    _draw_motion(seen.courses, seen.truth, path)
+    worst = float(seen.courses["segmented"].metrics(RADAR)["range_error_max_m"])
+    return [number("largest error of the range (m)", 2e-7, worst, 0.5e-7, "lower")]
+
+
+def _figure_7(seen: _Seen, path: Path) -> list[Check]:
+    cells, level = _focus(seen, "segmented", path)
+    ours = f"{cells:.2f} range cells; PSLR in azimuth {level:.1f} dB"
+    return [statement("compensation", "profiles within a range cell, focused points", cells < 1 and level < -12, ours)]
+
+
+def _figure_8(seen: _Seen, path: Path) -> list[Check]:
+    image = seen.traces["segmented"].signal
+    before, after = (
+        _near(finer_in_range(finer_in_range(seen.traces[name].signal))) for name in ("uncompensated", "segmented")
+    )
+    points = {f"point at {r:g} m": _around(after, x, r) for x, r in PLACES_M}
+    plot.save(plot.contours({"no compensation": before, "segmented interference": after, **points}), path, columns=3)
+    levels = [_response(image, x, r)["pslr_azimuth_db"] for x, r in PLACES_M]
+    ours = "PSLR in azimuth " + ", ".join(f"{level:.2f}" for level in levels) + " dB"
+    return [statement("contours", "all three points are focused", max(levels) < -12, ours)]
+
+
+def _figure_9(seen: _Seen, path: Path) -> list[Check]:
+    image = seen.traces["segmented"].signal
+    _draw_slices(image, seen.ideal, path)
+    ours, ideal = _response(image), _response(seen.ideal)
+    return [
+        number(f"{axis}: PSLR beyond that without motion (dB)", 0.0, ours[name] - ideal[name], 0.15)
+        for axis, name in (("range", "pslr_range_db"), ("azimuth", "pslr_azimuth_db"))
+    ]
+
+
+def _table_2(seen: _Seen, path: Path) -> list[Check]:
+    ours = _response(seen.traces["segmented"].signal)
+    rows = zip(NAMES.items(), TABLE_2, WITHIN, strict=True)
+    return [number(words, published, ours[name], within, "lower") for (name, words), published, within in rows]
+
+
+ITEMS = (
+    Item("Figure 2", "frequencies of the sweeps and of the dechirped echo", of=_frequencies, make=_figure_2),
+    Item("Figure 4", "scene of three points, at places of our own", of=_three_points, make=_figure_4),
+    Item("Figure 5", "range profiles and image without compensation", of=_three_points, make=_figure_5),
+    Item("Figure 6", "velocity and range error, true and estimated", of=_three_points, make=_figure_6),
+    Item("Figure 7", "range profiles and image after compensation", of=_three_points, make=_figure_7),
+    Item("Figure 8", "contours of the points before and after compensation", of=_three_points, make=_figure_8),
+    Item("Figure 9", "impulse response in range and azimuth", of=_three_points, make=_figure_9),
+    Item("Table 1", "parameters of the simulation", "table", _three_points, _table_1),
+    Item("Table 2", "quality of the impulse response", "table", _three_points, _table_2),
+)
