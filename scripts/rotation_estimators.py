@@ -15,10 +15,11 @@ range centre deviation as well; the coarse stage gives no rate.
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -124,26 +125,20 @@ def simulated(size: str, seed: int, snr_db: float) -> Bench:
     return Bench(simulate_turntable(radar, world, n_pulse, n_range, Draws(seed))[0].signal, radar)
 
 
-def without_box(bench: Bench) -> None:
+def without_box(bench: Bench, rounds: int) -> None:
     """What needs the data alone, short enough to be timed several times; the first call in a
     process is slower.
     """
-    bench.add("coarse", lambda: coarse_rotation(bench.signal.data, **bench.known), 5)
-    bench.add("coarse + phase fit", lambda: phase_fit_rotation(bench.signal.data, **bench.known), 5)
-    bench.add("recommended", lambda: uneven_rotation(bench.signal.data, **bench.known), 5)
+    bench.add("coarse", lambda: coarse_rotation(bench.signal.data, **bench.known), rounds)
+    bench.add("coarse + phase fit", lambda: phase_fit_rotation(bench.signal.data, **bench.known), rounds)
+    bench.add("recommended", lambda: uneven_rotation(bench.signal.data, **bench.known), rounds)
 
 
-def starts() -> Iterator[tuple[float, str]]:
-    for factor in (0.9, 1.0, 1.1):
-        for variables in ("raw", "shape"):
-            yield factor, variables
-
-
-def from_starts(bench: Bench, steps: int, oversamplings: tuple[float, ...]) -> None:
-    """Newton's method, which is what the paper calls Gauss-Newton, and the quasi-Newton method with
-    a line search.
+def from_starts(bench: Bench, steps: int, forms: tuple[str, ...], oversamplings: tuple[float, ...]) -> None:
+    """Newton's method in each form of the variables, which is what the paper calls Gauss-Newton,
+    and the quasi-Newton method with a line search.
     """
-    for factor, variables in starts():
+    for factor, variables in itertools.product((0.9, 1.0, 1.1), forms):
         for damped in (False, True):
             name = f"Newton{' damped' if damped else ''} x{factor:g} {variables}"
             figure = bench.figure(2.0, variables)
@@ -263,8 +258,11 @@ def main(arguments: list[str] | None = None) -> None:
     torch.set_num_threads(1)
     bench = simulated("tiny" if options.small else "mid", options.seed, options.snr_db)
     print(f"{'estimator':34}{'evals':>8}{'CPU s':>10}{'Om (%)':>11}{'k1 (%)':>11}{'k2 (%)':>11}{'ok':>5}")
-    without_box(bench)
-    from_starts(bench, 1 if options.small else 20, (1.0,) if options.small else (1.0, 2.0, 4.0))
+    without_box(bench, 1 if options.small else 5)
+    if options.small:
+        from_starts(bench, 1, ("raw",), (1.0,))
+    else:
+        from_starts(bench, 20, ("raw", "shape"), (1.0, 2.0, 4.0))
     in_box(
         bench, 1 if options.small else options.genetic_seeds, (3, 2, 2) if options.small else (39, 30, 36)
     )  # 162, 870 and 888 evaluations

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -32,3 +33,22 @@ def recorded() -> Callable[[str], Path]:
         return path
 
     return find
+
+
+@pytest.fixture(scope="module")
+def blank_pictures() -> Iterator[None]:
+    """Figures are made, but written as blank pictures: drawing takes two thirds of a small run.
+
+    Those of every system are drawn by test_frame.py, those of sweeps by test_sweep_report.py.
+    """
+    from matplotlib.image import imsave
+
+    from torchsar import plot
+
+    def save(figure: object, path: Path, **_: object) -> None:
+        assert figure
+        imsave(path, np.full((4, 4, 4), 255, np.uint8))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plot, "save", save)
+        yield

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from tests import scripting
+from tests.program import fork_workers
 from torchsar.compensate import correct_pulse_phase
 from torchsar.core import Draws
 from torchsar.metrics import phase_rmse
@@ -59,6 +60,7 @@ def test_the_sweep_of_the_documentation_is_right(printed: Printed, tmp_path: Pat
 
 
 def test_the_benchmark_of_sweeps_runs(printed: Printed) -> None:
+    fork_workers()
     overrides = ["processor.recommended.stages.velocity.lines=16", "world.lines=384"]
     arguments = ["stripmap_doppler", "--trials", "2", "--rounds", "1", *overrides]
     text = printed(ROOT / "scripts" / "sweep_speed.py", arguments)

@@ -884,10 +884,12 @@ def save(figure: Figure | Sequence[Figure], path: Any, dpi: int = 120, columns: 
         dpi: Resolution in dots per inch.
         columns: Number of panels in a row.
     """
-    if isinstance(figure, Figure):
-        figure.savefig(path, dpi=dpi)
+    figures = [figure] if isinstance(figure, Figure) else figure
+    if len(figures) == 1 and not str(path).endswith(".png"):
+        figures[0].savefig(path, dpi=dpi)  # with its vectors, where the format has them
         return
-    drawn = [_pixels(one, dpi) for one in figure]
+    # savefig draws a figure with a layout twice
+    drawn = [_pixels(one, dpi) for one in figures]
     rows = [drawn[first : first + columns] for first in range(0, len(drawn), columns)]
     wide = [max(row[i].shape[1] for row in rows if i < len(row)) for i in range(len(rows[0]))]
     sheet = np.full((sum(max(len(one) for one in row) for row in rows), sum(wide), 4), 255, np.uint8)

@@ -188,7 +188,7 @@ def test_stages_remove_the_differences():
 
 def test_trials_are_independent_and_empty_ones_not_ok():
     radar = published_radar()
-    data = differed(clutter(radar, flat, 30.0), radar)
+    data = differed(clutter(radar, flat, 30.0, n_range=60), radar)
     dead = data[:1] * torch.tensor([1.0, 0.0, 1.0])[:, None, None]
     data = torch.cat([data * torch.tensor([1.0, 1e3])[:, None, None, None], torch.zeros_like(data[:1]), dead])
     together = estimate_balance(data, radar, FlatBand(360.0), 2)

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from pathlib import Path
+from typing import Any
 
+import pytest
 import yaml
 
 from tests.study.tiny import TINY
+from torchsar import plot
 from torchsar.cli import main
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.table import load
@@ -292,3 +297,22 @@ def run(config: str, out: Path, *overrides: str) -> dict:
     """metrics.json of a run by command."""
     assert main(["run", config, *overrides, "--out", str(out)]) == 0
     return json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+
+
+def draw_first_panels(patch: pytest.MonkeyPatch, **copied: str) -> None:
+    """Of every picture the first panel is drawn: the others are copies, since they differ only in
+    their data. So are pictures that are named in the first place of `copied` instead of the second.
+    """
+    save, drawn = plot.save, {}
+
+    def once(figure: Any, path: Path, **how: Any) -> None:
+        kind = re.sub(r"_\d+$", "", path.stem.partition("_")[2])
+        for name, original in copied.items():
+            kind = kind.replace(name, original)
+        if kind in drawn:
+            shutil.copy(drawn[kind], path)
+        else:
+            save(figure, path, **how)
+            drawn[kind] = path
+
+    patch.setattr(plot, "save", once)

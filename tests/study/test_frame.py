@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ import pytest
 import torch
 import zarr
 
-from tests.study.scenes import IMAGE, ISAL, SCENES, bench_of, loaded_as, run, write
-from torchsar import plot
+from tests.study.scenes import IMAGE, ISAL, SCENES, bench_of, draw_first_panels, loaded_as, run, write
 from torchsar.cli import main
 from torchsar.compensate.pulse_phase import Sca
 from torchsar.core import Axis, Draws, Signal, numpy_random
@@ -57,7 +55,7 @@ def test_a_run_means_the_same_in_every_system(
 
     make = benches.build_chains
     monkeypatch.setattr(benches, "build_chains", counted)
-    _draw_once(monkeypatch)
+    draw_first_panels(monkeypatch, other_two="one")
     trials = 1 if system == "geo_ocean" else 2
     world = {**SCENES[system]["world"], "trials": trials}
     out = tmp_path / "out"
@@ -73,21 +71,6 @@ def test_a_run_means_the_same_in_every_system(
     _check_numbers(system, tree, loaded)
     _check_arrays(tree, out)
     _check_report(tree, loaded, out)
-
-
-def _draw_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures of the second case are those of the first with other data: they are copies."""
-    save, drawn = plot.save, {}
-
-    def once(figure: Any, path: Path) -> None:
-        kind = path.name.partition("_")[2].replace("other_two", "one")
-        if kind in drawn:
-            shutil.copy(drawn[kind], path)
-        else:
-            save(figure, path)
-            drawn[kind] = path
-
-    monkeypatch.setattr(plot, "save", once)
 
 
 def _check_methods(tree: dict, trials: int) -> None:

@@ -22,6 +22,8 @@ from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.text import find_config, read_tree
 from torchsar.study.table import load
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 
 def metrics_of(folder: Path, *overrides: str, trials: int = 3, **changes: object) -> dict[str, dict[str, float]]:
     """Means over the trials of every method."""

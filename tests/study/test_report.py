@@ -221,7 +221,7 @@ def test_an_image_is_rolled_to_where_another_one_lies() -> None:
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(blank_pictures: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with a velocity search, and one point far outside the strip."""
     folder = tmp_path_factory.mktemp("report")
     world = dict(TINY["world"]) | {"trials": 2}

@@ -38,6 +38,8 @@ from torchsar.study.names.registry import (
 from torchsar.study.table import load, systems
 from torchsar.study.trials.bench import Bench
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 
 def test_methods_reach_the_figures_of_a_point_also_where_the_beam_is_dark(tmp_path: Path) -> None:
     for changes in ({"world": world("sal", noise={"snr_db": None})}, {"radar": radar("sal", beam_rad=100e-6)}):

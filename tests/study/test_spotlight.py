@@ -15,6 +15,8 @@ from tests.test_docs import DOCS, block_with
 from torchsar.cli import main
 from torchsar.io import read_sicd
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 pytest.importorskip("sarkit", reason="sarkit is not installed (extra `formats`)")
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.study.scenes import draw_first_panels
 from torchsar.plot import axis_label
 from torchsar.study.montecarlo.pictures import SweepPictures, draw_sweep
 from torchsar.study.montecarlo.record import Record
@@ -71,7 +72,9 @@ def summary(record: Record, figures: Summary, tmp_path_factory: pytest.TempPathF
 @pytest.fixture(scope="module")
 def drawn(figures: Summary, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Picture]]:
     folder = tmp_path_factory.mktemp("sweep") / "figures"
-    return folder, draw_sweep(figures, folder, ["doppler_error_hz", "entropy_nats"])
+    with pytest.MonkeyPatch.context() as patch:
+        draw_first_panels(patch)
+        return folder, draw_sweep(figures, folder, ["doppler_error_hz", "entropy_nats"])
 
 
 @pytest.fixture(scope="module")
@@ -212,8 +215,9 @@ def test_three_parameters_have_curves_shares_and_maps(drawn: tuple[Path, list[Pi
 
 @pytest.mark.parametrize("labels, expected", SWEEPS.values(), ids=SWEEPS)
 def test_every_sweep_has_its_pictures(
-    labels: dict[str, tuple[float | str, ...]], expected: list[str], tmp_path: Path
+    labels: dict[str, tuple[float | str, ...]], expected: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    draw_first_panels(monkeypatch)
     record = synthetic(labels, trials=8)
     del record.metrics["entropy_nats"]
     success = {"doppler_error_hz": 4.0} if any("success" in name for name in expected) else {}

@@ -16,6 +16,8 @@ from torchsar.cli import main
 from torchsar.study import table
 from torchsar.study.trials.batch import Trials
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 # what a further system may cost at most, in statements
 MOST_STATEMENTS = 120
 FREQUENCIES = [3.0, 10.3, 20.1]

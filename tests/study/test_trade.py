@@ -22,6 +22,8 @@ from torchsar.study.trials.auto import choices_of, tolerance_of
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 ROOT = Path(__file__).parents[2]
 KEPT = sorted((ROOT / "docs" / "trade").glob("*.json"))
 FIELDS = {"name", "cpu_s", "wall_s", "peak_bytes", "loss", "within_tolerance", "recommended"}
