@@ -33,6 +33,7 @@ from torchsar.core.host import (
     validate,
     validation,
 )
+from torchsar.core.libraries import library
 from torchsar.core.linear import cholesky_factor, linear_solve, matrix_inverse
 from torchsar.core.memory import LargestTensor, PeakMemory, is_out_of_memory, keep_freed_memory, machine_memory_bytes
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
@@ -100,6 +101,7 @@ __all__ = [
     "keep_freed_memory",
     "legendre",
     "level_of",
+    "library",
     "linear_phasor",
     "linear_solve",
     "machine_memory_bytes",

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import gathered_checks
+from torchsar.core.show import Shown, Summary, kind_of
 from torchsar.core.signal import Recording, Signal
 
 Given = Mapping[str, Tensor | Estimate]
@@ -80,8 +81,8 @@ def use(stage: nn.Module, *, in_doubt: str = "neutral", **names: str) -> Use:
     return Use(stage, sources, in_doubt)
 
 
-@dataclass(frozen=True)
-class Trace:
+@dataclass(frozen=True, repr=False)
+class Trace(Shown):
     """All intermediate results of one run of a chain, by the names of the stages.
 
     Args:
@@ -112,6 +113,15 @@ class Trace:
     def signal(self) -> Signal:
         """Signal after the last stage."""
         return list(self.outputs.values())[-1]
+
+    def _summary(self) -> Summary:
+        stages = []
+        for name, signal in self.outputs.items():
+            estimate, seconds = self.estimates.get(name), self.seconds.get(name)
+            found = "" if estimate is None else f"{' and '.join(estimate.value)} {estimate._verdict}"
+            took = "" if seconds is None else f"{seconds:.3g} s"
+            stages.append((name, f"{kind_of(signal.data)} of {' and '.join(signal.names)}", found, took))
+        return Summary(f"{sum(self.seconds.values()):.3g} s", {"signals, estimates and times after stages": stages})
 
 
 @dataclass
@@ -171,7 +181,7 @@ class _Log:
         return Trace(self.inputs, self.outputs, known.estimates, known.values, **parts)
 
 
-class Chain(nn.Module):
+class Chain(Shown, nn.Module):
     """Sequence of stages that run in order and pass estimates to later stages as named values.
 
     `chain(x)` returns the signal after the last stage, and `chain.trace(x)` a Trace of all
@@ -209,6 +219,16 @@ class Chain(nn.Module):
         self.uses = {name: item.names if isinstance(item, Use) else {} for name, item in stages.items()}
         self.in_doubt = {name: item.in_doubt if isinstance(item, Use) else "neutral" for name, item in stages.items()}
         self._check()
+
+    def _summary(self) -> Summary:
+        stages = []
+        for name, stage in self.stages.items():
+            uses = " and ".join(f"{parameter} from {source}" for parameter, source in self.uses[name].items())
+            doubt = " (ok or not)" if self.in_doubt[name] == "apply" else ""
+            gives = " and ".join(_provided(stage))
+            row = (type(stage).__name__, uses and f"uses {uses}{doubt}", gives and f"estimates {gives}")
+            stages.append((name, *row))
+        return Summary(f"{len(stages)} stage{'s' * (len(stages) > 1)}", {"stages in their order": stages})
 
     def _check(self) -> None:
         """Reject connections that do not fit, and required values without a connection."""

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from torchsar.core.show import Shown, Summary, content, one_number
 
-@dataclass(frozen=True)
-class Estimate:
+
+@dataclass(frozen=True, repr=False)
+class Estimate(Shown):
     """Estimated values with their predicted accuracy and their reliability in each trial.
 
     All tensors begin with the trial dimensions (...). A trial in which the estimation fails raises
@@ -77,6 +79,17 @@ class Estimate:
             neutral = torch.full((), neutral, dtype=value.dtype, device=value.device)
         neutral = torch.as_tensor(neutral, dtype=value.dtype, device=value.device)
         return torch.where(self.ok[(...,) + (None,) * (value.ndim - self.ok.ndim)], value, neutral)
+
+    @property
+    def _verdict(self) -> str:
+        """Number of trials in which the estimate is ok, as words, such as "ok in 3 of 4"."""
+        count = one_number(self.ok.sum())
+        return f"ok of shape {tuple(self.ok.shape)}" if count is None else f"ok in {count} of {self.ok.numel()}"
+
+    def _summary(self) -> Summary:
+        std = {name: f"standard deviation {content(value)}" for name, value in self.std.items()}
+        values = [(name, content(value), std.get(name, "")) for name, value in self.value.items()]
+        return Summary(f"{self._verdict}, {self.ok.device}", {"values": values})
 
     @staticmethod
     def joined(parts: Sequence[Estimate], trials: torch.Size) -> Estimate:

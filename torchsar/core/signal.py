@@ -12,14 +12,15 @@ from torch import Tensor
 
 from torchsar.core.axis import Axis
 from torchsar.core.check import refuse_non_finite
+from torchsar.core.show import Rows, Shown, Summary, content, in_bytes, kind_of
 
 # Limit of plausibility, for errors in files: 200 dB is a factor of 1e10 in amplitude.
 AGC_LIMIT_DB = 200.0
 _ADVICE = "the numbers are too large for this type: scale the samples, or choose complex128"
 
 
-@dataclass(frozen=True)
-class Signal:
+@dataclass(frozen=True, repr=False)
+class Signal(Shown):
     """Samples with named trailing axes; every dimension before them is a Monte Carlo trial.
 
     Slow time comes before fast time, and range is last and contiguous. Samples are complex, except
@@ -136,9 +137,17 @@ class Signal:
         """Return the signal on another device or in another dtype; arguments as for Tensor.to."""
         return self.with_data(self.data.to(*args, **kwargs))
 
+    def _summary(self) -> Summary:
+        size = in_bytes(self.data.numel() * self.data.element_size())
+        return Summary(f"{kind_of(self.data)}, {self.data.device}, {size}", {"axes": self._spans()})
 
-@dataclass(frozen=True)
-class Recording:
+    def _spans(self) -> Rows:
+        """Number of samples, first and last coordinate of each axis."""
+        return [(a.name, f"{a.n}", f"{a.start:.6g} to {a.stop:.6g} {a.unit}") for a in self.axes]
+
+
+@dataclass(frozen=True, repr=False)
+class Recording(Shown):
     """Samples of an instrument, with its description and the side data recorded beside them.
 
     Args:
@@ -224,6 +233,11 @@ class Recording:
             self, signal=signal, aux={name: value.to(signal.data.device) for name, value in self.aux.items()}
         )
 
+    def _summary(self) -> Summary:
+        samples = self.signal._summary()
+        side_data = [(f"aux.{name}", content(value)) for name, value in self.aux.items()]
+        return Summary(f"{type(self.radar).__name__}; {samples.about}", {**samples.tables, "side data": side_data})
+
 
 def _as_tensor(value: Any, what: str) -> Tensor:
     """torch.as_tensor with an error message that names the data."""
@@ -273,8 +287,8 @@ def _check_side_data(side: Tensor, samples: Tensor, what: str) -> None:
         )
 
 
-@dataclass(frozen=True)
-class Truth:
+@dataclass(frozen=True, repr=False)
+class Truth(Shown):
     """True values of a simulation, for evaluation only; no processing stage may use them.
 
     Args:
@@ -285,3 +299,7 @@ class Truth:
 
     values: Mapping[str, Tensor]
     clean: Recording | None = None
+
+    def _summary(self) -> Summary:
+        values = [(name, content(value)) for name, value in self.values.items()]
+        return Summary("without `clean`" if self.clean is None else "with `clean`", {"values": values})

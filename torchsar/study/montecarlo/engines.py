@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from torchsar.core import keep_freed_memory
+from torchsar.core import keep_freed_memory, library
 from torchsar.study.montecarlo.work import Chunk, Computed, Work
 from torchsar.study.settings.errors import ConfigError, one_line
 
@@ -185,8 +185,9 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
             and because results then do not depend on the number of cores.
 
     Raises:
-        ConfigError: If a number is not accepted, both `workers` and `cluster` are given,
-            dask.distributed is not installed, or no scheduler answers at the address.
+        ConfigError: If a number is not accepted, both `workers` and `cluster` are given, or no
+            scheduler answers at the address.
+        ModuleNotFoundError: If dask.distributed is not installed.
     """
     for name, value in (("workers", workers), ("threads", threads)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
@@ -198,12 +199,7 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
         raise ConfigError(
             "--workers starts processes on this machine and --cluster uses running ones; give one of them"
         )
-    try:
-        import distributed
-    except ImportError:
-        raise ConfigError(
-            "workers and cluster need dask.distributed, which is not installed; run pip install 'torchsar-lab[cluster]'"
-        ) from None
+    distributed = library("distributed", "cluster", "a sweep with workers or a cluster")
     local = _local(distributed, workers or 1, threads)
     with local if cluster is None else _remote(distributed, cluster, threads) as chosen:
         yield chosen

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from torchsar.core import checksum
+from torchsar.core import checksum, library
+from torchsar.core.show import Shown, Summary, some_of
 from torchsar.study.montecarlo.grid import RESERVED, check_name
 from torchsar.study.settings.errors import ConfigError
 
@@ -16,8 +17,8 @@ OK = "ok"
 Labels = dict[str, tuple[float | str, ...]]
 
 
-@dataclass
-class Record:
+@dataclass(repr=False)
+class Record(Shown):
     """Results of a sweep. A trial that has not run is NaN in every metric and False in `done`.
 
     Args:
@@ -158,19 +159,20 @@ class Record:
         The array of a bound has the attributes `bound_of`, its metric, and `bound`, its name.
 
         Raises:
-            ImportError: If the extra `xarray` is not installed.
+            ModuleNotFoundError: If the extra `xarray` is not installed.
         """
-        try:
-            import xarray
-        except ImportError:
-            raise ImportError(
-                "to_xarray needs xarray, which is not installed; run pip install 'torchsar-lab[xarray]'"
-            ) from None
+        xarray = library("xarray", "xarray", "to_xarray")
         coordinates = {"algorithm": self.algorithms, **self.labels, "trial": range(self.trials)}
         return xarray.Dataset(
             {"done": (self.dims[1:], self.done), **{name: (d, x, a) for name, (x, d, a) in self.variables().items()}},
             {name: list(values) for name, values in coordinates.items()},
         )
+
+    def _summary(self) -> Summary:
+        axes = {"algorithm": self.algorithms, **self.labels}.items()
+        parts = [*((name, f"{len(x)}", some_of(x)) for name, x in axes), ("trial", f"{self.trials}")]
+        metrics = [(name, " and ".join(self.bounds.get(name, ()))) for name in self.metrics]
+        return Summary(f"{self.done.sum()} of {self.done.size} trials done", {"axes": parts, "metrics": metrics})
 
 
 def bound_name(metric: str, bound: str) -> str:

@@ -1,0 +1,164 @@
+"""Prompts and notebooks show kinds, spans and connections of objects, and no dumps of numbers."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+import torchsar
+from torchsar.core import Axis, Estimate, Recording, Signal, Stage, Truth, use
+from torchsar.core.show import in_bytes, some_of
+
+AXES = (Axis("pulse", 4, 0.0, 0.5, "s"), Axis("range", 1000, 700e3, 0.6, "m"))
+
+
+class Gain(Stage):
+    """Estimates a number."""
+
+    works_on = ("pulse", "range")
+    provides = ("gain_db",)
+
+    def forward(self, x: Signal) -> Estimate:
+        trials = x.data.new_zeros(x.trials).real
+        ok = torch.arange(trials.numel()).reshape(trials.shape) > 0
+        return Estimate({"gain_db": trials + 3}, trials, ok, {"gain_db": trials + 0.25})
+
+
+class Amplify(nn.Module):
+    """Uses it."""
+
+    def forward(self, x: Signal, gain_db: torch.Tensor) -> Signal:
+        return x.with_data(x.data * 2)
+
+
+def chain() -> torchsar.Chain:
+    return torchsar.Chain(gain=Gain(), louder=use(Amplify(), gain_db="gain", in_doubt="apply"))
+
+
+def signal(*trials: int) -> Signal:
+    return Signal(torch.zeros(*trials, 4, 1000, dtype=torch.complex64), AXES)
+
+
+def objects() -> dict[str, Any]:
+    recording = Recording(signal(3), Gain(), {"line_number": torch.arange(4)})
+    trace = chain().trace(recording)
+    truth = Truth({"snr_db": torch.zeros(3)}, recording)
+    return {
+        "signal": recording.signal,
+        "recording": recording,
+        "truth": truth,
+        "trace": trace,
+        "estimate": trace.estimates["gain"],
+        "chain": chain(),
+    }
+
+
+class Checked(HTMLParser):
+    """Raises AssertionError for elements that are not closed, and for what needs a network."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.words = ""
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert tag in ("div", "strong", "table", "tr", "th", "td"), tag
+        assert not {name for name, _ in attrs} - {"style", "colspan"}
+        self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words += f" {data}"
+
+
+def test_a_signal_has_kind_device_size_and_spans() -> None:
+    assert repr(signal()) == (
+        "Signal(complex64 (4, 1000), cpu, 32 kB; pulse: 4, 0 to 1.5 s; range: 1000, 700000 to 700599 m)"
+    )
+
+
+def test_a_text_that_is_too_long_has_a_line_for_each_part() -> None:
+    assert repr(signal(30, 20)).splitlines() == [
+        "Signal(complex64 (30, 20, 4, 1000), cpu, 19.2 MB",
+        "  pulse: 4, 0 to 1.5 s",
+        "  range: 1000, 700000 to 700599 m)",
+    ]
+
+
+def test_one_number_of_an_estimate_is_shown_and_several_are_not() -> None:
+    one = Estimate({"doppler_hz": torch.tensor(24.9)}, torch.ones(()), torch.tensor(True))
+    assert repr(one) == "Estimate(ok in 1 of 1, cpu; doppler_hz: 24.9)"
+    shown = repr(objects()["estimate"])
+    assert shown == "Estimate(ok in 2 of 3, cpu; gain_db: float32 (3,), standard deviation float32 (3,))"
+
+
+def test_a_chain_shows_its_connections() -> None:
+    assert repr(chain()).splitlines() == [
+        "Chain(2 stages",
+        "  gain: Gain, estimates gain_db",
+        "  louder: Amplify, uses gain_db from gain.gain_db (ok or not))",
+    ]
+    assert "gain_db from gain.gain_db" in Checked(chain()._repr_html_()).words
+
+
+def test_a_trace_shows_signals_verdicts_and_times() -> None:
+    words = Checked(objects()["trace"]._repr_html_()).words
+    assert "complex64 (3, 4, 1000) of pulse and range" in words and "gain_db ok in 2 of 3" in words
+    assert words.rstrip().endswith(" s")
+
+
+@pytest.mark.parametrize("name", ("signal", "recording", "truth", "trace", "estimate", "chain"))
+def test_a_notebook_gets_small_html_with_the_words_of_the_text(name: str) -> None:
+    shown = objects()[name]
+    html = shown._repr_html_()
+    words = Checked(html).words
+    assert len(html) < 1500 and len(repr(shown)) < 400
+    for line in repr(shown).strip("()").replace("(", " ", 1).splitlines()[1:]:
+        part, _, rest = line.strip(" )").partition(": ")
+        assert f" {part} " in words and all(one in words for one in rest.split(", ") if "(" not in one)
+
+
+def test_html_escapes_names() -> None:
+    aux = {"<script>alert(1)</script>": torch.zeros(4)}
+    assert "<script>" in Checked(Recording(signal(), None, aux)._repr_html_()).words  # as text
+
+
+def test_a_large_signal_is_shown_without_reading_it() -> None:
+    large = Signal(torch.empty(1000, 4, 1000, dtype=torch.complex64, device="meta"), AXES)  # has no values
+    assert "32 MB" in repr(large) and "meta" in large._repr_html_()
+
+
+def test_objects_are_shown_within_vmap() -> None:
+    seen = []
+
+    def look(x: Signal) -> Signal:
+        seen.append(repr(Estimate({"a_m": x.data.real[0, 0]}, x.data.real[0, 0], x.data.real[0, 0] > 0)))
+        return x
+
+    torch.func.vmap(look)(signal(3))
+    assert seen == ["Estimate(ok of shape (), cpu; a_m: float32 ())"]
+
+
+def test_sizes_and_lists_are_short() -> None:
+    assert [in_bytes(x) for x in (12, 1536, 6.3e6, 2e9, 5e15)] == ["12 bytes", "1.54 kB", "6.3 MB", "2 GB", "5e+03 TB"]
+    assert some_of((0.0, 10.0)) == "0, 10" and some_of([1.0, 2.0, 3.0, 4.0, 5.0]) == "1 to 5"
+
+
+def test_the_record_of_a_sweep_shows_its_axes_and_metrics() -> None:
+    study = pytest.importorskip("torchsar.study")
+    record = study.sweep(
+        lambda point, draws: {"mean": {"error_m": draws.normal("x") + point["snr_db"]}},
+        {"snr_db": [0.0, 10.0]},
+        trials=3,
+    )
+    shown = "Record(6 of 6 trials done; algorithm: 1, mean; snr_db: 2, 0, 10; trial: 3; error_m)"
+    assert repr(record) == shown
+    assert "snr_db" in Checked(record._repr_html_()).words
