@@ -70,8 +70,7 @@ class Bench:
         return OmegaK(self.recording.radar, velocity_m_s=self.velocity_m_s)(signal, doppler_hz=self.doppler_hz)
 
     def window(self, image: Signal) -> Signal:
-        n_a, n_r = image.data.shape[-2:]
-        return image.crop(azimuth=(MARGIN_LINES, n_a - MARGIN_LINES), range=(0, n_r - MARGIN_SAMPLES))
+        return image.isel(azimuth=slice(MARGIN_LINES, -MARGIN_LINES), range=slice(0, -MARGIN_SAMPLES))
 
     def rho(self, image: Signal) -> float:
         return float(correlation(self.window(image), self.window(self.clean)))

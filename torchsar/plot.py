@@ -2,16 +2,18 @@
 
 Each function that draws takes signals or arrays and returns a matplotlib Figure, or a list of
 Figures, one for each panel, so that a page can set the panels side by side or below each other.
-`save` writes a Figure or such a list into one file.
+`save` writes a Figure or such a list into one file, and notebooks show both as pictures.
 """
 
 from __future__ import annotations
 
 import functools
+import io
 import itertools
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -79,6 +81,26 @@ _STYLE: Any = {
 }
 
 
+class NotebookFigure(Figure):
+    """Figure that a notebook shows by itself, without pyplot and its settings."""
+
+    def _repr_png_(self) -> bytes:
+        return _png(self)
+
+
+class Panels(list[Figure]):
+    """Figures that a notebook shows side by side, row by row."""
+
+    def _repr_png_(self) -> bytes:
+        return _png(self)
+
+
+def _png(figure: Figure | Sequence[Figure]) -> bytes:
+    file = io.BytesIO()
+    save(figure, file)
+    return file.getvalue()
+
+
 Drawn = TypeVar("Drawn", Figure, list[Figure])
 
 
@@ -86,16 +108,17 @@ def _styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
     """Run a drawing function in the style of this module, without a change of global settings."""
 
     @functools.wraps(draw)
-    def styled(*args: Any, **options: Any) -> Drawn:
+    def styled(*args: Any, **options: Any) -> Any:
         with rc_context(_STYLE):
-            return draw(*args, **options)
+            drawn = draw(*args, **options)
+        return Panels(drawn) if isinstance(drawn, list) else drawn
 
     return styled
 
 
 def _figure(width: float, height: float, to_scale: bool = False) -> tuple[Figure, Axes]:
     """Figure of one panel, with its axes."""
-    figure = Figure(figsize=(width, height), layout="compressed" if to_scale else "constrained")
+    figure = NotebookFigure(figsize=(width, height), layout="compressed" if to_scale else "constrained")
     return figure, figure.subplots()
 
 
@@ -183,8 +206,8 @@ def within(signal: Signal, spans: Mapping[str, tuple[float, float]]) -> Signal:
         if axis.name in spans:
             first, last = (round(float(axis.index_of(edge))) for edge in spans[axis.name])
             first = min(max(first, 0), max(axis.n - 2, 0))
-            cut[axis.name] = (first, min(max(last + 1, first + 2), axis.n))
-    return signal.crop(**cut)
+            cut[axis.name] = slice(first, max(last + 1, first + 2))
+    return signal.isel(**cut)
 
 
 def boxes(centres: Sequence[tuple[float, float]], half_x: float, half_y: float) -> tuple[np.ndarray, np.ndarray]:
@@ -880,12 +903,13 @@ def save(figure: Figure | Sequence[Figure], path: Any, dpi: int = 120, columns: 
 
     Args:
         figure: Figure to write, or several, which are set side by side, row by row.
-        path: Path of the file; its suffix gives the format.
+        path: Path of the file, whose suffix gives the format, or a binary file for PNG.
         dpi: Resolution in dots per inch.
         columns: Number of panels in a row.
     """
+    kind = "png" if not isinstance(path, str | PathLike) or str(path).endswith(".png") else None
     figures = [figure] if isinstance(figure, Figure) else figure
-    if len(figures) == 1 and not str(path).endswith(".png"):
+    if len(figures) == 1 and kind is None:
         figures[0].savefig(path, dpi=dpi)  # with its vectors, where the format has them
         return
     # savefig draws a figure with a layout twice
@@ -899,7 +923,7 @@ def save(figure: Figure | Sequence[Figure], path: Any, dpi: int = 120, columns: 
             left = sum(wide[:i])
             sheet[above : above + len(one), left : left + one.shape[1]] = one
         above += max(len(one) for one in row)
-    imsave(path, sheet, dpi=dpi)
+    imsave(path, sheet, dpi=dpi, format=kind)
 
 
 def _pixels(figure: Figure, dpi: int) -> np.ndarray:

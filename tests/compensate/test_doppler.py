@@ -260,7 +260,7 @@ def test_recorded_blocks_without_prior_knowledge(
     radar = replace(
         recording.radar, near_range_m=recording.radar.near_range_m + columns[0] * recording.radar.range_step_m
     )
-    signal = recording.signal.crop(pulse=lines, range=columns)
+    signal = recording.signal.isel(pulse=slice(*lines), range=slice(*columns))
     doppler = DopplerCentroid(radar)(signal)
     assert bool(doppler.ok)
     assert float(doppler["ambiguity"]) == -6

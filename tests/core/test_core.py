@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -48,13 +50,78 @@ def test_signal_rejects_a_shape_that_does_not_end_in_its_axes():
         Signal(torch.zeros(5, 4), (Axis("pulse", 4, 0, 1, "s"), Axis("range", 5, 0, 1, "m")))
 
 
-def test_crop_shortens_samples_and_axis():
-    signal = Signal(torch.arange(12.0).reshape(3, 4), (Axis("pulse", 3, 0, 1, "s"), Axis("range", 4, 100, 2, "m")))
-    part = signal.crop(range=(1, 3))
+def ramp() -> Signal:
+    axes = Axis("pulse", 3, 0, 1, "s"), Axis("range", 4, 100, 2, "m")
+    return Signal(torch.arange(24.0).reshape(2, 3, 4), axes)
+
+
+def test_isel_shortens_samples_and_axis():
+    signal = ramp()
+    part = signal.isel(range=slice(1, 3))
     assert part.axis("range") == Axis("range", 2, 102, 2, "m")
-    assert part.data.tolist() == [[1, 2], [5, 6], [9, 10]]
-    with pytest.raises(ValueError, match="does not fit"):
-        signal.crop(range=(1, 9))
+    assert part.data[0].tolist() == [[1, 2], [5, 6], [9, 10]]
+    assert part.data.data_ptr() == signal.data[..., 1:].data_ptr()
+    thinned = signal.isel(pulse=slice(None, None, 2), range=slice(-3, 99))
+    assert thinned.axes == (Axis("pulse", 2, 0, 2, "s"), Axis("range", 3, 102, 2, "m"))
+    assert thinned.data[1].tolist() == [[13, 14, 15], [21, 22, 23]]
+
+
+def test_an_index_and_a_coordinate_remove_their_axis():
+    signal = ramp()
+    line = signal.isel(pulse=-1)
+    assert line.names == ("range",) and line.trials == (2,) and line.data[0].tolist() == [8, 9, 10, 11]
+    column = signal.sel(range=102.9)  # the nearest sample lies at 102
+    assert column.names == ("pulse",) and column.data[0].tolist() == [1, 5, 9]
+
+
+def test_sel_takes_the_samples_between_two_coordinates_with_both_ends():
+    part = ramp().sel(range=slice(102, 104), pulse=slice(0.2, None))
+    assert part.axes == (Axis("pulse", 2, 1, 1, "s"), Axis("range", 2, 102, 2, "m"))
+    fine = Signal(torch.zeros(1000), (Axis("range", 1000, 4000.0, 0.1, "m"),))
+    kept = fine.sel(range=slice(4000.3, 4000.7)).axes[0]  # these are no multiples of 0.1 in binary
+    assert kept.n == 5 and kept.start == pytest.approx(4000.3)
+    assert fine.sel(range=slice(None, math.inf)).axes == fine.axes
+
+
+@pytest.mark.parametrize(
+    "position", [slice(102.5, 103.5), slice(104, 102), slice(107, 200), slice(0, 99), 98.9, math.nan]
+)
+def test_sel_without_samples_says_where_they_are(position):
+    with pytest.raises(ValueError, match="axis 'range' has no samples at .*4 from 100 to 106 m"):
+        ramp().sel(range=position)
+
+
+def test_selections_that_do_not_exist_are_refused():
+    with pytest.raises(ValueError, match="axis 'range' with 4 samples: the slice 3:1 has no samples in rising order"):
+        ramp().isel(range=slice(3, 1))
+    with pytest.raises(ValueError, match="has no samples in rising order"):
+        ramp().isel(range=slice(None, None, -1))
+    with pytest.raises(ValueError, match="has no step"):
+        ramp().sel(range=slice(100, 104, 2))
+    with pytest.raises(IndexError):
+        ramp().isel(range=4)
+    with pytest.raises(KeyError, match="not 'azimuth'"):
+        ramp().sel(azimuth=0)
+
+
+def test_xarray_gets_names_coordinates_and_units():
+    pytest.importorskip("xarray", reason="xarray is not installed (extra `xarray`)")
+    signal = ramp()
+    array = replace(signal, data=signal.data.requires_grad_()).to_xarray()
+    assert array.dims == ("trial", "pulse", "range") and array.range.units == "m"
+    assert array.sel(range=102, pulse=2).values.tolist() == [9, 21]
+    conjugate = torch.ones(2, 2, 3, 4, dtype=torch.complex64).mul(1j).conj()
+    assert replace(signal, data=conjugate).to_xarray().dims[:2] == ("trial_0", "trial_1")
+    assert complex(replace(signal, data=conjugate).to_xarray()[0, 0, 0, 0]) == -1j
+    assert np.shares_memory(signal.to_xarray().values, signal.data.detach().numpy())
+
+
+def test_xarray_that_is_missing_is_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(
+        ModuleNotFoundError, match=r'Signal.to_xarray needs .* xarray: pip install "torchsar-lab\[xarray\]"'
+    ):
+        ramp().to_xarray()
 
 
 def test_conversion_of_a_recording_changes_only_the_dtype_of_samples():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -12,10 +13,13 @@ from torch import Tensor
 
 from torchsar.core.axis import Axis
 from torchsar.core.check import refuse_non_finite
+from torchsar.core.libraries import library
 from torchsar.core.show import Rows, Shown, Summary, content, in_bytes, kind_of
 
 # Limit of plausibility, for errors in files: 200 dB is a factor of 1e10 in amplitude.
 AGC_LIMIT_DB = 200.0
+# rounding of coordinates, in samples
+_ROUNDING = 1e-6
 _ADVICE = "the numbers are too large for this type: scale the samples, or choose complex128"
 
 
@@ -110,28 +114,72 @@ class Signal(Shown):
             self.dim(name)
         return Signal(data, tuple(axes.get(axis.name, axis) for axis in self.axes))
 
-    def crop(self, **bounds: tuple[int, int]) -> Signal:
-        """Return a part of the samples along some axes, such as `signal.crop(range=(0, 1480))`.
+    def isel(self, **index: int | slice) -> Signal:
+        """Select samples by indices along some axes, such as `signal.isel(range=slice(0, 9))`.
 
         Args:
-            **bounds: Pairs (first, last) by the name of the axis; samples first to last - 1 are
-                kept.
+            **index: By the name of the axis, an index, or a slice of indices. They count as in
+                Python: from the end if negative, and a slice may reach beyond the samples. An index
+                removes its axis.
+
+        Returns:
+            Signal with a view of the samples.
 
         Raises:
             KeyError: If the signal has no axis of one of these names.
-            ValueError: Unless 0 <= first < last <= number of samples of the axis.
+            IndexError: If there is no sample of such an index.
+            ValueError: If a slice has no samples, or runs backwards.
         """
         signal = self
-        for name, (first, last) in bounds.items():
-            axis = signal.axis(name)
-            if not 0 <= first < last <= axis.n:
+        for name, chosen in index.items():
+            axis, dim = signal.axis(name), signal.dim(name)
+            if not isinstance(chosen, slice):
+                rest = tuple(other for other in signal.axes if other is not axis)
+                signal = Signal(signal.data.select(dim, chosen), rest)
+                continue
+            kept = range(*chosen.indices(axis.n))
+            if kept.step < 1 or not kept:
                 raise ValueError(
-                    f"crop of axis {name!r} to {first}:{last} does not fit its {axis.n} samples; "
-                    f"give 0 <= first < last <= {axis.n}"
+                    f"axis {name!r} with {axis.n} samples: the slice {chosen.start}:{chosen.stop}"
+                    f"{'' if kept.step == 1 else f':{kept.step}'} has no samples in rising order"
                 )
-            data = signal.data.narrow(signal.dim(name), first, last - first)
-            signal = signal.with_axis(data, **{name: axis.part(first, last)})
+            data = signal.data[(..., chosen, *(slice(None),) * (-dim - 1))]
+            part = replace(axis.part(kept.start, kept.start + len(kept)), step=axis.step * kept.step)
+            signal = signal.with_axis(data, **{name: part})
         return signal
+
+    def sel(self, **position: float | slice) -> Signal:
+        """Select samples by coordinates of some axes, such as `signal.sel(range=slice(100, 200))`.
+
+        Args:
+            **position: By the name of the axis and in its unit, a coordinate, of which the nearest
+                sample is taken and the axis removed, or a slice(first, last) of coordinates, of
+                which both ends are included. An end that is None is that of the axis.
+
+        Returns:
+            Signal with a view of the samples.
+
+        Raises:
+            KeyError: If the signal has no axis of one of these names.
+            ValueError: If there are no samples there, or a slice has a step.
+        """
+        return self.isel(**{name: _indices(self.axis(name), chosen) for name, chosen in position.items()})
+
+    def to_xarray(self) -> Any:
+        """Return the signal as an xarray.DataArray on the CPU, without gradient.
+
+        Its dims are those of the trials (`trial`, or `trial_0`, `trial_1`, ... if there are
+        several) and the axes with their coordinates and attribute `units`. It shares the memory of
+        samples on the CPU.
+
+        Raises:
+            ModuleNotFoundError: If the extra `xarray` is not installed.
+        """
+        xarray, count = library("xarray", "xarray", "Signal.to_xarray"), len(self.trials)
+        trials = ("trial",) if count == 1 else tuple(f"trial_{i}" for i in range(count))
+        coordinates = {a.name: (a.name, a.values().numpy(), {"units": a.unit}) for a in self.axes}
+        data = torch.resolve_neg(self.data.detach().cpu().resolve_conj()).numpy()
+        return xarray.DataArray(data, coordinates, (*trials, *self.names))
 
     def to(self, *args: Any, **kwargs: Any) -> Signal:
         """Return the signal on another device or in another dtype; arguments as for Tensor.to."""
@@ -237,6 +285,25 @@ class Recording(Shown):
         samples = self.signal._summary()
         side_data = [(f"aux.{name}", content(value)) for name, value in self.aux.items()]
         return Summary(f"{type(self.radar).__name__}; {samples.about}", {**samples.tables, "side data": side_data})
+
+
+def _indices(axis: Axis, chosen: float | slice) -> int | slice:
+    """Index of the sample next to a coordinate, or indices of those between two coordinates."""
+    part = isinstance(chosen, slice)
+    if part and chosen.step is not None:
+        raise ValueError(f"axis {axis.name!r}: a slice of coordinates has no step, got {chosen}; see `isel`")
+    first, last = (chosen.start, chosen.stop) if part else (chosen, chosen)
+    low = float(axis.index_of(axis.start if first is None else first))
+    high = float(axis.index_of(axis.stop if last is None else last))
+    if not part and -0.5 <= low < axis.n - 0.5:
+        return round(low)
+    low, high = max(low, 0.0), min(high, axis.n - 1.0)
+    if part and low <= high and math.ceil(low - _ROUNDING) <= high + _ROUNDING:
+        return slice(math.ceil(low - _ROUNDING), math.floor(high + _ROUNDING) + 1)
+    raise ValueError(
+        f"axis {axis.name!r} has no samples at {chosen}; it has {axis.n} from {axis.start:g} to {axis.stop:g} "
+        f"{axis.unit}"
+    )
 
 
 def _as_tensor(value: Any, what: str) -> Tensor:

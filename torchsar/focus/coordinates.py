@@ -138,4 +138,4 @@ class PaddedLines(Stage):
         more = radar.aperture_lines(signal.axis("range").stop) if self.lines is None else self.lines
         padded = signal.with_axis(pad(signal.data, (0, 0, 0, more)), pulse=signal.axis("pulse").part(0, n + more))
         image = self.focuser(padded, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s)
-        return image.crop(azimuth=(0, n * (image.axis("azimuth").n // (n + more))))
+        return image.isel(azimuth=slice(0, n * (image.axis("azimuth").n // (n + more))))

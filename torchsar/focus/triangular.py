@@ -339,7 +339,7 @@ class CompressSweeps(Stage):
                 f"window_m must lie in the relative ranges {axes[1].start:.4g}..{axes[1].stop:.4g} m of the profiles "
                 f"and hold more than one range cell, got {tuple(self.window_m)}"
             )
-        return out.crop(range=(low, high + 1))
+        return out.isel(range=slice(low, high + 1))
 
 
 class DerampAzimuth(Stage):

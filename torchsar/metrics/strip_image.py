@@ -35,8 +35,8 @@ class Margin:
     last_samples: int = 0
 
 
-def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[str, tuple[int, int]]:
-    """Return the part of an image that the metrics use, as (first, last) by axis.
+def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[str, slice]:
+    """Return the part of an image that the metrics use, for `Signal.isel`.
 
     It has the lines with a full aperture and the samples with a full pulse, or what a given margin
     leaves. An axis of which fewer than 32 lines or samples would be left is used as a whole.
@@ -47,7 +47,7 @@ def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[s
         margin: Edges that are left out; None for those of the aperture and the pulse.
 
     Returns:
-        First index and the one after the last, by the name of the axis.
+        Slice of indices by the name of the axis.
     """
     lines, samples = (axis.n for axis in image.axes)
     if margin is None:
@@ -60,11 +60,12 @@ def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[s
         margin = Margin(first_lines=edge, last_lines=edge, last_samples=radar.pulse_samples)
     spans = {"azimuth": (lines, margin.first_lines, margin.last_lines)}
     spans["range"] = (samples, margin.first_samples, margin.last_samples)
-    kept = {axis: (first, n - last) for axis, (n, first, last) in spans.items()}
-    for axis, (first, last) in kept.items():
-        if last - first < _LEAST:
-            log.debug("a margin leaves %d of the image along %s: the whole axis is used", last - first, axis)
-            kept[axis] = (0, spans[axis][0])
+    kept = {axis: slice(first, n - last) for axis, (n, first, last) in spans.items()}
+    for axis, part in kept.items():
+        left = part.stop - part.start
+        if left < _LEAST:
+            log.debug("a margin leaves %d of the image along %s: the whole axis is used", left, axis)
+            kept[axis] = slice(0, spans[axis][0])
     return kept
 
 

@@ -275,16 +275,8 @@ def _own_image(data: Signal, name: str) -> Signal:
     standing = CorrectMigration(RADAR, Keystone(whole_swath=False), range_m=range_m)(data, **values)
     image = _product(standing, 2, values, range_m).image
     shown = RADAR.speed_m_s * float(PointMotion.of(RADAR, data.data, **values, range_m=range_m).image_s)
-    part = image.crop(
-        azimuth=_around(image.axis("azimuth"), shown, 20.0), range=_around(image.axis("range"), range_m, 40.0)
-    )
+    part = image.sel(azimuth=slice(shown - 20.0, shown + 20.0), range=slice(range_m - 40.0, range_m + 40.0))
     return _finer(_near(part.with_data(part.data[None]), 6.0, 15.0, 0))
-
-
-def _around(axis: Axis, position: float, reach: float) -> tuple[int, int]:
-    """First sample, and the one behind the last, within reach of a position."""
-    first, last = (round(float(axis.index_of(position + side))) for side in (-reach, reach))
-    return max(first, 0), min(last, axis.n)
 
 
 def _relative(image: Signal) -> Signal:

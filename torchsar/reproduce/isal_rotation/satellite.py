@@ -116,12 +116,7 @@ def _scaled(image: Signal, radar: InverseRadar, rate_rad_s: Tensor) -> Signal:
 
 
 def _cropped(image: Signal, azimuth: tuple[float, float], range_m: tuple[float, float], half_width_m: float) -> Signal:
-    edges_m = ([half_width_m * edge for edge in azimuth], range_m)
-    bounds = {}
-    for axis, edges in zip(image.axes, edges_m, strict=True):
-        first, last = (round(float(axis.index_of(edge))) for edge in edges)
-        bounds[axis.name] = (max(first, 0), min(last, axis.n))
-    return image.crop(**bounds)
+    return image.sel(azimuth=slice(*(half_width_m * edge for edge in azimuth)), range=slice(*range_m))
 
 
 def _figure_4(seen: _Seen, path: Path) -> list[Check]:

@@ -165,7 +165,7 @@ def _recorded(radar: TriangularLadar, n_period: int, seed: int) -> tuple[Recordi
 
 def _one_period(recording: Recording) -> Recording:
     """Blocks cut to the length of one period, which is what a ring needs."""
-    return Recording(recording.signal.crop(time=(0, 2 * RADAR.sweep_samples)), recording.radar, recording.aux)
+    return Recording(recording.signal.isel(time=slice(0, 2 * RADAR.sweep_samples)), recording.radar, recording.aux)
 
 
 def _judge(trace: Trace, course: Course) -> dict[str, float]:

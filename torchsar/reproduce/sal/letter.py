@@ -147,12 +147,8 @@ def _about_letter(signal: Signal) -> Signal:
     """Relative ranges of -0.7 to 0.9 m, with room for the shift of beats by the velocity, and
     azimuths of an image about the letter.
     """
-    bounds = {}
-    for name, edges in {"range": (-0.7, 0.9), "azimuth": (-0.12, 0.12)}.items():
-        if name in signal.names:
-            first, last = (round(float(signal.axis(name).index_of(edge))) for edge in edges)
-            bounds[name] = max(first, 0), min(last, signal.axis(name).n)
-    return signal.crop(**bounds)
+    part = signal.sel(range=slice(-0.7, 0.9))
+    return part.sel(azimuth=slice(-0.12, 0.12)) if "azimuth" in part.names else part
 
 
 def in_milliseconds(profiles: Signal) -> Signal:

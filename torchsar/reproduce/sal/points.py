@@ -158,17 +158,12 @@ def _near(signal: Signal) -> Signal:
 
 
 def _within(signal: Signal, low_m: float, high_m: float) -> Signal:
-    first, last = (round(float(signal.axis("range").index_of(edge))) for edge in (low_m, high_m))
-    return signal.crop(range=(first, last))
+    return signal.sel(range=slice(low_m, high_m))
 
 
 def _around(image: Signal, azimuth_m: float, range_m: float) -> Signal:
     """Four cells to either side of a point."""
-    bounds = {}
-    for axis, position, reach in zip(image.axes, (azimuth_m, range_m), (0.024, 0.12), strict=True):
-        first, last = (round(float(axis.index_of(position + side))) for side in (-reach, reach))
-        bounds[axis.name] = (max(first, 0), min(last, axis.n))
-    return image.crop(**bounds)
+    return image.sel(azimuth=slice(azimuth_m - 0.024, azimuth_m + 0.024), range=slice(range_m - 0.12, range_m + 0.12))
 
 
 def _draw_motion(courses: Mapping[str, Course], truth: Truth, path: Path) -> None:

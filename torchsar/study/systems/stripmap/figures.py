@@ -59,7 +59,7 @@ class Strip:
         """Images of all methods but reruns, in the window that the metrics use."""
         methods, margin = self.result.bench.config.processor, self.result.bench.judging.margin
         images = {name: image for name, image in self.result.images.items() if methods[name].rerun is None}
-        return {name: image.crop(**window(image, self.radar, margin)) for name, image in images.items()}
+        return {name: image.isel(**window(image, self.radar, margin)) for name, image in images.items()}
 
     def step(self, name: str, output: bool) -> Signal:
         """Input or output of a stage of the recommended chain."""
@@ -137,7 +137,7 @@ def _squint(strip: Strip) -> Drawn:
         if method.rerun is not None and any(key.endswith("doppler_hz") for key in method.rerun.given):
             wrong = strip.result.images[name]
             shown = {"squint taken into account": strip.images()["recommended"]}
-            shown[method.title or name] = wrong.crop(**window(wrong, strip.radar, margin))
+            shown[method.title or name] = wrong.isel(**window(wrong, strip.radar, margin))
             caption = (
                 "First: focused at the estimated Doppler centroid. Second: the same data focused as if the beam "
                 "pointed exactly sideways. Targets are then displaced and blurred, and false targets appear."

@@ -54,7 +54,7 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -
     if trace.signal.names != IMAGE:
         return Judged(metrics)
     used = Used.by(chain, trace, bench.radar, n)
-    image = trace.signal.crop(**window(trace.signal, bench.radar, bench.judging.margin))
+    image = trace.signal.isel(**window(trace.signal, bench.radar, bench.judging.margin))
     metrics.update(used.metrics(bench.radar), entropy_nats=entropy(image).expand(n), contrast=contrast(image).expand(n))
     if not detail:
         return Judged(metrics, view=used)
@@ -94,7 +94,7 @@ def compare(bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
     if one is None or other is None or one is other or not one.names == other.names == IMAGE:
         return judged
     pair = [
-        image.crop(**window(image, bench.radar, bench.judging.margin)).to(torch.complex128)  # sums over many pixels
+        image.isel(**window(image, bench.radar, bench.judging.margin)).to(torch.complex128)  # sums over many pixels
         for image in common_lines(one, other)
     ]
     count = len(judged.metrics["seconds"])
