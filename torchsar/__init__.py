@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 # subpackages that are no part of the public face: what they need is not always installed
-_ON_REQUEST = ("data", "optim", "plot", "reproduce", "study")
+_ON_REQUEST = ("data", "datasets", "optim", "plot", "reproduce", "study")
 
 __all__ = [
     "Axis",

@@ -191,7 +191,7 @@ class Signal(Shown):
 
     def _spans(self) -> Rows:
         """Number of samples, first and last coordinate of each axis."""
-        return [(a.name, f"{a.n}", f"{a.start:.6g} to {a.stop:.6g} {a.unit}") for a in self.axes]
+        return [(a.name, f"{a.n}", f"{a.start:.6g} to {a.stop:.6g} {a.unit}".rstrip()) for a in self.axes]
 
 
 @dataclass(frozen=True, repr=False)
