@@ -47,6 +47,7 @@ $(STAMP): pyproject.toml constraints.txt Makefile
 	else \
 		$(PY) -m pip install -c constraints.txt '$(TORCH)' && $(PY) -m pip install -c constraints.txt -e '.[dev]'; \
 	fi
+	@$(VENV)/bin/torchsar config schema > configs/schema.json  # for editors
 	@touch $(STAMP)
 
 clean:

@@ -31,6 +31,15 @@ _EXCHANGE = {
 _REPRODUCE = "make the figures and tables of the papers, and compare them with what was published"
 
 
+# commands that only print, and need no device
+_PRINTED = {
+    "list": "experiments, systems, stages and data keys",
+    "config": "print a packaged config, to begin one's own with, or the JSON schema of configs for editors",
+    "completion": "print a script by which a shell completes the commands",
+}
+_SHELLS = ("bash", "zsh", "fish")
+
+
 def parser() -> argparse.ArgumentParser:
     """Return the argument parser of the program `torchsar`.
 
@@ -84,7 +93,12 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument(
         "--out", type=_place, default=Path("out") / "reproduce", metavar="DIR", help="folder of records and pictures"
     )
-    commands.add_parser("list", help="experiments, systems, stages and data keys")
+    for name, text in _PRINTED.items():
+        commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    one = commands.choices["config"]
+    one.add_argument("what", choices=("show", "schema"), help="a packaged config, or the schema of all configs")
+    one.add_argument("config", nargs="?", help="name of the packaged config (see `torchsar list`)")
+    commands.choices["completion"].add_argument("shell", choices=_SHELLS, help="the shell")
     return top
 
 
@@ -130,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         if options.command == "reproduce":
             print(f"torchsar: reproduce {options.paper or 'all papers'}", file=sys.stderr, flush=True)
-        elif options.command != "list":  # before the import of torch, which takes seconds
+        elif options.command not in _PRINTED:  # before the import of torch, which takes seconds
             subject = options.file if options.command in _EXCHANGE else options.config
             print(f"torchsar: {options.command} {subject}", file=sys.stderr, flush=True)
         with _log_to_stderr(), warnings.catch_warnings(), _short_memory():
@@ -173,14 +187,16 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
     if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
         top.error(f"unrecognized arguments: {' '.join(rest)}")
     if options.command is None and not options.version:
-        top.error(f"a command is missing: choose one of {', '.join((*_COMMANDS, *_EXCHANGE, 'reproduce', 'list'))}")
+        top.error(f"a command is missing: choose one of {', '.join((*_COMMANDS, *_EXCHANGE, 'reproduce', *_PRINTED))}")
+    if options.command == "config" and (options.what == "show") == (options.config is None):
+        top.error("`torchsar config show` needs the name of a config, and `torchsar config schema` takes none")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
 
 
 def _dispatch(options: argparse.Namespace, command: str) -> int:
-    from torchsar.study.settings.text import experiments, find_config
+    from torchsar.study.settings.text import find_config
 
     actions = {"import": _import, "export": _export, "reproduce": _reproduce}
     if options.command in actions:
@@ -188,20 +204,14 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
             return actions[options.command](options)
         except (ValueError, FileNotFoundError, FileExistsError) as error:
             raise ConfigError(str(error)) from error
-    if options.command == "list":  # the experiments, or an unknown name, before the import of torch
-        print(experiments(), flush=True)
-    else:
-        find_config(options.config)
+    if options.command in _PRINTED:
+        return _print(options)
+    find_config(options.config)  # an unknown name, before the import of torch
     import torch
 
     from torchsar.core import device_fault, keep_freed_memory
-    from torchsar.study.table import load, systems
+    from torchsar.study.table import load
 
-    if options.command == "list":
-        from torchsar.study.commands.listing import listing
-
-        print(listing(systems))
-        return 0
     keep_freed_memory()
     if options.threads is not None:
         torch.set_num_threads(options.threads)
@@ -225,6 +235,32 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
 
         print((requires if options.command == "requires" else trade)(loaded, out, options.device))
         print(out)
+    return 0
+
+
+def _print(options: argparse.Namespace) -> int:
+    from torchsar.study.settings.text import experiments, find_config, packaged_configs
+
+    if options.command == "completion":
+        from torchsar.completion import completion
+
+        print(completion(options.shell, parser(), packaged_configs()), end="")
+        return 0
+    if options.command == "config" and options.config is not None:
+        print(find_config(options.config).read_text(encoding="utf-8").replace("=../schema", "=schema"), end="")
+        return 0
+    if options.command == "list":
+        print(experiments(), flush=True)  # before the import of torch
+    from torchsar.study.table import systems
+
+    if options.command == "list":
+        from torchsar.study.commands.listing import listing
+
+        print(listing(systems))
+    else:
+        from torchsar.schema import config_schema, schema_text
+
+        print(schema_text(config_schema(systems)), end="")
     return 0
 
 

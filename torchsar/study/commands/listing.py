@@ -53,7 +53,7 @@ def _keys(section: Section, above: str = "") -> list[str]:
     """A line for each key, with its default and its description by the docstring of its target;
     `NAME` denotes names that a config chooses.
     """
-    described, lines = _arguments(section.target), []
+    described, lines = arguments(section.target), []
     for name, key in section.keys.items():
         shown = f"{above}{name}{'*' if key.per_trial else ''}"
         shown += "" if key.default is ... else f"={_short(key.default)}"
@@ -63,7 +63,7 @@ def _keys(section: Section, above: str = "") -> list[str]:
     return lines
 
 
-def _arguments(target: Callable[..., Any]) -> dict[str, str]:
+def arguments(target: Callable[..., Any]) -> dict[str, str]:
     """The first sentence about each argument in the docstrings of a class and its bases."""
     found: dict[str, str] = {}
     docs = [getattr(one, "__doc__", None) or "" for one in reversed(getattr(target, "__mro__", (target,)))]
