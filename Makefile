@@ -1,5 +1,6 @@
 # make run: the embedded experiment. make test: the tests, in JOBS processes of one thread. Both set up $(VENV) first.
 # make docs: the documentation site, in docs/_build/html; it works without a network.
+# make package: sdist and wheel, and the wheel used outside the repository as its users do.
 # An environment that already has torch keeps it: make run VENV=/path/to/venv
 VENV   ?= .venv
 PYTHON ?= python3
@@ -17,7 +18,7 @@ export OMP_WAIT_POLICY
 PY    := $(VENV)/bin/python
 STAMP := $(VENV)/.torchsar-installed
 
-.PHONY: run test lint docs docs-install install clean
+.PHONY: run test lint docs docs-install package install clean
 
 run: install
 	$(VENV)/bin/torchsar run $(CONFIG) $(ARGS) --out $(OUT)
@@ -36,6 +37,9 @@ docs-install: install
 docs: docs-install
 	$(PY) -m sphinx -W --keep-going -n -q docs docs/_build/html
 	@echo 'the documentation is in docs/_build/html/index.html'
+
+package: install
+	VENV=$(VENV) .ci/package
 
 install: $(STAMP)
 
