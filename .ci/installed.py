@@ -41,7 +41,7 @@ RUNS = {
 SWEEP = ("isal_snr", "sweep.trials=2", "sweep.world.noise.snr_db=[10]")
 SIDECAR = """system: isal
 samples: {key: profiles, dtype: complex64, shape: [64, 32], dims: [pulse, range]}
-radar: {f0_hz: 10 GHz, bandwidth_hz: 500 MHz, prf_hz: 200}
+radar: {f0_hz: 10 GHz, bandwidth_hz: 500 MHz, prf_hz: 200, range_step_m: 0.3}
 """
 
 
