@@ -73,7 +73,7 @@ def parser() -> argparse.ArgumentParser:
         commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
     one = commands.choices["import"]
     one.add_argument("file", metavar="FILE", help="HDF5, MATLAB, numpy or flat binary data")
-    one.add_argument("--sidecar", required=True, metavar="YAML", help="what the file holds, see torchsar.io.import_recording")
+    one.add_argument("--sidecar", required=True, metavar="YAML", help="its content, see torchsar.io.import_recording")
     one.add_argument("--out", type=_place, required=True, metavar="NPZ", help="new file for data.file of a config")
     one = commands.choices["export"]
     one.add_argument("file", metavar="RUN_DIR", help="the result folder of torchsar run")
