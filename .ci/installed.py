@@ -99,6 +99,7 @@ def main(repository: Path, sdist: Path) -> None:
         assert (Path(f"run_{system}") / "report.html").is_file()
     name, *small = SWEEP
     command("sweep", own_config(name), *small, "--out", "sweep")
+    command("reproduce", "geo", "figure17", "--small", "--out", "papers")
     command("requires", "stripmap_damaged", "--out", "requires")
     if find_spec("h5py"):
         command("export", "run_stripmap", "--to", "netcdf", "--out", "images")
