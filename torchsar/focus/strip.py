@@ -242,25 +242,38 @@ def focus_strip(
         )
     axes = radar.raw_axes(plan.n_lines, source.shape[-1]) if axes is None else axes
     for read, keep in plan.blocks:
-        image = _focus_block(source, focus, radar, axes, read, keep, {} if values is None else values(read), device)
+        raw = torch.as_tensor(source[..., read, :], device=device)
+        image = focus_block(raw, focus, radar, axes, read, keep, {} if values is None else values(read))
+        del raw
         factor = image.data.shape[-2] // (keep.stop - keep.start)
         yield slice(keep.start * factor, keep.stop * factor), image
 
 
-def _focus_block(
-    source: Lines,
+def focus_block(
+    raw: Tensor,
     focus: Callable[..., Signal],
     radar: StripmapRadar,
     axes: tuple[Axis, ...],
     read: slice,
     keep: slice,
     values: Mapping[str, Tensor | float],
-    device: torch.device | str | None,
 ) -> Signal:
-    """Focus one block and select the image lines to keep."""
+    """Focus one block of a strip and select the image lines to keep.
+
+    Args:
+        raw: Raw lines of the block, shape (..., line, sample).
+        focus: Focusing stage or chain, as for `focus_strip`.
+        radar: Radar of the recording.
+        axes: Axes of the raw matrix of the whole strip, (pulse, range).
+        read: Slice of the raw lines of the block, an entry of `StripPlan.blocks`.
+        keep: Slice of the image lines to keep, of the same entry.
+        values: Values for the focusing stage.
+
+    Returns:
+        The image lines to keep.
+    """
     pulse, range_ = axes
-    raw = Signal(torch.as_tensor(source[..., read, :], device=device), (pulse.part(read.start, read.stop), range_))
-    image = focus(raw, **values).data
+    image = focus(Signal(raw, (pulse.part(read.start, read.stop), range_)), **values).data
     del raw
     # the azimuth transform is circular: an image line outside the block appears at its position
     # modulo the block
