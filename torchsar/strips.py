@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.core import Signal
+from torchsar.core import Axis, Signal
 from torchsar.focus import Detect, FocusStrip, QuickLook, StripPlan, focus_block
 from torchsar.io import StripImage, StripRecording, samples_checksum, write_strip_geotiff
 from torchsar.io.strip import CHUNK_LINES
@@ -54,11 +54,8 @@ def focus_recording(loaded: Loaded, out: Path, resume: bool = False, device: str
     began = time.perf_counter()
     strip = _Strip(loaded, device)
     with opened(out, "focus", FILES) as folder:
-        image, plan, values = strip.image(folder, resume)
-        count = Count("lines", plan.n_lines)
         try:
-            with Ticker(count.say):
-                strip.fill(image, plan, values, count)
+            image = strip.focused(folder, resume)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"finished blocks are kept in {out}; go on with --resume") from None
         with folder.staged() as new:
@@ -110,60 +107,62 @@ class _Strip:
         if [type(stage) for stage in after] not in ([], [Detect], [QuickLook], [Detect, QuickLook]):
             raise ConfigError(f"{where}: the stages {names[len(self._before) + 1 :]} follow {strips[0]}; {_HINT}")
         self.detect = next((stage for stage in after if isinstance(stage, Detect)), None)
+        self._looks = 1 if self.detect is None else self.detect.looks[0]
         self.picture = next((stage for stage in after if isinstance(stage, QuickLook)), QuickLook())
         recommended = config.model_dump()["processor"]["recommended"]["stages"]
         shape, radar = list(self.recording.shape), repr(self.recording.radar)
         self._identity = {"recording": [shape, radar], "config": [recommended, config.precision]}
 
-    def image(self, folder: ResultFolder, resume: bool) -> tuple[StripImage, StripPlan, dict[str, Tensor]]:
-        """The image in a folder, new or to be continued, the plan of its blocks, and the values of
-        the estimators.
-        """
+    def focused(self, folder: ResultFolder, resume: bool) -> StripImage:
+        """The image in the folder: blocks that it has are checked, the others computed."""
         path = folder.path / "image.zarr"
         if path.exists() and not folder.claimed:
             raise ConfigError(f"--out {folder.path}: torchsar focus did not write {path.name}; choose another folder")
-        begun = StripImage.is_begun(path)
-        if begun and not resume:
+        image = StripImage(path, "r+") if StripImage.is_begun(path) else None
+        if image is not None and not resume:
             raise ConfigError(
                 f"{folder.path} holds an image already; add --resume to go on with it, or choose another folder"
             )
-        if begun:
-            image = StripImage(path, "r+")
+        if image is not None:
             image.refuse_another(self._identity)
-            values = {name: torch.tensor(value, dtype=torch.float64) for name, value in image.about["values"].items()}
-            plan = self._plan(values)
-            image.refuse_another({"plan": repr(plan)})
-            return image, plan, values
         folder.claim()
-        values = self._estimated()
+        known = self._estimated() if image is None else image.about["values"]
+        values = {name: torch.tensor(value, dtype=torch.float64) for name, value in known.items()}
         plan = self._plan(values)
-        (read, keep), identity = plan.blocks[0], {**self._identity, "plan": repr(plan)}
-        raw = self._raw(read)
-        first = self._block(raw, read, keep, values)  # whose size tells that of the image
+        identity = {**self._identity, "plan": repr(plan)}
+        if image is not None:
+            image.refuse_another(identity)
+        done = [] if image is None else [keep for _, keep in plan.blocks if image.is_finished(self._rows(image, keep))]
+        count = Count("lines", plan.n_lines, sum(keep.stop - keep.start for keep in done))
+        with Ticker(count.say):
+            for read, keep in plan.blocks:
+                raw = self.recording.recording(read.start, read.stop).signal.data
+                checksum = samples_checksum(raw)
+                if image is not None and keep in done:
+                    image.check(self._rows(image, keep), checksum)
+                    continue
+                if image is not None and keep.stop - keep.start < self._looks:
+                    break  # the last lines do not fill a look
+                block = self._block(raw, read, keep, values)
+                if image is None:  # the first block tells the size of the image
+                    about = {"values": known, "rows": [block.axes[0].n, keep.stop]}
+                    image = StripImage.create(path, self._axes(block, plan, keep), block.data.dtype, identity, about)
+                image.write(self._rows(image, keep), block.data.cpu(), checksum)
+                count.advance(keep.stop - keep.start)
+        assert image is not None
+        return image
+
+    @staticmethod
+    def _axes(first: Signal, plan: StripPlan, keep: slice) -> tuple[Axis, Axis]:
+        """Axes of the whole image, whose first block has the rows of the lines that it keeps."""
         azimuth, range_ = first.axes
-        rows = plan.n_lines * azimuth.n // keep.stop
-        about = {
-            "values": {name: value.tolist() for name, value in values.items()},
-            "rows_per_block": [azimuth.n, keep.stop],
-        }
-        image = StripImage.create(path, (azimuth.part(0, rows), range_), first.data.dtype, identity, about)
-        image.write(slice(0, azimuth.n), first.data.cpu(), samples_checksum(raw))
-        return image, plan, values
+        return azimuth.part(0, plan.n_lines * azimuth.n // keep.stop), range_
 
-    def fill(self, image: StripImage, plan: StripPlan, values: Mapping[str, Tensor], count: Count) -> None:
-        """Compute and write the blocks that the image lacks, and check the others."""
-        rows, lines = image.about["rows_per_block"]
-        for read, keep in plan.blocks:
-            raw = self._raw(read)
-            checksum, block = samples_checksum(raw), slice(*(n * rows // lines for n in (keep.start, keep.stop)))
-            if image.is_finished(block):
-                image.check(block, checksum)
-            elif block.start < block.stop:
-                image.write(block, self._block(raw, read, keep, values).data.cpu(), checksum)
-            count.advance(keep.stop - keep.start)
-
-    def _raw(self, read: slice) -> Tensor:
-        return self.recording.recording(read.start, read.stop).signal.data
+    @staticmethod
+    def _rows(image: StripImage, keep: slice) -> slice:
+        """Rows of an image that belong to raw lines; there may be several per line, or looks."""
+        rows, lines = image.about["rows"]
+        return slice(keep.start * rows // lines, keep.stop * rows // lines)
 
     @torch.no_grad()
     def _block(self, raw: Tensor, read: slice, keep: slice, values: Mapping[str, Tensor]) -> Signal:
@@ -175,11 +174,10 @@ class _Strip:
 
     def _plan(self, values: Mapping[str, Tensor]) -> StripPlan:
         """Blocks whose image lines are whole chunks of the store and whole looks."""
-        looks = 1 if self.detect is None else self.detect.looks[0]
-        itemsize = self.recording.dtype.itemsize
-        return self.focus.plan(self.recording.shape, self.recording.axes, itemsize, CHUNK_LINES * looks, **values)
+        strip = self.recording
+        return self.focus.plan(strip.shape, strip.axes, strip.dtype.itemsize, CHUNK_LINES * self._looks, **values)
 
-    def _estimated(self) -> dict[str, Tensor]:
+    def _estimated(self) -> dict[str, float]:
         """Values that the estimators before the focusing stage find in the middle of the strip."""
         if not self._before:
             return {}
@@ -196,4 +194,4 @@ class _Strip:
         for name, estimate in trace.estimates.items():
             shown = ", ".join(f"{key} {float(x.double().mean()):.6g}" for key, x in estimate.value.items())
             log.info("%s: %s%s", name, shown, "" if estimate.ok.all() else " (not reliable)")
-        return {name: value.detach().cpu().double() for name, value in trace.arguments[self._name].items()}
+        return {name: float(value) for name, value in trace.arguments[self._name].items()}

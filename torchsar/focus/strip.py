@@ -42,7 +42,7 @@ class Lines(Protocol):
 
     shape: Any
 
-    def __getitem__(self, key: Any) -> Any: ...
+    def __getitem__(self, key: Any, /) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -402,8 +402,8 @@ class FocusStrip(Stage):
         Raises:
             ValueError: If a value is not valid, see `omega_k`, or the memory is too small.
         """
-        given = {"doppler_hz": doppler_hz, "velocity_m_s": velocity_m_s}
-        given = {name: value for name, value in given.items() if value is not None}
+        values = {"doppler_hz": doppler_hz, "velocity_m_s": velocity_m_s}
+        given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
         data, raw_axes = signal.data, signal.axes
         plan = self.plan(data.shape, raw_axes, data.element_size(), **given)
         blocks = focus_strip(data, self.focus, self.focus.radar, plan, axes=raw_axes, values=lambda _: given)
