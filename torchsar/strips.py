@@ -15,7 +15,6 @@ from torchsar import plot
 from torchsar.core import Axis, Signal
 from torchsar.focus import Detect, FocusStrip, QuickLook, StripPlan, focus_block
 from torchsar.io import StripImage, StripRecording, samples_checksum, write_strip_geotiff
-from torchsar.io.strip import CHUNK_LINES
 from torchsar.study.output.folder import ResultFolder, fresh_result, opened
 from torchsar.study.output.progress import Count, Ticker
 from torchsar.study.settings.errors import ConfigError
@@ -23,6 +22,8 @@ from torchsar.study.settings.sections import Loaded
 from torchsar.study.trials.chains import build_chains
 
 log = logging.getLogger("torchsar")
+# image lines of a chunk of the store at most
+_CHUNK_LINES = 256
 FILES = ("config.yaml", "quick_look.png")
 _HINT = "a chain for long strips has estimators, one stage focus_strip, then detect and quick_look, or neither"
 
@@ -108,6 +109,7 @@ class _Strip:
             raise ConfigError(f"{where}: the stages {names[len(self._before) + 1 :]} follow {strips[0]}; {_HINT}")
         self.detect = next((stage for stage in after if isinstance(stage, Detect)), None)
         self._looks = 1 if self.detect is None else self.detect.looks[0]
+        self._chunk_lines = max(1, _CHUNK_LINES // self._looks)
         self.picture = next((stage for stage in after if isinstance(stage, QuickLook)), QuickLook())
         recommended = config.model_dump()["processor"]["recommended"]["stages"]
         shape, radar = list(self.recording.shape), repr(self.recording.radar)
@@ -146,7 +148,8 @@ class _Strip:
                 block = self._block(raw, read, keep, values)
                 if image is None:  # the first block tells the size of the image
                     about = {"values": known, "rows": [block.axes[0].n, keep.stop]}
-                    image = StripImage.create(path, self._axes(block, plan, keep), block.data.dtype, identity, about)
+                    axes, dtype = self._axes(block, plan, keep), block.data.dtype
+                    image = StripImage.create(path, axes, dtype, identity, about, self._chunk_lines)
                 image.write(self._rows(image, keep), block.data.cpu(), checksum)
                 count.advance(keep.stop - keep.start)
         assert image is not None
@@ -174,8 +177,8 @@ class _Strip:
 
     def _plan(self, values: Mapping[str, Tensor]) -> StripPlan:
         """Blocks whose image lines are whole chunks of the store and whole looks."""
-        strip = self.recording
-        return self.focus.plan(strip.shape, strip.axes, strip.dtype.itemsize, CHUNK_LINES * self._looks, **values)
+        strip, multiple = self.recording, self._chunk_lines * self._looks
+        return self.focus.plan(strip.shape, strip.axes, strip.dtype.itemsize, multiple, **values)
 
     def _estimated(self) -> dict[str, float]:
         """Values that the estimators before the focusing stage find in the middle of the strip."""

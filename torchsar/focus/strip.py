@@ -405,13 +405,13 @@ class FocusStrip(Stage):
         values = {"doppler_hz": doppler_hz, "velocity_m_s": velocity_m_s}
         given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
         data, raw_axes = signal.data, signal.axes
+        if ARRAYS * data.numel() * data.element_size() <= self.memory_bytes:
+            return self.focus(signal, **given)
         plan = self.plan(data.shape, raw_axes, data.element_size(), **given)
         blocks = focus_strip(data, self.focus, self.focus.radar, plan, axes=raw_axes, values=lambda _: given)
         lines, first = next(blocks)
-        if len(plan.blocks) == 1:
-            return first
         azimuth, range_ = first.axes
-        n = plan.n_lines * (azimuth.n // plan.blocks[0][1].stop)
+        n = plan.n_lines * azimuth.n // plan.blocks[0][1].stop
         whole = data.new_empty((*data.shape[:-2], n, range_.n))
         write_strip(chain([(lines, first)], blocks), whole)
         return Signal(whole, (azimuth.part(0, n), range_))

@@ -19,10 +19,10 @@ from torchsar.io.recorded import describe_stripmap
 
 # number of the layout of the store; another one is refused
 _FORMAT = 1
-# lines and samples of a chunk: 8 MB as complex64, a whole number of lines of most images
-CHUNK_LINES, _CHUNK_SAMPLES = 256, 4096
-# bytes of samples that are in memory at once when an image is read, by choice
-_PART_BYTES = 64 << 20
+# samples of a chunk along range, by choice: 8 MB as complex64 with the lines of a chunk
+_CHUNK_SAMPLES = 4096
+# bytes of samples that are read at once from an image, by choice
+_PART_BYTES = 32 << 20
 # side data with one entry per line
 _PER_LINE = ("agc_db", "line_number")
 
@@ -145,6 +145,7 @@ class StripImage:
         dtype: torch.dtype,
         identity: Mapping[str, Any],
         about: Mapping[str, Any],
+        chunk_lines: int = 256,
     ) -> StripImage:
         """Make a store without finished blocks.
 
@@ -154,6 +155,7 @@ class StripImage:
             dtype: Type of its samples.
             identity: What the image depends on, values that JSON can hold.
             about: Further values that JSON can hold.
+            chunk_lines: Image lines of a chunk; blocks should have whole chunks.
 
         Returns:
             The store, open for writing.
@@ -172,7 +174,7 @@ class StripImage:
             "image",
             shape=shape,
             dtype=str(dtype).removeprefix("torch."),
-            chunks=(min(shape[0], CHUNK_LINES), min(shape[1], _CHUNK_SAMPLES)),
+            chunks=(min(shape[0], chunk_lines), min(shape[1], _CHUNK_SAMPLES)),
             compressors=[Crc32cCodec()],
             dimension_names=[axis.name for axis in axes],
             attributes={"unit": "1"},
@@ -234,7 +236,7 @@ class StripImage:
         self._root.update_attributes(sealed({**dict(self._root.attrs), "blocks": self._blocks}))
 
     def parts(self, multiple: int = 1) -> Iterator[tuple[slice, Signal]]:
-        """Read the image in parts of at most 64 MB, or of `multiple` lines if these are more.
+        """Read the image in parts of at most 32 MiB, or of `multiple` lines if these are more.
 
         Args:
             multiple: Number of which the lines of every part but the last are a whole multiple.
@@ -246,10 +248,9 @@ class StripImage:
             ValueError: If a chunk is damaged.
         """
         azimuth, range_ = self.axes
-        step = math.lcm(multiple, CHUNK_LINES)
-        if step * range_.n * self.array.dtype.itemsize > _PART_BYTES:
-            step = multiple
-        step *= max(1, _PART_BYTES // (step * range_.n * self.array.dtype.itemsize))
+        whole = math.lcm(multiple, self.array.chunks[0])  # so that no chunk is read twice
+        step = max(1, _PART_BYTES // (multiple * range_.n * self.array.dtype.itemsize)) * multiple
+        step -= step % whole if step >= whole else 0
         for first in range(0, azimuth.n, step):
             lines = slice(first, min(first + step, azimuth.n))
             with reading(self.path, "an image of a strip"):
