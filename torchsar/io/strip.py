@@ -163,9 +163,7 @@ class StripImage:
         Raises:
             ModuleNotFoundError: If zarr is not installed (extra `study`).
         """
-        zarr = library("zarr", "study", f"writing {path}")
-        from zarr.codecs import Crc32cCodec  # by which a damaged chunk is found
-
+        zarr, codecs = (library(name, "study", f"writing {path}") for name in ("zarr", "zarr.codecs"))
         root = zarr.open_group(str(path), mode="w", zarr_format=3)
         for axis in axes:
             put(root, axis.name, axis.values(), (axis.name,), unit=axis.unit, step=axis.step)
@@ -175,7 +173,7 @@ class StripImage:
             shape=shape,
             dtype=str(dtype).removeprefix("torch."),
             chunks=(min(shape[0], chunk_lines), min(shape[1], _CHUNK_SAMPLES)),
-            compressors=[Crc32cCodec()],
+            compressors=[codecs.Crc32cCodec()],  # by which a damaged chunk is found
             dimension_names=[axis.name for axis in axes],
             attributes={"unit": "1"},
         )
