@@ -12,11 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 
+from tests.study.tiny import TINY
 from torchsar.cli import main
 from torchsar.core import PeakMemory
 from torchsar.focus import Detect, FocusStrip, QuickLook
 from torchsar.io import StripImage, read_images, read_stripmap
+from torchsar.study.table import load
+from torchsar.study.trials.bench import Bench
 
 NUMBERS = {
     "fs_hz": 32e6,
@@ -203,6 +207,18 @@ def test_detection_in_blocks_and_the_quick_look_are_those_of_the_whole_image(fol
     look = image.quick_look(QuickLook(50))
     torch.testing.assert_close(look.data, QuickLook(50)(found).data)
     assert look.axes == QuickLook(50)(found).axes and max(look.data.shape) <= 50
+
+
+@pytest.mark.parametrize("after", [[], ["detect"], ["detect", "quick_look"], ["quick_look"]], ids=" ".join)
+def test_a_simulated_run_has_the_same_stages(after: list[str], tmp_path: Path) -> None:
+    tree = {**TINY, "metrics": {"reference": "clean"}}
+    stages = {"focus": {"stage": "focus_strip"}, **{name: {"stage": name} for name in after}}
+    tree["processor"] = {"clean": TINY["processor"]["clean"], "recommended": {"stages": stages}}
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+    bench = Bench(load(tmp_path / "tiny.yaml"))
+    outcome = bench.batch(bench.draws(), detail=True).outcomes["recommended"]
+    assert not outcome.failed and outcome.signal is not None
+    assert outcome.signal.data.is_complex() == (not after) == ("entropy_nats" in outcome.metrics)
 
 
 def test_estimates_from_the_middle_hold_for_the_whole_strip(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

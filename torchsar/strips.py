@@ -171,7 +171,7 @@ class _Strip:
     def _block(self, raw: Tensor, read: slice, keep: slice, values: Mapping[str, Tensor]) -> Signal:
         """The image of a block, detected if the chain says so."""
         given = {name: value.to(self._device) for name, value in values.items()}
-        focus, radar = self.focus.focus, self.recording.radar
+        focus, radar = self.focus.focuser, self.recording.radar
         image = focus_block(raw.to(self._device), focus, radar, self.recording.axes, read, keep, given)
         return image if self.detect is None else self.detect(image)
 

@@ -94,7 +94,7 @@ def test_every_seam_is_below_minus_60_db_for_noise_over_the_whole_prf(dtype, for
     plan = stage.plan(raw.shape, NEAR.raw_axes(*raw.shape))
     plan = replace(plan, height=plan.reach[1] - plan.reach[0] + 180)
     assert len(plan.blocks) > 6
-    assert worst_seam_db(stage.focus, raw, plan) < -60
+    assert worst_seam_db(stage.focuser, raw, plan) < -60
 
 
 def test_every_seam_is_below_minus_60_db_for_points():
@@ -110,7 +110,7 @@ def test_every_seam_is_below_minus_60_db_for_points():
     raw = recording.signal.data.reshape(1800, 120)
     stage = FocusStrip(NEAR, doppler_hz=0.0)
     plan = stage.plan(raw.shape, NEAR.raw_axes(*raw.shape))
-    assert worst_seam_db(stage.focus, raw, replace(plan, height=plan.reach[1] - plan.reach[0] + 160)) < -60
+    assert worst_seam_db(stage.focuser, raw, replace(plan, height=plan.reach[1] - plan.reach[0] + 160)) < -60
 
 
 @pytest.mark.parametrize("band, levels", [(None, (-25.0, -31.0)), (1250.0, (-31.0, -37.0)), (1100.0, (-50.0, -80.0))])
@@ -135,7 +135,7 @@ def test_the_stage_joins_the_blocks():
     stage = FocusStrip(NEAR, memory_gb=400 * 40 * 24e-9)
     values = {"doppler_hz": torch.tensor(-7050.0), "velocity_m_s": torch.tensor(7060.0)}
     blocks = stage.plan(raw.shape, signal.axes, **values).blocks
-    whole, joined = stage.focus(signal, **values), stage(signal, **values)
+    whole, joined = stage.focuser(signal, **values), stage(signal, **values)
     assert len(blocks) > 5 and joined.axes == whole.axes
     torch.testing.assert_close(joined.data[200:-200], whole.data[200:-200], atol=2e-3, rtol=0)
     assert torch.equal(FocusStrip(NEAR)(signal, **values).data, whole.data)

@@ -349,7 +349,7 @@ class FocusStrip(Stage):
         if not (memory_gb > 0 and seam_db < 0):
             raise ValueError(f"memory_gb must be positive and seam_db negative, got {memory_gb} and {seam_db}")
         band_hz = radar.prf_hz / (1 + BAND_EDGE) if band_hz is None else band_hz
-        self.focus: Focuser = FORMS[form](radar, reference, velocity_m_s, doppler_hz, frame_hz, band_hz)
+        self.focuser: Focuser = FORMS[form](radar, reference, velocity_m_s, doppler_hz, frame_hz, band_hz)
         self.memory_bytes, self.seam_db = int(memory_gb * 1e9), seam_db
 
     def plan(
@@ -377,7 +377,7 @@ class FocusStrip(Stage):
         Raises:
             ValueError: If the memory is too small; the message names the least memory.
         """
-        focus = self.focus
+        focus = self.focuser
         doppler, velocity = (
             (own if given is None else given).detach()
             for own, given in ((focus.doppler_hz, doppler_hz), (focus.velocity_m_s, velocity_m_s))
@@ -406,9 +406,9 @@ class FocusStrip(Stage):
         given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
         data, raw_axes = signal.data, signal.axes
         if ARRAYS * data.numel() * data.element_size() <= self.memory_bytes:
-            return self.focus(signal, **given)
+            return self.focuser(signal, **given)
         plan = self.plan(data.shape, raw_axes, data.element_size(), **given)
-        blocks = focus_strip(data, self.focus, self.focus.radar, plan, axes=raw_axes, values=lambda _: given)
+        blocks = focus_strip(data, self.focuser, self.focuser.radar, plan, axes=raw_axes, values=lambda _: given)
         lines, first = next(blocks)
         azimuth, range_ = first.axes
         n = plan.n_lines * azimuth.n // plan.blocks[0][1].stop
