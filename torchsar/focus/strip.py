@@ -197,6 +197,9 @@ def plan_strip(
             "GB, or process a narrower Doppler band (band_hz, at most PRF / 1.1), or accept larger errors at seams"
         )
     height = max((h for h in range(max(least, height // 2), height + 1) if smooth_length(h) == h), default=height)
+    step = (height - overlap) // multiple * multiple
+    even = math.ceil(n_lines / math.ceil(n_lines / step) / multiple) * multiple  # so that the last block is no shorter
+    height = min(height, smooth_length(overlap + even))
     return StripPlan(n_lines, height, reach, height * line_bytes, multiple)
 
 
