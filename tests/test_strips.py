@@ -131,7 +131,7 @@ def test_an_image_of_other_data_or_another_config_is_not_continued(
 ) -> None:
     killed_in(lambda: focus(folder, "out"), 3)
     iq = np.load(folder / "raw.npz")["iq"]
-    iq[600, 7, 0] += 1  # in the second block
+    iq[500, 7, 0] += 1  # in the second block
     other = recording(folder / "other.npz", iq=iq)
     capsys.readouterr()
     assert focus(folder, "out", "--resume", data=other) == 2
