@@ -60,7 +60,11 @@ def child_seconds(*arguments: str) -> tuple[float, subprocess.CompletedProcess[s
         (["--help"], 0, "usage: torchsar"),
         (["run", "--help"], 0, "--device"),
         (["--version"], 0, "torchsar-lab "),
-        ([], 2, "a command is missing: choose one of run, sweep, requires, trade, import, export, reproduce, list"),
+        (
+            [],
+            2,
+            "a command is missing: choose one of run, focus, sweep, requires, trade, import, export, reproduce, list",
+        ),
         (["walk"], 2, "invalid choice: 'walk'"),
         (["requires"], 2, "arguments are required: config\n"),
         (["run", "stripmap_damaged", "--speed"], 2, "unrecognized arguments: --speed"),

@@ -20,6 +20,7 @@ _LONGEST = 2000  # characters of a message, far more than those without a long p
 EXIT_BAD_INPUT = 2  # the status of argparse for a command line that it rejects
 _COMMANDS = {
     "run": "run an experiment and write its images, figures and report",
+    "focus": "focus a recorded strip that is longer than memory, block by block",
     "sweep": "run the Monte Carlo sweep of a config: many trials of every point of its grid",
     "requires": "show the requirements of the scene of a config on models and methods",
     "trade": "measure the time and the loss of alternative methods, relative to an exact reference",
@@ -66,7 +67,8 @@ def parser() -> argparse.ArgumentParser:
         )
         one.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), cuda, cuda:1, ...")
     sweep = commands.choices["sweep"]
-    sweep.add_argument("--resume", action="store_true", help="go on with the sweep in the folder, if there is one")
+    for one, what in ((sweep, "sweep"), (commands.choices["focus"], "image")):
+        one.add_argument("--resume", action="store_true", help=f"go on with the {what} in the folder, if there is one")
     sweep.add_argument("--workers", type=_positive, metavar="N", help="compute in N processes (extra `cluster`)")
     sweep.add_argument("--cluster", metavar="ADDRESS", help="compute on a running dask scheduler, tcp://host:8786")
     for name, text in _EXCHANGE.items():
@@ -76,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
     one.add_argument("--sidecar", required=True, metavar="YAML", help="its content, see torchsar.io.import_recording")
     one.add_argument("--out", type=_place, required=True, metavar="NPZ", help="new file for data.file of a config")
     one = commands.choices["export"]
-    one.add_argument("file", metavar="RUN_DIR", help="the result folder of torchsar run")
+    one.add_argument("file", metavar="RUN_DIR", help="the result folder of torchsar run or torchsar focus")
     one.add_argument("--to", choices=("netcdf", "sicd", "geotiff", "cphd"), required=True, help="the format")
     one.add_argument("--out", type=_place, required=True, metavar="DIR", help="folder of the new files")
     one.add_argument(
@@ -212,7 +214,8 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
     from torchsar.core import device_fault, keep_freed_memory
     from torchsar.study.table import load
 
-    keep_freed_memory()
+    if options.command != "focus":  # whose blocks are so large that kept ones would not fit
+        keep_freed_memory()
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     reason = device_fault(options.device)
@@ -224,6 +227,13 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
         from torchsar.study.commands.run import run
 
         print(run(loaded, out, command, options.device))
+    elif options.command == "focus":
+        from torchsar.strips import focus_recording
+
+        try:
+            print(focus_recording(loaded, out, options.resume, options.device))
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
     elif options.command == "sweep":
         from torchsar.study.commands.sweep import sweep
 
@@ -275,7 +285,13 @@ def _import(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    config = Path(options.file) / "config.yaml"
+    config, strip = (Path(options.file) / name for name in ("config.yaml", "image.zarr"))
+    if strip.is_dir():
+        from torchsar.strips import export_strip
+
+        export_strip(strip, options.to, options.out)
+        print(options.out)
+        return 0
     if not config.is_file():
         raise ConfigError(f"{config} does not exist; give the folder of the result of torchsar run")
     from torchsar.radar import LocalFrame

@@ -24,7 +24,7 @@ from sphinx.environment import BuildEnvironment
 # packages in the order in which they build on each other
 PACKAGES = (
     *("core", "radar", "scene", "echo", "repair", "compensate", "multichannel", "focus"),
-    *("metrics", "optim", "io", "data", "datasets", "study", "reproduce", "plot"),
+    *("metrics", "optim", "io", "data", "datasets", "strips", "study", "reproduce", "plot"),
 )
 # public in a part of a package, and taken by functions of its face
 PARTS = ("compensate.pulse_phase", "compensate.rotation")

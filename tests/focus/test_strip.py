@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from torchsar.core import Signal
+from torchsar.core import Draws, Signal
+from torchsar.echo import simulate
 from torchsar.focus import (
     Detect,
+    FocusStrip,
     OmegaK,
     OmegaKStolt,
     QuickLook,
+    StripPlan,
     amplitude,
     focus_strip,
     multilook,
@@ -27,6 +31,7 @@ from torchsar.focus import (
 )
 from torchsar.focus.strip import ARRAYS
 from torchsar.radar import LinearFM, StripmapRadar
+from torchsar.scene import Dwell, Points, StripmapWorld
 
 RADAR = StripmapRadar(5.3e9, LinearFM(30.116e6, 1e-6, -1), 32.317e6, 1256.98, 7066.0, 988647.0)
 N_LINES, N_RANGE = 6000, 48
@@ -60,6 +65,104 @@ def test_blocks_follow_another_frame():
     reach = reach_lines(RADAR, RADAR.raw_axes(N_LINES, N_RANGE), (-700.0, -700.0), frame_hz=0.0, band_hz=800.0)
     assert reach[0] > 0
     assert strip_error_db(stage, reach) < -70
+
+
+NEAR = replace(RADAR, near_range_m=100e3)  # an aperture of 90 lines
+
+
+def worst_seam_db(focus, raw, plan) -> float:
+    """Error of 8 lines in dB relative to the rms of the image, the largest one: at a seam."""
+    axes = NEAR.raw_axes(*raw.shape)
+    one = focus(Signal(raw, axes)).data
+    out = torch.empty_like(one)
+    write_strip(focus_strip(raw, focus, NEAR, plan, axes=axes), out)
+    inner = slice(max(-plan.reach[0], 0), raw.shape[0] - max(plan.reach[1], 0))
+    error = (out - one)[inner].abs().square().mean(-1).unfold(0, 8, 4).mean(-1)
+    return 10 * math.log10(float(error.max() / one[inner].abs().square().mean()))
+
+
+def noise(lines: int, dtype=torch.complex128) -> torch.Tensor:
+    return torch.randn(lines, 40, dtype=dtype, generator=torch.Generator().manual_seed(5))
+
+
+@pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
+@pytest.mark.parametrize("form", ["omega_k", "omega_k_stolt", "range_doppler"])
+@pytest.mark.parametrize("doppler, frame", [(-7050.0, None), (0.0, None), (-500.0, 0.0)])
+def test_every_seam_is_below_minus_60_db_for_noise_over_the_whole_prf(dtype, form, doppler, frame):
+    stage = FocusStrip(NEAR, form, doppler_hz=doppler, frame_hz=frame)
+    raw = noise(1500, dtype)
+    plan = stage.plan(raw.shape, NEAR.raw_axes(*raw.shape))
+    plan = replace(plan, height=plan.reach[1] - plan.reach[0] + 180)
+    assert len(plan.blocks) > 6
+    assert worst_seam_db(stage.focuser, raw, plan) < -60
+
+
+def test_every_seam_is_below_minus_60_db_for_points():
+    """A point each 40 lines, whose energy fills nearly the whole PRF."""
+    world = StripmapWorld(
+        Points(
+            [40.0 * i * NEAR.velocity_m_s / NEAR.prf_hz for i in range(-20, 20)], [3.0 * (i % 9) for i in range(40)]
+        ),
+        Dwell(0.9 * 1256.98 / float(NEAR.azimuth_rate_hz_s(100e3))),
+        doppler_hz=0.0,
+    )
+    recording, _ = simulate(replace(NEAR, pointing_doppler_hz=0.0), world, 1800, 120, Draws(1))
+    raw = recording.signal.data.reshape(1800, 120)
+    stage = FocusStrip(NEAR, doppler_hz=0.0)
+    plan = stage.plan(raw.shape, NEAR.raw_axes(*raw.shape))
+    assert worst_seam_db(stage.focuser, raw, replace(plan, height=plan.reach[1] - plan.reach[0] + 160)) < -60
+
+
+@pytest.mark.parametrize("band, levels", [(None, (-25.0, -31.0)), (1250.0, (-31.0, -37.0)), (1100.0, (-50.0, -80.0))])
+def test_the_level_at_seams_is_kept(band, levels):
+    """For a filter of the whole PRF as well, whose overlap grows fourfold for 6 dB."""
+    for level in levels:
+        raw, focus = noise(3000), OmegaK(NEAR, doppler_hz=-7050.0, band_hz=band)
+        reach = reach_lines(NEAR, NEAR.raw_axes(*raw.shape), (-7050.0, -7050.0), band_hz=band, seam_db=level)
+        assert worst_seam_db(focus, raw, StripPlan(3000, reach[1] - reach[0] + 400, reach, 0)) < level
+
+
+def test_a_filter_for_the_whole_prf_has_no_short_overlap():
+    reach = reach_lines(NEAR, NEAR.raw_axes(3000, 40), (0.0, 0.0))
+    assert reach[1] > 200_000
+    with pytest.raises(ValueError, match="or accept larger errors at seams"):
+        plan_strip((300_000, 40), reach, 64 << 20)
+
+
+def test_the_stage_joins_the_blocks():
+    raw = noise(1500, torch.complex64)
+    signal = Signal(raw, NEAR.raw_axes(*raw.shape, 2.0))
+    stage = FocusStrip(NEAR, memory_gb=400 * 40 * 24e-9)
+    values = {"doppler_hz": torch.tensor(-7050.0), "velocity_m_s": torch.tensor(7060.0)}
+    blocks = stage.plan(raw.shape, signal.axes, **values).blocks
+    whole, joined = stage.focuser(signal, **values), stage(signal, **values)
+    assert len(blocks) > 5 and joined.axes == whole.axes
+    torch.testing.assert_close(joined.data[200:-200], whole.data[200:-200], atol=2e-3, rtol=0)
+    assert torch.equal(FocusStrip(NEAR)(signal, **values).data, whole.data)
+
+
+def test_mistakes_of_the_stage():
+    with pytest.raises(ValueError, match="form of FocusStrip must be one of omega_k, omega_k_stolt, range_doppler"):
+        FocusStrip(NEAR, "chirp_scaling")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="memory_gb must be positive and seam_db negative, got 0"):
+        FocusStrip(NEAR, memory_gb=0.0)
+    with pytest.raises(ValueError, match="looks must be two numbers of at least 1"):
+        Detect((0, 1))
+
+
+def test_blocks_keep_whole_multiples():
+    plan = plan_strip((5000, 8), (-100, 100), 1500 * 8 * 8 * ARRAYS, multiple=256)
+    assert [keep.start % 256 for _, keep in plan.blocks] == [0] * len(plan.blocks) and len(plan.blocks) > 3
+    assert all(
+        read.start <= max(0, keep.start - 100) and read.stop >= min(5000, keep.stop + 100) for read, keep in plan.blocks
+    )
+
+
+def test_amplitudes_are_averaged_as_amplitudes():
+    axes = RADAR.image_axes(RADAR.raw_axes(64, 48))
+    image = Signal(torch.randn(64, 48, dtype=torch.complex64) * 1e25, axes)
+    torch.testing.assert_close(Detect((4, 4))(Detect()(image)).data, Detect((4, 4))(image).data)
+    torch.testing.assert_close(QuickLook(16)(Detect()(image)).data, QuickLook(16)(image).data)
 
 
 def test_a_shorter_overlap_gives_a_larger_error():

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from torchsar.core import Signal
+from torchsar.cli import main
+from torchsar.core import Axis, Signal
 from torchsar.focus import DirectImage, PathImage
-from torchsar.io import write_geotiff
+from torchsar.io import StripImage, write_geotiff
 from torchsar.radar import LocalFrame
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (extra `geo`)")
@@ -77,3 +78,19 @@ def test_other_images_are_refused(tmp_path):
     with pytest.raises(ValueError, match="a file holds one trial"):
         write_geotiff(image.with_data(image.data.expand(2, -1, -1)), tmp_path / "a.tif", stage, frame)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_strip_has_overviews_and_its_own_coordinates(tmp_path, monkeypatch):
+    monkeypatch.setattr("torchsar.io.strip._PART_BYTES", 1 << 20)
+    axes = (Axis("azimuth", 1700, 500.0, 2.0, "m"), Axis("range", 600, 9000.0, 4.0, "m"))
+    data = torch.randn(1700, 600, dtype=torch.complex64)
+    image = StripImage.create(tmp_path / "image.zarr", axes, torch.complex64, {}, {})
+    image.write(slice(0, 1700), data, 0)
+    assert main(["export", str(tmp_path), "--to", "geotiff", "--out", str(tmp_path / "out")]) == 0
+    with rasterio.open(tmp_path / "out" / "image.tif") as file:
+        assert np.array_equal(file.read(1), data.abs().numpy()) and file.block_shapes == [(512, 512)]
+        assert file.xy(3, 5) == (9000.0 + 5 * 4.0, 500.0 + 3 * 2.0)
+        assert file.overviews(1) == [2] and file.tags()["rows"] == "azimuth in m"
+        half = file.read(1, out_shape=(850, 300))
+        np.testing.assert_allclose(half, data.abs().reshape(850, 2, 300, 2).mean((1, 3)).numpy(), rtol=1e-5)
+    assert main(["export", str(tmp_path), "--to", "sicd", "--out", str(tmp_path / "other")]) == 2

@@ -143,6 +143,7 @@ NOT_SHIFTED = {
         **dict.fromkeys(
             (
                 "OmegaK:omega_k",
+                "FocusStrip:focus_strip",
                 "OmegaK:omega_k_flat",
                 "OmegaKStolt:omega_k_stolt",
                 "RangeDoppler:range_doppler",

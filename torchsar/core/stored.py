@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import struct
 import textwrap
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -30,12 +31,16 @@ class StoredArray:
         shape: Shape of the array.
         dtype: Type of its numbers in the file.
         opened: Function that opens the array as a stream in the format .npy.
+        plain: Path of the file that holds the numbers without compression, the position of the
+            first of them in bytes, and whether the first dimension is contiguous; None for a
+            compressed array.
     """
 
     what: str
     shape: tuple[int, ...]
     dtype: np.dtype
     opened: Callable[[], IO[bytes]]
+    plain: tuple[Path, int, bool] | None = None
 
     @property
     def described(self) -> str:
@@ -63,13 +68,46 @@ class StoredArray:
                 f"{self.what}: {self.described} takes {size / 1e9:.3g} GB, twice as much with a converted copy, and "
                 f"this machine has {memory / 1e9:.3g} GB; cut the array into parts"
             )
-        widest = np.dtype({"f": np.float64, "c": np.complex128}.get(self.dtype.kind, self.dtype))
-        kept = widest if self.dtype.itemsize > widest.itemsize else self.dtype.newbyteorder("=")
         try:
             with self.opened() as stream, np.errstate(over="ignore"):
-                return np.lib.format.read_array(stream, allow_pickle=False).astype(kept, copy=False)
+                return np.lib.format.read_array(stream, allow_pickle=False).astype(self._kept, copy=False)
         except Exception as error:  # the parsers of numpy and zipfile raise errors of many kinds
             raise ValueError(f"{self.what} cannot be loaded ({_reason(error)}); {_AGAIN}") from None
+
+    @property
+    def _kept(self) -> np.dtype:
+        """The type of loaded numbers."""
+        widest = np.dtype({"f": np.float64, "c": np.complex128}.get(self.dtype.kind, self.dtype))
+        return widest if self.dtype.itemsize > widest.itemsize else self.dtype.newbyteorder("=")
+
+    def rows(self, first: int, last: int) -> np.ndarray:
+        """Load a part of the array along its first dimension; nothing else is in memory.
+
+        Args:
+            first: Index of the first row.
+            last: Index after the last row, at most the length of the dimension.
+
+        Returns:
+            The rows, in the type that `load` returns.
+
+        Raises:
+            ValueError: If the array is compressed, or the file was cut off.
+        """
+        if self.plain is None:
+            raise ValueError(
+                f"{self.what} is compressed, so that its rows cannot be read one by one; save it by numpy.savez, which "
+                "does not compress"
+            )
+        path, begin, turned = self.plain
+        row = math.prod(self.shape[1:])
+        if path.stat().st_size < begin + self.shape[0] * row * self.dtype.itemsize:
+            raise ValueError(f"{self.what} was cut off while it was read; {_AGAIN}")
+        if turned:
+            part: np.ndarray = np.array(np.memmap(path, self.dtype, "r", begin, self.shape, "F")[first:last], order="C")
+        else:  # not mapped, since pages of a map count as memory of the process
+            part = np.fromfile(path, self.dtype, (last - first) * row, offset=begin + first * row * self.dtype.itemsize)
+        with np.errstate(over="ignore"):
+            return part.reshape(last - first, *self.shape[1:]).astype(self._kept, copy=False)
 
 
 class ArrayFile(Mapping[str, StoredArray]):
@@ -123,12 +161,14 @@ class ArrayFile(Mapping[str, StoredArray]):
             if info.flag_bits & 1:
                 raise ValueError(f"{what} is encrypted; save the archive without a password")
             size, opened = info.file_size, partial(_member, self.path, info)
+        stored = info is None or info.compress_type == zipfile.ZIP_STORED
         try:
             with opened() as stream:
                 start = io.BytesIO(stream.read(_LONGEST_HEADER))
             one = np.lib.format.read_magic(start) == (1, 0)
             read = np.lib.format.read_array_header_1_0 if one else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(start)
+            shape, turned, dtype = read(start)
+            begin = start.tell() + (0 if info is None else _begin_of(self.path, info))
         except Exception as error:  # the parsers of numpy and zipfile raise errors of many kinds
             raise ValueError(f"{what} is damaged or no numpy array ({_reason(error)}); {_AGAIN}") from None
         if dtype.hasobject:
@@ -136,7 +176,8 @@ class ArrayFile(Mapping[str, StoredArray]):
         held, needed = size - start.tell(), math.prod(shape) * dtype.itemsize
         if min(shape, default=0) < 0 or held != needed:
             raise ValueError(f"{what} is damaged: {dtype} of shape {shape} needs {needed} bytes, got {held}; {_AGAIN}")
-        return StoredArray(what, shape, dtype, opened)
+        turned = turned and len(shape) > 1
+        return StoredArray(what, shape, dtype, opened, (self.path, begin, turned) if stored else None)
 
     def __contains__(self, name: object) -> bool:
         return name in self._members
@@ -152,6 +193,14 @@ def _member(path: Path, info: zipfile.ZipInfo) -> IO[bytes]:
     """A member of an archive as a stream."""
     with zipfile.ZipFile(path) as archive:
         return archive.open(info)  # the file stays open until the stream is closed
+
+
+def _begin_of(path: Path, info: zipfile.ZipInfo) -> int:
+    """Position of the first byte of a member of an archive, behind its header."""
+    with path.open("rb") as file:
+        file.seek(info.header_offset)
+        name, extra = struct.unpack("<26xHH", file.read(30))
+    return info.header_offset + 30 + name + extra
 
 
 def _reason(error: Exception) -> str:

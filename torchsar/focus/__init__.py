@@ -28,7 +28,7 @@ from torchsar.focus.requirements import Requirement, recommended_form, requireme
 from torchsar.focus.spotlight import GroundGrid, SpotlightBackprojection, backproject_spotlight
 from torchsar.focus.spotlight_image import SceneGrid, SpotlightImage, scene_grid
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
-from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
+from torchsar.focus.strip import FocusStrip, StripPlan, focus_block, focus_strip, plan_strip, reach_lines, write_strip
 from torchsar.focus.strip_backprojection import (
     Backproject,
     DopplerBand,
@@ -66,6 +66,7 @@ __all__ = [
     "DopplerLines",
     "EveryPulse",
     "ExplicitSum",
+    "FocusStrip",
     "Gridding",
     "GroundGrid",
     "ImageGrid",
@@ -114,6 +115,7 @@ __all__ = [
     "defocus_omega_k",
     "deramp_azimuth",
     "flat_reference",
+    "focus_block",
     "focus_strip",
     "image_tiles",
     "inverse_requirements",

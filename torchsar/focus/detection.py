@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -137,15 +139,32 @@ def _looked(axis: Axis, looks: int) -> Axis:
 class Detect(Stage):
     """Stage that computes the amplitude of a focused image, see `amplitude`.
 
+    The samples of a real image are amplitudes, such as those of an earlier `Detect`.
+
     Args:
         looks: Samples of a block in azimuth and range, over which the power is averaged.
+
+    Raises:
+        ValueError: If `looks` are not two numbers of at least 1.
     """
 
     works_on = ("azimuth", "range")
+    takes_real = True
 
-    def __init__(self, looks: tuple[int, int] = (1, 1)) -> None:
+    def __init__(self, looks: Sequence[int] = (1, 1)) -> None:
         super().__init__()
-        self.looks = looks
+        if len(looks) != 2 or min(looks) < 1:
+            raise ValueError(f"looks must be two numbers of at least 1, in azimuth and range, got {list(looks)}")
+        self.looks = (looks[0], looks[1])
+
+    def axes(self, image: Sequence[Axis]) -> tuple[Axis, Axis]:
+        """Return the axes of the amplitude; they have one sample in the middle of each block.
+
+        Args:
+            image: Axes (azimuth, range) of the image.
+        """
+        azimuth, range_ = image
+        return _looked(azimuth, self.looks[0]), _looked(range_, self.looks[1])
 
     def forward(self, signal: Signal) -> Signal:
         """Compute the amplitude of an image with axes (azimuth, range).
@@ -159,13 +178,17 @@ class Detect(Stage):
         Raises:
             ValueError: If a block exceeds the image.
         """
-        data = amplitude(signal.data, self.looks)
-        azimuth, range_ = signal.axes
-        return Signal(data, (_looked(azimuth, self.looks[0]), _looked(range_, self.looks[1])))
+        data = signal.data
+        if data.is_complex():
+            return Signal(amplitude(data, self.looks), self.axes(signal.axes))
+        level = level_of(data)
+        return Signal(amplitude((data / level).square(), self.looks) * level, self.axes(signal.axes))
 
 
 class QuickLook(Stage):
     """Stage that makes an amplitude picture of limited size with cells nearly square in metres.
+
+    The samples of a real image are amplitudes, such as those of `Detect`.
 
     Args:
         size: Largest number of samples per side of the picture.
@@ -175,12 +198,22 @@ class QuickLook(Stage):
     """
 
     works_on = ("azimuth", "range")
+    takes_real = True
 
     def __init__(self, size: int = 1024) -> None:
         super().__init__()
         if size < 1:
             raise ValueError(f"size of a QuickLook must be at least 1 sample per side, got {size}")
         self.size = size
+
+    def detect(self, image: Sequence[Axis]) -> Detect:
+        """Return the stage that averages an image with given axes.
+
+        Args:
+            image: Axes (azimuth, range) of the image.
+        """
+        azimuth, range_ = image
+        return Detect(quicklook_looks((azimuth.n, range_.n), (azimuth.step, range_.step), self.size))
 
     def forward(self, signal: Signal) -> Signal:
         """Reduce an image with axes (azimuth, range) to an amplitude picture of limited size.
@@ -191,5 +224,4 @@ class QuickLook(Stage):
         Returns:
             Amplitude, real, with the mean power of each block of samples.
         """
-        azimuth, range_ = signal.axes
-        return Detect(quicklook_looks(signal.data.shape, (azimuth.step, range_.step), self.size))(signal)
+        return self.detect(signal.axes)(signal)

@@ -1,30 +1,37 @@
 """Focusing of strips longer than memory, by overlapping azimuth blocks.
 
-A focused line is a convolution of raw lines with the azimuth filter. The filter occupies (processed
-band) / (Doppler rate) seconds and has tails beyond. Blocks overlap by this length and by a guard.
-The guard is so long that the energy of the tails beyond it, which are cut off, is below a
-tolerance. Apart from these tails, the blocks equal one transform of the whole strip. The filter of
-a focuser with a processed band (`band_hz`) has short tails. A filter for the whole PRF has long
-tails, because it is discontinuous where the PRF band wraps.
+A focused line is a convolution of raw lines with the azimuth filter. The filter occupies the time
+in which the line of sight crosses the processed Doppler band, and has tails beyond. Blocks overlap
+by this length and by a guard, so long that the tails beyond it, which are cut off, are below a
+level. Apart from these tails, the blocks equal one transform of the whole strip.
+
+The soft edges of a processed band (`band_hz`) make the tails short. A filter for the whole PRF
+jumps where the PRF band wraps. Its tails fall as 1 / g at g lines from the ends of the aperture,
+however long the blocks are: -35 dB at the seams takes a guard of 640 lines, -60 dB takes 203,000.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal
+from torchsar.core import Axis, Signal, Stage
 from torchsar.focus.nufft import smooth_length
-from torchsar.focus.omega_k import BAND_EDGE
+from torchsar.focus.omega_k import BAND_EDGE, Focuser, OmegaK, raised_cosine_band
+from torchsar.focus.range_doppler import RangeDoppler
+from torchsar.focus.stolt import OmegaKStolt
 from torchsar.radar import StripmapRadar
 
 # arrays of block size in memory: raw block, its image, and the previous image held by the caller
 ARRAYS = 3
+# sine of the squint above which no aperture is computed: waves along the path
+_STEEPEST = 1 - 1e-6
 
 
 class Lines(Protocol):
@@ -35,7 +42,7 @@ class Lines(Protocol):
 
     shape: Any
 
-    def __getitem__(self, key: Any) -> Any: ...
+    def __getitem__(self, key: Any, /) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -49,19 +56,22 @@ class StripPlan:
         height: Raw lines read per block.
         reach: First and last raw line that contribute to an image line, relative to it.
         bytes: Memory in bytes for the samples of the three arrays that `plan_strip` describes.
+        multiple: Number of which the image lines kept per block are a whole multiple, except in the
+            last block.
     """
 
     n_lines: int
     height: int
     reach: tuple[int, int]
     bytes: int
+    multiple: int = 1
 
     @property
     def blocks(self) -> list[tuple[slice, slice]]:
         """Raw lines to read and image lines to keep for each block; kept lines tile the strip."""
         if self.height >= self.n_lines:
             return [(slice(0, self.n_lines), slice(0, self.n_lines))]
-        step = self.height - (self.reach[1] - self.reach[0])
+        step = (self.height - (self.reach[1] - self.reach[0])) // self.multiple * self.multiple
         cuts = [*range(0, self.n_lines, step), self.n_lines]
         starts = (min(max(0, first + self.reach[0]), self.n_lines - self.height) for first in cuts[:-1])
         return [
@@ -70,20 +80,28 @@ class StripPlan:
         ]
 
 
-def filter_tail(guard_lines: float) -> float:
-    """Compute the part of the energy of an azimuth filter beyond its aperture and a guard.
+def guard_lines(radar: StripmapRadar, band_hz: float | None, seam_db: float = -60.0) -> float:
+    """Compute how far beyond its aperture an azimuth filter reaches.
 
-    The filter uses the whole PRF, and its phase jumps where the PRF band wraps. The largest jump,
-    by pi, gives a tail of magnitude 1 / (pi g) at g lines from the ends of the aperture. The mean
-    energy over jumps of all phases, which is returned, is half of that of the largest.
+    A raised-cosine edge of width w has tails whose energy beyond the time t is at most 3e-5
+    (w t)^-5 of that of the filter, as measured. Where the spectrum is cut at a weight W, as at the
+    ends of the PRF band, it jumps by 2 W at most. The energy beyond g lines is then W^2 / (pi^2 g)
+    at most, which is missing in a block and, since the transform of a block is circular, enters it
+    from the other side: together 2 W^2 / (pi^2 g).
 
     Args:
-        guard_lines: Distance g from the ends of the aperture in lines.
+        radar: Radar of the recording.
+        band_hz: Processed Doppler bandwidth in Hz; None for the whole PRF.
+        seam_db: Energy that is missing and that enters, relative to that of the filter, in dB.
 
     Returns:
-        Energy beyond the guard relative to the whole energy of the filter.
+        Number of lines on either side.
     """
-    return 1 / (math.pi**2 * guard_lines)
+    energy, prf = 10 ** (seam_db / 10), radar.prf_hz
+    if band_hz is None:
+        return 2 / (math.pi**2 * energy)
+    cut = float(raised_cosine_band(torch.tensor(prf / 2 / band_hz, dtype=torch.float64)))
+    return (3e-5 / energy) ** 0.2 * prf / (BAND_EDGE * band_hz) + 2 * cut**2 / (math.pi**2 * energy)
 
 
 def reach_lines(
@@ -93,15 +111,17 @@ def reach_lines(
     *,
     frame_hz: float | None = None,
     band_hz: float | None = None,
-    tolerance_db: float = -60.0,
+    seam_db: float = -60.0,
 ) -> tuple[int, int]:
     """Compute the first and last raw line, relative to an image line, that contribute to it.
 
-    With a processed band (`band_hz`), its soft edges make the azimuth filter short: few lines
-    contribute, and the tolerance holds for any data. Without it the aperture is that of the whole
-    PRF. The tolerance then holds for data whose spectrum is 30 dB down at the ends of the PRF band
-    (a beam narrower than the PRF, little noise). For data that fill the band, the blocks agree with
-    one transform of the whole strip to about -45 dB.
+    These are the lines in which the line of sight crosses the Doppler band with its edges, over all
+    ranges of the swath and all range frequencies, and the guard of `guard_lines` on either side. At
+    a seam of two blocks the image then differs by `seam_db` from one transform of the whole strip,
+    for any data, white noise over the whole PRF included; away from seams by less.
+
+    Process a band of at most PRF / 1.1 with soft edges. Without a band the filter has long tails:
+    -60 dB takes a guard of 203,000 lines, -42 dB takes 3,200, -35 dB takes 640.
 
     Args:
         radar: Radar of the recording.
@@ -110,44 +130,39 @@ def reach_lines(
         frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
             None for the centroid itself.
         band_hz: Processed Doppler bandwidth of the focuser in Hz; None for the whole PRF.
-        tolerance_db: Energy of the tails of the filter that are cut off, relative to its whole
-            energy, in dB.
+        seam_db: Error at the seams relative to the rms of the image of white noise, in dB.
 
     Returns:
         First and last contributing raw line relative to the image line; the first is negative where
         earlier lines contribute.
     """
-    far, near = axes[-1].stop, axes[-1].start
-    cos2 = 1 - max(float(radar.sin_squint(f)) ** 2 for f in doppler_hz)
-    rate = float(radar.azimuth_rate_hz_s(far)) * cos2**1.5
-    if band_hz is None:
-        aperture, guard = radar.prf_hz**2 / rate, 1e-3 * filter_tail(1.0) / 10 ** (tolerance_db / 10)
-    else:
-        # tails of a raised-cosine edge of width w fall as (w tau)^-5 in energy: 3e-5 (w tau)^-5
-        periods = (3e-5 / 10 ** (tolerance_db / 10)) ** 0.2
-        aperture, guard = (
-            band_hz * (1 + BAND_EDGE) * radar.prf_hz / rate,
-            (2 + periods) * radar.prf_hz / (BAND_EDGE * band_hz),
-        )
+    half = radar.prf_hz / 2 if band_hz is None else min(radar.prf_hz, band_hz * (1 + BAND_EDGE)) / 2
     shifts = [
-        _frame_shift_s(radar, f, f if frame_hz is None else frame_hz, r) * radar.prf_hz
+        _frame_shift_s(radar, f + offset, f if frame_hz is None else frame_hz, r, top) * radar.prf_hz
         for f in doppler_hz
-        for r in (near, far)
+        for offset in (-half, half)
+        for r in (axes[-1].start, axes[-1].stop)
+        for top in (-0.5, 0.5)
     ]
-    half = aperture / 2 + guard
-    return math.floor(min(shifts) - half), math.ceil(max(shifts) + half)
+    guard = guard_lines(radar, band_hz, seam_db)
+    return math.floor(min(shifts) - guard), math.ceil(max(shifts) + guard)
 
 
-def _frame_shift_s(radar: StripmapRadar, doppler_hz: float, frame_hz: float, range_m: float) -> float:
-    """Time from the crossing of the frame direction to the crossing of the beam centre, for a
-    target at slant range range_m in the frame.
+def _frame_shift_s(radar: StripmapRadar, doppler_hz: float, frame_hz: float, range_m: float, top: float) -> float:
+    """Time from the crossing of the frame direction to that of the direction with a Doppler
+    frequency at a range frequency, `top` sampling rates above the carrier, for a target at slant
+    range range_m in the frame.
     """
-    sin, sin_frame = (float(radar.sin_squint(f)) for f in (doppler_hz, frame_hz))
+    ratio = max(0.5, 1 + top * radar.sampling_hz / radar.carrier_hz)
+    sin, sin_frame = float(radar.sin_squint(doppler_hz)) / ratio, float(radar.sin_squint(frame_hz))
+    sin = max(-_STEEPEST, min(_STEEPEST, sin))
     closest = range_m * math.sqrt(1 - sin_frame**2)
     return closest / radar.velocity_m_s * (sin_frame / math.sqrt(1 - sin_frame**2) - sin / math.sqrt(1 - sin**2))
 
 
-def plan_strip(shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int, itemsize: int = 8) -> StripPlan:
+def plan_strip(
+    shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int, itemsize: int = 8, multiple: int = 1
+) -> StripPlan:
     """Divide a strip into blocks that fit a memory limit.
 
     Three arrays of the size of a block are in memory at once: its raw lines, its image, and the
@@ -159,29 +174,33 @@ def plan_strip(shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int
             `reach_lines`.
         memory_bytes: Memory for these arrays in bytes.
         itemsize: Bytes per sample.
+        multiple: Number of which the image lines kept per block shall be a whole multiple.
 
     Returns:
         Plan of the blocks.
 
     Raises:
-        ValueError: If the memory holds fewer lines per block than 9/8 of the overlap of the blocks;
-            the message names the least memory.
+        ValueError: If the memory holds fewer lines per block than 9/8 of the overlap of the blocks
+            or than the overlap and `multiple`; the message names the least memory.
     """
     n_lines = shape[-2]
     line_bytes = ARRAYS * itemsize * math.prod(shape[:-2]) * shape[-1]
     overlap = reach[1] - reach[0]
     height = memory_bytes // line_bytes
     if height >= n_lines:
-        return StripPlan(n_lines, n_lines, reach, n_lines * line_bytes)
-    least = overlap + max(1, overlap // 8)
+        return StripPlan(n_lines, n_lines, reach, n_lines * line_bytes, multiple)
+    least = overlap + max(multiple, overlap // 8)
     if height < least:
         raise ValueError(
             f"memory_bytes must hold blocks of at least {least} lines, since blocks overlap by {overlap} lines, got "
             f"{memory_bytes / 1e9:.3g} GB, which hold {height} lines; allow at least {least * line_bytes / 1e9:.3g} "
-            "GB, or process a narrower Doppler band"
+            "GB, or process a narrower Doppler band (band_hz, at most PRF / 1.1), or accept larger errors at seams"
         )
     height = max((h for h in range(max(least, height // 2), height + 1) if smooth_length(h) == h), default=height)
-    return StripPlan(n_lines, height, reach, height * line_bytes)
+    step = (height - overlap) // multiple * multiple
+    even = math.ceil(n_lines / math.ceil(n_lines / step) / multiple) * multiple  # so that the last block is no shorter
+    height = min(height, smooth_length(overlap + even))
+    return StripPlan(n_lines, height, reach, height * line_bytes, multiple)
 
 
 def focus_strip(
@@ -226,25 +245,38 @@ def focus_strip(
         )
     axes = radar.raw_axes(plan.n_lines, source.shape[-1]) if axes is None else axes
     for read, keep in plan.blocks:
-        image = _focus_block(source, focus, radar, axes, read, keep, {} if values is None else values(read), device)
+        raw = torch.as_tensor(source[..., read, :], device=device)
+        image = focus_block(raw, focus, radar, axes, read, keep, {} if values is None else values(read))
+        del raw
         factor = image.data.shape[-2] // (keep.stop - keep.start)
         yield slice(keep.start * factor, keep.stop * factor), image
 
 
-def _focus_block(
-    source: Lines,
+def focus_block(
+    raw: Tensor,
     focus: Callable[..., Signal],
     radar: StripmapRadar,
     axes: tuple[Axis, ...],
     read: slice,
     keep: slice,
     values: Mapping[str, Tensor | float],
-    device: torch.device | str | None,
 ) -> Signal:
-    """Focus one block and select the image lines to keep."""
+    """Focus one block of a strip and select the image lines to keep.
+
+    Args:
+        raw: Raw lines of the block, shape (..., line, sample).
+        focus: Focusing stage or chain, as for `focus_strip`.
+        radar: Radar of the recording.
+        axes: Axes of the raw matrix of the whole strip, (pulse, range).
+        read: Slice of the raw lines of the block, an entry of `StripPlan.blocks`.
+        keep: Slice of the image lines to keep, of the same entry.
+        values: Values for the focusing stage.
+
+    Returns:
+        The image lines to keep.
+    """
     pulse, range_ = axes
-    raw = Signal(torch.as_tensor(source[..., read, :], device=device), (pulse.part(read.start, read.stop), range_))
-    image = focus(raw, **values).data
+    image = focus(Signal(raw, (pulse.part(read.start, read.stop), range_)), **values).data
     del raw
     # the azimuth transform is circular: an image line outside the block appears at its position
     # modulo the block
@@ -268,3 +300,121 @@ def write_strip(blocks: Iterator[tuple[slice, Signal]], target: Any) -> None:
         samples: Any = image.data if isinstance(target, Tensor) else image.data.cpu().numpy()
         target[..., lines, :] = samples
         del image
+
+
+FORMS = {"omega_k": OmegaK, "omega_k_stolt": OmegaKStolt, "range_doppler": RangeDoppler}
+
+
+class FocusStrip(Stage):
+    """Stage that focuses stripmap data in overlapping blocks of lines, see `focus_strip`.
+
+    The image differs from that of one transform by `seam_db` at the seams of the blocks. It needs
+    the working memory of one block; `torchsar focus` also reads the data and writes the image block
+    by block. Values passed to `forward` take precedence over those given here.
+
+    Args:
+        radar: Radar of the recording.
+        form: Focusing algorithm: "omega_k", "omega_k_stolt" or "range_doppler".
+        reference: Filter that compresses the pulses in range in the same pass: "matched", "flat" or
+            "phase"; None for range-compressed data.
+        velocity_m_s: Effective velocity in m/s; None for that of the radar.
+        doppler_hz: Absolute Doppler centroid in Hz; None for the nominal pointing of the radar, or
+            0 where it has none.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates, 0
+            for a zero-Doppler image; None for the nominal pointing of the radar, or for the
+            centroid where the radar has none.
+        band_hz: Processed Doppler bandwidth in Hz; None for PRF / 1.1, the largest band whose soft
+            edges the PRF holds.
+        memory_gb: Memory for the samples of a block, its image and the image before it, in 10^9
+            bytes.
+        seam_db: Largest error at the seams relative to the rms of an image of white noise, in dB.
+
+    Raises:
+        ValueError: If `form` or `reference` is not known, or `memory_gb` or `seam_db` does not
+            have the right sign.
+    """
+
+    def __init__(
+        self,
+        radar: StripmapRadar,
+        form: Literal["omega_k", "omega_k_stolt", "range_doppler"] = "omega_k",
+        reference: Literal["matched", "flat", "phase"] | None = "matched",
+        velocity_m_s: float | None = None,
+        doppler_hz: float | None = None,
+        frame_hz: float | None = None,
+        band_hz: float | None = None,
+        memory_gb: float = 2.0,
+        seam_db: float = -60.0,
+    ) -> None:
+        super().__init__()
+        if form not in FORMS:
+            raise ValueError(f"form of FocusStrip must be one of {', '.join(FORMS)}, got {form!r}")
+        if not (memory_gb > 0 and seam_db < 0):
+            raise ValueError(f"memory_gb must be positive and seam_db negative, got {memory_gb} and {seam_db}")
+        band_hz = radar.prf_hz / (1 + BAND_EDGE) if band_hz is None else band_hz
+        self.focuser: Focuser = FORMS[form](radar, reference, velocity_m_s, doppler_hz, frame_hz, band_hz)
+        self.memory_bytes, self.seam_db = int(memory_gb * 1e9), seam_db
+
+    def plan(
+        self,
+        shape: tuple[int, ...],
+        axes: tuple[Axis, ...],
+        itemsize: int = 8,
+        multiple: int = 1,
+        doppler_hz: Tensor | None = None,
+        velocity_m_s: Tensor | None = None,
+    ) -> StripPlan:
+        """Divide a strip into blocks that fit the memory, see `plan_strip`.
+
+        Args:
+            shape: Shape of the strip, (..., line, sample).
+            axes: Axes of the raw matrix, (pulse, range).
+            itemsize: Bytes per sample.
+            multiple: Number of which the image lines kept per block shall be a whole multiple.
+            doppler_hz: Doppler centroid in Hz; None for that of the stage.
+            velocity_m_s: Effective velocity in m/s; None for that of the stage.
+
+        Returns:
+            Plan of the blocks.
+
+        Raises:
+            ValueError: If the memory is too small; the message names the least memory.
+        """
+        focus = self.focuser
+        doppler, velocity = (
+            (own if given is None else given).detach()
+            for own, given in ((focus.doppler_hz, doppler_hz), (focus.velocity_m_s, velocity_m_s))
+        )
+        slowest = replace(focus.radar, velocity_m_s=float(velocity.min()))
+        frame = focus.radar.pointing_doppler_hz if focus.frame_hz is None else focus.frame_hz
+        ends = float(doppler.min()), float(doppler.max())
+        reach = reach_lines(slowest, axes, ends, frame_hz=frame, band_hz=focus.band_hz, seam_db=self.seam_db)
+        return plan_strip(shape, reach, self.memory_bytes, itemsize, multiple)
+
+    def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
+        """Focus a signal with axes (pulse, range).
+
+        Args:
+            signal: Recording.
+            doppler_hz: Doppler centroid in Hz; None for that of the stage.
+            velocity_m_s: Effective velocity in m/s; None for that of the stage.
+
+        Returns:
+            Image with axes (azimuth, range).
+
+        Raises:
+            ValueError: If a value is not valid, see `omega_k`, or the memory is too small.
+        """
+        values = {"doppler_hz": doppler_hz, "velocity_m_s": velocity_m_s}
+        given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+        data, raw_axes = signal.data, signal.axes
+        if ARRAYS * data.numel() * data.element_size() <= self.memory_bytes:
+            return self.focuser(signal, **given)
+        plan = self.plan(data.shape, raw_axes, data.element_size(), **given)
+        blocks = focus_strip(data, self.focuser, self.focuser.radar, plan, axes=raw_axes, values=lambda _: given)
+        lines, first = next(blocks)
+        azimuth, range_ = first.axes
+        n = plan.n_lines * azimuth.n // plan.blocks[0][1].stop
+        whole = data.new_empty((*data.shape[:-2], n, range_.n))
+        write_strip(chain([(lines, first)], blocks), whole)
+        return Signal(whole, (azimuth.part(0, n), range_))

@@ -32,18 +32,18 @@ def write_arrays(
     for name, signal in images.items():
         group = root.create_group(name)
         for axis in signal.axes:
-            _put(group, axis.name, axis.values(), (axis.name,), unit=axis.unit, step=axis.step)
-        _put(group, "image", signal.data, signal.names, unit="1")
+            put(group, axis.name, axis.values(), (axis.name,), unit=axis.unit, step=axis.step)
+        put(group, "image", signal.data, signal.names, unit="1")
     if truth:
         group = root.create_group("truth")
         for name, value in truth.items():
-            _put(group, name, value)
+            put(group, name, value)
     if any(estimates.values()):
         group = root.create_group("estimate")
         for method, values in estimates.items():
             inner = group.create_group(method)
             for name, value in values.items():
-                _put(inner, name, value)
+                put(inner, name, value)
 
 
 def read_images(path: str | Path) -> dict[str, Signal]:
@@ -79,7 +79,16 @@ def _images(zarr: Any, group: Any, name: str) -> Iterator[tuple[str, Signal]]:
         yield from _images(zarr, inner, f"{name}/{below}".strip("/"))
 
 
-def _put(group: Any, name: str, value: Tensor, dims: tuple[str, ...] | None = None, **attributes: Any) -> None:
+def put(group: Any, name: str, value: Tensor, dims: tuple[str, ...] | None = None, **attributes: Any) -> None:
+    """Write an array into a group.
+
+    Args:
+        group: Open zarr group.
+        name: Name of the array.
+        value: Its numbers.
+        dims: Names of its dimensions.
+        **attributes: Attributes of the array.
+    """
     data = torch.as_tensor(value).detach().cpu().resolve_conj().numpy()
     chunks = tuple(min(n, 1024) for n in data.shape)
     array = group.create_array(

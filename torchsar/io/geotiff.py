@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from torchsar.focus.detection import to_db
 from torchsar.focus.path_image import PathImage
 from torchsar.io.extras import write_whole
 from torchsar.io.geometry import image_samples
+from torchsar.io.strip import StripImage
 from torchsar.radar import LocalFrame
 
 # largest distance in pixels between the affine map and the projection, by choice; images for which
@@ -21,6 +23,8 @@ from torchsar.radar import LocalFrame
 _MOST_PIXELS = 0.1
 # points along either axis at which the map is fitted, and which become control points
 _POINTS = 7
+# side of a tile in pixels, and bytes of written tiles in memory, by choice
+_TILE, _CACHE_BYTES = 512, 128 << 20
 
 
 def write_geotiff(
@@ -80,6 +84,55 @@ def write_geotiff(
 
     write_whole(path, write)
     return float(error)
+
+
+def write_strip_geotiff(image: StripImage, path: str | Path) -> None:
+    """Write the amplitude of a strip as a tiled GeoTIFF with overviews, reading it in parts.
+
+    The file has columns along slant range and rows along azimuth, its coordinates are slant range
+    and azimuth in metres, and it names no map projection: a straight stripmap path has no position
+    on the Earth. Overviews are reduced by 2, 4, 8, ... with averaged amplitudes.
+
+    Args:
+        image: Image of `torchsar focus`.
+        path: Path of the file.
+
+    Raises:
+        ModuleNotFoundError: If rasterio is not installed (extra `geo`).
+        FileNotFoundError: If the folder does not exist.
+        ValueError: If a chunk of the image is damaged.
+    """
+    rasterio, enums = (library(name, "geo", f"writing {path}") for name in ("rasterio", "rasterio.enums"))
+    azimuth, range_ = image.axes
+    corner = rasterio.Affine.translation(range_.start - range_.step / 2, azimuth.start - azimuth.step / 2)
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "height": azimuth.n,
+        "width": range_.n,
+        "count": 1,
+        "dtype": "float32",
+        "transform": corner * rasterio.Affine.scale(range_.step, azimuth.step),
+        "tiled": True,
+        "blockxsize": _TILE,
+        "blockysize": _TILE,
+        "BIGTIFF": "IF_SAFER",
+    }
+    fewest = max(1, max(azimuth.n, range_.n) // _TILE)
+    factors = [2**k for k in range(1, fewest.bit_length())]
+
+    def write(part: Path) -> None:
+        with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES), rasterio.open(part, "w+", **profile) as file:
+            for lines, signal in image.parts(_TILE):
+                window = ((lines.start, lines.stop), (0, range_.n))
+                file.write(signal.data.abs().float().numpy(), 1, window=window)
+            file.set_band_description(1, "amplitude")
+            file.update_tags(columns="slant range in m", rows="azimuth in m")
+            if factors:
+                file.build_overviews(factors, enums.Resampling.average)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        write_whole(path, write)
 
 
 def _north_up(values: np.ndarray, image: PathImage) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -114,7 +114,7 @@ def _images(strip: Strip) -> Drawn:
 
 def _cuts(strip: Strip) -> Drawn:
     label, *at = strip.strongest()
-    images = {name: image for name, image in strip.result.images.items() if name in _CUT_METHODS}
+    images = {n: image for n, image in strip.result.images.items() if n in _CUT_METHODS and image.data.is_complex()}
     found = {name: impulse_cuts(image, (at[0], at[1])) for name, image in images.items()}
     parts = [
         {
@@ -127,7 +127,8 @@ def _cuts(strip: Strip) -> Drawn:
         for axis in IMAGE
     ]
     caption = f"Cuts through {label}, interpolated by a factor of 16. 0 dB is the peak of each curve."
-    yield "cuts", "Impulse-response cuts", caption, plot.panels(parts)
+    if found:
+        yield "cuts", "Impulse-response cuts", caption, plot.panels(parts)
 
 
 def _squint(strip: Strip) -> Drawn:

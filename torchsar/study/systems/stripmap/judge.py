@@ -54,6 +54,8 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -
     if trace.signal.names != IMAGE:
         return Judged(metrics)
     used = Used.by(chain, trace, bench.radar, n)
+    if not trace.signal.data.is_complex():  # the metrics of images and responses are those before detection
+        return Judged({**metrics, **used.metrics(bench.radar)}, view=used)
     image = trace.signal.isel(**window(trace.signal, bench.radar, bench.judging.margin))
     metrics.update(used.metrics(bench.radar), entropy_nats=entropy(image).expand(n), contrast=contrast(image).expand(n))
     if not detail:
@@ -92,6 +94,8 @@ def compare(bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
     judged = over_targets(bench, outcome.judged, None if ideal is None else ideal.judged)
     one, other = outcome.signal, None if ideal is None else ideal.signal
     if one is None or other is None or one is other or not one.names == other.names == IMAGE:
+        return judged
+    if not (one.data.is_complex() and other.data.is_complex()):
         return judged
     pair = [
         image.isel(**window(image, bench.radar, bench.judging.margin)).to(torch.complex128)  # sums over many pixels

@@ -1,0 +1,287 @@
+"""Strips longer than memory: recordings read and images written in blocks of lines."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchsar.core import Axis, Recording, Signal, canonical, group_attributes, sealed
+from torchsar.focus.detection import QuickLook
+from torchsar.io.arrays import put
+from torchsar.io.extras import library, reading
+from torchsar.io.fields import archive, joined, naming
+from torchsar.io.recorded import describe_stripmap
+
+# number of the layout of the store; another one is refused
+_FORMAT = 1
+# samples of a chunk along range, by choice: 8 MB as complex64 with the lines of a chunk
+_CHUNK_SAMPLES = 4096
+# bytes of samples that are read at once from an image, by choice
+_PART_BYTES = 32 << 20
+# side data with one entry per line
+_PER_LINE = ("agc_db", "line_number")
+
+
+class StripRecording:
+    """Raw stripmap recording in an archive for `read_stripmap`, of which lines are read.
+
+    Args:
+        path: Path of the archive, written without compression, such as by `torchsar import`.
+        dtype: complex64 or complex128, dtype of the samples.
+
+    Attributes:
+        radar: Radar of the recording.
+        shape: Numbers of lines and samples.
+        axes: Axes of the raw matrix, (pulse, range).
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is not such an archive, or its samples are compressed.
+    """
+
+    def __init__(self, path: str | Path, dtype: torch.dtype = torch.complex64) -> None:
+        self.path, self.dtype = Path(path), dtype
+        found = describe_stripmap(archive(self.path, "raw stripmap data"), self.path)
+        self._samples, self.radar, self._aux = found
+        self.shape: tuple[int, int] = found.samples.shape[:2]  # pyright: ignore[reportAttributeAccessIssue]
+        self.axes = self.radar.raw_axes(*self.shape)
+        for name in _PER_LINE:
+            if name in self._aux and self._aux[name].shape != self.shape[:1]:
+                raise ValueError(
+                    f"{path}: {name} must have one entry per line, {self.shape[0]}, got {self._aux[name].shape}"
+                )
+        found.samples.rows(0, 1)
+
+    def recording(self, first: int, last: int) -> Recording:
+        """Read some of the lines.
+
+        Args:
+            first: Index of the first line.
+            last: Index after the last line.
+
+        Returns:
+            Recording of these lines, with their slow times and side data.
+
+        Raises:
+            ValueError: If a sample or side data are not valid, as for `read_stripmap`.
+        """
+        aux = {name: x[first:last] if name in _PER_LINE else x for name, x in self._aux.items()}
+        with naming(self.path):
+            iq = self._samples.rows(first, last)
+            data = iq if iq.ndim == 2 else joined(iq[..., 0], iq[..., 1])
+            start_s, what = self.axes[0].start + first * self.axes[0].step, f"{self.path}: lines {first} to {last - 1}"
+            return Recording.from_arrays(data, self.radar, dtype=self.dtype, start_s=start_s, what=what, **aux)
+
+    def __getitem__(self, key: Any) -> torch.Tensor:
+        """Samples of some of the lines, key[-2], as `focus_strip` reads them."""
+        return self.recording(key[-2].start, key[-2].stop).signal.data
+
+
+class StripImage:
+    """Image in a zarr store of version 3 that is written in blocks of lines; see `create`.
+
+    The store has the arrays `image`, `azimuth` and `range`, as a group of the arrays of a run (see
+    `read_images`). Its attributes hold what the image depends on, and the finished blocks with
+    checksums of their samples. They are written, in a single file, after the samples of a block: if
+    a program is killed, at most the block at which it worked is lost.
+
+    Args:
+        path: Folder of an existing store.
+        mode: "r" to read, "r+" to write further blocks.
+
+    Attributes:
+        axes: Axes of the image, (azimuth, range).
+        about: What was given to `create`.
+
+    Raises:
+        FileNotFoundError: If there is no such store.
+        ModuleNotFoundError: If zarr is not installed (extra `study`).
+        ValueError: If the store is damaged or of another kind.
+    """
+
+    def __init__(self, path: str | Path, mode: str = "r") -> None:
+        self.path = Path(path)
+        if not (self.path / "zarr.json").is_file():
+            raise FileNotFoundError(f"{path} does not exist; give the folder of the result of torchsar focus")
+        zarr = library("zarr", "study", f"reading {path}")
+        with reading(self.path, "an image of a strip"):
+            held = group_attributes(self.path)
+            if held.get("format") != _FORMAT or not {"identity", "about", "blocks"} <= set(held):
+                raise ValueError(f"{path} was not written by this version of torchsar focus; choose another folder")
+            self._root: Any = zarr.open_group(str(path), mode=mode)
+            self.identity, self.about = held["identity"], held["about"]
+            self._blocks: dict[str, list[int]] = held["blocks"]
+            self.array: Any = self._root["image"]
+            self.axes = tuple(self._axis(name) for name in self.array.metadata.dimension_names)
+
+    def _axis(self, name: str) -> Axis:
+        held = self._root[name]
+        return Axis(name, held.shape[0], float(held[0]), float(held.attrs["step"]), str(held.attrs["unit"]))
+
+    @staticmethod
+    def is_begun(path: str | Path) -> bool:
+        """Whether a store has finished blocks, so that it cannot simply be replaced.
+
+        Args:
+            path: Folder of the store, which may not exist, or be cut off while it was created.
+
+        Raises:
+            ValueError: If it is damaged.
+        """
+        if not (Path(path) / "zarr.json").is_file():
+            return False
+        with reading(Path(path), "an image of a strip"):
+            return bool(group_attributes(Path(path)).get("blocks"))
+
+    @staticmethod
+    def create(
+        path: str | Path,
+        axes: tuple[Axis, ...],
+        dtype: torch.dtype,
+        identity: Mapping[str, Any],
+        about: Mapping[str, Any],
+        chunk_lines: int = 256,
+    ) -> StripImage:
+        """Make a store without finished blocks.
+
+        Args:
+            path: Folder of the new store; an earlier one is replaced.
+            axes: Axes of the image, (azimuth, range).
+            dtype: Type of its samples.
+            identity: What the image depends on, values that JSON can hold.
+            about: Further values that JSON can hold.
+            chunk_lines: Image lines of a chunk; blocks should have whole chunks.
+
+        Returns:
+            The store, open for writing.
+
+        Raises:
+            ModuleNotFoundError: If zarr is not installed (extra `study`).
+        """
+        zarr, codecs = (library(name, "study", f"writing {path}") for name in ("zarr", "zarr.codecs"))
+        root = zarr.open_group(str(path), mode="w", zarr_format=3)
+        for axis in axes:
+            put(root, axis.name, axis.values(), (axis.name,), unit=axis.unit, step=axis.step)
+        shape = tuple(axis.n for axis in axes)
+        root.create_array(
+            "image",
+            shape=shape,
+            dtype=str(dtype).removeprefix("torch."),
+            chunks=(min(shape[0], chunk_lines), min(shape[1], _CHUNK_SAMPLES)),
+            compressors=[codecs.Crc32cCodec()],  # by which a damaged chunk is found
+            dimension_names=[axis.name for axis in axes],
+            attributes={"unit": "1"},
+        )
+        plain = {"format": _FORMAT, "identity": dict(identity), "about": dict(about), "blocks": {}}
+        root.update_attributes(sealed(plain))
+        return StripImage(path, "r+")
+
+    def refuse_another(self, identity: Mapping[str, Any]) -> None:
+        """Check that the finished blocks are of the image that is to be continued.
+
+        Args:
+            identity: What the image depends on.
+
+        Raises:
+            ValueError: If it differs from that given to `create`.
+        """
+        for key, value in identity.items():
+            if canonical(self.identity.get(key)) != canonical(value):
+                raise ValueError(
+                    f"{self.path} was made with another {key}, {_short(self.identity.get(key))} instead of "
+                    f"{_short(value)}; choose another folder"
+                )
+
+    def is_finished(self, lines: slice) -> bool:
+        """Whether a block of image lines is finished."""
+        return str(lines.start) in self._blocks
+
+    def check(self, lines: slice, raw: int) -> None:
+        """Check that a finished block is that of some raw lines, and that it is whole.
+
+        Args:
+            lines: Image lines of the block.
+            raw: Checksum of these raw lines, see `samples_checksum`.
+
+        Raises:
+            ValueError: If the raw lines or the samples of the image have changed.
+        """
+        of_raw, of_image = self._blocks[str(lines.start)]
+        if of_raw != raw:
+            raise ValueError(
+                f"{self.path}: lines {lines.start} to {lines.stop - 1} were made from other raw data than those of "
+                "now; choose another folder"
+            )
+        with reading(self.path, "an image of a strip"):
+            if of_image != samples_checksum(torch.from_numpy(self.array[lines])):
+                raise ValueError(f"{self.path}: lines {lines.start} to {lines.stop - 1} are damaged; start again")
+
+    def write(self, lines: slice, image: torch.Tensor, raw: int) -> None:
+        """Write a block of the image, and then mark it as finished.
+
+        Args:
+            lines: Image lines of the block.
+            image: Their samples.
+            raw: Checksum of the raw lines from which it was made, see `samples_checksum`.
+        """
+        self.array[lines] = image.numpy()
+        self._blocks[str(lines.start)] = [raw, samples_checksum(image)]
+        self._root.update_attributes(sealed({**dict(self._root.attrs), "blocks": self._blocks}))
+
+    def parts(self, multiple: int = 1) -> Iterator[tuple[slice, Signal]]:
+        """Read the image in parts of at most 32 MiB, or of `multiple` lines if these are more.
+
+        Args:
+            multiple: Number of which the lines of every part but the last are a whole multiple.
+
+        Yields:
+            The lines of a part, and the part with its axes.
+
+        Raises:
+            ValueError: If a chunk is damaged.
+        """
+        azimuth, range_ = self.axes
+        whole = math.lcm(multiple, self.array.chunks[0])  # so that no chunk is read twice
+        step = max(1, _PART_BYTES // (multiple * range_.n * self.array.dtype.itemsize)) * multiple
+        step -= step % whole if step >= whole else 0
+        for first in range(0, azimuth.n, step):
+            lines = slice(first, min(first + step, azimuth.n))
+            with reading(self.path, "an image of a strip"):
+                data = torch.from_numpy(self.array[lines])
+            yield lines, Signal(data, (azimuth.part(lines.start, lines.stop), range_))
+
+    def quick_look(self, stage: QuickLook) -> Signal:
+        """Compute the picture of the image that a stage makes of it, reading it in parts.
+
+        Args:
+            stage: The stage.
+
+        Returns:
+            Amplitude, as from the stage for the whole image.
+        """
+        detect = stage.detect(self.axes)
+        looks = detect.looks[0]
+        looked = [detect(part).data for lines, part in self.parts(looks) if lines.stop - lines.start >= looks]
+        return Signal(torch.cat(looked, -2), detect.axes(self.axes))
+
+
+def samples_checksum(samples: torch.Tensor) -> int:
+    """Compute a checksum (CRC-32) of samples on the CPU, by which other samples are recognised.
+
+    Args:
+        samples: Samples, any shape.
+
+    Returns:
+        The checksum.
+    """
+    return zlib.crc32(samples.contiguous().view(torch.uint8).numpy().data)
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) < 100 else f"{text[:100]}..."
