@@ -81,7 +81,7 @@ _STYLE: Any = {
 }
 
 
-class NotebookFigure(Figure):
+class _NotebookFigure(Figure):
     """Figure that a notebook shows by itself, without pyplot and its settings."""
 
     def _repr_png_(self) -> bytes:
@@ -118,7 +118,7 @@ def _styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
 
 def _figure(width: float, height: float, to_scale: bool = False) -> tuple[Figure, Axes]:
     """Figure of one panel, with its axes."""
-    figure = NotebookFigure(figsize=(width, height), layout="compressed" if to_scale else "constrained")
+    figure = _NotebookFigure(figsize=(width, height), layout="compressed" if to_scale else "constrained")
     return figure, figure.subplots()
 
 
