@@ -72,6 +72,10 @@ LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
     "range cells shows: `ok` is False where a sparse description is more likely": [
         *(("compensate.LinkPhases", "own", snr_db) for snr_db in (20.0, 60.0)),
     ],
+    "what scene and motion leave of samples at 40 dB is an error of the model, not noise: fringes of right "
+    "results do not settle, and where other starts fail the deviation is too large": [
+        ("compensate.PathAutofocus", "own", 40.0),
+    ],
 }
 
 

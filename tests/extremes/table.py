@@ -714,6 +714,7 @@ REASONS = {
     "core.refuse_non_finite_values": "the check itself; tests/core/test_core.py",
     "core.best_of": "index arithmetic that callers inside the package have checked",
     "core.address": "hashes parameters, not samples; tests/study/test_sweep.py",
+    "core.library": "imports a package by its name",
     "core.canonical": "writes parameters as text; tests/core/test_fingerprint.py",
     "core.fingerprint": "describes code; tests/core/test_fingerprint.py",
     "core.checksum": "works on the bytes of a store; tests/study/test_store_faults.py",
