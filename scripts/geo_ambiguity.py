@@ -21,19 +21,11 @@ from torchsar.multichannel import (
     MovingPointVelocity,
     WalkAmbiguity,
 )
-from torchsar.radar import BistaticRadar, LinearFM
+from torchsar.radar import BistaticRadar
+from torchsar.reproduce.geo.sensor import INTEGRATION_S, RADAR
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 
-RADAR = BistaticRadar(
-    1.25e9,
-    LinearFM(50e6, 10e-6),
-    sampling_hz=60e6,
-    prf_hz=180.0,
-    speed_m_s=300.0,
-    reference_range_m=5000.0,
-    wave_speed_m_s=3e8,
-)
-INTEGRATION_S, RECORD_S = 4.5, 5.0
+RECORD_S = 5.0
 AMBIGUOUS_M_S = (25.0, -35.0)
 
 

@@ -22,17 +22,9 @@ from torchsar.multichannel import (
     condition_number,
     noise_gain_db,
 )
-from torchsar.radar import BistaticRadar, LinearFM
+from torchsar.radar import BistaticRadar
+from torchsar.reproduce.geo.sensor import RADAR
 
-RADAR = BistaticRadar(
-    1.25e9,
-    LinearFM(50e6, 10e-6),
-    sampling_hz=60e6,
-    prf_hz=180.0,
-    speed_m_s=300.0,
-    reference_range_m=5000.0,
-    wave_speed_m_s=3e8,
-)
 UNEVEN = replace(RADAR, channel_m=(-0.8, 0.0, 0.75))
 EXPECTED_PRF = (125.0, 160.0, 170.0, 180.0, 185.0, 187.0, 190.0, 195.0, 200.0, 250.0)
 EXPECTED_CONDITION = {  # at EXPECTED_PRF, condition number and noise gain (dB)

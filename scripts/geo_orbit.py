@@ -16,26 +16,9 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.radar import (
-    BistaticRadar,
-    LinearFM,
-    Orbit,
-    range_coefficients,
-    seen_point,
-)
+from torchsar.radar import range_coefficients, seen_point
 from torchsar.radar.orbit import EARTH_GRAVITY_M3_S2
-
-RADAR = BistaticRadar(
-    1.25e9,
-    LinearFM(50e6, 10e-6),
-    sampling_hz=60e6,
-    prf_hz=180.0,
-    speed_m_s=300.0,
-    reference_range_m=5000.0,
-    wave_speed_m_s=3e8,
-)
-HEIGHT_M, OFF_NADIR_DEG, INTEGRATION_S = 36_500e3, 7.0, 4.5
-ORBIT = Orbit.at_height(HEIGHT_M, inclination_deg=60.0, raan_deg=195.5, argument_of_perigee_deg=270.0)
+from torchsar.reproduce.geo.sensor import INTEGRATION_S, OFF_NADIR_DEG, ORBIT, RADAR
 
 
 def coefficients(n: int) -> tuple[Tensor, dict[str, Tensor]]:

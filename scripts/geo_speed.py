@@ -42,19 +42,10 @@ from torchsar.multichannel import (
     StaticBulk,
 )
 from torchsar.multichannel.migration import Migration
-from torchsar.radar import BistaticRadar, LinearFM
+from torchsar.reproduce.geo.sensor import BANDWIDTH_HZ, INTEGRATION_S, RADAR
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 
-RADAR = BistaticRadar(
-    1.25e9,
-    LinearFM(50e6, 10e-6),
-    sampling_hz=60e6,
-    prf_hz=180.0,
-    speed_m_s=300.0,
-    reference_range_m=5000.0,
-    wave_speed_m_s=3e8,
-)
-INTEGRATION_S, BANDWIDTH_HZ, N_PULSE = 4.5, 337.5, 900
+N_PULSE = 900
 U_R_M_S, SNR_DB = 10.0, 7.0
 MIGRATIONS: dict[str, Migration] = {
     "keystone, whole swath": Keystone(),

@@ -48,6 +48,13 @@ def cell(value: float | None) -> str:
     )
 
 
+def read(directive: SphinxDirective, folder: str, name: str) -> dict[str, Any]:
+    """A record, on which the page of the directive then depends."""
+    path = Path(directive.env.srcdir) / folder / f"{name}.json"
+    directive.env.note_dependency(str(path))
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
 # statistics of a record, and how a caption names them
 STATISTICS = {"median": "Medians", "rmse": "RMS values", "success_share": "Shares"}
 
@@ -81,9 +88,7 @@ class Sweep(SphinxDirective):
 
     def record(self) -> dict[str, Any]:
         """The record, on which the page depends."""
-        path = Path(self.env.srcdir) / "sweeps" / f"{self.arguments[0]}.json"
-        self.env.note_dependency(str(path))
-        return json.loads(path.read_text(encoding="utf-8"))
+        return read(self, "sweeps", self.arguments[0])
 
     def fits(self, parameters: Mapping[str, Any]) -> bool:
         """Whether a point of the grid is one of those that are shown."""
@@ -174,9 +179,8 @@ class TradeTable(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        path = Path(self.env.srcdir) / "trade" / f"{self.arguments[0]}.json"
-        self.env.note_dependency(str(path))
-        record = json.loads(path.read_text(encoding="utf-8"))
+        name = self.arguments[0]
+        record = read(self, "trade", name)
         lines = ["| step | alternative | CPU time (ms) | loss | recommended |", "| --- | --- | ---: | --- | --- |"]
         for choice, alternatives in {record["choice"]: record["alternatives"], **record["others"]}.items():
             for i, row in enumerate(alternatives):
@@ -188,7 +192,7 @@ class TradeTable(SphinxDirective):
         limits = ", ".join(f"`{name}` {value:g}" for name, value in record["tolerance"].items())
         with_ = f"torch {record['machine']['torch']}, threads: {record['machine']['threads']}"
         note = (
-            f"Config `{record['config']}`; largest loss accepted: {limits}; {with_}; record: `docs/trade/{path.name}`."
+            f"Config `{record['config']}`; largest loss accepted: {limits}; {with_}; record: `docs/trade/{name}.json`."
         )
         return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
 
@@ -202,9 +206,7 @@ class RequiresTable(SphinxDirective):
         ]
         lines.append("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
         for system in SYSTEMS:
-            path = Path(self.env.srcdir) / "requires" / f"{system}.json"
-            self.env.note_dependency(str(path))
-            r = json.loads(path.read_text(encoding="utf-8"))
+            r = read(self, "requires", system)
             numbers = (r["scenes"], int(r["rows"]), int(r["acceptable"]))
             shares = f"{r['precision']:.3f} | {r['recall']:.3f} | {r['median_error']:.2g} dB"
             lines.append(f"| `{system}` | {' | '.join(map(str, numbers))} | {shares} |")
@@ -217,9 +219,7 @@ class ReproducedTable(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        path = Path(self.env.srcdir) / "reproduce" / f"{self.arguments[0]}.json"
-        self.env.note_dependency(str(path))
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = read(self, "reproduce", self.arguments[0])
         lines = ["| item | compared | published | ours | verdict |", "| --- | --- | --- | --- | --- |"]
         for found in record["items"]:
             lines += self.rows(found)
@@ -232,7 +232,7 @@ class ReproducedTable(SphinxDirective):
             versions = ", ".join(f"{name} {version}" for name, version in one["versions"].items())
             where = f"{one['date']}, commit `{one['commit']}`, {one['machine']}, {versions}"
             notes.append(f"{one['form'].capitalize()} form, {where}: {', '.join(labels)}.")
-        source = f"{record['source']}. Record: `docs/reproduce/{path.name}`."
+        source = f"{record['source']}. Record: `docs/reproduce/{self.arguments[0]}.json`."
         return self.parse_text_to_nodes("\n\n".join([source, "\n".join(lines), *notes]))
 
     def rows(self, found: dict[str, Any]) -> list[str]:
@@ -254,8 +254,7 @@ class ReproducedCounts(SphinxDirective):
         words = ("reproduced", "better", "not reproduced", "reduced form only", "diagram", "photograph")
         lines = [f"| paper | {' | '.join(words)} |", f"| --- {'| ---: ' * len(words)}|"]
         for path in sorted((Path(self.env.srcdir) / "reproduce").glob("*.json")):
-            self.env.note_dependency(str(path))
-            items = json.loads(path.read_text(encoding="utf-8"))["items"]
+            items = read(self, "reproduce", path.stem)["items"]
             reduced = [bool(one["made"]) and one["made"]["form"] == "reduced" for one in items]
             verdicts = [words[3] if few else one["verdict"] for one, few in zip(items, reduced, strict=True)]
             lines.append(f"| `{path.stem}` | {' | '.join(str(verdicts.count(word)) for word in words)} |")

@@ -31,7 +31,7 @@ from torchsar.reproduce.record import read, write
 
 
 @pytest.mark.parametrize(
-    "ours, std, better, told",
+    "ours, std, better, expected",
     [
         (1.0, 0.0, "", REPRODUCED),
         (1.09, 0.0, "", REPRODUCED),
@@ -45,8 +45,8 @@ from torchsar.reproduce.record import read, write
         (-math.inf, 0.0, "lower", NOT_REPRODUCED),
     ],
 )
-def test_verdict(ours: float, std: float, better: str, told: str) -> None:
-    assert verdict(1.0, ours, std, 0.1, better) == told
+def test_verdict(ours: float, std: float, better: str, expected: str) -> None:
+    assert verdict(1.0, ours, std, 0.1, better) == expected
 
 
 def test_numbers_of_draws_have_a_deviation() -> None:

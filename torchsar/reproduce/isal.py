@@ -87,8 +87,8 @@ def _images(case: str, sharp: tuple[str, ...], blurred: tuple[str, ...]) -> Call
         checks = []
         for name in (*sharp, *blurred):
             above = seen.above(case, METHODS[name])
-            told, holds = ("focused", above < FOCUSED) if name in sharp else ("defocused", above > DEFOCUSED)
-            checks.append(statement(name, told, holds, f"{above:.2f} nats above the error-free image"))
+            claim, holds = ("focused", above < FOCUSED) if name in sharp else ("defocused", above > DEFOCUSED)
+            checks.append(statement(name, claim, holds, f"{above:.2f} nats above the error-free image"))
         return checks
 
     return make

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,8 +82,21 @@ def number(
     if isinstance(ours, Sequence):
         draws = torch.tensor([float(x) for x in ours], dtype=torch.float64)
         ours, spread = float(draws.mean()), float(draws.std() / math.sqrt(len(draws))) if len(draws) > 1 else None
-    told = verdict(published, float(ours), spread or 0.0, tolerance, better)
-    return Check(name, float(published), float(ours), spread, float(tolerance), told)
+    found = verdict(published, float(ours), spread or 0.0, tolerance, better)
+    return Check(name, float(published), float(ours), spread, float(tolerance), found)
+
+
+def parameters(rows: Mapping[str, tuple[float, float]], share: float) -> list[Check]:
+    """Compare the parameters of a table.
+
+    Args:
+        rows: Published and our value by name, with its unit.
+        share: Largest difference that counts as reproduced, as a share of the published value.
+
+    Returns:
+        The comparisons.
+    """
+    return [number(name, published, ours, share * abs(published)) for name, (published, ours) in rows.items()]
 
 
 def statement(name: str, published: str, holds: bool, ours: str) -> Check:
@@ -114,8 +127,8 @@ def falling(name: str, values: dict[str, float], rising: bool = False) -> Check:
     """
     ours = list(values.values())
     holds = ours == sorted(ours, reverse=not rising)
-    told = "; ".join(f"{method} {value:.4g}" for method, value in values.items())
-    return statement(name, f"{'rises' if rising else 'falls'} in the order: {'; '.join(values)}", holds, told)
+    listed = "; ".join(f"{method} {value:.4g}" for method, value in values.items())
+    return statement(name, f"{'rises' if rising else 'falls'} in the order: {'; '.join(values)}", holds, listed)
 
 
 @dataclass(frozen=True)
@@ -196,10 +209,10 @@ def settled(item: Item, checks: Sequence[Check]) -> str:
     """
     if item.kind in SHOWN:
         return item.kind
-    told = {check.verdict for check in checks}
-    if not checks or NOT_REPRODUCED in told:
+    verdicts = {check.verdict for check in checks}
+    if not checks or NOT_REPRODUCED in verdicts:
         return NOT_REPRODUCED
-    return BETTER if BETTER in told else REPRODUCED
+    return BETTER if BETTER in verdicts else REPRODUCED
 
 
 def in_order(*items: Item) -> tuple[Item, ...]:

@@ -126,9 +126,7 @@ def _figure_2(strip: _Strip, path: Path) -> list[Check]:
     found, lines = find_contamination(data.data).lines, true["tone.contaminated"]
     right, wrong = int((found & lines).sum()), int((found & ~lines).sum())
     ours = f"{right} of {int(lines.sum())} lines with the tone found, {wrong} others"
-    return [
-        statement("lines with an external signal", "can be told from the others", bool((found == lines).all()), ours)
-    ]
+    return [statement("lines with an external signal", "stand out from the others", bool((found == lines).all()), ours)]
 
 
 def _figure_3(strip: _Strip, path: Path) -> list[Check]:
@@ -187,8 +185,8 @@ def _figure_5(recording: Recording, path: Path) -> list[Check]:
     plot.save(plot.panels([part]), path, columns=1)
     spread, error = float(block.std()), abs(mean - true)
     ours = f"blocks scatter by {spread:.1f} Hz, their mean is {error:.1f} Hz off"
-    told = "varies with the scene at a constant squint; the mean tells the centroid"
-    return [statement("estimate", told, error < spread / 2, ours)]
+    claim = "varies with the scene at a constant squint; the mean tells the centroid"
+    return [statement("estimate", claim, error < spread / 2, ours)]
 
 
 def _figure_6(strip: _Strip, path: Path) -> list[Check]:

@@ -178,8 +178,8 @@ def _figure_2(diagram: TimingDiagram, path: Path) -> list[Check]:
     swaths = _nearest_swaths(diagram)
     ours = ", ".join(f"{prf:g} Hz: {swaths[prf] / 1e3:+.0f} km" for prf in RATES if prf in swaths)
     holds = all(prf in swaths for prf in RATES)
-    told = "pulse rates of 160 to 200 Hz, such as 180 Hz, leave 500 km clear"
-    return [statement("clear swath, and its middle from 7 degrees off nadir", told, holds, ours)]
+    claim = "pulse rates of 160 to 200 Hz, such as 180 Hz, leave 500 km clear"
+    return [statement("clear swath, and its middle from 7 degrees off nadir", claim, holds, ours)]
 
 
 def _figure_3(speed: Tensor, path: Path) -> list[Check]:
@@ -199,8 +199,8 @@ def _figure_4(speed: Tensor, path: Path) -> list[Check]:
     change = 100 * float((_delay_s(point)[-1, 2] / _delay_s(point)[0, 2] - 1).abs())
     shift = float(_phase_shift_rad(point)[-1, 2])
     ours = f"at 20 m/s the delay changes by {change:.2f} %, the phase by {shift:.2f} rad"
-    told = "a small effect on velocity and delay, a clear one on the phase"
-    return [statement("slant-range velocity", told, change < 1 < abs(shift), ours)]
+    claim = "a small effect on velocity and delay, a clear one on the phase"
+    return [statement("slant-range velocity", claim, change < 1 < abs(shift), ours)]
 
 
 def _figure_8(speed: Tensor, path: Path) -> list[Check]:
@@ -208,8 +208,8 @@ def _figure_8(speed: Tensor, path: Path) -> list[Check]:
     along, across = (float(_worst_phase_rad(*u)) for u in ((0.0, 10.0), (10.0, 0.0)))
     imbalance = float(_phase_shift_rad(_motion(10.0, 0.0))[2].abs())
     ours = f"at 10 m/s {along:.1f} rad along track, {across:.2f} rad in slant range; imbalance {imbalance:.2f} rad"
-    told = "larger by the along-track velocity; the slant-range velocity unbalances the channels"
-    return [statement("phase errors", told, along > across and imbalance > 0.5, ours)]
+    claim = "larger by the along-track velocity; the slant-range velocity unbalances the channels"
+    return [statement("phase errors", claim, along > across and imbalance > 0.5, ours)]
 
 
 ITEMS = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from torchsar.radar import BistaticRadar, LinearFM, Orbit
-from torchsar.reproduce.item import Check, Item, number
+from torchsar.reproduce.item import Check, Item, parameters
 
 # of Table 1; pulse length and sampling are chosen, and 3e8 m/s is the speed behind the printed
 # numbers
@@ -45,7 +45,7 @@ def _table_1(radar: BistaticRadar, path: Path) -> list[Check]:
         "channels": (3, radar.channels),
         "spacing of the channels (m)": (0.8, spacing),
     }
-    return [number(name, published, ours, 1e-6 * published) for name, (published, ours) in rows.items()]
+    return parameters(rows, 1e-6)
 
 
 ITEMS = (Item("Table 1", "parameters of the simulation", "table", _sensor, _table_1),)

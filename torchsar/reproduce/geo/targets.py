@@ -321,14 +321,14 @@ def _figure(name: str, method: str) -> Callable[[_Seen, Path], list[Check]]:
         _draw_target(two, trial, f"({u_r:g}, {u_a:g}) m/s, {method}", path, 60.0 if blurred else 15.0)
         width, false = (float(_measured(seen.batch, two)[trial, which]) for which in (0, -1))
         focused, clean = width < 1, false < -40
-        told = "focused, without false targets"
+        claim = "focused, without false targets"
         if method == "conventional" and u_a:
-            told, holds = "strongly defocused in azimuth", not focused
+            claim, holds = "strongly defocused in azimuth", not focused
         elif method == "conventional" and u_r:
-            told, holds = "false targets at a high level", not clean
+            claim, holds = "false targets at a high level", not clean
         else:
             holds = focused and clean
-        return [statement("point", told, holds, f"width {width:.2f} m, false targets {false:.1f} dB")]
+        return [statement("point", claim, holds, f"width {width:.2f} m, false targets {false:.1f} dB")]
 
     return make
 

@@ -190,7 +190,7 @@ def _points(small: bool) -> dict[str, _Profile]:
     return _compensated(simulate_turntable(radar, world, 20000, 8, Draws(1))[0].signal, radar)
 
 
-def _told(profiles: Mapping[str, _Profile], name: str, x_m: float) -> tuple[float, str]:
+def _seen_at(profiles: Mapping[str, _Profile], name: str, x_m: float) -> tuple[float, str]:
     """Peak (dB) of a point, and its numbers in words."""
     peak, width, side = profiles[name].near(x_m, REACH_M).figures()
     return peak, f"{NAMES[name]}: peak {peak:.1f} dB, width {width:.2f} mm, side lobe {side:.1f} dB"
@@ -203,10 +203,10 @@ def _shown(names: Sequence[str], reach_m: Sequence[float]) -> Callable[[dict[str
         _draw_profiles(profiles, names, reach_m, path)
         checks = []
         for x in (PLACES_M[-1], PLACES_M[1]):
-            peaks, words = zip(*(_told(profiles, name, x) for name in names), strict=True)
+            peaks, words = zip(*(_seen_at(profiles, name, x) for name in names), strict=True)
             rising = list(peaks) == sorted(peaks) and abs(peaks[-1]) < 0.1
-            told = "focused best by the last of the compensations"
-            checks.append(statement(f"point at {x:g} m", told, rising, "; ".join(words)))
+            claim = "focused best by the last of the compensations"
+            checks.append(statement(f"point at {x:g} m", claim, rising, "; ".join(words)))
         return checks
 
     return make

@@ -66,7 +66,7 @@ def _compensated(seen: _Seen, factor: float | None) -> Signal:
     return Signal(image.data, (Axis("Doppler", doppler.n, 1e-3 * doppler.start, 1e-3 * doppler.step, "kHz"), range_))
 
 
-def _told(seen: _Seen, factor: float | None) -> str:
+def _words(seen: _Seen, factor: float | None) -> str:
     return ", ".join(
         f"{name} {100 * float(error):+.2g} %"
         for name, error in zip(("Om", "k1", "k2"), seen.error(factor), strict=True)
@@ -91,9 +91,9 @@ def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
 
 def _outcome(seen: _Seen, factor: float) -> Check:
     close = bool((seen.error(factor).abs() < CLOSE).all())
-    told = "close to the truth, focused" if factor == 1 else "far from the truth, defocused"
+    claim = "close to the truth, focused" if factor == 1 else "far from the truth, defocused"
     return statement(
-        f"Newton's method from {factor:g} times the truth", told, close == (factor == 1), _told(seen, factor)
+        f"Newton's method from {factor:g} times the truth", claim, close == (factor == 1), _words(seen, factor)
     )
 
 
@@ -101,7 +101,7 @@ def _table_2(seen: _Seen, path: Path) -> list[Check]:
     best = bool((seen.error(None).abs() < CLOSE).all())
     return [
         *(_outcome(seen, factor) for factor in FACTORS),
-        statement("without a start", "a method that needs none is close to the truth", best, _told(seen, None)),
+        statement("without a start", "a method that needs none is close to the truth", best, _words(seen, None)),
     ]
 
 

@@ -34,9 +34,9 @@ from torchsar.metrics import contrast, entropy, impulse_response
 from torchsar.metrics.radial_motion import Course, course_of, finer_in_range
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.repair import BlankTurningPoints, CircularShift, SplitSweeps
-from torchsar.reproduce.item import Check, Item, falling, number, statement
+from torchsar.reproduce.item import Check, Item, falling, number, parameters, statement
 from torchsar.reproduce.sal.letter import in_milliseconds
-from torchsar.reproduce.sal.points import ISLR_DB, NAMES, NULLS
+from torchsar.reproduce.sal.points import ISLR_DB, NAMES, NULLS, draw_over_time
 from torchsar.scene import (
     EverySample,
     LadarWorld,
@@ -212,32 +212,21 @@ def _draw_separation(recording: Recording, path: Path) -> None:
 
 
 def _draw_motion(courses: Mapping[str, Course], truth: Truth, path: Path) -> None:
-    """Velocity and motion, true and by both methods of the paper, and what they
-    leave.
-    """
+    """Velocity and motion, true and by both methods of the paper, and what they leave."""
     pulse, names = courses["segmented"].pulse, ["cross-correlation", "segmented", "recommended"]
-    ms, true = plot.array(1e3 * pulse.values()), truth.values["range_error_up_m"]
+    true = truth.values["range_error_up_m"]
     velocity = {**{name: courses[name].velocity_m_s for name in names[:2]}, "true": truth.values["velocity_m_s"]}
     motion = {
         **{name: 1e3 * (true - true[0] + courses[name].error_m - courses[name].error_m[0]) for name in names[:2]},
         "true": 1e3 * (true - true[0]),
     }
     left = {name: 1e6 * courses[name].detrended_m for name in names}
-    parts = []
-    for title, unit, lines in (
-        ("radial velocity", "m/s", velocity),
-        ("motion", "mm", motion),
-        ("motion left, without constant and slope", "um", left),
-    ):
-        parts.append(
-            {
-                "series": {name: (ms, plot.array(y)) for name, y in lines.items()},
-                "xlabel": "slow time (ms)",
-                "ylabel": unit,
-                "title": title,
-            }
-        )
-    plot.save(plot.panels(parts), path, columns=3)
+    drawn = {
+        "radial velocity": ("m/s", velocity),
+        "motion": ("mm", motion),
+        "motion left, without constant and slope": ("um", left),
+    }
+    draw_over_time(pulse, drawn, path)
 
 
 def _draw_slices(traces: Mapping[str, Trace], path: Path) -> None:
@@ -312,7 +301,7 @@ def _table_4(seen: _Seen, path: Path) -> list[Check]:
         "reference range (m)": (4339.5, RADAR.reference_range_m),
         "range of the target (m)": (4350.0, RADAR.reference_range_m + RETRO_M),
     }
-    return [number(name, published, ours, 2e-3 * published) for name, (published, ours) in rows.items()]
+    return parameters(rows, 2e-3)
 
 
 def _table_5(seen: _Seen, path: Path) -> list[Check]:

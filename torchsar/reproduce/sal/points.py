@@ -19,14 +19,14 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.compensate import CompensateMotion, CorrectPulsePhase, RadialMotion, SegmentedInterference
-from torchsar.core import Chain, Draws, Signal, Trace, Truth, use
+from torchsar.core import Axis, Chain, Draws, Signal, Trace, Truth, use
 from torchsar.echo import simulate_ladar, simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import impulse_response
 from torchsar.metrics.cuts import impulse_cuts
 from torchsar.metrics.radial_motion import Course, course_of, finer_in_range
 from torchsar.radar import LIGHT_M_S, TriangularLadar
-from torchsar.reproduce.item import Check, Item, number, statement
+from torchsar.reproduce.item import Check, Item, number, parameters, statement
 from torchsar.scene import LadarWorld, Points, Polynomial, QuadraticInSweep, Sinusoid
 
 # of Table 1; the sampling is chosen
@@ -172,20 +172,32 @@ def _draw_motion(courses: Mapping[str, Course], truth: Truth, path: Path) -> Non
     velocity = {"segmented": found.velocity_m_s, "true": truth.values["velocity_m_s"]}
     motion = {"segmented": 1e3 * (true + found.error_m - found.error_m[0]), "true": 1e3 * true}
     error = {name: 1e9 * (courses[name].error_m - courses[name].error_m[0]) for name in ("segmented", "recommended")}
-    ms, parts = plot.array(1e3 * found.pulse.values()), []
-    for title, unit, lines in (
-        ("radial velocity", "m/s", velocity),
-        ("range error", "mm", motion),
-        ("estimated minus true range error", "nm", error),
-    ):
-        parts.append(
-            {
-                "series": {name: (ms, plot.array(y)) for name, y in lines.items()},
-                "xlabel": "slow time (ms)",
-                "ylabel": unit,
-                "title": title,
-            }
-        )
+    drawn = {
+        "radial velocity": ("m/s", velocity),
+        "range error": ("mm", motion),
+        "estimated minus true range error": ("nm", error),
+    }
+    draw_over_time(found.pulse, drawn, path)
+
+
+def draw_over_time(pulse: Axis, drawn: Mapping[str, tuple[str, Mapping[str, Tensor]]], path: Path) -> None:
+    """Draw panels side by side over slow time.
+
+    Args:
+        pulse: Slow time in seconds.
+        drawn: Unit, and lines (pulse,) by name, of each panel by its title.
+        path: Picture.
+    """
+    ms = plot.array(1e3 * pulse.values())
+    parts = [
+        {
+            "series": {name: (ms, plot.array(y)) for name, y in lines.items()},
+            "xlabel": "slow time (ms)",
+            "ylabel": unit,
+            "title": title,
+        }
+        for title, (unit, lines) in drawn.items()
+    ]
     plot.save(plot.panels(parts), path, columns=3)
 
 
@@ -242,7 +254,7 @@ def _table_1(seen: _Seen, path: Path) -> list[Check]:
         "speed (m/s)": (60.0, RADAR.speed_m_s),
         "height (m), our reference range": (3000.0, RADAR.reference_range_m),
     }
-    return [number(name, published, ours, 1e-3 * published) for name, (published, ours) in rows.items()]
+    return parameters(rows, 1e-3)
 
 
 def _figure_4(seen: _Seen, path: Path) -> list[Check]:
