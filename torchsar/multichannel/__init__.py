@@ -7,7 +7,8 @@ the velocity of the target.
 
 from torchsar.multichannel.azimuth import FocusAzimuth, azimuth_filter, focus_azimuth
 from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
-from torchsar.multichannel.body import Body, Extraction, body_echo, find_body
+from torchsar.multichannel.body import Body, body_echo, find_body
+from torchsar.multichannel.chip import Extraction
 from torchsar.multichannel.compress import CompressChannels
 from torchsar.multichannel.detection import Detection, detect
 from torchsar.multichannel.known_motion import known_motion_chain

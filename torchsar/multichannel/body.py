@@ -1,17 +1,8 @@
-"""Velocity, image and echo of extended moving targets ("bodies").
+"""Velocity, image and echo of extended moving targets ("bodies"), see `chip`.
 
-All scatterers of a body have one velocity. Range lines around the body are shifted by the range
-history of its middle and deramped channel by channel. Each scatterer then is one tone in all
-channels, even if aliased. The frequency F of the tone gives the along-track position y = y0 + F
-lambda R0 / v of the scatterer, with the position y0 and the closest range R0 of the middle and the
-along-track speed v of the receiver relative to the body. Position and velocity determine the phases
-of the tone across the channels.
-
-In a short segment of slow time, the sea clutter at the frequency of a tone comes from only a few
-look angles, one for each Doppler band. Its covariance across the channels is estimated from range
-lines beside the body. The slant-range velocity is the one of highest likelihood over all tones and
-segments, each with a free amplitude. The along-track velocity is the one of the sharpest image. The
-echo is the fit with both velocities.
+The slant-range velocity of a body is the one of highest likelihood over all tones and segments,
+each with a free amplitude; at the end it is fitted to the tones of the pixels of the body's image.
+The along-track velocity is the one of the sharpest image. The echo is the fit with both velocities.
 
 Reference:
     Remote Sens. 2020, 12, 1703, section 4.3 (extraction of moving targets, one velocity for
@@ -26,41 +17,26 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_phasor, matrix_inverse, unit_level, unit_phasor
+from torchsar.core import linear_phasor, unit_level
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.migration import Frame, StaticBulk, correct_migration
+from torchsar.multichannel.chip import Chip, Extraction, Picture, centred_motion, chip_about
+from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.model import point_phasor
-from torchsar.radar import BistaticRadar
 
 _TINY = 1e-100  # floor of divisors, far from the overflow of reciprocals
-# Range cells left out beside a body, whose side lobes reach there. Found by trial: 2 to 12 cells
-# give the same velocities.
-_GUARD_CELLS = 6
 # Brightest lines used for the sharpness of an image, found by trial: 4 to 16 lines give the same
 # velocities, 16 take a quarter more time.
 _LINES_USED = 8
 # convention: two overlapping segments of two pulses
 _LEAST_PULSES = 4
-# Lines beside a body are left out beyond this many standard deviations of their energies, which are
-# 1.48 times the median deviation of a normal distribution. Found by trial: 4 to 8 leave out lines
-# that hold other ships, and no sea.
-_OUTLIER, _OUTLIER_ROUNDS, _MAD_TO_STD = 6.0, 3, 1.4826
-# Difference of u_r for its derivative, and Gauss-Newton steps: a third one changes u_r by less than
-# a hundredth of its standard deviation.
-_SPEED_STEP_M_S, _FIT_STEPS = 1e-3, 2
+# Gauss-Newton steps of u_r: a third one changes it by a hundredth of its standard deviation at most
+_FIT_STEPS = 2
 # Largest predicted standard deviation of a reliable body, found by trial: of 50 pairs of ships in
 # one place, those below it were at most 3.7 deviations off, others up to 12. Ships on a sea stay
 # below 0.13. u_r displaces a body by about 20 m per m/s.
 _USABLE_M_S = 0.3
-_LEAST_LINES = 12  # convention: fewest lines beside a body for the covariance of the sea
-_LOADING = 1e-5  # relative to the mean power: keeps the covariance of noise-free data invertible
-# Intensities in units of the residual sea and noise of a pixel, all found by trial. Pixels of a
-# body exceed _BRIGHT (4 to 30 give the same velocities) and this share of the brightest pixel.
-_BRIGHT, _BRIGHT_SHARE = 12.0, 0.01
-# Pixels above this are subtracted with a body: less removes sea as well, more leaves some body.
-_CLEAR = 2.0
 # Least mean of the bright pixels of a reliable body: sea alone stays below 18 in 15 trials, a ship
 # that is weak but visible (4 dB in the frames of the tests) reaches 7000.
 _CREDIBLE = 40.0
@@ -76,326 +52,6 @@ _INSIDE = 0.98
 # changes by little. Trades time against the number of rounds.
 _WIDE_ROUNDS = 2
 _NEAR_U_R_M_S, _NEAR_U_A_M_S, _LAST_U_R_M_S = 2.0, 1.0, 1.0
-
-
-@dataclass(frozen=True)
-class Extraction:
-    """Extent of the data that are extracted for one body, an extended moving target.
-
-    Args:
-        along_m: Half width along track about the middle of the body in metres.
-        range_m: Half width in range about the middle of the body in metres.
-        integration_s: Time in seconds for which a scatterer is illuminated.
-        segment_s: Length in seconds of the segments of slow time in which the clutter is
-            suppressed.
-
-    Raises:
-        ValueError: If a value is not positive and finite.
-    """
-
-    along_m: float = 120.0
-    range_m: float = 60.0
-    integration_s: float = 4.5
-    segment_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("along_m", "range_m", "integration_s", "segment_s"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} of an extraction must be positive and finite, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class Segments:
-    """Short-time Fourier transform of slow time with half-overlapping Hann windows.
-
-    Args:
-        n: Number of pulses.
-        length: Number of pulses of a segment.
-        bins: Indices of the FFT bins (tones) that are kept of each segment, shape (tone,).
-        rows: Indices of the segments in which a body is illuminated, shape (segment,).
-    """
-
-    n: int
-    length: int
-    bins: Tensor
-    rows: Tensor
-
-    @property
-    def hop(self) -> int:
-        """Number of pulses from one segment to the next, half the length of a segment."""
-        return self.length // 2
-
-    def window(self) -> Tensor:
-        """Return the Hann window of a segment, float64 (length,)."""
-        return torch.hann_window(self.length, dtype=torch.float64, device=self.bins.device)
-
-    def of(self, x: Tensor) -> Tensor:
-        """Return the short-time spectra (..., segment, tone) of complex128 data (..., pulse)."""
-        made = torch.stft(
-            x.flatten(0, -2),
-            self.length,
-            self.hop,
-            window=self.window(),
-            center=True,
-            pad_mode="constant",
-            onesided=False,
-            return_complex=True,
-        )
-        return made[:, self.bins][..., self.rows].mT.unflatten(0, x.shape[:-1])
-
-    def back(self, cells: Tensor) -> Tensor:
-        """Transform short-time spectra (..., segment, tone) back to slow time (..., pulse).
-
-        This is the inverse of `of`; segments and FFT bins that were left out count as zero.
-        """
-        full = torch.zeros(
-            cells.shape[:-2].numel(), self.length, self.n // self.hop + 1, dtype=cells.dtype, device=cells.device
-        )
-        full[:, self.bins[:, None], self.rows] = cells.flatten(0, -3).mT
-        made = torch.istft(
-            full,
-            self.length,
-            self.hop,
-            window=self.window(),
-            center=True,
-            onesided=False,
-            length=self.n,
-            return_complex=True,
-        )
-        return made.unflatten(0, cells.shape[:-2])
-
-
-@dataclass(frozen=True)
-class Chip:
-    """Short-time spectra of the range lines around a body, deramped by the motion of its middle.
-
-    Args:
-        radar: Radar parameters.
-        motion: Motion of the middle of the body.
-        segments: Short-time Fourier transform of slow time.
-        cells: Spectra of the range lines of the body, complex128 (line, channel, segment, tone).
-        beside: Spectra of the range lines beside the body, complex128 (line, channel, segment,
-            tone).
-        tone_hz: Doppler frequencies of the kept bins after deramping in Hz, shape (tone,).
-        range_m: Closest ranges of the range lines of the body in metres, shape (line,).
-        inverse: Inverse covariance of sea and noise across the channels, complex128 (segment, tone,
-            channel, channel).
-        lit: True for pulses at which some part of the body is illuminated, bool (pulse,).
-        time_s: Slow time in seconds, float64 (pulse,).
-    """
-
-    radar: BistaticRadar
-    motion: PointMotion
-    segments: Segments
-    cells: Tensor
-    beside: Tensor
-    tone_hz: Tensor
-    range_m: Tensor
-    inverse: Tensor
-    lit: Tensor
-    time_s: Tensor
-
-    def steering(self, motion: PointMotion, tone_hz: Tensor) -> Tensor:
-        """Return the phases across the channels of scatterers with given tones in deramped data.
-
-        A scatterer at along-track position y has the phasor exp(-j 2 pi (y - y0) dx_m / (lambda
-        R0)) in the channel at dx_m, with the along-track position y0 of the middle of the body and
-        the closest range R0.
-
-        Args:
-            motion: Motion of the scatterers, shape (...,).
-            tone_hz: Frequencies of the tones in Hz, shape (tone,).
-
-        Returns:
-            Phasors, complex128 (..., tone, channel).
-        """
-        position = self.position_m(motion, tone_hz) - self.motion.y0_m
-        return unit_phasor(
-            -position[..., None]
-            * self.radar.channels_at(position.device)
-            / (self.radar.wavelength_m * motion.range_m[..., None, None]),
-            torch.complex128,
-        )
-
-    def position_m(self, motion: PointMotion, tone_hz: Tensor) -> Tensor:
-        """Return the along-track positions of scatterers with given tones in deramped data.
-
-        Args:
-            motion: Motion of the scatterers, shape (...,); its along-track position is that of a
-                tone of frequency zero.
-            tone_hz: Frequencies of the tones in Hz, shape (tone,).
-
-        Returns:
-            Positions at t = 0 in metres, shape (..., tone).
-        """
-        per_hz = self.radar.wavelength_m * motion.range_m / motion.along_m_s
-        return motion.y0_m[..., None] + per_hz[..., None] * tone_hz
-
-    def _weights(self, motion: PointMotion) -> tuple[Tensor, Tensor]:
-        """Return R^-1 a (..., segment, tone, channel) and a^H R^-1 a (..., segment, tone)."""
-        steering = self.steering(motion, self.tone_hz)
-        weight = torch.einsum("sfmn,...fn->...sfm", self.inverse, steering)
-        return weight, (steering[..., None, :, :].conj() * weight).sum(-1).real.clamp_min(_TINY)
-
-    def energy(self, motions: PointMotion) -> Tensor:
-        """Return the energy of the data that scatterers with each candidate motion explain.
-
-        Each cell (range line, segment, tone) has a free complex amplitude. The energy is relative
-        to the covariance of sea and noise; up to constants it is the log-likelihood.
-
-        Args:
-            motions: Candidate motions, shape (candidate,).
-
-        Returns:
-            Energy summed over all cells, without unit, shape (candidate,).
-        """
-        weight, gain = self._weights(motions)
-        return (torch.einsum("lmsf,csfm->clsf", self.cells, weight.conj()).abs().square() / gain[:, None]).sum(
-            (-3, -2, -1)
-        )
-
-    def whitened(self, cells: Tensor) -> Tensor:
-        """Return the energy of cells relative to the covariance of sea and noise.
-
-        Args:
-            cells: Short-time spectra of range lines, complex128 (line, channel, segment, tone).
-
-        Returns:
-            Energies, (line, segment, tone); of sea and noise, their mean is the number of channels.
-        """
-        return torch.einsum("lmsf,sfmn,lnsf->lsf", cells.conj(), self.inverse, cells).real
-
-    def model(self, picture: Picture) -> Tensor:
-        """Return the deramped echo of an image of the body in every channel.
-
-        Args:
-            picture: Image of the body. Pixels count that exceed twice the mean intensity of the
-                residual sea and noise.
-
-        Returns:
-            Echo, complex128 (line, channel, pulse), zero in pulses in which no part of the body is
-            illuminated.
-        """
-        clear = picture.amplitude * (picture.level > _CLEAR)
-        spectrum = torch.zeros(len(clear), self.radar.channels, self.segments.n, dtype=clear.dtype, device=clear.device)
-        spectrum[..., picture.index] = clear[:, None] * self.steering(self.motion, picture.tone_hz).mT
-        return torch.fft.ifft(spectrum) * self.lit
-
-    def fit(self, picture: Picture, image_s: float, image_m: float) -> Fit:
-        """Fit u_r to the echo of an image of the body, in which each pixel has a tone of its own.
-
-        The phases that `energy` gives a cell are those of the middle of its Doppler bin, up to half
-        a bin off. The pixels of the image are much finer.
-
-        Args:
-            picture: Image of the body.
-            image_s: Slow time in seconds at which an image of the stationary scene shows the body.
-            image_m: Range in metres at which it does.
-
-        Returns:
-            One Gauss-Newton step of the maximum-likelihood fit, with a free amplitude in each cell.
-        """
-        made = self.segments.of(self.model(picture))
-        backed = torch.einsum("sfmn,lnsf->lmsf", self.inverse, made)
-        level = (made.conj() * backed).sum(1).real
-
-        def across(cells: Tensor) -> Tensor:
-            """Return the part of cells that no amplitude of the model explains."""
-            return cells - ((backed.conj() * cells).sum(1) / level.clamp_min(_TINY))[:, None] * made
-
-        speed = self.motion.u_r_m_s + _SPEED_STEP_M_S
-        there = _motion_imaged_at(self.radar, self.cells, speed, self.motion.u_a_m_s, image_s, image_m)
-        turns = (self.motion.y0_m - there.y0_m) / (_SPEED_STEP_M_S * self.radar.wavelength_m * there.range_m)
-        slope = across(2j * math.pi * turns * self.radar.channels_at(made.device)[:, None, None] * made)
-        pull = torch.einsum("lmsf,sfmn->lnsf", slope.conj(), self.inverse)
-        curvature = (pull * slope).sum().real.clamp_min(_TINY)
-        left = across(self.cells - made)
-        bright = level > _BRIGHT
-        count = (bright.sum() * (self.radar.channels - 1)).clamp_min(1)
-        misfit = (self.whitened(left) * bright).sum() / count
-        # every pulse lies in two segments, so that the curvature, and the segments, count it twice
-        twice = self.segments.length / self.segments.hop
-        step = (pull * left).sum(1).real / curvature
-        scatter = step.sum((-2, -1)).square().sum() + twice * step.sum((0, -1)).square().sum()
-        std = torch.maximum(torch.sqrt(twice / curvature) * misfit.clamp_min(1.0), torch.sqrt(scatter))
-        return Fit(step.sum(), std, misfit)
-
-    def echo(self, cells: Tensor) -> Tensor:
-        """Return the most likely deramped echo of scatterers that move as the middle of the body.
-
-        Args:
-            cells: Short-time spectra of range lines, complex128 (line, channel, segment, tone).
-
-        Returns:
-            Echo as received by a channel at the along-track position 0, complex128 (line, pulse),
-            zero in pulses in which no part of the body is illuminated.
-        """
-        weight, gain = self._weights(self.motion)
-        return self.segments.back(torch.einsum("lmsf,sfm->lsf", cells, weight.conj()) / gain) * self.lit
-
-    def picture(self) -> Picture:
-        """Return the image of the body: the Doppler spectra of its deramped echo.
-
-        The image includes the mean intensity of the residual sea and noise, which is measured in
-        the range lines beside the body.
-        """
-        n = self.segments.n
-        hz = torch.fft.fftfreq(n, 1 / self.radar.prf_hz, dtype=torch.float64, device=self.lit.device)
-        inside = (hz.abs() <= self.tone_hz.abs().max()).nonzero()[:, 0]
-        own, others = (torch.fft.fft(self.echo(cells))[:, inside] for cells in (self.cells, self.beside))
-        return Picture(own, others.abs().square().mean().clamp_min(_TINY), hz[inside], inside)
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Fit of the slant-range speed to the echo of an image of a body.
-
-    Args:
-        step_m_s: Change of u_r that explains more of the data, in m/s.
-        std_m_s: Predicted standard deviation of u_r in m/s: that of sea and noise times `misfit`,
-            since an error of the model is the same in all cells of a scatterer and does not
-            average; or the scatter of the steps that single range lines and segments ask for, if
-            that is more.
-        misfit: Energy that is left of the bright cells for each free dimension, relative to the
-            covariance of sea and noise: 1 if scatterers of one velocity explain them.
-    """
-
-    step_m_s: Tensor
-    std_m_s: Tensor
-    misfit: Tensor
-
-
-@dataclass(frozen=True)
-class Picture:
-    """Image of a body over range lines and tones, the Doppler bins of its deramped echo.
-
-    Args:
-        amplitude: Spectrum of the echo, summed over the illuminated pulses, complex128 (line,
-            tone).
-        left: Mean intensity of the residual sea and noise in a pixel, shape ().
-        tone_hz: Frequencies of the tones in Hz, shape (tone,).
-        index: Index of each tone in an FFT over all pulses, shape (tone,).
-    """
-
-    amplitude: Tensor
-    left: Tensor
-    tone_hz: Tensor
-    index: Tensor
-
-    @property
-    def level(self) -> Tensor:
-        """Ratio of the intensity of each pixel to the mean residual sea and noise, (line, tone)."""
-        return self.amplitude.abs().square() / self.left
-
-    @property
-    def bright(self) -> Tensor:
-        """True for pixels of the body, shape (line, tone).
-
-        They exceed 12 times the mean intensity of the residual sea and noise, and 1 % of the
-        brightest pixel.
-        """
-        level = self.level
-        return level > torch.maximum(level.new_tensor(_BRIGHT), _BRIGHT_SHARE * level.max())
 
 
 @dataclass(frozen=True)
@@ -421,105 +77,6 @@ class Body:
     picture: Picture
     level: Tensor
     ok: Tensor
-
-
-def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Chip:
-    """Extract the range cells of a body, deramped with its motion, as short-time spectra.
-
-    Args:
-        data: Range-compressed channels with the transmit range removed from the phase, shape
-            (channel, pulse, range), complex, with the range cells of the body and at least 12
-            beside it.
-        frame: Radar, slow time and ranges of the data.
-        motion: Motion of the body.
-        extraction: Extent of the body.
-
-    Returns:
-        Short-time spectra of the range cells, with the inverse covariance of sea and noise.
-
-    Raises:
-        ValueError: If the data have no range cell of the body, or fewer than 12 beside it.
-    """
-    off = (frame.range_m - motion.range_m).abs()
-    guard_m = _GUARD_CELLS * frame.radar.range_step_m
-    body, beside = (near.nonzero()[:, 0] for near in (off <= extraction.range_m, off > extraction.range_m + guard_m))
-    if not len(body) or len(beside) < _LEAST_LINES:
-        counts = (
-            f"{len(body)} cells within {extraction.range_m:g} m of "
-            f"its range of {float(motion.range_m):.0f} m and {len(beside)} beside it"
-        )
-        raise ValueError(
-            f"the data must hold range cells of the body and at least {_LEAST_LINES} beside it for the covariance of "
-            f"the sea, got {counts}; give more range cells or a smaller extraction"
-        )
-    lit = (
-        frame.time_s - motion.y0_m / motion.along_m_s
-    ).abs() < extraction.integration_s / 2 + extraction.along_m / 2 / motion.along_m_s
-    shifted = correct_migration(data.to(torch.complex128), frame, motion, StaticBulk()).movedim(-1, 0)
-    deramped = shifted * point_phasor(frame.radar, motion, frame.time_s, torch.complex128).conj()
-    segments, tone_hz = _segments(frame, motion, extraction, lit)
-    empty = torch.zeros(0, device=data.device)
-    chip = Chip(
-        frame.radar,
-        motion,
-        segments,
-        segments.of(deramped[body]),
-        segments.of(deramped[beside]),
-        tone_hz,
-        frame.range_m[body],
-        empty,
-        lit,
-        frame.time_s,
-    )
-    return _without_outliers(replace(chip, inverse=_inverse_covariance(chip)))
-
-
-def _without_outliers(chip: Chip) -> Chip:
-    """Leave out lines beside the body that hold more than sea and noise, such as another target.
-
-    The energy of a line is whitened, so that a target counts that the sea hides. The spread of the
-    energies is measured by their median deviation, so at most half of the lines are left out.
-    """
-    for _ in range(_OUTLIER_ROUNDS):
-        energy = chip.whitened(chip.beside).sum((-2, -1))
-        off = energy - energy.median()
-        kept = off <= _OUTLIER * _MAD_TO_STD * off.abs().median()
-        if bool(kept.all()) or int(kept.sum()) < _LEAST_LINES:
-            break
-        chip = replace(chip, beside=chip.beside[kept])
-        chip = replace(chip, inverse=_inverse_covariance(chip))
-    return chip
-
-
-def _segments(frame: Frame, motion: PointMotion, extraction: Extraction, lit: Tensor) -> tuple[Segments, Tensor]:
-    """Return the segments in which the body is illuminated, and the frequencies of its tones."""
-    n, prf = len(frame.time_s), frame.radar.prf_hz
-    length = min(2 * max(4, round(extraction.segment_s * prf / 2)), n // 2 * 2)
-    tone_hz = torch.fft.fftfreq(length, 1 / prf, dtype=torch.float64, device=lit.device)
-    reach = extraction.along_m * float(motion.along_m_s / motion.range_m) / frame.radar.wavelength_m + 2 * prf / length
-    bins = (tone_hz.abs() <= reach).nonzero()[:, 0]
-    middle = torch.arange(n // (length // 2) + 1, device=lit.device) * (length // 2)
-    covered = torch.cat([torch.zeros(1, device=lit.device), lit.to(torch.float32).cumsum(0)])
-    rows = (covered[(middle + length // 2).clamp(0, n)] - covered[(middle - length // 2).clamp(0, n)] > 0).nonzero()[
-        :, 0
-    ]
-    return Segments(n, length, bins, rows), tone_hz[bins]
-
-
-def _inverse_covariance(chip: Chip) -> Tensor:
-    """Return the inverse covariance of the lines beside the body.
-
-    Its phases depend on the tone as those of positions do; otherwise it is the same for all tones
-    of a segment.
-    """
-    turn = chip.steering(chip.motion, chip.tone_hz)
-    aligned = chip.beside.movedim(1, -1) * turn.conj()
-    covariance = torch.einsum("lsfm,lsfn->smn", aligned, aligned.conj()) / (aligned.shape[0] * aligned.shape[2])
-    level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1).clamp_min(_TINY)
-    covariance = covariance + _LOADING * level[:, None, None] * torch.eye(
-        covariance.shape[-1], dtype=covariance.dtype, device=covariance.device
-    )
-    return turn[..., :, None] * matrix_inverse(covariance)[:, None] * turn.conj()[..., None, :]
 
 
 def find_body(
@@ -563,10 +120,10 @@ def find_body(
     if data.shape[-2] < _LEAST_PULSES:
         raise ValueError(f"find_body needs at least {_LEAST_PULSES} pulses, got {data.shape[-2]}; give a longer record")
     half = frame.radar.ambiguous_velocity_m_s / 2 if u_r_half_m_s is None else u_r_half_m_s
-    chip = chip_about(data, frame, _motion_imaged_at(frame.radar, data, 0.0, 0.0, image_s, image_m), extraction)
+    chip = chip_about(data, frame, PointMotion.imaged_at(frame.radar, data, 0.0, 0.0, image_s, image_m), extraction)
     for number in range(rounds):
         u_r, std = _closing_speed(chip, image_s, image_m, half if number < _WIDE_ROUNDS else _NEAR_U_R_M_S)
-        motion = _motion_imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
+        motion = PointMotion.imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
         if not _inside_frame(frame, motion, extraction):
             return _body_of(chip, std, half, lost=True)
         moved = chip_about(data, frame, motion, extraction)
@@ -577,16 +134,16 @@ def find_body(
             extraction,
             u_a_half_m_s if number < _WIDE_ROUNDS else _NEAR_U_A_M_S,
         )
-        chip = chip_about(data, frame, _motion_imaged_at(frame.radar, data, u_r, u_a, image_s, image_m), extraction)
+        chip = chip_about(data, frame, PointMotion.imaged_at(frame.radar, data, u_r, u_a, image_s, image_m), extraction)
         image_s, image_m, motion = _centred(chip, image_s, image_m)
         chip = chip_about(data, frame, motion, extraction)
     u_r, std = _closing_speed(chip, image_s, image_m, _LAST_U_R_M_S)
     for _ in range(_FIT_STEPS):
-        motion = _motion_imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
+        motion = PointMotion.imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
         chip = chip_about(data, frame, motion, extraction)
         fit = chip.fit(chip.picture(), image_s, image_m)
         u_r, std = u_r + fit.step_m_s.clamp(-_LAST_U_R_M_S, _LAST_U_R_M_S), fit.std_m_s
-    motion = _motion_imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
+    motion = PointMotion.imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
     return _body_of(chip_about(data, frame, motion, extraction), std, half)
 
 
@@ -605,28 +162,6 @@ def _body_of(chip: Chip, std: Tensor, half_m_s: float, lost: bool = False) -> Bo
     return Body(chip.motion, std, chip, picture, level, ok & (not lost))
 
 
-def _motion_imaged_at(
-    radar: BistaticRadar,
-    like: Tensor,
-    u_r: Tensor | float,
-    u_a: Tensor | float,
-    image_s: Tensor | float,
-    image_m: Tensor | float,
-) -> PointMotion:
-    """Return the motion of given velocities that is imaged at a slow time and range.
-
-    Rmin V = v R0 - u_r y0 and V^2 t = u_r R0 + v y0.
-    """
-    m = PointMotion.of(radar, like.real, u_r, u_a)
-    speed = m.square_m2_s2.sqrt()
-    least, turned = torch.as_tensor(image_m, dtype=torch.float64), torch.as_tensor(image_s, dtype=torch.float64) * speed
-    return replace(
-        m,
-        range_m=(m.along_m_s * least + m.u_r_m_s * turned) / speed,
-        y0_m=(m.along_m_s * turned - m.u_r_m_s * least) / speed,
-    )
-
-
 def _closing_speed(chip: Chip, image_s: float, image_m: float, half_m_s: float) -> tuple[Tensor, Tensor]:
     """Return the most likely u_r near that of the chip, and its standard deviation."""
     middle, step = chip.motion.u_r_m_s, torch.as_tensor(half_m_s / _GRID_HALF, dtype=torch.float64)
@@ -636,7 +171,7 @@ def _closing_speed(chip: Chip, image_s: float, image_m: float, half_m_s: float) 
         energy = torch.cat(
             [
                 chip.energy(
-                    _motion_imaged_at(
+                    PointMotion.imaged_at(
                         chip.radar, chip.cells, part, chip.motion.u_a_m_s.expand(part.shape), image_s, image_m
                     )
                 )
@@ -694,28 +229,6 @@ def _centred(chip: Chip, image_s: float, image_m: float) -> tuple[float, float, 
         if motion is chip.motion
         else (float(motion.image_s), float(motion.closest_m), motion)
     )
-
-
-def centred_motion(chip: Chip) -> PointMotion:
-    """Return the motion of a body with its position and range measured at its middle.
-
-    The middle is the mean position of the bright pixels of its image, weighted by intensity.
-    Without bright pixels the motion is unchanged.
-
-    Args:
-        chip: Short-time spectra of the range lines about one body.
-
-    Returns:
-        Motion with tensors of shape (); the velocity is that of `chip.motion`.
-    """
-    picture = chip.picture()
-    weight = picture.level * picture.bright
-    total = weight.sum()
-    if not float(total) > 0:
-        return chip.motion
-    position = (weight.sum(0) * chip.position_m(chip.motion, picture.tone_hz)).sum() / total
-    near = (weight.sum(1) * chip.range_m).sum() / total
-    return replace(chip.motion, y0_m=position, range_m=near)
 
 
 def known_body(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Body:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -75,6 +75,40 @@ class PointMotion:
         )
         _check_motion(motion)
         return motion
+
+    @staticmethod
+    def imaged_at(
+        radar: BistaticRadar, like: Tensor, u_r_m_s: Number, u_a_m_s: Number, image_s: Number, closest_m: Number
+    ) -> PointMotion:
+        """Return the motion of given velocities that an image shows at a slow time and range.
+
+        It solves V Rmin = v R0 - u_r y0 and V^2 t = u_r R0 + v y0 for y0 and R0, see `image_s` and
+        `closest_m`.
+
+        Args:
+            radar: Radar parameters.
+            like: Tensor whose device is used.
+            u_r_m_s: Slant-range speed in m/s, closing positive.
+            u_a_m_s: Along-track speed in m/s.
+            image_s: Slow time t in seconds at which an image of the stationary scene shows the
+                point.
+            closest_m: Range Rmin in metres at which it does.
+
+        Returns:
+            Motion with float64 tensors.
+
+        Raises:
+            ValueError: As `of`.
+        """
+        motion = PointMotion.of(radar, like.real, u_r_m_s, u_a_m_s)
+        speed = motion.square_m2_s2.sqrt()
+        least = torch.as_tensor(closest_m, dtype=torch.float64)
+        turned = torch.as_tensor(image_s, dtype=torch.float64) * speed
+        return replace(
+            motion,
+            range_m=(motion.along_m_s * least + motion.u_r_m_s * turned) / speed,
+            y0_m=(motion.along_m_s * turned - motion.u_r_m_s * least) / speed,
+        )
 
     def each(self, change: Callable[[Tensor], Tensor]) -> PointMotion:
         """Return the motion with a function applied to u_r_m_s, u_a_m_s, y0_m and range_m."""

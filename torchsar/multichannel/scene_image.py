@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Stage, fft_lines, linear_phasor
-from torchsar.multichannel.body import Body, Extraction, body_echo, body_image, find_body, known_body
+from torchsar.multichannel.body import Body, body_echo, body_image, find_body, known_body
+from torchsar.multichannel.chip import Extraction
 from torchsar.multichannel.detection import Detection, detect
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
