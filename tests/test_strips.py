@@ -238,7 +238,7 @@ def test_estimates_from_the_middle_hold_for_the_whole_strip(folder: Path, capsys
 
 def test_the_memory_is_that_of_a_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchsar.io.strip._PART_BYTES", 1 << 20)
-    lines, samples = 7168, 512
+    lines, samples = 14_336, 512
     raw = np.memmap(tmp_path / "iq.bin", np.complex64, "w+", shape=(lines, samples))
     raw[:] = np.random.default_rng(0).normal(size=(256, samples)).astype(np.complex64)[np.arange(lines) % 256]
     np.savez(tmp_path / "raw.npz", iq=raw, **NUMBERS)
@@ -249,5 +249,6 @@ def test_the_memory_is_that_of_a_block(tmp_path: Path, monkeypatch: pytest.Monke
     with PeakMemory() as peak:
         assert focus(tmp_path, "out") == 0
     if peak.bytes is not None:
-        # the recording and its image have 29 MB each, the arrays of a block 5.8 MB
-        assert peak.bytes < 24e6
+        # the recording and its image have 59 MB each, the arrays of a block 5.8 MB; what the process
+        # keeps besides varies by megabytes with what ran in it before
+        assert peak.bytes < 32e6
