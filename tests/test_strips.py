@@ -249,6 +249,6 @@ def test_the_memory_is_that_of_a_block(tmp_path: Path, monkeypatch: pytest.Monke
     with PeakMemory() as peak:
         assert focus(tmp_path, "out") == 0
     if peak.bytes is not None:
-        # the recording and its image have 59 MB each, the arrays of a block 5.8 MB; what the process
-        # keeps besides varies by megabytes with what ran in it before
+        # the recording and its image have 59 MB each, the arrays of a block 5.8 MB; what the
+        # process keeps besides varies by megabytes with what ran in it before
         assert peak.bytes < 32e6
