@@ -167,4 +167,4 @@ def test_rounds_end_when_nothing_but_an_unobservable_line_is_left(monkeypatch: p
     monkeypatch.setattr(joint, "scene_of", lambda *known: rounds.append(1) or scene_of(*known))
     operator = ground_image(frequency, recorded(path, error), 0.0, None, FINE_STEP)
     three_axes(rows, operator, torch.zeros(PULSES, dtype=F64), torch.ones(PULSES, dtype=torch.bool))
-    assert len(rounds) <= 3, rounds
+    assert len(rounds) <= 4, rounds  # of six
