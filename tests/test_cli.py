@@ -19,6 +19,7 @@ from tests.helpers import enable_interrupts
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 from torchsar.study.commands import run
+from torchsar.study.output.progress import Steps
 
 
 @pytest.fixture
@@ -47,9 +48,7 @@ def test_list_explains_experiments_systems_stages_keys_and_data(capsys: pytest.C
 def child_seconds(*arguments: str) -> tuple[float, subprocess.CompletedProcess[str]]:
     """CPU time of the command in a process of its own, and what it said."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(
-        [sys.executable, "-m", "torchsar.cli", *arguments], capture_output=True, text=True, timeout=120
-    )
+    done = subprocess.run([sys.executable, "-m", "torchsar", *arguments], capture_output=True, text=True, timeout=120)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done
 
@@ -78,6 +77,24 @@ def test_help_and_usage_errors_answer_at_once(arguments: list[str], status: int,
     spent, done = child_seconds(*arguments)
     assert done.returncode == status and said in done.stdout + done.stderr and "Traceback" not in done.stderr
     assert spent < 0.5
+
+
+def test_a_remaining_time_is_named_while_a_step_takes_no_longer_than_those_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = 0.0
+    monkeypatch.setattr("torchsar.study.output.progress.time.perf_counter", lambda: now)
+    steps = Steps(["echo", "autofocus", "image"])
+    steps.begin("echo")
+    assert "left" not in steps.say()
+    now = 10.0
+    steps.begin("autofocus")
+    now = 14.0
+    assert steps.say() == "step 2 of 3: autofocus for 0:04, 0:14 in all, about 0:16 left"
+    now = 60.0
+    assert steps.say() == "step 2 of 3: autofocus for 0:50, 1:00 in all"
+    steps.begin("image")
+    assert steps.say().endswith("about 0:30 left")
 
 
 @pytest.mark.parametrize("command", ["run", "sweep", "requires", "trade", "import", "list"])
@@ -287,7 +304,7 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
-        "torchsar.cli",
+        "torchsar",
         "run",
         str(config),
         "world.lines=60000",

@@ -369,7 +369,3 @@ def _log_to_stderr() -> Iterator[None]:
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     """Write a Python warning as one line of the log, without its position in the code."""
     logging.getLogger("torchsar").warning("warning: %s", " ".join(str(message).split()))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -68,13 +68,14 @@ class Steps:
 
     @property
     def left_s(self) -> float | None:
-        """Remaining time in s; None before the end of the first step."""
+        """Remaining time in s; None before the end of the first step, and in one longer than expected."""
         coming = self._names[max(self._at, 0) :]
         if not self._spent or not coming:
             return None
         usual = sum(self._spent.values()) / len(self._spent)
-        whole = sum(self._spent.get(name, usual) for name in coming)
-        return max(0.0, whole - (time.perf_counter() - self._since))
+        here, *later = (self._spent.get(name, usual) for name in coming)
+        rest = here - (time.perf_counter() - self._since)
+        return rest + sum(later) if rest >= 0 else None
 
     def say(self) -> str:
         """Return the present step, its time, and the remaining time."""
