@@ -68,7 +68,7 @@ class Steps:
 
     @property
     def left_s(self) -> float | None:
-        """Remaining time in s; None before the end of the first step, and in one longer than expected."""
+        """Remaining time in s; None in the first step, and in one that is longer than expected."""
         coming = self._names[max(self._at, 0) :]
         if not self._spent or not coming:
             return None
