@@ -12,7 +12,7 @@ from torchsar.compensate import LinkPhases, autofocus, entropy_fixed_point, link
 from torchsar.compensate.pulse_phase.homogeneous import describe, sparse_gain_nats
 from torchsar.compensate.pulse_phase.linking import _grown, _Scene
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
-from torchsar.core import Axis, Signal
+from torchsar.core import Axis, LargestTensor, Signal
 from torchsar.metrics.phase import phase_rmse
 
 F64 = torch.float64
@@ -94,6 +94,18 @@ def test_blocks_without_a_neighbour_are_joined() -> None:
     data = clutter(1, 0.4, 15.0, 5, n=n)[..., ::6]
     phase = torch.angle(_grown(_Scene.of(data.mT, torch.ones(1, n, dtype=torch.bool))))
     assert float(phase_rmse(phase, torch.zeros(1, n, dtype=F64)).max()) < 0.3
+
+
+def test_long_records_take_no_memory_for_pairs_of_pulses() -> None:
+    """Ten thousand pulses of a rotating satellite, which looks homogeneous, took more than 8 GB."""
+    n, generator = 3200, torch.Generator().manual_seed(17)
+    spectrum = normal(generator, n, 16) * (torch.arange(n) < 0.3 * n)[:, None]
+    phase = 2 * math.pi * torch.rand(n, 1, generator=generator, dtype=F64)
+    data = (torch.fft.fft(spectrum, dim=0) * torch.exp(1j * phase)).to(torch.complex64)
+    with LargestTensor() as largest:
+        found = autofocus(data, search=10, polish=2)
+    assert bool(found.info["homogeneous"]) and not bool(found.ok)
+    assert largest.bytes < 8 * data.numel() * data.element_size() < n**2
 
 
 def test_sharpness_is_not_trusted_in_homogeneous_clutter() -> None:

@@ -57,8 +57,9 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
     """Estimate the phase of each pulse of a homogeneous scene by maximum likelihood.
 
     The scene is speckle with any Doppler spectrum. Its error does not depend on the size or kind of
-    the phase errors. The time grows with the cube of the number of pulses. Differentiable: the
-    derivative is that of a Newton step of the phases for the spectra found.
+    the phase errors. The time grows with the cube of the number of pulses, and the memory with its
+    square (200 MB for 1024 pulses). Differentiable: the derivative is that of a Newton step of the
+    phases for the spectra found.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.

@@ -30,6 +30,8 @@ _RELAXATION = 1.8
 # lines of the image in a strip, by choice: more than the response of a point is wide
 _STRIP = 4
 _SLOPES = 48  # slopes tried over one turn per pulse, found by trial: spacing against time
+# longest records whose phases are linked: the matrices of all pairs of pulses then take 2 to 3 GB
+_MOST_LINKED = 3072
 
 
 def autofocus(
@@ -46,7 +48,9 @@ def autofocus(
 
     In sparse scenes the phases sharpen the image. In scenes whose homogeneous description is more
     likely (see `describe`), such as clutter that fills a large part of the Doppler band, they are
-    those of `link_phases`, because sharpness does not find them.
+    those of `link_phases`, because sharpness does not find them. Longer records than 3072 pulses
+    keep the phases that sharpen, which are not ok there: the memory of `link_phases` grows with the
+    square of the number of pulses, and its time with the cube.
 
     The sharpening has three steps. The first is `sca`. The second repeats the iterations of
     `entropy_fixed_point` until the phases no longer change; cells below 2.5 times the mean power of
@@ -136,8 +140,11 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
     """The estimate with the linked phases in trials whose scene is more likely homogeneous.
 
     Where that description turns out to be less likely with the linked phases, the sharpest phases
-    stay; they are not ok, because the descriptions contradict each other.
+    stay; they are not ok, because the descriptions contradict each other. They also stay in long
+    records.
     """
+    if pulses.n > _MOST_LINKED:
+        return sharpest
     homogeneous = sharpest.info["homogeneous"].flatten()
     count = host_value(homogeneous.sum(), 0)
     if not count:

@@ -18,10 +18,8 @@ from torchsar import plot
 from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
-    autofocus,
     chirplet_clean,
     coarse_rotation,
-    correct_pulse_phase,
     descend_rotation,
     uneven_rotation,
 )
@@ -97,11 +95,9 @@ def _images(signal: Signal, radar: InverseRadar, estimate: Estimate, atoms: int)
     rotation = {name: estimate[name] for name in ("omega_rad_s", "warp_k", "yc_m")}
     chirplets = chirplet_clean(signal.data, radar.prf_hz, atoms=atoms).image
     uncompensated = focus(signal)
-    uniform = correct_pulse_phase(signal.data, autofocus(signal.data)["phase_rad"])
     return {
         "no compensation": uncompensated,
         "chirplets (ACL)": uncompensated.with_data(chirplets),
-        "uniform autofocus": focus(signal.with_data(uniform)),
         "SM, order 2": focus(signal, _second_order(signal, radar)["warp_k"]),
         "order 3, azimuth": focus(signal, rotation["warp_k"]),
         "order 3, two-dimensional": focus(flat(signal, **rotation), rotation["warp_k"]),
