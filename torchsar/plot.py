@@ -213,7 +213,7 @@ def within(signal: Signal, spans: Mapping[str, tuple[float, float]]) -> Signal:
 def boxes(centres: Sequence[tuple[float, float]], half_x: float, half_y: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the outlines of equal rectangles about some positions as one line with gaps.
 
-    The function `overlays` draws such a line over an image.
+    The functions `overlays` and `images` draw such a line over an image.
 
     Args:
         centres: Positions (x, y) of the centres of the rectangles.
@@ -353,6 +353,7 @@ def images(
     dynamic_range_db: float = 50.0,
     percentile: float = 99.9,
     reference: str | None = None,
+    lines: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]] | None = None,
 ) -> list[Figure]:
     """Draw several images with the same 0 dB amplitude, each into a figure of its own.
 
@@ -361,13 +362,18 @@ def images(
         dynamic_range_db: Range of levels shown in dB; everything lower is black.
         percentile: Percentile of the amplitude, 0 to 100, that is 0 dB.
         reference: Title of the image whose percentile is 0 dB; by default the first image.
+        lines: Dashed lines over some of the images, by their titles: a mapping from names to pairs
+            of coordinates (x, y), such as those of `boxes`.
 
     Returns:
         The figures, one for each signal.
     """
     width = _width(len(signals))
     top = level(signals[reference or next(iter(signals))], percentile, width)
-    return [_show(signal, width, dynamic_range_db, title, top, "dB") for title, signal in signals.items()]
+    figures = {title: _show(signal, width, dynamic_range_db, title, top, "dB") for title, signal in signals.items()}
+    for title, over in (lines or {}).items():
+        _draw_over(figures[title], over, None)
+    return list(figures.values())
 
 
 @_styled

@@ -146,15 +146,17 @@ def _draw_profiles(found: _Results, truth: Truth, path: Path) -> None:
     """Figure 20: a profile through each of the cubes, every method, on the true scale; a random
     phase also shifts images, so that each is centred at its peak.
     """
-    names = ("uniform autofocus", "autofocus + SM", "alternation", "clean reference")
+    # the alternation last, since it lies on the reference
+    names = ("clean reference", "uniform autofocus", "autofocus + SM", "alternation")
     shown = {name: _scaled(found.images[name], truth.values) for name in names}
     parts = []
     for cube, (x, y) in enumerate(zip(CUBES.azimuth_m, CUBES.range_m, strict=True), start=1):
-        series = {name: _profile(image, float(y)) for name, image in shown.items()}
+        profiles = {name: _profile(image, float(y)) for name, image in shown.items()}
+        series = {name: (1e3 * offset, level) for name, (offset, level) in profiles.items()}
         parts.append(
             {
                 "series": series,
-                "xlabel": "cross range from the peak (m)",
+                "xlabel": "cross range from the peak (mm)",
                 "ylabel": "amplitude (dB)",
                 "title": f"cube {cube}, x = {1e3 * x:g} mm",
                 "ylim": (-40.0, 1.0),

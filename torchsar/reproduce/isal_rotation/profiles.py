@@ -30,6 +30,7 @@ OMEGA_RAD_S, WARP_K = 0.02, (10.0, 1000.0)
 TRUE_K = torch.tensor(WARP_K, dtype=torch.float64)
 # places of the points (m)
 PLACES_M, RANGE_M = (-12.0, 0.0, 12.0), 12.0
+CELLS_M = (3.4, 6.0, 12.0)  # ranges of the single cells of figure 1
 FINE = 16  # lines of a profile per Doppler cell
 REACH_M = 5.0  # to either side of a point, for the figures of its profile
 # of a fit of second order to the phase by least squares; least entropy gives 20.05
@@ -132,7 +133,7 @@ def _draw_profiles(
             {
                 "series": series,
                 "xlabel": "cross range (m)",
-                "ylabel": "level (dB)",
+                "ylabel": "level (dB, 0 for an ideal point)",
                 "title": f"x = {centre:g} m",
                 "ylim": (-50.0, 3.0),
             }
@@ -166,19 +167,21 @@ def _whole_image(
     }
 
 
-def _draw_centre(yc_m: Tensor, cell: Mapping[str, Tensor], image: Mapping[str, Tensor], path: Path) -> None:
-    """Figure 1, and the same of an image."""
-    parts = []
-    for title, ratios in (("one range cell, yc ignored", cell), ("a whole image", image)):
-        series = {name: (plot.array(yc_m), plot.array(ratio)) for name, ratio in ratios.items()}
-        parts.append(
-            {
-                "series": series,
-                "xlabel": "range centre deviation yc (m)",
-                "ylabel": "estimated over true rate",
-                "title": title,
-            }
-        )
+def _draw_centre(yc_m: Tensor, image: Mapping[str, Tensor], path: Path) -> None:
+    """Figure 1, and the same of an image. In one range cell the rate, the acceleration and the
+    jerk change by the same factor.
+    """
+    fine_m = torch.linspace(float(yc_m[0]), float(yc_m[-1]), 61, dtype=torch.float64)
+    cell = {f"y = {y:g} m": _one_cell(fine_m, y) for y in CELLS_M}
+    parts = [
+        {
+            "series": {name: (plot.array(at), plot.array(ratio)) for name, ratio in ratios.items()},
+            "xlabel": "range centre deviation yc (m)",
+            "ylabel": "estimated over true rate",
+            "title": title,
+        }
+        for title, at, ratios in (("one range cell, yc ignored", fine_m, cell), ("a whole image", yc_m, image))
+    ]
     plot.save(plot.panels(parts), path)
 
 
@@ -228,8 +231,7 @@ def _deviations(small: bool) -> _Deviations:
 
 
 def _figure_1(seen: _Deviations, path: Path) -> list[Check]:
-    cell = {f"y = {y:g} m": _one_cell(seen.yc_m, y) for y in (3.4, 6.0, 12.0)}
-    _draw_centre(seen.yc_m, cell, seen.image, path)
+    _draw_centre(seen.yc_m, seen.image, path)
     ignored, estimated = (float((seen.image[name] - 1).abs().max()) for name in ("ignored", "estimated"))
     ours = f"rate off by up to {100 * ignored:.0f} % if ignored, {100 * estimated:.1f} % if estimated"
     return [statement("deviation", "ignored, it biases the rotation", ignored > 0.1 > 5 * estimated, ours)]
@@ -242,12 +244,12 @@ ITEMS = (
         "Figure 2",
         "profiles without, with one- and with two-dimensional compensation",
         of=_points,
-        make=_shown(("none", "azimuth", "full"), (0.05, 0.05, 0.05)),
+        make=_shown(("none", "azimuth", "full"), (0.025, 0.025, 0.025)),
     ),
     Item(
         "Figure 3",
         "profiles by the order of the compensation",
         of=_points,
-        make=_shown(("none", "order 2", "full"), (1.5, 0.05, 1.5)),
+        make=_shown(("none", "order 2", "full"), (1.0, 0.025, 1.0)),
     ),
 )

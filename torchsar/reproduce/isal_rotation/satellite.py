@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,9 +45,13 @@ PUBLISHED = {
     "k1_per_s": (10.002, 0.02),
     "k2_per_s2": (999.6835, 2.0),
 }
-# parts of an image: cross range in half widths of the target, range (m)
-WHOLE = ((-1.09, 1.09), (-3.8, 3.8))
-REGIONS = {"A, tip of a panel": ((-1.03, -0.81), (-1.6, 1.6)), "B, bus and dish": ((-0.11, 0.11), (-3.6, -0.4))}
+# half the size of an image over that of the target in cross range; range (m)
+WHOLE = 1.09, (-3.8, 3.8)
+# enlarged regions: middle in half widths of the target in cross range, range (m); half their height
+# (m), at which single scatterers can be seen
+TIP = "A, tip of a panel"
+REGIONS = {TIP: (-0.98, (-1.6, 1.6)), "B, bus and dish": (0.04, (-3.6, -0.4))}
+REGION_M = 0.15
 # the methods of the paper
 SHOWN = ("no compensation", "chirplets (ACL)", "SM, order 2", "order 3, two-dimensional")
 
@@ -62,6 +67,22 @@ class _Seen:
 
     def entropies(self, *names: str) -> dict[str, float]:
         return {name: float(entropy(self.shown[name])) for name in names}
+
+    def whole(self, name: str) -> Signal:
+        """The target in the image of a method."""
+        return _cut(self.shown[name], 0.0, WHOLE[0] * self.half_width_m, WHOLE[1])
+
+    def region(self, name: str, which: str) -> Signal:
+        """One of the enlarged regions."""
+        middle, range_m = REGIONS[which]
+        return _cut(self.shown[name], middle * self.half_width_m, REGION_M, range_m)
+
+    def outlines(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Lines about the enlarged regions."""
+        return {
+            name: plot.boxes([((near + far) / 2, middle * self.half_width_m)], (far - near) / 2, REGION_M)
+            for name, (middle, (near, far)) in REGIONS.items()
+        }
 
 
 def _satellite(small: bool) -> _Seen:
@@ -111,24 +132,22 @@ def _scaled(image: Signal, radar: InverseRadar, rate_rad_s: Tensor) -> Signal:
     return Signal(image.data, (Axis("azimuth", doppler.n, doppler.start * scale, doppler.step * scale, "m"), range_))
 
 
-def _cropped(image: Signal, azimuth: tuple[float, float], range_m: tuple[float, float], half_width_m: float) -> Signal:
-    return image.sel(azimuth=slice(*(half_width_m * edge for edge in azimuth)), range=slice(*range_m))
+def _cut(image: Signal, middle_m: float, half_m: float, range_m: tuple[float, float]) -> Signal:
+    return plot.within(image, {"azimuth": (middle_m - half_m, middle_m + half_m), "range": range_m})
 
 
 def _figure_4(seen: _Seen, path: Path) -> list[Check]:
     """Nothing is published to compare it with."""
     x, y, level = (plot.array(seen.truth.values[name]) for name in ("cross_range_m", "range_m", "amplitude"))
-    plot.save(plot.scatterers(y, x, abs(level), "range (m)", "cross range (m)", f"{len(x)} scatterers"), path)
+    title = f"{len(x)} scatterers, with areas as their amplitudes"
+    plot.save(plot.scatterers(y, x, abs(level), "range (m)", "cross range (m)", title), path)
     return []
 
 
 def _draw(seen: _Seen, name: str, path: Path) -> None:
     """An image and two regions of it, in dB of its peak."""
-    parts = {
-        region: _cropped(seen.shown[name], *edges, seen.half_width_m)
-        for region, edges in ({name: WHOLE} | REGIONS).items()
-    }
-    plot.save(plot.images(parts, 40, percentile=100), path, columns=3)
+    parts = {name: seen.whole(name)} | {which: seen.region(name, which) for which in REGIONS}
+    plot.save(plot.images(parts, 40, percentile=100, lines={name: seen.outlines()}), path, columns=3)
 
 
 def _figure_5(seen: _Seen, path: Path) -> list[Check]:
@@ -154,12 +173,12 @@ def _figure_7(seen: _Seen, path: Path) -> list[Check]:
 def _figure_8(seen: _Seen, path: Path) -> list[Check]:
     """The recommended estimator, which gets the data alone; and all methods in one picture."""
     _draw(seen, "order 3, two-dimensional", path)
-    shown = {}
-    for suffix, edges in (("", WHOLE), (": tip of a panel", REGIONS["A, tip of a panel"])):
-        for name in SHOWN:
-            image = _cropped(seen.shown[name], *edges, seen.half_width_m)
-            shown[name + suffix] = image.with_data(image.data / image.data.abs().max())
-    plot.save(plot.images(shown, 40, percentile=100), path.with_stem(f"{path.stem}_methods"))
+    shown = {name: seen.whole(name) for name in SHOWN} | {f"{name}, A": seen.region(name, TIP) for name in SHOWN}
+    peaks = {name: image.data.abs().max() for name, image in shown.items()}
+    # each in dB of the peak of its whole image
+    shown = {name: image.with_data(image.data / peaks[name.removesuffix(", A")]) for name, image in shown.items()}
+    lines = {name: {TIP: seen.outlines()[TIP]} for name in SHOWN}
+    plot.save(plot.images(shown, 40, percentile=100, lines=lines), path.with_stem(f"{path.stem}_methods"))
     return [
         falling("entropy (nats)", seen.entropies("SM, order 2", "order 3, azimuth", "order 3, two-dimensional")),
         *(
@@ -171,7 +190,8 @@ def _figure_8(seen: _Seen, path: Path) -> list[Check]:
 
 def _figure_9(seen: _Seen, path: Path) -> list[Check]:
     best = seen.shown["order 3, two-dimensional"]
-    plot.save(plot.image(_cropped(best, *WHOLE, seen.half_width_m), 40, "scaled to metres", percentile=100), path)
+    whole = seen.whole("order 3, two-dimensional")
+    plot.save(plot.image(whole, 40, "scaled to metres", percentile=100), path)
     found = _tips(best, seen.truth)
     ours = ", ".join(f"{tip:.3f} m for {true:.3f} m" for true, tip in found.items())
     close = all(abs(tip / true - 1) < 0.02 for true, tip in found.items())

@@ -39,7 +39,7 @@ from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.reproduce.item import Check, Item, falling, number, statement
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
-NAMES = {"omega_rad_s": "Om", "k1_per_s": "k1", "k2_per_s2": "k2"}
+NAMES = {"omega_rad_s": "rate", "k1_per_s": "k1", "k2_per_s2": "k2"}
 # rotation of the satellite (rad/s, 1/s, 1/s2)
 TRUE = {"omega_rad_s": 0.02, "k1_per_s": 10.0, "k2_per_s2": 1000.0}
 # of figures 14 to 17
@@ -201,8 +201,8 @@ def _small_target(small: bool) -> _Errors:
     target, trials, few, search = (TINY, 2, 2, (1, 6)) if small else (SMALL, TRIALS, GENETIC, (30,))
     methods = {
         "recommended": (_recommended, trials),
-        "GA, 1 line": (_genetic(1.0, *search), few),
-        "GA, 4 lines": (_genetic(4.0, *search), few),
+        "GA, 1 line per cell": (_genetic(1.0, *search), few),
+        "GA, 4 lines per cell": (_genetic(4.0, *search), few),
     }
     at = (SNR_DB[0], SNR_DB[-1]) if small else SNR_DB
     found = {(name, snr): _errors(find, target, snr, 1, n) for snr in at for name, (find, n) in methods.items()}
@@ -223,11 +223,11 @@ def _fall(seen: _Errors, method: str) -> list[Check]:
 
 def _figure_13(seen: _Errors, path: Path) -> list[Check]:
     _draw_errors(seen.found, seen.least, path)
-    return _fall(seen, "recommended") + _fall(seen, "GA, 4 lines")
+    return _fall(seen, "recommended") + _fall(seen, "GA, 4 lines per cell")
 
 
 def _table_3(seen: _Errors, path: Path) -> list[Check]:
-    return _fall(seen, "GA, 1 line") + _fall(seen, "recommended")
+    return _fall(seen, "GA, 1 line per cell") + _fall(seen, "recommended")
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,7 @@ def _picture(snr_db: float) -> Callable[[_Tips, Path], list[Check]]:
     """One of the figures 14 to 17."""
 
     def make(tips: _Tips, path: Path) -> list[Check]:
-        plot.save(plot.image(tips.images[snr_db], 45, f"{snr_db:g} dB", percentile=100), path)
+        plot.save(plot.image(tips.images[snr_db], 40, f"SNR {snr_db:g} dB", percentile=100), path)
         before, after = tips.entropies[snr_db]
         ours = f"entropy {before:.2f} nats without, {after:.2f} nats with compensation"
         return [statement("image", "focused by the compensation", after < before, ours)]

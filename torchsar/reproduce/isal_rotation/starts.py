@@ -27,6 +27,8 @@ TRUTH = torch.tensor([0.02, 10.0, 1000.0], dtype=torch.float64)
 NAMES = ("omega_rad_s", "k1_per_s", "k2_per_s2")
 # starts over the truth, and largest relative error of an estimate that is close to it
 FACTORS, CLOSE = (0.9, 1.0, 1.1), 0.05
+# enlarged part of a picture over its largest Doppler
+PART = (0.35, 0.45)
 
 
 @dataclass(frozen=True)
@@ -77,13 +79,17 @@ def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
     """Figure 10, 11 or 12: the middle of the image, a part of it, and the recommended one."""
 
     def make(seen: _Seen, path: Path) -> list[Check]:
-        shown = {}
-        for title, one in ((f"start x{factor:g}", factor), ("recommended", None)):
+        shown, lines = {}, {}
+        for title, one in ((f"from {factor:g} times the truth", factor), ("recommended", None)):
             image = _compensated(seen, one)
             half = -0.25 * image.axes[0].start  # a quarter of the band
             shown[title] = plot.within(image, {"Doppler": (-half, half)})
-            shown[f"{title}, part"] = plot.within(image, {"Doppler": (0.3 * half, 0.5 * half)})
-        plot.save(plot.images(shown, 40, percentile=100), path)
+            shown[f"{title}, part"] = plot.within(image, {"Doppler": (PART[0] * half, PART[1] * half)})
+            range_m = image.axis("range")
+            middle_m, half_m = range_m.start + range_m.step * (range_m.n - 1) / 2, range_m.step * range_m.n / 2
+            middle, height = half * sum(PART) / 2, half * (PART[1] - PART[0]) / 2
+            lines[title] = {"part": plot.boxes([(middle_m, middle)], half_m, height)}
+        plot.save(plot.images(shown, 40, percentile=100, lines=lines), path)
         return [_outcome(seen, factor)]
 
     return make
