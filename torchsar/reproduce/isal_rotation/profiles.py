@@ -133,7 +133,7 @@ def _draw_profiles(
             {
                 "series": series,
                 "xlabel": "cross range (m)",
-                "ylabel": "level (dB, 0 for an ideal point)",
+                "ylabel": "level over an ideal one (dB)",
                 "title": f"x = {centre:g} m",
                 "ylim": (-50.0, 3.0),
             }

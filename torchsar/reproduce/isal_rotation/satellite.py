@@ -189,12 +189,17 @@ def _figure_8(seen: _Seen, path: Path) -> list[Check]:
 
 
 def _figure_9(seen: _Seen, path: Path) -> list[Check]:
+    """Both tips are enlarged, with the true position of the brightest scatterer of each."""
     best = seen.shown["order 3, two-dimensional"]
-    whole = seen.whole("order 3, two-dimensional")
-    plot.save(plot.image(whole, 40, "scaled to metres", percentile=100), path)
-    found = _tips(best, seen.truth)
-    ours = ", ".join(f"{tip:.3f} m for {true:.3f} m" for true, tip in found.items())
-    close = all(abs(tip / true - 1) < 0.02 for true, tip in found.items())
+    tips = _tips(best, seen.truth)
+    shown, lines = {"scaled to metres": seen.whole("order 3, two-dimensional")}, {}
+    for tip in tips:
+        title = f"tip at {tip.true_m:.2f} m"
+        shown[title] = _cut(best, tip.true_m, REGION_M, (tip.range_m - 1.6, tip.range_m + 1.6))
+        lines[title] = {"true position": plot.boxes([(tip.range_m, tip.true_m)], 0.3, 0.1 * REGION_M)}
+    plot.save(plot.images(shown, 40, percentile=100, lines=lines), path, columns=3)
+    ours = ", ".join(f"{tip.seen_m:.3f} m for {tip.true_m:.3f} m" for tip in tips)
+    close = all(abs(tip.seen_m / tip.true_m - 1) < 0.02 for tip in tips)
     return [statement("tips of the panels", "scaled consistently with the simulation", close, ours)]
 
 
@@ -207,15 +212,25 @@ def _table_1(seen: _Seen, path: Path) -> list[Check]:
     ]
 
 
-def _tips(image: Signal, truth: Truth) -> dict[float, float]:
-    """Cross range (m) at which the brightest scatterer of each tip is seen, by its true one."""
+@dataclass(frozen=True)
+class _Tip:
+    """True cross range and range of the brightest scatterer of a tip, and the cross range at which
+    it is seen (m).
+    """
+
+    true_m: float
+    range_m: float
+    seen_m: float
+
+
+def _tips(image: Signal, truth: Truth) -> list[_Tip]:
+    """The tips of both panels."""
     x, y, level = (truth.values[name] for name in ("cross_range_m", "range_m", "amplitude"))
-    found = {}
+    found = []
     for side in (-1, 1):
         which = int(torch.where(side * x > 0.999 * x.abs().max(), level.abs(), 0).argmax())
-        found[float(x[which])] = float(
-            impulse_response(image, (x[which], y[which]), search_m=0.1)["position_azimuth_m"]
-        )
+        at = float(x[which]), float(y[which])
+        found.append(_Tip(*at, float(impulse_response(image, at, search_m=0.1)["position_azimuth_m"])))
     return found
 
 

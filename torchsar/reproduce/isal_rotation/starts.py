@@ -26,7 +26,8 @@ from torchsar.scene import Satellite, TurntableWorld
 TRUTH = torch.tensor([0.02, 10.0, 1000.0], dtype=torch.float64)
 NAMES = ("omega_rad_s", "k1_per_s", "k2_per_s2")
 # starts over the truth, and largest relative error of an estimate that is close to it
-FACTORS, CLOSE = (0.9, 1.0, 1.1), 0.05
+BEGINNINGS = {0.9: "from 0.9 times the truth", 1.0: "from the truth", 1.1: "from 1.1 times the truth"}
+FACTORS, CLOSE = tuple(BEGINNINGS), 0.05
 # enlarged part of a picture over its largest Doppler
 PART = (0.35, 0.45)
 
@@ -80,7 +81,7 @@ def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
 
     def make(seen: _Seen, path: Path) -> list[Check]:
         shown, lines = {}, {}
-        for title, one in ((f"from {factor:g} times the truth", factor), ("recommended", None)):
+        for title, one in ((BEGINNINGS[factor], factor), ("recommended", None)):
             image = _compensated(seen, one)
             half = -0.25 * image.axes[0].start  # a quarter of the band
             shown[title] = plot.within(image, {"Doppler": (-half, half)})
@@ -98,9 +99,7 @@ def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
 def _outcome(seen: _Seen, factor: float) -> Check:
     close = bool((seen.error(factor).abs() < CLOSE).all())
     claim = "close to the truth, focused" if factor == 1 else "far from the truth, defocused"
-    return statement(
-        f"Newton's method from {factor:g} times the truth", claim, close == (factor == 1), _words(seen, factor)
-    )
+    return statement(f"Newton's method {BEGINNINGS[factor]}", claim, close == (factor == 1), _words(seen, factor))
 
 
 def _table_2(seen: _Seen, path: Path) -> list[Check]:
@@ -120,7 +119,7 @@ ITEMS = (
     *(
         Item(
             f"Figure {label}",
-            f"image by Newton's method from {factor:g} times the truth",
+            f"image by Newton's method {BEGINNINGS[factor]}",
             of=_starts,
             make=_picture(factor),
             why=LOST,
