@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 _BASH = """# completion of torchsar for bash
-_torchsar() {{
+_torchsar_words() {{
     local word="${{COMP_WORDS[COMP_CWORD]}}" before="${{COMP_WORDS[COMP_CWORD-1]}}" command="" words="" i
     local configs="{configs}"
     for ((i = 1; i < COMP_CWORD; i++)); do
@@ -18,12 +18,15 @@ _torchsar() {{
     esac
     COMPREPLY=($(compgen -W "$words" -- "$word"))
 }}
-complete -o default -F _torchsar torchsar
+complete -o default -F _torchsar_words torchsar
 """
-# zsh understands the script for bash
+# zsh understands the script for bash, whether it is sourced or loaded at the first completion, as
+# the body of the function _torchsar, which then has to complete by itself
 _ZSH = """#compdef torchsar
-autoload -U +X compinit && compinit
+(( $+functions[compdef] )) || {{ autoload -U +X compinit && compinit; }}
 autoload -U +X bashcompinit && bashcompinit
+{bash}
+[[ $funcstack[1] != _torchsar ]] || _bash_complete -o default -F _torchsar_words
 """
 
 
@@ -63,7 +66,8 @@ def completion(shell: str, parser: argparse.ArgumentParser, configs: Iterable[st
     whole, known = _command("", "", parser), " ".join(sorted(configs))
     if shell == "fish":
         return _fish(whole, commands, known)
-    return (_ZSH if shell == "zsh" else "") + _bash(whole, commands, known)
+    script = _bash(whole, commands, known)
+    return _ZSH.format(bash=script) if shell == "zsh" else script
 
 
 def _command(name: str, about: str, parser: argparse.ArgumentParser) -> _Command:
@@ -91,12 +95,15 @@ def _bash(whole: _Command, commands: Sequence[_Command], configs: str) -> str:
 
 def _fish(whole: _Command, commands: Sequence[_Command], configs: str) -> str:
     lines = ["# completion of torchsar for fish", f"set -l configs {configs}"]
+    before = f"not __fish_seen_subcommand_from {' '.join(one.name for one in commands)}"
     for one in (whole, *commands):
-        condition = f"__fish_seen_subcommand_from {one.name}" if one.name else "__fish_use_subcommand"
+        condition = f"__fish_seen_subcommand_from {one.name}" if one.name else before
         for option in one.options:
             values = f" -r -a '{' '.join(one.values[option])}'" if option in one.values else ""
             lines.append(f"complete -c torchsar -n '{condition}' -l {option[2:]}{values}")
         if one.words:
             lines.append(f"complete -c torchsar -n '{condition}' -a \"{' '.join(one.words)}\"")
-    lines += [f"complete -c torchsar -n __fish_use_subcommand -a {one.name} -d '{one.about}'" for one in commands]
+    for one in commands:
+        about = one.about.replace("\\", "\\\\").replace("'", "\\'")
+        lines.append(f"complete -c torchsar -n '{before}' -a {one.name} -d '{about}'")
     return "\n".join(lines) + "\n"
