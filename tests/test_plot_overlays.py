@@ -39,3 +39,12 @@ def test_contours_and_overlays_draw() -> None:
     over, beside = (figure.axes[0] for figure in plot.overlays(parts))
     assert over.get_images() and len(over.get_lines()) == 1 and not beside.get_images()
     assert over.get_xlim() == pytest.approx((-0.05, 2.95))
+
+
+def test_lines_over_one_of_several_images_change_no_limits() -> None:
+    signal = Signal(torch.rand(20, 30) + 0j, (Axis("azimuth", 20, -1.0, 0.1, "m"), Axis("range", 30, 0.0, 0.1, "m")))
+    outline = plot.boxes([(0.0, 0.0)], 9.0, 0.2)  # wider than the image
+    marked, plain = plot.images({"a": signal, "b": signal}, lines={"a": {"part": outline}})
+    assert [text.get_text() for text in marked.legends[0].get_texts()] == ["part"] and not plain.legends
+    assert len(marked.axes[0].lines) == 1 and marked.axes[0].get_xlim() == plain.axes[0].get_xlim()
+    assert marked.axes[0].get_ylim() == plain.axes[0].get_ylim()
