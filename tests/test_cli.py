@@ -19,7 +19,7 @@ from tests.helpers import enable_interrupts
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 from torchsar.study.commands import run
-from torchsar.study.output.progress import Steps
+from torchsar.study.output.progress import Count, Steps
 
 
 @pytest.fixture
@@ -95,6 +95,12 @@ def test_a_remaining_time_is_named_while_a_step_takes_no_longer_than_those_befor
     assert steps.say() == "step 2 of 3: autofocus for 0:50, 1:00 in all"
     steps.begin("image")
     assert steps.say().endswith("about 0:30 left")
+    count = Count("trials", 40)
+    now = 70.0
+    count.advance(10)
+    assert count.say() == "10 of 40 trials after 0:10, 1 trials/s, about 0:30 left"
+    now = 130.0
+    assert count.say() == "10 of 40 trials after 1:10, 1 trials/s"
 
 
 @pytest.mark.parametrize("command", ["run", "sweep", "requires", "trade", "import", "list"])
