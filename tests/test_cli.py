@@ -45,6 +45,17 @@ def test_list_explains_experiments_systems_stages_keys_and_data(capsys: pytest.C
     assert "rad, rad/s, ...\n" in text and not re.search(r"[^.]\.\.\n", text)
 
 
+def test_a_method_that_uses_true_values_says_that_a_recording_has_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = {"uses": {"doppler_hz": "truth.doppler_hz"}}
+    ideal = {"oracle": True, "stages": {"focus": {"stage": "omega_k", **truth}}}
+    config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor={"recommended": ideal})
+    file = recording(tmp_path / "raw.npz")
+    assert main(["run", str(config), f"data.file={file}", "--out", str(tmp_path / "result")]) == 2
+    assert "recommended: it uses truth.doppler_hz, which is known of simulated data only" in spoken(capsys)[-1]
+
+
 def child_seconds(*arguments: str) -> tuple[float, subprocess.CompletedProcess[str]]:
     """CPU time of the command in a process of its own, and what it said."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
