@@ -143,7 +143,8 @@ def test_own_stage_joins_through_the_entry_point(tmp_path: Path) -> None:
     code = (
         "from torchsar.study.names.registry import stages, group_of; s = "
         "stages().make({'stage': 'louder', 'gain': 3.0}, 'x', 'f'); print(s.gain, group_of('louder')); "
-        "from torchsar.study.commands.listing import listing; print(*(line for line in listing({}).splitlines() if line[:8] in ('  louder', '  silent')), sep='\\n')"
+        "from torchsar.study.commands.listing import listing; "
+        "print(*(line for line in listing({}).splitlines() if line[:8] in ('  louder', '  silent')), sep='\\n')"
     )
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
