@@ -40,12 +40,11 @@ def short(value: float | None) -> str:
 
 
 def cell(value: float | None) -> str:
-    """A number in a table, with zeros in place of an exponent."""
-    return (
-        "-"
-        if value is None or not math.isfinite(value)
-        else np.format_float_positional(float(f"{value:.3g}"), trim="-")
-    )
+    """A number to three digits, with zeros in place of an exponent, and thousands apart."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    rounded = float(f"{value:.3g}")
+    return f"{rounded:,.0f}" if abs(rounded) >= 1e4 else np.format_float_positional(rounded, trim="-")
 
 
 def read(directive: SphinxDirective, folder: str, name: str) -> dict[str, Any]:
