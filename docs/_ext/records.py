@@ -182,11 +182,14 @@ class TradeTable(SphinxDirective):
         record = read(self, "trade", name)
         lines = ["| step | alternative | CPU time (ms) | loss | recommended |", "| --- | --- | ---: | --- | --- |"]
         for choice, alternatives in {record["choice"]: record["alternatives"], **record["others"]}.items():
+            losses = list(dict.fromkeys(name for row in alternatives for name in row["loss"]))
             for i, row in enumerate(alternatives):
                 time = "-" if row["cpu_s"] is None else cell(1e3 * row["cpu_s"])
                 exact = {name: "exact" if x <= EXACT_DB else f"{x:.3g}" for name, x in row["loss"].items()}
-                loss = ", ".join(f"{x} (`{name}`)" for name, x in exact.items()) or "failed"
-                first = choice if i == 0 else ""
+                named = [f"{x} (`{name}`)" if len(losses) > 1 else x for name, x in exact.items()]
+                loss = ", ".join(named) or "failed"
+                only = f" (`{losses[0]}`)" if len(losses) == 1 else ""  # the same of every alternative
+                first = f"{choice}{only}" if i == 0 else ""
                 lines.append(f"| {first} | {row['name']} | {time} | {loss} | {'yes' if row['recommended'] else ''} |")
         limits = ", ".join(f"`{name}` {value:g}" for name, value in record["tolerance"].items())
         with_ = f"torch {record['machine']['torch']}, threads: {record['machine']['threads']}"
