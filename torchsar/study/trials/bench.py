@@ -202,8 +202,7 @@ class Bench:
             if name == "recommended" or os.environ.get("TORCHSAR_DEBUG"):
                 raise ConfigError(f"{self.file}: processor.{name}: {text}") from error
             log.warning("warning: %s failed: %s", name, text)
-            no = torch.zeros(trials.count, dtype=torch.bool)
-            return Outcome(Judged({"ok": no}), failed=text)
+            return Outcome(Judged({"ok": torch.zeros(trials.count, dtype=torch.bool)}), failed=text)
         spent = torch.full((trials.count,), sum(seconds.values()) / trials.count, dtype=torch.float64)
         judged = replace(judged, metrics={"seconds": spent, **verdict(estimates, trials.count), **judged.metrics})
         left = [stage for stage in trace.inputs if trace.outputs[stage] is trace.inputs[stage]]
