@@ -19,7 +19,7 @@ from tests.helpers import enable_interrupts
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 from torchsar.study.commands import run
-from torchsar.study.output.progress import Steps
+from torchsar.study.output.progress import Count, Steps
 
 
 @pytest.fixture
@@ -43,6 +43,17 @@ def test_list_explains_experiments_systems_stages_keys_and_data(capsys: pytest.C
     silent = [words[0] for words in keys if len(words) == 1]
     assert len(keys) > 500 and not silent, silent
     assert "rad, rad/s, ...\n" in text and not re.search(r"[^.]\.\.\n", text)
+
+
+def test_a_method_that_uses_true_values_says_that_a_recording_has_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = {"uses": {"doppler_hz": "truth.doppler_hz"}}
+    ideal = {"oracle": True, "stages": {"focus": {"stage": "omega_k", **truth}}}
+    config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor={"recommended": ideal})
+    file = recording(tmp_path / "raw.npz")
+    assert main(["run", str(config), f"data.file={file}", "--out", str(tmp_path / "result")]) == 2
+    assert "recommended: it uses truth.doppler_hz, which is known of simulated data only" in spoken(capsys)[-1]
 
 
 def child_seconds(*arguments: str) -> tuple[float, subprocess.CompletedProcess[str]]:
@@ -95,6 +106,12 @@ def test_a_remaining_time_is_named_while_a_step_takes_no_longer_than_those_befor
     assert steps.say() == "step 2 of 3: autofocus for 0:50, 1:00 in all"
     steps.begin("image")
     assert steps.say().endswith("about 0:30 left")
+    count = Count("trials", 40)
+    now = 70.0
+    count.advance(10)
+    assert count.say() == "10 of 40 trials after 0:10, 1 trials/s, about 0:30 left"
+    now = 130.0
+    assert count.say() == "10 of 40 trials after 1:10, 1 trials/s"
 
 
 @pytest.mark.parametrize("command", ["run", "sweep", "requires", "trade", "import", "list"])

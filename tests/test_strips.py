@@ -236,6 +236,19 @@ def test_estimates_from_the_middle_hold_for_the_whole_strip(folder: Path, capsys
     assert set(values) == {"doppler_hz"} and abs(values["doppler_hz"]) < 1257
 
 
+def test_an_estimate_that_is_not_ok_is_shown_with_the_value_in_its_place(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = config(folder / "strip.yaml", before="doppler: {stage: energy_centre}").read_text(encoding="utf-8")
+    connected = text.replace("doppler_hz: -3000.0", "uses: {doppler_hz: doppler.doppler_baseband_hz}")
+    (folder / "strip.yaml").write_text(connected, encoding="utf-8")
+    assert focus(folder, "out") == 0
+    lines = capsys.readouterr().err.splitlines()
+    (found,) = (line for line in lines if line.startswith("torchsar: doppler: "))
+    (used,) = (line for line in lines if line.startswith("torchsar: focus uses "))
+    assert found.endswith(" (not ok)") and used == "torchsar: focus uses doppler_hz 0"
+
+
 def test_the_memory_is_that_of_a_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchsar.io.strip._PART_BYTES", 1 << 20)
     lines, samples = 14_336, 512

@@ -4,4 +4,5 @@ import sys
 
 from torchsar.cli import main
 
-sys.exit(main())
+if __name__ == "__main__":  # tests and tools import every module of the package
+    sys.exit(main())

@@ -196,5 +196,7 @@ class _Strip:
             raise ConfigError(f"the stage {changed[0]!r} before {self._name} changes the samples; {_HINT}")
         for name, estimate in trace.estimates.items():
             shown = ", ".join(f"{key} {float(x.double().mean()):.6g}" for key, x in estimate.value.items())
-            log.info("%s: %s%s", name, shown, "" if estimate.ok.all() else " (not reliable)")
-        return {name: float(value) for name, value in trace.arguments[self._name].items()}
+            log.info("%s: %s%s", name, shown, "" if estimate.ok.all() else " (not ok)")
+        used = {name: float(value) for name, value in trace.arguments[self._name].items()}
+        log.info("%s uses %s", self._name, ", ".join(f"{key} {value:.6g}" for key, value in used.items()))
+        return used

@@ -40,12 +40,11 @@ def short(value: float | None) -> str:
 
 
 def cell(value: float | None) -> str:
-    """A number in a table, with zeros in place of an exponent."""
-    return (
-        "-"
-        if value is None or not math.isfinite(value)
-        else np.format_float_positional(float(f"{value:.3g}"), trim="-")
-    )
+    """A number to three digits, with zeros in place of an exponent, and thousands apart."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    rounded = float(f"{value:.3g}")
+    return f"{rounded:,.0f}" if abs(rounded) >= 1e4 else np.format_float_positional(rounded, trim="-")
 
 
 def read(directive: SphinxDirective, folder: str, name: str) -> dict[str, Any]:
@@ -183,11 +182,14 @@ class TradeTable(SphinxDirective):
         record = read(self, "trade", name)
         lines = ["| step | alternative | CPU time (ms) | loss | recommended |", "| --- | --- | ---: | --- | --- |"]
         for choice, alternatives in {record["choice"]: record["alternatives"], **record["others"]}.items():
+            losses = list(dict.fromkeys(name for row in alternatives for name in row["loss"]))
             for i, row in enumerate(alternatives):
                 time = "-" if row["cpu_s"] is None else cell(1e3 * row["cpu_s"])
                 exact = {name: "exact" if x <= EXACT_DB else f"{x:.3g}" for name, x in row["loss"].items()}
-                loss = ", ".join(f"{x} (`{name}`)" for name, x in exact.items()) or "failed"
-                first = choice if i == 0 else ""
+                named = [f"{x} (`{name}`)" if len(losses) > 1 else x for name, x in exact.items()]
+                loss = ", ".join(named) or "failed"
+                only = f" (`{losses[0]}`)" if len(losses) == 1 else ""  # the same of every alternative
+                first = f"{choice}{only}" if i == 0 else ""
                 lines.append(f"| {first} | {row['name']} | {time} | {loss} | {'yes' if row['recommended'] else ''} |")
         limits = ", ".join(f"`{name}` {value:g}" for name, value in record["tolerance"].items())
         with_ = f"torch {record['machine']['torch']}, threads: {record['machine']['threads']}"

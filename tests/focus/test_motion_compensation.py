@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Signal
-from torchsar.focus import ImageGrid, MotionCompensation, OmegaKImage, ProcessedBeam, compensated_omega_k
+from torchsar.focus import ImageGrid, MotionCompensation, OmegaKImage, ProcessedBeam, TileImage, compensated_omega_k
 from torchsar.metrics import error_db
 from torchsar.radar import AntennaPath, InverseRadar, range_profiles
 
@@ -180,6 +180,8 @@ def test_the_stage_images_profiles_and_refuses_what_does_not_suit() -> None:
     known = {"transmitter_m": antennas.transmitter_m, "path_reference_m": antennas.reference_m}
     image = stage(signal, frequency_hz=frequency, **known)
     torch.testing.assert_close(image.data, strip.plan().image(strip.noise))
+    seen = OmegaKImage(16.0, 36.0, 0.5, 2.0).seen(antennas)
+    assert 0 < seen.sum() < antennas.pulses and seen.equal(TileImage(16.0, 36.0, 0.5, beam_deg=2.0).seen(antennas))
     with pytest.raises(ValueError, match="this path is bistatic; image it by tiles"):
         stage(signal, frequency_hz=frequency, receiver_m=antennas.transmitter_m, **known)
     with pytest.raises(ValueError, match="order of motion compensation is 1 or 2"):

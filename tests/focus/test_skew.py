@@ -29,6 +29,19 @@ L_BAND = StripmapRadar(1.25e9, LinearFM(250e6, 0.2e-6), 300e6, 80.0, 100.0, 4850
 DOPPLER_HZ = 2 * 100.0 * 0.5 * 1.25e9 / LIGHT_M_S  # squint of 30 degrees
 
 
+def test_the_remedy_of_range_doppler_is_a_form_that_is_enough() -> None:
+    """Omega-K without Stolt interpolation is enough for a small squint and a narrow swath only."""
+    narrow = StripmapRadar(3.2e9, LinearFM(200e6, 3e-6), 250e6, 2000.0, 7000.0, 700e3, integration_s=1.0)
+    wide = StripmapRadar(9.6e9, LinearFM(2.88e9, 0.2e-6), 3.2e9, 1000.0, 100.0, 10e3, integration_s=2.0)
+    for radar, samples, doppler_hz, form in (
+        (narrow, 1536, 1304.0, "omega_k"),
+        (wide, 100_000, 2190.0, "omega_k_stolt"),
+    ):
+        bulk, coupling, *_ = requirements(radar, radar.raw_axes(3072, samples), doppler_hz)
+        assert coupling.effect == "range-Doppler" and bulk.ok == (form == "omega_k")
+        assert not coupling.ok and coupling.remedy == f"use {form}"
+
+
 def noise(*shape: int) -> torch.Tensor:
     return torch.randn(*shape, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
 

@@ -27,6 +27,10 @@ class Louder(Stage):
         self.gain = gain
     def forward(self, signal):
         return signal.with_data(signal.data * self.gain)
+
+class Silent(Stage):
+    def forward(self, signal):
+        return signal
 '''
 
 
@@ -135,10 +139,12 @@ def test_own_stage_joins_through_the_entry_point(tmp_path: Path) -> None:
     info = tmp_path / "louder-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: louder\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[torchsar.stages]\nlouder = louder:Louder\n")
+    (info / "entry_points.txt").write_text("[torchsar.stages]\nlouder = louder:Louder\nsilent = louder:Silent\n")
     code = (
         "from torchsar.study.names.registry import stages, group_of; s = "
-        "stages().make({'stage': 'louder', 'gain': 3.0}, 'x', 'f'); print(s.gain, group_of('louder'))"
+        "stages().make({'stage': 'louder', 'gain': 3.0}, 'x', 'f'); print(s.gain, group_of('louder')); "
+        "from torchsar.study.commands.listing import listing; "
+        "print(*(line for line in listing({}).splitlines() if line[:8] in ('  louder', '  silent')), sep='\\n')"
     )
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
@@ -149,4 +155,7 @@ def test_own_stage_joins_through_the_entry_point(tmp_path: Path) -> None:
         timeout=120,
         cwd=Path(__file__).parents[2],
     )
-    assert done.stdout.split() == ["3.0", "own"], done.stderr[-1500:]
+    made, *listed = done.stdout.splitlines() or [""]
+    assert made == "3.0 own", done.stderr[-1500:]
+    # a stage without a docstring is not described by that of its base class
+    assert [line.split(maxsplit=1) for line in listed] == [["louder", "Everything times a gain."], ["silent"]]

@@ -215,7 +215,7 @@ def test_a_running_scheduler_serves_and_a_failing_trial_is_named(alone: Record) 
         n_workers=1, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=40
     ) as cluster:
         bitwise(toy.run(cluster=cluster.scheduler_address, chunk=7), alone)
-        with pytest.raises(ConfigError, match="failed in trials 0 to 1 of law=flat: KeyError: nothing"):
+        with pytest.raises(ConfigError, match="trials 0 to 1 of law=flat failed: KeyError: nothing"):
             toy.run(trial=failing, cluster=cluster.scheduler_address, chunk=2, trials=2)
 
 

@@ -145,7 +145,7 @@ class ArrayFile(Mapping[str, StoredArray]):
                 raise ValueError(f"{self.path} is cut off or damaged ({_reason(error)}); {_AGAIN}") from None
             raise ValueError(
                 f"{self.path} must be a numpy archive (.npz) or array (.npy), but it is a file of another kind; save "
-                "the arrays by numpy.savez"
+                "the arrays by numpy.savez, or convert HDF5, MATLAB or flat binary data by torchsar import"
             ) from None
         members: dict[str, zipfile.ZipInfo | None] = {}
         for name, info in found:

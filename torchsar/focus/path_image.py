@@ -52,6 +52,9 @@ class PathImage(Stage):
             or the window is not known.
     """
 
+    beam: ProcessedBeam | None = None
+    """Beam whose pulses are summed, for strips; None for all pulses."""
+
     def __init__(
         self,
         azimuth_m: float,
@@ -101,15 +104,22 @@ class PathImage(Stage):
         raise NotImplementedError
 
     def lit(self, antennas: AntennaPath) -> Lit | None:
-        """Return the function of the pulses that are summed for a point, see `TilePlan`.
+        """Return the function of the pulses that see a point within the processed beam.
 
         Args:
-            antennas: Path of the antennas.
+            antennas: Path of the antennas. The beam is that of the receiver, seen from the mean
+                path of all trials.
 
         Returns:
-            Function, or None for all pulses.
+            Function, see `TilePlan`, or None for all pulses.
+
+        Raises:
+            ValueError: If the receiver does not advance, see `StraightTrack.fitted`.
         """
-        return None
+        if self.beam is None:
+            return None
+        place = antennas.places[-1].detach()
+        return partial(self.beam.lit_pulses, place.reshape(-1, antennas.pulses, 3).mean(0))
 
     def seen(self, antennas: AntennaPath) -> Tensor:
         """Return the pulses that see a part of the image.
@@ -215,24 +225,6 @@ class TileImage(PathImage):
         self.error_db = error_db
         self.beam = None if beam_deg is None else ProcessedBeam(beam_deg, squint_deg)
 
-    def lit(self, antennas: AntennaPath) -> Lit | None:
-        """Return the function of the pulses that see a point within the beam, see `TilePlan`.
-
-        Args:
-            antennas: Path of the antennas. The beam is that of the receiver, seen from the mean
-                path of all trials.
-
-        Returns:
-            Function, or None for all pulses.
-
-        Raises:
-            ValueError: If the receiver does not advance, see `StraightTrack.fitted`.
-        """
-        if self.beam is None:
-            return None
-        place = antennas.places[-1].detach()
-        return partial(self.beam.lit_pulses, place.reshape(-1, antennas.pulses, 3).mean(0))
-
     def form(self, history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid) -> Tensor:
         """Form the image by tiles.
 
@@ -329,4 +321,5 @@ class OmegaKImage(PathImage):
         """
         refuse_bistatic(antennas)
         places = antennas.transmitter_m, antennas.reference_m
+        assert self.beam is not None
         return compensated_omega_k(history, frequency_hz, *places, grid, self.beam, self.order)

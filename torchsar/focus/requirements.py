@@ -296,33 +296,35 @@ def requirements(
             effect, neglects, phase_rad, range_cells, tolerance_rad, remedy, error_db, tolerance_db, limit_rad
         )
 
+    without_stolt = row(
+        "bulk + refocus (omega_k)",
+        "change of migration over the swath",
+        bulk,
+        float(aperture.slope.abs().max()) * half / cells,
+        "use omega_k_stolt",
+        bulk_rad,
+    )
+    one_centroid = row(
+        "one Doppler centroid for all range frequencies",
+        f"skew of the spectrum; an aperture spans {aperture.doppler_band_hz + skew_hz(radar, doppler):.4g} Hz "
+        f"instead of {aperture.doppler_band_hz:.4g} Hz, the PRF is {radar.prf_hz:g} Hz",
+        skewed,
+        math.nan,
+        "use omega_k_stolt",
+        skewed_rad,
+    )
     return (
-        row(
-            "bulk + refocus (omega_k)",
-            "change of migration over the swath",
-            bulk,
-            float(aperture.slope.abs().max()) * half / cells,
-            "use omega_k_stolt",
-            bulk_rad,
-        ),
+        without_stolt,
         row(
             "range-Doppler",
             "coupling of range and azimuth (no secondary range compression)",
             rda,
             math.nan,
-            "use omega_k",
+            "use omega_k" if without_stolt.ok and one_centroid.ok else "use omega_k_stolt",
             coupling_rad,
             COUPLING_RAD,
         ),
-        row(
-            "one Doppler centroid for all range frequencies",
-            f"skew of the spectrum; an aperture spans {aperture.doppler_band_hz + skew_hz(radar, doppler):.4g} Hz "
-            f"instead of {aperture.doppler_band_hz:.4g} Hz, the PRF is {radar.prf_hz:g} Hz",
-            skewed,
-            math.nan,
-            "use omega_k_stolt",
-            skewed_rad,
-        ),
+        one_centroid,
         row(
             "parabolic range history", "third and higher orders of the hyperbola", path, math.nan, "keep the hyperbola"
         ),

@@ -44,7 +44,7 @@ def listing(systems: Mapping[str, System]) -> str:
 def _entries(catalogue: Catalogue, names: Any) -> list[str]:
     lines = []
     for name in names:
-        about = _plain((inspect.getdoc(catalogue.entries[name]) or "").split("\n\n")[0])
+        about = _plain((catalogue.entries[name].__doc__ or "").split("\n\n")[0])
         lines += [f"  {name:<26}{about.removeprefix('Impairment: ')}", *_keys(catalogue.sections[name])]
     return lines
 

@@ -123,9 +123,8 @@ class Work:
 
     def _refuse_unless_halving_helps(self, chunk: Chunk, error: Exception) -> None:
         """Raise a ConfigError unless a batch of several trials did not fit into memory."""
-        points = ", ".join(f"{k}={v}" for k, v in self.cases[chunk.case].fixed.items())
-        of = f" of {points}" if points else ""
-        where = f"the trial function failed in trials {min(chunk.trials)} to {max(chunk.trials)}{of}"
+        points = ", ".join(f"{k}={v}" for k, v in self.cases[chunk.case].fixed.items()) or "the sweep"
+        where = f"trials {min(chunk.trials)} to {max(chunk.trials)} of {points} failed"
         if not is_out_of_memory(error):
             raise ConfigError(
                 f"{where}: {'' if isinstance(error, ConfigError) else type(error).__name__ + ': '}"

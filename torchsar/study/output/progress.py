@@ -119,7 +119,8 @@ class Count:
         then, spent = "the remaining time is known after the first batch", self._since - self._began
         if self.new:
             left = (self.total - self.done) * spent / self.new - (time.perf_counter() - self._since)
-            then = f"{self.new / max(spent, 1e-9):.3g} {self.unit}/s, about {clock(max(left, 0.0))} left"
+            then = f"{self.new / max(spent, 1e-9):.3g} {self.unit}/s"
+            then += f", about {clock(left)} left" if left > 0 else ""
         return f"{self.done} of {self.total} {self.unit} after {clock(self.seconds)}, {then}"
 
 

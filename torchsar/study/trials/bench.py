@@ -202,11 +202,9 @@ class Bench:
             if name == "recommended" or os.environ.get("TORCHSAR_DEBUG"):
                 raise ConfigError(f"{self.file}: processor.{name}: {text}") from error
             log.warning("warning: %s failed: %s", name, text)
-            no = torch.zeros(trials.count, dtype=torch.bool)
-            return Outcome(Judged({"ok": no}), failed=text)
-        spent = sum(seconds.values()) / trials.count
-        known = {"seconds": torch.full((trials.count,), spent, dtype=torch.float64), **verdict(estimates, trials.count)}
-        judged = replace(judged, metrics={**known, **judged.metrics})
+            return Outcome(Judged({"ok": torch.zeros(trials.count, dtype=torch.bool)}), failed=text)
+        spent = torch.full((trials.count,), sum(seconds.values()) / trials.count, dtype=torch.float64)
+        judged = replace(judged, metrics={"seconds": spent, **verdict(estimates, trials.count), **judged.metrics})
         left = [stage for stage in trace.inputs if trace.outputs[stage] is trace.inputs[stage]]
         neutral = {key: rows(mask, trials.count).any(1) for key, mask in trace.neutral.items()}
         return Outcome(judged, estimates, trace.signal, seconds, trace, left, neutral=neutral)
@@ -227,6 +225,8 @@ class Bench:
             again = chain.retrace(source, method.rerun.start, given)
             return again, {}, {"rerun": time.perf_counter() - began}
         shared = self._shared(method, earlier)
+        for key in sorted(true_names(chain) - trials.truth.keys()):
+            raise ValueError(f"it uses truth.{key}, which is known of simulated data only")
         true = {f"given.{key}": trials.truth[key] for key in true_names(chain)}
         with self._announced(chain, name):
             trace = chain.trace(recording, {**shared.estimates, **true})
