@@ -199,7 +199,7 @@ def test_a_single_trial_that_does_not_fit_is_a_sentence() -> None:
 def test_what_a_trial_does_wrong_is_named_with_its_position(result, said: str) -> None:
     with pytest.raises(ConfigError, match=said) as caught:
         sweep(lambda parameters, draws: result(len(draws.trials)), {"law": ["flat"]}, trials=5, chunk=5)
-    assert "in trials 0 to 4 of law=flat" in str(caught.value)
+    assert "trials 0 to 4 of law=flat failed" in str(caught.value)
     assert caught.value.__cause__ is not None
 
 
