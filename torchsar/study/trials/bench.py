@@ -225,8 +225,8 @@ class Bench:
             again = chain.retrace(source, method.rerun.start, given)
             return again, {}, {"rerun": time.perf_counter() - began}
         shared = self._shared(method, earlier)
-        for key in sorted(true_names(chain) - trials.truth.keys()):
-            raise ValueError(f"it uses truth.{key}, which is known of simulated data only")
+        if unknown := sorted(true_names(chain) - trials.truth.keys()):
+            raise ValueError(f"it uses truth.{unknown[0]}, which is known of simulated data only")
         true = {f"given.{key}": trials.truth[key] for key in true_names(chain)}
         with self._announced(chain, name):
             trace = chain.trace(recording, {**shared.estimates, **true})
