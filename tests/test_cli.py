@@ -9,6 +9,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -335,6 +336,27 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
     _, said = running.communicate(timeout=60)
     assert running.returncode == 130 and said.splitlines()[-1] == "torchsar: interrupted, nothing was written"
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+def test_an_interrupt_that_python_drops_comes_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Callback:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    def long(*_: object, **__: object) -> None:
+        Callback()  # Python prints an exception in `__del__` and goes on
+        for _ in range(1000):
+            time.sleep(0.01)
+
+    monkeypatch.setattr("torchsar.study.commands.run.run", long)
+    earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert main(["run", str(write_tiny(tmp_path)), "--out", str(tmp_path / "result")]) == 130
+    finally:
+        signal.signal(signal.SIGINT, earlier)
+    assert spoken(capsys)[-1] == "torchsar: interrupted, nothing was written"
 
 
 @pytest.mark.parametrize("word", ["0", "-3", "many", "9" * 30])

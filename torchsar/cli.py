@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import logging
 import os
 import shlex
 import sys
 import textwrap
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -149,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif options.command not in _PRINTED:  # before the import of torch, which takes seconds
             subject = options.file if options.command in _EXCHANGE else options.config
             print(f"torchsar: {options.command} {subject}", file=sys.stderr, flush=True)
-        with _log_to_stderr(), warnings.catch_warnings(), _short_memory():
+        with _log_to_stderr(), warnings.catch_warnings(), _short_memory(), _interrupts_kept():
             warnings.showwarning = _show_warning
             status = _dispatch(options, "torchsar " + shlex.join(given))
             sys.stdout.flush()
@@ -338,6 +340,28 @@ def _short_memory() -> Iterator[None]:
         raise MemoryError(
             f"memory is too short ({str(error).splitlines()[0] if str(error) else 'no message'})"
         ) from error
+
+
+@contextmanager
+def _interrupts_kept() -> Iterator[None]:
+    """Interrupt again where Python drops Ctrl-C, as it does with any exception in a callback of the
+    garbage collector or of an import.
+    """
+    earlier, again = sys.unraisablehook, list[threading.Timer]()
+
+    def hook(dropped: sys.UnraisableHookArgs) -> None:
+        if not issubclass(dropped.exc_type, KeyboardInterrupt):
+            return earlier(dropped)
+        again.append(threading.Timer(0.1, _thread.interrupt_main))
+        again[-1].start()
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = earlier
+        for timer in again:
+            timer.cancel()
 
 
 @contextmanager
