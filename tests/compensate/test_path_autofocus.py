@@ -231,8 +231,9 @@ def test_a_start_that_explains_the_samples_worse_does_not_widen_the_deviation() 
         value = torch.tensor(noise, dtype=F64)
         return Found(line, torch.zeros(PULSES, 3), torch.full_like(line, 3e-5), image, value, value * 0)
 
-    best, near, far = found(1.0, 0.0, 0.1), found(1.02, 2e-5, 0.2), found(1.3, 3e-4, 0.3)
-    for others, std_m, only in (([far, near], 3.3e-5, False), ([near], 3.3e-5, False), ([far], 2e-4, True)):
+    best, near, far, lost = found(1, 0, 0.1), found(1.02, 2e-5, 0.2), found(1.3, 3e-4, 0.3), found(10, 3e-4, 0.4)
+    cases = (([far, near], 3.3e-5, False), ([near], 3.3e-5, False), ([far], 1.7e-4, True), ([far, lost], 4e-5, True))
+    for others, std_m, only in cases:
         sharpest, std, alone = line_of_sight._sharpest([*others, best], search)  # pyright: ignore[reportArgumentType]
         assert sharpest is best and alone is only
         assert float(std.square().mean().sqrt()) == pytest.approx(std_m, rel=0.2)

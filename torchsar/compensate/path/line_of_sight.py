@@ -227,9 +227,11 @@ def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor, bool]:
     """The result of the sharpest image, the standard deviation of its line of sight (m), and
     whether it stands alone: no other result explains the samples as well.
 
-    The standard deviation contains the difference from the nearest other result, of those that
-    explain the samples as well if there are any: one that does not differs by errors of its own.
-    All have the errors by noise in common; what differs comes from the search.
+    The standard deviation contains a share of the difference from another result, of the nearest of
+    those that explain the samples as well if there are any. All have the errors by noise in common;
+    what differs comes from the search. Of the difference of two results the errors of each are
+    taken to be in proportion to what it leaves of the samples: half the power comes from one that
+    is as good, little from one that is lost.
     """
     best, *others = sorted(found, key=lambda one: float(entropy(one.image)))
     as_well = [one for one in others if one.noise <= _AS_WELL * best.noise]
@@ -238,6 +240,9 @@ def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor, bool]:
     def phase(one: Found) -> Tensor:
         return radians * placed(one.line_of_sight_m, present)
 
-    apart = [residual_phase(phase(best), phase(other), present)[present] for other in as_well or others]
-    least = torch.stack([x.square().mean() for x in apart]).amin() / radians**2
-    return best, (best.std_m.square() + least / 2).sqrt(), not as_well
+    def shared(other: Found) -> Tensor:
+        apart = residual_phase(phase(best), phase(other), present)[present] / radians
+        return apart.square().mean() / (1 + (other.noise / best.noise).square())
+
+    least = torch.stack([shared(other) for other in as_well or others]).amin()
+    return best, (best.std_m.square() + least).sqrt(), not as_well
