@@ -7,11 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from tests.scripting import script
 from torchsar.cli import main
+from torchsar.focus import OmegaKStolt
+from torchsar.metrics import error_after_gain_db
 from torchsar.study.commands.requires import needs
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.systems.stripmap.choices import probe_of
 from torchsar.study.table import SYSTEMS, load
 from torchsar.study.trials.auto import choices_of
 from torchsar.study.trials.bench import Bench
@@ -64,17 +68,38 @@ def test_auto_takes_what_the_tolerance_dictates(place: tuple[str, str]) -> None:
     config, path, changes = PLACES[place]
     choice = next(one for one in choices_of(Bench(load(config, changes))) if one.at == place[1])
     predicted = [one for one in choice.alternatives if one.loss is not None]
-    assert any(one.loss for one in predicted) and not predicted[-1].loss
-    for one in [one for one in predicted if one.loss][:2]:
+    lossy = [one for one in predicted[:-1] if one.loss][:2]
+    assert lossy
+    for one in lossy:
         ((metric, loss),) = one.loss.items()  # pyright: ignore[reportOptionalMemberAccess]
         for tolerance in (loss + 0.01, loss - 0.01):
             limit = f"trade.tolerance.{metric}={tolerance!r}"
             bench = Bench(load(config, [*changes, f"{path}=auto", limit]))
-            taken = next(x for x in predicted if not x.loss or x.loss[metric] <= tolerance)
+            taken = next((x for x in predicted if not x.loss or x.loss[metric] <= tolerance), predicted[-1])
             entry = at(bench.config, path)
             assert {key: entry[key] for key in taken.keys} == dict(taken.keys)
             assert len(bench.chosen) == 1 and f"{taken.name} was chosen" in bench.chosen[0]
+            assert ("the most exact" in bench.chosen[0]) == bool(taken.loss and taken.loss[metric] > tolerance)
             assert (taken is one) <= (tolerance > loss)
+
+
+def test_what_stolt_interpolation_loses_are_the_weights_of_the_range_band() -> None:
+    """A bandwidth of 30 % of the carrier and 20 degrees of squint, against the direct sum."""
+    pulse = "radar.pulse={bandwidth_hz: 2.88e9, duration_s: 0.15e-6}"
+    squint = [f"{key}=2190" for key in ("radar.pointing_doppler_hz", "world.doppler_hz")]
+    speed = [f"{key}=100" for key in ("radar.velocity_m_s", "world.velocity_m_s")]
+    sizes = ["radar.prf_hz=1000", "world.lines=1024", "world.samples=2048", "world.beam.dwell_s=0.5"]
+    radar = ["radar.carrier_hz=9.6e9", pulse, "radar.sampling_hz=3.2e9", "radar.near_range_m=10e3"]
+    bench = Bench(load("stripmap_damaged", [*radar, *squint, *speed, *sizes, "radar.integration_s=0.5"]))
+    forms = next(one for one in choices_of(bench) if one.at == "stage")
+    (predicted,) = (forms.alternatives[-1].loss or {}).values()
+    raw, patches, known = probe_of(bench).seen()
+    image = OmegaKStolt(bench.radar, velocity_m_s=known[1], doppler_hz=known[0])(raw).data
+    weight = (1 + bench.radar.range_frequency_hz(image.shape[-1]) / bench.radar.carrier_hz).rsqrt()
+    weighted = torch.fft.ifft(torch.fft.fft(image) * weight)
+    exact = patches.exact(raw, *known)
+    measured, left = (float(error_after_gain_db(patches.cut(x), exact).max()) for x in (image, weighted))
+    assert predicted == pytest.approx(measured, abs=0.5) and left < measured - 15
 
 
 def test_auto_is_refused_where_nothing_is_to_choose() -> None:

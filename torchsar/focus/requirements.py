@@ -18,6 +18,8 @@ from torchsar.focus.omega_k import FrameGeometry, wavenumber
 from torchsar.focus.skew import EXCESS, skew_hz
 from torchsar.radar import StripmapRadar
 
+# the simplification of every form of omega-K and of range-Doppler
+EQUAL_WEIGHTS = "equal weights of range frequencies"
 # measured PSLR in range beside that of exact focusing: 0.03 dB higher at 0.6 rad without squint,
 # 0.10 dB higher at 0.53 rad and 0.8 dB at 1.2 rad with squint
 COUPLING_RAD = 0.5
@@ -281,6 +283,8 @@ def requirements(
     inside = math.pi * aperture.doppler_band_hz * radar.pulse.duration_s
     displaced = abs(doppler) / abs(radar.pulse.rate_hz_s) * radar.sampling_hz
     single = 2 * math.pi * back_turns * far * 2.0**-24
+    # mean square over the band of (1 + f / f0)^(-1/2) - 1, about f / (2 f0)
+    equal_weights = (radar.pulse.bandwidth_hz / radar.carrier_hz) ** 2 / 48
 
     def row(
         effect: str,
@@ -291,7 +295,7 @@ def requirements(
         over: Tensor | None = None,
         limit_rad: float = math.inf,
     ) -> Requirement:
-        error_db = math.nan if over is None else phase_error_db(over)
+        error_db = math.nan if over is None else 10 * math.log10(10 ** (phase_error_db(over) / 10) + equal_weights)
         return Requirement(
             effect, neglects, phase_rad, range_cells, tolerance_rad, remedy, error_db, tolerance_db, limit_rad
         )
@@ -325,6 +329,14 @@ def requirements(
             COUPLING_RAD,
         ),
         one_centroid,
+        row(
+            EQUAL_WEIGHTS,
+            "weights (1 + f / f0)^(-1/2) of the range frequencies f, which the direct sum has",
+            0.0,
+            math.nan,
+            "multiply the range spectrum of the image by them",
+            torch.zeros(1),
+        ),
         row(
             "parabolic range history", "third and higher orders of the hyperbola", path, math.nan, "keep the hyperbola"
         ),

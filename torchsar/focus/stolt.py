@@ -83,10 +83,15 @@ def omega_k_stolt(
 ) -> Tensor:
     """Focus by omega-K with Stolt interpolation.
 
-    The image of a target is exact at every range. Coordinates and phases are those of `omega_k`,
-    and for narrow swaths without squint the two functions give the same image. The computation
-    takes two to three times as long as `omega_k`. Differentiable in the raw data, the velocity and
-    `frame_hz`.
+    The image of a target is focused exactly at every range. Coordinates and phases are those of
+    `omega_k`, and for narrow swaths without squint the two functions give the same image. The
+    computation takes two to three times as long as `omega_k`. Differentiable in the raw data, the
+    velocity and `frame_hz`.
+
+    All range frequencies f have equal weights, as in every form of omega-K. Lower frequencies of an
+    echo sweep the Doppler band more slowly, and the direct sum, a matched filter, weighs them by
+    (1 + f / f0)^(-1/2). For a bandwidth of 30 % of the carrier frequency f0 the two images differ
+    by -27 dB.
 
     The Doppler of a squinted beam is proportional to the transmitted frequency. The azimuth
     spectrum is therefore unwrapped about the centroid of each range frequency, so that the PRF has

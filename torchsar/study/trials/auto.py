@@ -1,4 +1,6 @@
-"""Keys with the value `auto` get the cheapest alternative with an acceptable predicted loss."""
+"""Keys with the value `auto` get the cheapest alternative with an acceptable predicted loss, or the
+most exact one.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ def within(loss: Mapping[str, float] | None, tolerance: Mapping[str, float]) -> 
 
 
 def cheapest(choice: Choice, tolerance: Mapping[str, float]) -> Alternative:
-    """Return the first alternative with an acceptable predicted loss, or else the exact one."""
+    """Return the first alternative with an acceptable predicted loss, or else the last one."""
     kept = [one for one in choice.alternatives if one.loss is not None and within(one.loss, tolerance)]
     return kept[0] if kept else choice.alternatives[-1]
 
@@ -49,7 +51,7 @@ def choices_of(bench: Any) -> Sequence[Choice]:
 
 def resolved(loaded: Loaded, bench_of: Callable[[Loaded], Any]) -> tuple[Loaded, tuple[str, ...]]:
     """Replace every `auto` of a config by the cheapest alternative with a predicted loss within the
-    tolerance.
+    tolerance, or by the most exact one where there is none.
 
     Args:
         loaded: The config.
@@ -84,9 +86,8 @@ def resolved(loaded: Loaded, bench_of: Callable[[Loaded], Any]) -> tuple[Loaded,
         why = ", ".join(
             f"{name} {value:.3g} (at most {tolerance[name]:g})" for name, value in (taken.loss or {}).items()
         )
-        reasons.append(
-            f"{path}: {taken.name} was chosen, the cheapest with an acceptable predicted loss: {why or 'exact'}"
-        )
+        best = "the cheapest with an acceptable" if within(taken.loss, tolerance) else "the most exact, with a"
+        reasons.append(f"{path}: {taken.name} was chosen, {best} predicted loss: {why or 'exact'}")
     return loaded.changed(changes, "auto"), tuple(reasons)
 
 

@@ -58,7 +58,7 @@ class Choice:
         name: Name in tables.
         at: The key that may have the value `auto`: a dotted key of the world such as
             `world.fidelity`, `stage`, or `STAGE.key` for a key of all stages of that name.
-        alternatives: The alternatives, the cheapest first and the exact one last.
+        alternatives: The alternatives, the cheapest first and the most exact one last.
         measured: Function that prepares the measurement of the alternatives, which may take long;
             None if they cannot be measured.
         yardstick: Exact alternative to which losses are relative, if it is not the last one of

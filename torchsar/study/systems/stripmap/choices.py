@@ -15,7 +15,7 @@ from torchsar.core import Draws, Recording, Signal, Truth
 from torchsar.echo import simulate
 from torchsar.echo.jitter import sample_unevenly
 from torchsar.focus.patches import HALF, PointPatches
-from torchsar.focus.requirements import Requirement, full_swath_m, requirements
+from torchsar.focus.requirements import EQUAL_WEIGHTS, Requirement, full_swath_m, requirements
 from torchsar.metrics import error_after_gain_db, error_db
 from torchsar.metrics.direct_images import PIXELS, DirectlySummed, points_of_a_strip
 from torchsar.radar import StripmapRadar
@@ -27,7 +27,11 @@ from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_d
 
 # a period of four timing offsets (samples) as in Tsvetkov 2017, and raw lines enough to time them
 _OFFSETS, _LINES = (0.0, 0.18, -0.12, 0.07), 1024
-FORMS = {"range_doppler": "range-Doppler", "omega_k": "bulk + refocus (omega_k)", "omega_k_stolt": ""}
+FORMS = {
+    "range_doppler": "range-Doppler",
+    "omega_k": "bulk + refocus (omega_k)",
+    "omega_k_stolt": EQUAL_WEIGHTS,
+}
 
 
 @dataclass(frozen=True)
@@ -124,9 +128,7 @@ def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
         rows: What simplified focusing neglects, by name of the effect.
     """
     forms = [
-        Alternative(
-            name, {"stage": name}, {"image_error_db": rows[row].error_db} if row else {}, _neglects(rows, row), row
-        )
+        Alternative(name, {"stage": name}, {"image_error_db": rows[row].error_db}, rows[row].neglects, row)
         for name, row in FORMS.items()
     ]
     exact = Alternative("backprojection, complex128, times extrapolated from patches")
@@ -149,10 +151,6 @@ def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
         correctors = [Alternative(name, {"corrector": c}) for name, c in _CORRECTORS.items()]
         found.append(Choice("jitter correction", "stage of the name jitter", correctors, partial(_jitter, bench)))
     return found
-
-
-def _neglects(rows: Mapping[str, Requirement], row: str) -> str:
-    return rows[row].neglects if row else ""
 
 
 def _focused(bench: Bench, form: str, signal: Signal, known: tuple[Tensor, Tensor]) -> Tensor:
