@@ -25,7 +25,8 @@ def metrics(out: Path) -> dict:
     return json.loads((out / "metrics.json").read_text())
 
 
-def test_all_impairments_at_once(tmp_path):
+def test_all_impairments_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "draw_all", lambda *_, **__: [])  # a third of the time
     tree = yaml.safe_load(find_config("stripmap_damaged").read_text(encoding="utf-8"))
     del tree["processor"]["squint_ignored"]  # of no interest here
     (tmp_path / "strip.yaml").write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
