@@ -216,8 +216,8 @@ def test_a_bad_archive_gives_one_sentence_and_nothing_is_written(
     content, sentence = MISTAKEN[mistake]
     path = tmp_path / "data.npz"
     path.write_bytes(content)
-    status = main(["run", "radarsat1", f"data.file={path}", "--out", str(tmp_path / "out")])
-    said = [line for line in capsys.readouterr().err.splitlines() if line != "torchsar: run radarsat1"]
+    status = main(["run", "recorded_strip", f"data.file={path}", "--out", str(tmp_path / "out")])
+    said = [line for line in capsys.readouterr().err.splitlines() if line != "torchsar: run recorded_strip"]
     assert status == 2 and len(said) == 1 and str(path) in said[0] and sentence in said[0], said
     assert not (tmp_path / "out").exists()
 
