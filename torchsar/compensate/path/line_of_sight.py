@@ -46,9 +46,8 @@ _AS_WELL = 1.1
 # largest share of the pulses whose fringes the last round may have changed, and factor by which the
 # sharpest image may leave more of the samples than that of another start, by trial: 3 % and 1.1
 # where the result was right, 19 % and 3 in a wrong minimum that all starts had in common; and share
-# of the power that a fit may leave without noise: it left up to 1 % at 40 dB before fits went as
-# far as the noise asks for, and 0.1 % since
-_RESTLESS, _WORSE, _UNFIT = 0.1, 1.5, 0.01
+# of the power that a fit may leave without noise: fits of right results left up to 0.2 % at 40 dB
+_RESTLESS, _WORSE, _UNFIT = 0.1, 1.5, 0.003
 
 
 def path_autofocus(
