@@ -220,7 +220,7 @@ def test_an_envelope_that_drifts_against_the_phases_is_found() -> None:
     assert float((found - drift).square().mean().sqrt()) < fringe
 
 
-def test_a_start_that_explains_the_samples_worse_does_not_widen_the_deviation() -> None:
+def test_a_start_that_explains_the_samples_worse_widens_the_doubt_and_not_the_deviation() -> None:
     present = torch.ones(PULSES, dtype=torch.bool)
     search = SimpleNamespace(fringe_m=0.0156, present=present)
 
@@ -232,8 +232,13 @@ def test_a_start_that_explains_the_samples_worse_does_not_widen_the_deviation() 
         return Found(line, torch.zeros(PULSES, 3), torch.full_like(line, 3e-5), image, value, value * 0)
 
     best, near, far, lost = found(1, 0, 0.1), found(1.02, 2e-5, 0.2), found(1.3, 3e-4, 0.3), found(10, 3e-4, 0.4)
-    cases = (([far, near], 3.3e-5, False), ([near], 3.3e-5, False), ([far], 1.7e-4, True), ([far, lost], 4e-5, True))
-    for others, std_m, only in cases:
-        sharpest, std, alone = line_of_sight._sharpest([*others, best], search)  # pyright: ignore[reportArgumentType]
+    cases = (
+        ([far, near], 3.3e-5, 3.3e-5, False),
+        ([near], 3.3e-5, 3.3e-5, False),
+        ([far], 1.7e-4, 2e-4, True),
+        ([far, lost], 4e-5, 2e-4, True),
+    )
+    for others, std_m, doubt_m, only in cases:
+        sharpest, *found, alone = line_of_sight._sharpest([*others, best], search)  # pyright: ignore[reportArgumentType]
         assert sharpest is best and alone is only
-        assert float(std.square().mean().sqrt()) == pytest.approx(std_m, rel=0.2)
+        assert [float(x.square().mean().sqrt()) for x in found] == pytest.approx([std_m, doubt_m], rel=0.2)

@@ -109,13 +109,14 @@ def path_autofocus(
         positions in metres, recorded minus true, of both antennas alike, for `CorrectPath`. The
         standard deviation, of `line_of_sight_m` only, is that modulo half a wavelength; it follows
         from what the estimated scene and motion leave of the samples, and from the difference from
-        the nearest result of another start that explains the samples as well. `quality` is the
-        Strehl ratio predicted from it, times the share of the sharpness that noise does not
-        explain. Sharpness is the amount by which the image entropy lies below that of speckle. `ok`
-        is False unless the image is twice as sharp as autofocus can make pure noise, more than one
-        range cell contributes to the sharpness, the Strehl ratio for 1.5 standard deviations
-        exceeds 0.8, the fringes have settled, and no start explains the samples better by far; it
-        does not say whether fringes are right. It is False for fewer than 8 pulses with samples.
+        the result of another start, weighed by how well that explains the samples. `quality` is the
+        Strehl ratio predicted from it with half of the power of that difference, however well the
+        other explains the samples, times the share of the sharpness that noise does not explain.
+        Sharpness is the amount by which the image entropy lies below that of speckle. `ok` is False
+        unless the image is twice as sharp as autofocus can make pure noise, more than one range
+        cell contributes to the sharpness, the same Strehl ratio for 1.5 standard deviations exceeds
+        0.8, the fringes have settled, and no start explains the samples better by far; it does not
+        say whether fringes are right. It is False for fewer than 8 pulses with samples.
         `info` holds "roughness" (see `roughness`: about 1 if the fringes come from single
         envelopes, less for smooth motions) and "entropy_nats" of the image, shape (...,).
 
@@ -194,18 +195,18 @@ def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
 
     range_m, rough = search.by_envelopes(_FIRST_BAND)
     results = [refined(range_m), refined(search.by_phases())]
-    found, std_m, alone = _sharpest(results, search)
-    if alone or strehl(_SPREAD * std_m) <= LEAST_STREHL:
+    found, std_m, doubt_m, alone = _sharpest(results, search)
+    if alone or strehl(_SPREAD * doubt_m) <= LEAST_STREHL:
         results.append(refined(search.by_envelopes(_OTHER_BAND)[0]))
-        found, std_m, _ = _sharpest(results, search)
+        found, std_m, doubt_m, _ = _sharpest(results, search)
     sharp, noise, telling = _sharpness(found.image)
-    quality = strehl(std_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
+    quality = strehl(doubt_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
     least = torch.stack([one.noise for one in results]).amin()
     least = _WORSE * least + _UNFIT * search.rows.abs().square().double().mean()
     sure = [
         sharp > _MARGIN * noise,
         telling > LEAST_ROWS,
-        strehl(_SPREAD * std_m) > LEAST_STREHL,
+        strehl(_SPREAD * doubt_m) > LEAST_STREHL,
         found.restless <= _RESTLESS,
         found.noise <= least,
     ]
@@ -222,15 +223,17 @@ def _sharpness(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return sharp, sharpness_of_noise((effective * FINE_STEP).clamp_min(1)), telling
 
 
-def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor, bool]:
-    """The result of the sharpest image, the standard deviation of its line of sight (m), and
+def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor, Tensor, bool]:
+    """The result of the sharpest image, two standard deviations of its line of sight (m), and
     whether it stands alone: no other result explains the samples as well.
 
-    The standard deviation contains a share of the difference from another result, of the nearest of
-    those that explain the samples as well if there are any. All have the errors by noise in common;
-    what differs comes from the search. Of the difference of two results the errors of each are
-    taken to be in proportion to what it leaves of the samples: half the power comes from one that
-    is as good, little from one that is lost.
+    Both contain a part of the difference from another result, of the nearest of those that explain
+    the samples as well if there are any. All have the errors by noise in common; what differs comes
+    from the search. The first takes the errors of each to be in proportion to what it leaves of the
+    samples: half the power of the difference comes from one that is as good, little from one that
+    is lost. The second, by which a result is doubted, takes half the power in any case: a wrong
+    motion can explain the samples as well as the true one, with more scatterers, and it stands
+    alone then.
     """
     best, *others = sorted(found, key=lambda one: float(entropy(one.image)))
     as_well = [one for one in others if one.noise <= _AS_WELL * best.noise]
@@ -239,9 +242,9 @@ def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor, bool]:
     def phase(one: Found) -> Tensor:
         return radians * placed(one.line_of_sight_m, present)
 
-    def shared(other: Found) -> Tensor:
-        apart = residual_phase(phase(best), phase(other), present)[present] / radians
-        return apart.square().mean() / (1 + (other.noise / best.noise).square())
-
-    least = torch.stack([shared(other) for other in as_well or others]).amin()
-    return best, (best.std_m.square() + least).sqrt(), not as_well
+    compared = as_well or others
+    apart = [residual_phase(phase(best), phase(other), present)[present] / radians for other in compared]
+    square = torch.stack([x.square().mean() for x in apart])
+    share = torch.stack([1 / (1 + (other.noise / best.noise).square()) for other in compared])
+    std, doubt = ((best.std_m.square() + (square * part).amin()).sqrt() for part in (share, 0.5))
+    return best, std, doubt, not as_well
