@@ -369,6 +369,19 @@ def test_the_increment_of_one_whole_target_is_reliable() -> None:
     assert not bool(RangeDependentCentroid(AIRCRAFT)(signal).ok.any())  # one target shows no slope over range
 
 
+@pytest.mark.parametrize("estimate", [phase_increment, energy_centre])
+def test_independent_lines_have_no_centroid_whatever_the_range_cells_share(estimate) -> None:
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.view_as_complex(torch.randn(40, 256, 64, 2, generator=generator, dtype=torch.float64))
+    bright = noise.clone()
+    bright[..., 20] *= 100
+    turns = torch.rand(40, 256, 1, generator=generator, dtype=torch.float64) + 0.2123 * torch.arange(64)
+    tone = noise + 10 * torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+    for x in (bright, tone):
+        assert not bool(estimate(x, PRF).ok.any())
+    assert bool(estimate(sum(bright.roll(k, -2) for k in range(6)), PRF).ok.all())
+
+
 def test_the_deviation_over_range_includes_the_few_targets_that_are_cut() -> None:
     """A chirp fills several blocks, whose residuals agree: errors of 7 deviations."""
     radar, generator = replace(AIRCRAFT, prf_hz=200.0), torch.Generator().manual_seed(3)

@@ -41,6 +41,10 @@ MOST_STD = 0.015
 # Least extent of the energy along the record, as a share of its length: targets seen for less are
 # cut by the end of the record, or nearly as short as their own drift of Doppler.
 _LEAST_EXTENT = 0.3
+# Least power of the sum of the products of adjacent lines over the sum of their powers, one product
+# per pair of lines. It is exponentially distributed with mean 1 where the lines are independent,
+# whatever the range cells have in common; more than 9 then occurs once in 8000 records.
+_LEAST_COHERENCE = 9.0
 _FINE = (2, 4)  # parts of a block along pulses and range, for the power at its edges
 # Least number of range blocks whose scatter is taken as the standard deviation; with fewer, it is
 # the scatter of all blocks, which the sweep of the targets makes too large.
@@ -229,6 +233,8 @@ class Increments(NamedTuple):
             see `cut_lines`; in lines, shape (...,).
         half_band_rad: Half of the band that a target sweeps in the beam, as a phase increment in
             rad, shape (...,).
+        coherence: Power of the sum of the products of all pairs of lines over the sum of their
+            powers, 0 to the number of pairs, shape (...,); about 1 for lines that are independent.
     """
 
     products: Tensor
@@ -237,6 +243,7 @@ class Increments(NamedTuple):
     sides: Tensor
     lines: Tensor
     half_band_rad: Tensor
+    coherence: Tensor
 
 
 def increments(
@@ -280,12 +287,22 @@ def increments(
         torch.cat(sides, -1),
         cut_lines(half_band, dwell_lines),
         half_band,
+        _coherence_of_pairs(x),
     )
 
 
 def _grouped(x: Tensor, count: int, dim: int) -> Tensor:
     """Sums of `count` neighbours along a dimension."""
     return x.unflatten(dim, (-1, count)).sum(dim)
+
+
+def _coherence_of_pairs(x: Tensor) -> Tensor:
+    """Power of the sum of the products of pairs of lines over the sum of their powers, (...,)."""
+    x = unit_level(x)
+    x = x / _peak(x)
+    pairs = torch.linalg.vecdot(x[..., :-1, :], x[..., 1:, :]).to(torch.complex128)
+    scatter = pairs.abs().square().sum(-1)
+    return pairs.sum(-1).abs().square() / torch.where(scatter > 0, scatter, 1)
 
 
 def _half_band_rad(x: Tensor, total: Tensor) -> Tensor:
@@ -367,7 +384,10 @@ def reliable_increment(found: Increments, phase_rad: Tensor, scatter_rad: Tensor
     """Decide whether a phase increment between adjacent lines shows the Doppler centroid.
 
     The scatter must be below 1.5 % of the PRF, and the shift by cut apertures below an eighth of
-    the band of the beam. If the record is divided into four blocks or more along pulses, the energy
+    the band of the beam. The products of adjacent lines, each summed over all range cells, must
+    add up to more than three times the root of the sum of their powers: in independent lines they
+    do not, but a bright range cell, or interference that all range cells share, hides this from the
+    scatter of the range blocks. If the record is divided into four blocks or more along pulses, the energy
     must also fill 0.3 of the record: where targets are seen only at an end of the record, nothing
     shows how much of their apertures is cut.
 
@@ -384,6 +404,7 @@ def reliable_increment(found: Increments, phase_rad: Tensor, scatter_rad: Tensor
     square = real.square().sum(-1)
     extent = real.sum(-1).square() / torch.where(square > 0, square, 1) / real.shape[-1]
     filled = (square > 0) & ((extent >= _LEAST_EXTENT) | (real.shape[-1] < 4))
+    filled = filled & (found.coherence > _LEAST_COHERENCE)
     return filled & (scatter_rad < 2 * math.pi * MOST_STD) & (shift_rad.abs() < found.half_band_rad / 4)
 
 
@@ -402,8 +423,8 @@ def baseband_estimate(found: Increments, phase_rad: Tensor, prf_hz: float, **inf
         Hz, which includes the shift by apertures that the ends of the record cut. `quality` is the
         coherence of adjacent lines. `ok` is False where there is no energy, where the scatter of
         the blocks gives a standard deviation of 1.5 % of the PRF or more, where the shift by cut
-        apertures is an eighth of the band of the beam or more, or where the energy fills less than
-        0.3 of the record, see `reliable_increment`. `info` holds "block_hz" (centroid of each
+        apertures is an eighth of the band of the beam or more, where adjacent lines are not
+        significantly coherent, or where the energy fills less than 0.3 of the record, see `reliable_increment`. `info` holds "block_hz" (centroid of each
         block) and "block_power", both of shape (..., a, b), "cut_hz" (the estimated shift by cut
         apertures, which the value still contains), shape (...,), and the entries given.
     """
