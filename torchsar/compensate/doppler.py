@@ -387,9 +387,9 @@ def reliable_increment(found: Increments, phase_rad: Tensor, scatter_rad: Tensor
     the band of the beam. The products of adjacent lines, each summed over all range cells, must
     add up to more than three times the root of the sum of their powers: in independent lines they
     do not, but a bright range cell, or interference that all range cells share, hides this from the
-    scatter of the range blocks. If the record is divided into four blocks or more along pulses, the energy
-    must also fill 0.3 of the record: where targets are seen only at an end of the record, nothing
-    shows how much of their apertures is cut.
+    scatter of the range blocks. If the record is divided into four blocks or more along pulses, the
+    energy must also fill 0.3 of the record: where targets are seen only at an end of the record,
+    nothing shows how much of their apertures is cut.
 
     Args:
         found: Products of adjacent lines.
@@ -424,9 +424,12 @@ def baseband_estimate(found: Increments, phase_rad: Tensor, prf_hz: float, **inf
         coherence of adjacent lines. `ok` is False where there is no energy, where the scatter of
         the blocks gives a standard deviation of 1.5 % of the PRF or more, where the shift by cut
         apertures is an eighth of the band of the beam or more, where adjacent lines are not
-        significantly coherent, or where the energy fills less than 0.3 of the record, see `reliable_increment`. `info` holds "block_hz" (centroid of each
-        block) and "block_power", both of shape (..., a, b), "cut_hz" (the estimated shift by cut
-        apertures, which the value still contains), shape (...,), and the entries given.
+        significantly coherent, or where the energy fills less than 0.3 of the record, see
+        `reliable_increment`. The centroid is that of the samples as they are: where they are
+        quantised to one bit, harmonics shift it by up to 1 % of the PRF, which the standard
+        deviation does not contain. `info` holds "block_hz" (centroid of each block) and
+        "block_power", both of shape (..., a, b), "cut_hz" (the estimated shift by cut apertures,
+        which the value still contains), shape (...,), and the entries given.
     """
     scale = prf_hz / (2 * math.pi)
     scatter, shift = increment_std_rad(found, phase_rad)
