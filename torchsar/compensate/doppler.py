@@ -271,6 +271,8 @@ def increments(
     strips, k = fine.sum(-2), split[1]
     sides = [strips[..., :1], 0.5 * (strips[..., k - 1 : -1 : k] + strips[..., k::k]), strips[..., -1:]]
     total = fine.sum((-2, -1))
+    x = unit_level(x)
+    x = x / _peak(x)
     if rate_hz_s is None or dwell_s is None:
         half_band = _half_band_rad(x, total)
     else:
@@ -298,8 +300,6 @@ def _grouped(x: Tensor, count: int, dim: int) -> Tensor:
 
 def _coherence_of_pairs(x: Tensor) -> Tensor:
     """Power of the sum of the products of pairs of lines over the sum of their powers, (...,)."""
-    x = unit_level(x)
-    x = x / _peak(x)
     pairs = torch.linalg.vecdot(x[..., :-1, :], x[..., 1:, :]).to(torch.complex128)
     scatter = pairs.abs().square().sum(-1)
     return pairs.sum(-1).abs().square() / torch.where(scatter > 0, scatter, 1)
@@ -308,10 +308,9 @@ def _coherence_of_pairs(x: Tensor) -> Tensor:
 def _half_band_rad(x: Tensor, total: Tensor) -> Tensor:
     """Half width (...,) of a band of constant density, from products of lines two apart.
 
-    total: Sum of the products of adjacent lines, as from `lag_products`, shape (...,).
+    x: Lines as in `lag_products`, of unit peak. total: Sum of the products of adjacent lines, as
+    from there, shape (...,).
     """
-    x = unit_level(x)
-    x = x / _peak(x)
     second = torch.linalg.vecdot(x[..., :-2, :].flatten(-2), x[..., 2:, :].flatten(-2)).to(torch.complex128)
     size = total.abs()
     direction = total / torch.where(size > 0, size, 1)
@@ -426,8 +425,8 @@ def baseband_estimate(found: Increments, phase_rad: Tensor, prf_hz: float, **inf
         apertures is an eighth of the band of the beam or more, where adjacent lines are not
         significantly coherent, or where the energy fills less than 0.3 of the record, see
         `reliable_increment`. The centroid is that of the samples as they are: where they are
-        quantised to one bit, harmonics shift it by up to 1 % of the PRF, which the standard
-        deviation does not contain. `info` holds "block_hz" (centroid of each block) and
+        quantised to one bit, harmonics shift it by some tenths of a percent of the PRF, which the
+        standard deviation does not contain. `info` holds "block_hz" (centroid of each block) and
         "block_power", both of shape (..., a, b), "cut_hz" (the estimated shift by cut apertures,
         which the value still contains), shape (...,), and the entries given.
     """

@@ -88,10 +88,10 @@ def omega_k_stolt(
     computation takes two to three times as long as `omega_k`. Differentiable in the raw data, the
     velocity and `frame_hz`.
 
-    All range frequencies f have equal weights, as in every form of omega-K. Lower frequencies of an
-    echo sweep the Doppler band more slowly, and the direct sum, a matched filter, weighs them by
-    (1 + f / f0)^(-1/2). For a bandwidth of 30 % of the carrier frequency f0 the two images differ
-    by -27 dB.
+    All range frequencies f have equal weights, as in every form of omega-K. At lower frequencies
+    the Doppler of an echo changes more slowly, its spectrum is higher, and the direct sum, a
+    matched filter, weighs it by (1 + f / f0)^(-1/2). For a bandwidth of 30 % of the carrier
+    frequency f0 the two images differ by -27 dB.
 
     The Doppler of a squinted beam is proportional to the transmitted frequency. The azimuth
     spectrum is therefore unwrapped about the centroid of each range frequency, so that the PRF has
