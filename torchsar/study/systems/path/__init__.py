@@ -137,7 +137,8 @@ class AnyPath(System):
         ]
         # by the beam of the method that uses omega-K, if there is one
         lit = None if bench.recording is not None else bench.world().beam
-        beams = [s.beam for c in bench.chains.values() for s in c.stages.values() if isinstance(s, OmegaKImage)]
+        images = (s for c in bench.chains.values() for s in c.stages.values() if isinstance(s, OmegaKImage))
+        beams = [image.beam for image in images if image.beam is not None]
         straight = {} if not beams else possible_compensations(geometry[0], antennas, grid, beams[0])
         compensated = [
             Alternative(
