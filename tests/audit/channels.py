@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
+from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms, unlit
 from tests.direct.bistatic import Survey
 from tests.multichannel import ocean
 from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar
@@ -418,7 +418,7 @@ def entries() -> list[Entry]:
             "multichannel.WalkAmbiguity",
             WalkAmbiguity(RADAR),
             [
-                *in_range,
+                *unlit(in_range),
                 *ranged,
                 *(World("aliased", lines(snr, number=1), snr) for snr in (-30.0, -20.0, 10.0)),
             ],
@@ -476,7 +476,7 @@ def entries() -> list[Entry]:
         Entry(
             "multichannel.EstimateSynchronisation",
             lambda x: sync(dummy.with_data(x[:, None, :, 0].expand(-1, 3, -1)), direct_path=x),
-            [*nothing((60, 64)), *(World("direct", direct_path(snr), snr) for snr in SNR_DB)],
+            [*unlit(nothing((60, 64))), *(World("direct", direct_path(snr), snr) for snr in SNR_DB)],
             [Quantity("phase_rad", 0.5, circular, 1e-4), Quantity("delay_s", 5e-9, floor=1e-13)],
         ),
     ]

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torchsar.core import Draws, Estimate
 
 PACKAGES = ("core", "repair", "compensate", "multichannel", "focus", "metrics", "optim", "io")
-NOTHING = ("noise", "zeros")  # worlds with nothing to be found
+NOTHING = ("noise", "zeros", "real noise", "bright cells", "bright lines")  # worlds with nothing to be found
 SURE, RATIO = 5.0, (0.7, 1.5)  # predicted standard deviations of a false ok; bar of predicted over true
 DOUBT = 0.05  # bar of needless doubt, 10 dB above the threshold
 SNR_DB = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 40.0, 60.0)
@@ -245,8 +245,34 @@ def silent(shape: Sequence[int], dtype: torch.dtype = torch.complex64) -> Callab
     return lambda trials, seed: torch.zeros(trials, *shape, dtype=dtype)
 
 
+def uneven(shape: Sequence[int], dim: int, most: int = 3) -> Callable[[int, int], Tensor]:
+    """Draw white noise, 20 or 40 dB stronger in 1 to `most` places of a dimension of `shape`."""
+    noise = white(shape)
+
+    def draw(trials: int, seed: int) -> Tensor:
+        x = noise(trials, seed).movedim(dim, -1)
+        order = Draws(seed, trials=range(trials)).uniform("audit.places", (x.shape[-1],)).argsort(-1).argsort(-1)
+        number = torch.arange(seed, seed + trials)[:, None]
+        level = torch.where(order <= number % most, 10.0 ** (1 + number // most % 2), 1.0)
+        level = level.reshape(trials, *[1] * (x.ndim - 2), -1)
+        return (x * level).movedim(-1, dim)
+
+    return draw
+
+
+def real(shape: Sequence[int]) -> Callable[[int, int], Tensor]:
+    """Draw white noise (trial, *shape) whose imaginary part is zero."""
+    noise = white(shape)
+
+    def draw(trials: int, seed: int) -> Tensor:
+        x = noise(trials, seed).real
+        return torch.complex(x, torch.zeros_like(x))
+
+    return draw
+
+
 def nothing(shape: Sequence[int], wrap: Callable[[Tensor], Any] = lambda x: x, **values: Any) -> list[World]:
-    """Make the worlds of pure noise and of zeros, for data of this shape."""
+    """Make the worlds in which nothing can be found, for data of this shape."""
 
     def of(draw: Callable[[int, int], Tensor]) -> Callable[[int, int], Batch]:
         def batch(trials: int, seed: int) -> Batch:
@@ -255,4 +281,15 @@ def nothing(shape: Sequence[int], wrap: Callable[[Tensor], Any] = lambda x: x, *
 
         return batch
 
-    return [World("noise", of(white(shape))), World("zeros", of(silent(shape)))]
+    return [
+        World("noise", of(white(shape))),
+        World("zeros", of(silent(shape))),
+        World("real noise", of(real(shape))),
+        World("bright cells", of(uneven(shape, -1))),
+        *([World("bright lines", of(uneven(shape, -2)))] if len(shape) > 1 else []),
+    ]
+
+
+def unlit(worlds: Sequence[World]) -> list[World]:
+    """Leave out bright cells, for estimators that are right about a range cell that stays bright."""
+    return [world for world in worlds if world.name != "bright cells"]

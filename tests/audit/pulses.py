@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
+from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms, unlit
 from tests.compensate.scenes import noisy, still, turned, white
 from tests.direct.inverse import Ladar, echo
 from torchsar.compensate import (
@@ -202,7 +202,7 @@ WORLDS = (
     *(World(f"displaced {points} points", displaced(15.0, points, 0.6), 15.0) for points in (6, 60)),
 )
 ALIGN_WORLDS = (
-    *nothing((PULSES, 128)),
+    *unlit(nothing((PULSES, 128))),
     *(World("direct", aligned(snr, 3.0), snr) for snr in SNR_DB),
     World("clutter", lambda trials, seed: Batch(clutter(10.0, 0.6)(trials, seed).data.data, None), 10.0),
     World("far", aligned(10.0, 40.0), 10.0),

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
+from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms, unlit
 from tests.audit.strips import turntable
 from tests.direct.stripmap import Instrument, echo
 from tests.repair.triangles import ground, record, table1
@@ -310,7 +310,7 @@ def entries() -> list[Entry]:
     """Entries of the estimators of receiver damage."""
     none = none_of((LINES, CELLS))
     images = [
-        *nothing(IMAGE, lambda x: Signal(x, RADAR.image_axes(RADAR.raw_axes(*IMAGE)))),
+        *unlit(nothing(IMAGE, lambda x: Signal(x, RADAR.image_axes(RADAR.raw_axes(*IMAGE))))),
         *(World("own", response(MANY, snr), snr) for snr in (-30.0, -20.0, -10.0, 0.0, 20.0, 40.0)),
         World("clutter", response(FIELD, 20.0), 20.0),
         World("one point", response(Points([0.0], [0.0], random_phase=True), 20.0), 20.0),
@@ -374,7 +374,7 @@ def entries() -> list[Entry]:
         Entry(
             "repair.EstimateResponse:default",
             EstimateResponse(RADAR),
-            [images[0], images[6], images[8]],
+            [images[0], *(w for w in images if (w.name, w.snr_db) in (("own", 20.0), ("clutter", 20.0)))],
             phase,
         ),
         Entry(

@@ -25,7 +25,7 @@ from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import StripmapRadar
 
 # What remains without noise, from the interpolation of the response, in cycles per dwell.
-_REST_CYCLES = 2e-4
+_REST_CYCLES = 2.5e-4
 # Power of the brightest point over that of any other, beyond the peaks of noise. Among equal points
 # or speckle nothing shows which point the beam centre crosses at the given time.
 _LEAST_LEAD = 4.0
@@ -148,6 +148,20 @@ def _rival(power: Tensor, line: Tensor, sample: Tensor, lines: Tensor, samples: 
     return power.masked_fill(rows[..., :, None] & columns[..., None, :], 0).amax((-2, -1))
 
 
+def _tail(power: Tensor, floor: Tensor) -> Tensor:
+    """Mean power (...,) of circular noise whose highest peaks are those of an image (..., azimuth,
+    range) of noise and a few bright points, at least its mean power `floor` (...,).
+
+    The power of circular noise has an exponential distribution: 97 of 100 samples do not exceed the
+    median by more than the mean times ln(50 / 3). In noise with a longer tail, such as that of real
+    samples, they do.
+    """
+    ordered = power.flatten(-2)
+    few = 3 * ordered.shape[-1] // 100
+    high = ordered.kthvalue(ordered.shape[-1] - few, -1).values.double() - ordered.median(-1).values.double()
+    return torch.maximum(floor, high / math.log(50 / 3))
+
+
 class PointDoppler(Stage):
     """Doppler centroid of the beam from the brightest point of an image.
 
@@ -239,7 +253,6 @@ class PointDoppler(Stage):
         value, finite = settle(value, 0.0)
         # noise power has an exponential distribution, whose mean is the median / ln 2
         floor = power.flatten(-2).median(-1).values.double() / math.log(2)
-        peak_to_noise = found["peak"].abs().square() / torch.where(floor > 0, floor, 1)
         visible = max(seen[1] - seen[0], 1 / radar.prf_hz)
         strongest_noise = math.log(azimuth.n * slant.n) + 10
         rival = _rival(
@@ -249,6 +262,7 @@ class PointDoppler(Stage):
             _POINT_CELLS * radar.prf_hz / (rate * visible),
             _POINT_CELLS * radar.range_resolution_m / slant.step,
         )
+        above = found["peak"].abs().square() > strongest_noise * _tail(power, floor)
         leads = found["peak"].abs().square() > _LEAST_LEAD * (rival.double() - strongest_noise * floor)
         # The peak is the highest of many samples with noise of the whole PRF; the sum of the
         # history has that of its own band. Noise alone gives it a power of 1.
@@ -260,7 +274,7 @@ class PointDoppler(Stage):
         return Estimate(
             {"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)},
             1 - 1 / (1 + q),
-            finite & (floor > 0) & (0 <= crossing <= record) & (peak_to_noise > strongest_noise) & leads,
+            finite & (floor > 0) & (0 <= crossing <= record) & above & leads,
             {"doppler_hz": std, "doppler_baseband_hz": std},
             {"q": q},
         )

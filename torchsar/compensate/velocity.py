@@ -110,18 +110,19 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
     lines = checked_samples(group.data, "velocity_objective", "pulse, range")
     group = RangeGroup(unit_level(lines), group.start, group.radar)
     spectrum = beam_spectrum(group, doppler_hz)
-    return _objective(spectrum, doppler_hz, _nominal(spectrum, doppler_hz, dwell_s)[0])
+    weight, _, _ = _nominal(spectrum, doppler_hz, dwell_s)
+    return _objective(spectrum, doppler_hz, weight)
 
 
 @torch.no_grad()
-def _nominal(spectrum: BeamSpectrum, doppler_hz: Tensor, dwell_s: float) -> tuple[Tensor, Tensor]:
-    """Weights of the blocks (..., block) and entropy (...,), from the image of the nominal
-    velocity.
+def _nominal(spectrum: BeamSpectrum, doppler_hz: Tensor, dwell_s: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights of the blocks (..., block), entropy (...,), and the standard deviation (...,) that it
+    has if the image is noise, from the image of the nominal velocity.
     """
     radar = spectrum.group.radar
     image = spectrum.image(doppler_hz, radar.velocity_m_s)
     weight = block_weights(image, radar, doppler_hz, dwell_s)
-    return weight, (block_entropy(image) * weight).sum(-1)
+    return weight, (block_entropy(image) * weight).sum(-1), _noise_std(image, weight)
 
 
 def _objective(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Callable[[Tensor], Tensor]:
@@ -257,7 +258,7 @@ def minimum_entropy_velocity(
     lines = checked_samples(group.data, "minimum_entropy_velocity", "pulse, range", empty=False)
     group = RangeGroup(unit_level(lines), group.start, group.radar)
     spectrum, nominal = beam_spectrum(group, doppler_hz), group.radar.velocity_m_s
-    weight, cost = _nominal(spectrum, doppler_hz, dwell_s)
+    weight, cost, noise_std = _nominal(spectrum, doppler_hz, dwell_s)
     blocks = _objective(spectrum, doppler_hz, weight)
 
     def whole(velocity_m_s: Tensor) -> Tensor:
@@ -290,7 +291,7 @@ def minimum_entropy_velocity(
         std = torch.hypot(scatter, rest).clamp_max(1e6)
         known = group.radar.integration_s
         most = _MOST_WIDTHS * width if known is None else full_step / 8
-        clear = grid.inside & (curvature > 0) & (depth > _LEAST_DEPTH * _noise_std(spectrum, weight))
+        clear = grid.inside & (curvature > 0) & (depth > _LEAST_DEPTH * noise_std)
         if known is not None and lines.shape[-2] < known * group.radar.prf_hz:
             clear = torch.zeros_like(clear)
     points = nominal + torch.linspace(-reach, reach, grid.costs.shape[-1], dtype=torch.float64, device=start.device)
@@ -382,12 +383,21 @@ def _over(value: Tensor, curvature: Tensor) -> Tensor:
     return torch.where(good, value / torch.where(good, curvature, 1), 1e6).clamp_max(1e6)
 
 
-def _noise_std(spectrum: BeamSpectrum, weight: Tensor) -> Tensor:
-    """Standard deviation (...,) in nats of the weighted entropy of an image of noise."""
-    radar = spectrum.group.radar
-    filled = min(1.0, radar.pulse.bandwidth_hz / radar.sampling_hz)  # neighbouring samples are alike
-    pixels = filled * spectrum.data.shape[-2] * spectrum.data.shape[-1] / weight.shape[-1]
-    return (_NOISE_ENTROPY / pixels * weight.square().sum(-1)).sqrt()
+def _noise_std(image: Tensor, weight: Tensor) -> Tensor:
+    """Standard deviation (...,) in nats of the weighted entropy of an image (..., azimuth, range)
+    of noise that has the powers and the correlations of the image's range cells.
+
+    Cells of equal power without correlation have the variance 0.29 / number of pixels. In general,
+    the squared elements of the covariance between cells take the place of 1 / number of cells.
+    """
+    n, parts = image.shape[-2], image.tensor_split(weight.shape[-1], -1)
+    norms = [torch.linalg.vector_norm(part, dim=(-2, -1)).clamp_min(1e-30) for part in parts]
+    scale = weight.sqrt() / torch.stack(norms, -1)
+    scaled = [part * share[..., None, None] for part, share in zip(parts, scale.to(norms[0]).unbind(-1), strict=True)]
+    lines = torch.cat(scaled, -1)
+    squares = torch.linalg.vector_norm(lines.mH @ lines, dim=(-2, -1)).square().to(torch.float64)
+    # less what independent cells contribute because the number of pixels is finite
+    return (_NOISE_ENTROPY / n * (squares - 1 / n).clamp_min(1 / image.shape[-1])).sqrt()
 
 
 def _comb_std(low: Tensor, middle: Tensor, high: Tensor, half: float) -> Tensor:

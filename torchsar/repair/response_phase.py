@@ -116,29 +116,27 @@ def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0) -> Tenso
     return torch.where(s > floor, s / (s + _FULL), 0)
 
 
-def halved(windows: Tensor, weight: Tensor, line: Tensor) -> tuple[Tensor, Tensor]:
-    """Divide windows into two halves that share few targets.
+def halved(weight: Tensor, line: Tensor) -> Tensor:
+    """Divide windows into two halves that share few targets and no samples.
 
-    A target has windows in several lines. The windows are therefore divided into quarters by their
-    line; the outer two are one half, the inner two the other.
+    A target has windows in several lines, and windows of one line overlap. The windows are
+    therefore divided into quarters by their line; the outer two are one half, the inner two the
+    other. All windows of a line belong to the quarter of the first of them.
 
     Args:
-        windows: Windows, shape (trial, points, width).
-        weight: Weights of the windows, shape (trial, points); windows of weight 0 go anywhere.
+        weight: Weights of the windows, shape (trial, points); windows of weight 0 do not count.
         line: Lines of the windows, shape (trial, points).
 
     Returns:
-        Windows and weights, the first halves of all trials before the second ones, shapes (2 trial,
-        points // 2, width) and (2 trial, points // 2).
+        Weights of the windows in the first halves, then in the second ones, shape (2 trial,
+        points): 0 for windows of the other half. If all windows lie in one line, a half has none.
     """
     used = weight > 0
-    place = torch.where(used, line, line.amax() + 1).argsort(dim=-1, stable=True).argsort(dim=-1, stable=True)
-    quarter = 4 * place // used.sum(-1, keepdim=True).clamp_min(1)
-    inner = torch.where(used, (quarter == 1) | (quarter == 2), place % 2 == 0)
-    order = inner.to(torch.int64).argsort(dim=-1, stable=True)[..., : windows.shape[-2] // 2 * 2]
-    order = torch.cat(order.chunk(2, -1))
-    windows, weight = torch.cat([windows, windows]), torch.cat([weight, weight])
-    return windows.gather(-2, order[..., None].expand(*order.shape, windows.shape[-1])), weight.gather(-1, order)
+    place = torch.where(used, line, line.amax() + 1)
+    first = torch.searchsorted(place.sort(-1).values, place)  # windows in lines before
+    quarter = 4 * first // used.sum(-1, keepdim=True).clamp_min(1)
+    inner = (quarter == 1) | (quarter == 2)
+    return torch.cat([weight * ~inner, weight * inner])
 
 
 @dataclass(frozen=True)
@@ -377,7 +375,7 @@ def estimate_response_sharpest(
         weight = window_weights(windows, sharper)
         if i < passes - 1:
             total = total + sharpest_coefficients(windows, weight, band, orders if i == 0 else orders[-1:])
-    halves, weights = halved(windows, weight, line)
+    halves, weights = windows.repeat(2, 1, 1), halved(weight, line)
     found = sharpest_coefficients(halves, weights, band, orders[-1:])
     phase_rad = (total + sum(found.chunk(2)) / 2) @ basis
     std = _deviation(halves, weights, band, found, _bound(weight, found.shape[-1]))
@@ -543,7 +541,7 @@ def estimate_response_points(
         strength = window_weights(windows, sharper)
         weight = (strength > 0).to(torch.float64)
         total = total + point_average_coefficients(windows, weight, band, order)
-    halves, weights = halved(windows, weight, line)
+    halves, weights = windows.repeat(2, 1, 1), halved(weight, line)
     found = point_average_coefficients(halves, weights, band, order)
     std = _deviation(halves, weights, band, found, _bound(strength, order - 1))
     return _phase_estimate(total @ basis, std, image.shape[:-2])

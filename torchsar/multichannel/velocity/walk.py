@@ -104,7 +104,7 @@ class WalkAmbiguity(Stage):
             `ambiguity` of shape (...,). `info` holds `line`, the index of the range line of the
             point, and `contrast`, the energy of this line minus that of the strongest line with the
             next best number, in standard deviations of the energy of a line of noise. `ok` is False
-            unless the contrast is above 5.
+            unless the contrast is above 5; it says that a line stays bright, whatever its phases.
         """
         reference = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         number, contrast, line = walk_ambiguity(signal.data, Frame.of(self.radar, signal), reference, self.most)
