@@ -291,5 +291,5 @@ def nothing(shape: Sequence[int], wrap: Callable[[Tensor], Any] = lambda x: x, *
 
 
 def unlit(worlds: Sequence[World]) -> list[World]:
-    """Leave out bright cells, for estimators that are right about a range cell that stays bright."""
+    """Leave out bright cells, for estimators that are right about a cell that stays bright."""
     return [world for world in worlds if world.name != "bright cells"]
