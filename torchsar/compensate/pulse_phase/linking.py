@@ -164,8 +164,9 @@ def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[Tensor
     with torch.no_grad():
         scene = _Scene.of(rows.detach(), present)
         u, fit = _refined(scene, _grown(scene) if start is None else cis(start.to(torch.float64)))
-        gain = scene.independent * scene.gain(u, fit)
-        std = _deviation(scene.independent[:, None, None] * scene.information(fit))
+        independent = scene.independent_share(u, fit)
+        gain = independent * scene.gain(u, fit)
+        std = _deviation(independent[:, None, None] * scene.information(fit))
     if not rows.requires_grad or not torch.is_grad_enabled():
         return torch.angle(u), std, gain
     step = _step(_Scene.of(rows, present).matrix(fit.inverses), u)
@@ -424,12 +425,43 @@ class _Scene:
         return self.samples - fit.constant - _value(fit.matrix, u)
 
     def information(self, fit: _Fit) -> Tensor:
-        """Fisher information of the phases in 1/rad^2, shape (trial, pulse, pulse)."""
-        total, eye = 0.0, torch.eye(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
-        for (_, _, cells), spectrum, inverse in zip(self.groups, fit.spectra, fit.inverses, strict=True):
-            covariance = self._toeplitz(torch.fft.ifft(spectrum))
-            total = total + 2 * cells[:, None, None] * ((inverse * covariance).real - eye)
-        return torch.as_tensor(total)
+        """Fisher information of the phases in 1/rad^2, shape (trial, pulse, pulse), if all range
+        cells are independent.
+        """
+        each = self._information(fit)
+        return sum(
+            (cells[:, None, None] * own for (*_, cells), own in zip(self.groups, each, strict=True)),
+            torch.zeros_like(each[0]),
+        )
+
+    def _information(self, fit: _Fit) -> list[Tensor]:
+        """Fisher information of the phases in a range cell of each group."""
+        eye = torch.eye(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
+        covariances = [self._toeplitz(torch.fft.ifft(spectrum)) for spectrum in fit.spectra]
+        return [2 * ((one * other).real - eye) for one, other in zip(fit.inverses, covariances, strict=True)]
+
+    def independent_share(self, u: Tensor, fit: _Fit) -> Tensor:
+        """Share of the information that counts, because range cells depend on each other, (trial,).
+
+        Cells that a point fills with its side lobes, or that are sampled finer than the band
+        requires, have the same innovations. What the phases gain from two cells depends as the
+        square of their correlation. Correlations of independent cells of n pulses have a mean
+        square of 1 / n.
+        """
+        innovations, told = 0.0, 0.0
+        for (own, *_), inverse, each in zip(self.groups, fit.inverses, self._information(fit), strict=True):
+            lower = cholesky_factor(inverse.mT)
+            innovations = innovations + lower.mH @ (own * u.conj()[..., None])
+            here = (own.real.square() + own.imag.square()).sum(-2) > 0
+            told = told + here * torch.diagonal(each, dim1=-2, dim2=-1).sum(-1).clamp_min(0)[:, None]
+        level, count = torch.linalg.vector_norm(innovations, dim=-2), self.present.sum(-1).clamp_min(2)
+        innovations = innovations / or_one(level)[:, None, :]
+        alike = innovations.mH @ innovations
+        excess = (alike.real.square() + alike.imag.square() - 1 / count[:, None, None]) / (1 - 1 / count)[:, None, None]
+        weight = told.sqrt()
+        both = (weight[:, None, :] @ (excess @ weight[..., None]))[:, 0, 0] - (weight.square() * (level > 0)).sum(-1)
+        total = weight.square().sum(-1)
+        return torch.where(total > 0, total / or_one(total + both.clamp_min(0)), 1)
 
     def matrix(self, inverses: list[Tensor]) -> Tensor:
         """R^-T o C, summed over the range cells, for the R^-T of each group."""

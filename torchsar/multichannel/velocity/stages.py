@@ -205,7 +205,8 @@ class LikelihoodVelocity(_Velocity):
             `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), with standard deviations of those
             estimated. Where the point is lit in a part of the aperture only, this part is used, see
             `seen_aperture`. `ok` is False where the SNR of the point over all samples is below 19
-            dB, or where its illumination is not understood, see `lit_as_expected`.
+            dB, where its illumination is not understood, see `lit_as_expected`, or where the steps
+            have not reached the maximum.
 
         Raises:
             ValueError: If the data have other channels than the radar or fewer than 4 pulses, or
@@ -215,6 +216,9 @@ class LikelihoodVelocity(_Velocity):
         aperture, _ = seen_aperture(data, radar, start, aperture)
         found = maximum_likelihood(data, radar, start, aperture, self.unknowns)
         ok = (found.snr_db >= DETECTED_DB) & lit_as_expected(data, radar, found.motion, aperture)
+        # from a start too far away, another step would explain more than the noise of a few samples
+        again = maximum_likelihood(data, radar, found.motion, aperture, self.unknowns, steps=1)
+        ok = ok & (again.energy - found.energy <= 4 * found.noise_power + 1e-9 * found.energy)
         return estimate_of(found, ok, ((found.snr_db - DETECTED_DB) / 3).sigmoid())
 
 
