@@ -138,20 +138,57 @@ def aligned(snr_db: float, size: float, even: bool = False) -> Callable[[int, in
     return draw
 
 
+def _points(draws: Draws, count: int, course: Tensor | float = 0.0, history: Tensor | None = None) -> Tensor:
+    """Draw points at any range and cross range, (trial, pulse, range).
+
+    course: Displacement of the pulses in range cells, (..., pulse, 1).
+    history: Complex factors of the points, (trial, point, pulse).
+    """
+    where, turns = draws.uniform("range", (count,), 0, CELLS), draws.uniform("cross range", (count,), -0.4, 0.4)
+    pulses = torch.exp(2j * math.pi * turns[..., None] * torch.arange(PULSES, dtype=F64))
+    pulses = pulses * draws.normal("amplitude", (count,), torch.complex128)[..., None]
+    frequency = torch.fft.fftfreq(CELLS, dtype=F64)
+    at = torch.exp(-2j * math.pi * frequency * where[..., None])
+    spectrum = torch.einsum("tkp,tkf->tpf", pulses if history is None else pulses * history, at)
+    return CELLS**0.5 * torch.fft.ifft(spectrum * torch.exp(-2j * math.pi * course * frequency))
+
+
+def another(snr_db: float, points: int) -> Callable[[int, int], Batch]:
+    """Draw scenes of points that are others from some pulse on; their phases cannot be compared."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        before, after = (_points(Draws(seed + k, trials=range(trials)), points) for k in (9, 509))
+        change = Draws(seed, trials=range(trials)).uniform("change", (), PULSES / 4, 3 * PULSES / 4)
+        scene = torch.where((torch.arange(PULSES) < change[:, None])[..., None], before, after)
+        return Batch(signal(turned(noisy(scene, snr_db, seed + 2), white(trials, PULSES, seed + 1))), None)
+
+    return draw
+
+
+def scintillating(snr_db: float, points: int, pulses: float) -> Callable[[int, int], Batch]:
+    """Draw points whose complex amplitudes change at random within so many pulses."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        draws, keep = Draws(seed + 9, trials=range(trials)), math.exp(-1 / pulses)
+        steps = draws.normal("scintillation", (points, PULSES), torch.complex128)
+        values = [steps[..., 0]]
+        for step in steps[..., 1:].unbind(-1):
+            values.append(keep * values[-1] + math.sqrt(1 - keep**2) * step)
+        scene = _points(draws, points, history=torch.stack(values, -1))
+        phase = white(trials, PULSES, seed + 1)
+        return Batch(signal(turned(noisy(scene, snr_db, seed + 2), phase)), {"phase_rad": phase})
+
+    return draw
+
+
 def displaced(snr_db: float, points: int, jitter: float) -> Callable[[int, int], Batch]:
     """Draw points whose pulses are displaced in range by `jitter` cells rms, with white phases."""
 
     def draw(trials: int, seed: int) -> Batch:
         draws = Draws(seed + 9, trials=range(trials))
-        where, turns = draws.uniform("range", (points,), 0, CELLS), draws.uniform("cross range", (points,), -0.4, 0.4)
-        amplitude = draws.normal("amplitude", (points,), torch.complex128)
-        at = torch.fft.fftfreq(CELLS, dtype=F64) * where[..., None]
-        pulses = torch.exp(2j * math.pi * turns[..., None] * torch.arange(PULSES, dtype=F64))
-        spectrum = torch.einsum("tk,tkp,tkf->tpf", amplitude, pulses, torch.exp(-2j * math.pi * at))
-        course = jitter * draws.normal("displacement", (PULSES, 1))
-        moved = torch.fft.ifft(spectrum * torch.exp(-2j * math.pi * course * torch.fft.fftfreq(CELLS, dtype=F64)))
+        moved = _points(draws, points, jitter * draws.normal("displacement", (PULSES, 1)))
         phase = white(trials, PULSES, seed + 1)
-        return Batch(signal(turned(noisy(CELLS**0.5 * moved, snr_db, seed + 2), phase)), {"phase_rad": phase})
+        return Batch(signal(turned(noisy(moved, snr_db, seed + 2), phase)), {"phase_rad": phase})
 
     return draw
 
@@ -200,6 +237,8 @@ WORLDS = (
     World("direct", direct(-10.0), -10.0),
     *(World("direct pulses", dechirped(snr), snr) for snr in (-5.0, 10.0)),
     *(World(f"displaced {points} points", displaced(15.0, points, 0.6), 15.0) for points in (6, 60)),
+    *(World(f"another scene of {points} points", another(20.0, points), 20.0) for points in (8, 40)),
+    *(World(f"scintillating {points} points", scintillating(20.0, points, 16.0), 20.0) for points in (8, 40)),
 )
 ALIGN_WORLDS = (
     *unlit(nothing((PULSES, 128))),

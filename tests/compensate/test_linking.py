@@ -188,6 +188,20 @@ def test_what_has_no_coherence_is_not_ok() -> None:
         assert not bool(link_phases(data := normal(generator, 2, 8)).ok) and data.shape == (2, 8)
 
 
+def test_scenes_that_change_at_a_pulse_are_not_ok() -> None:
+    early, late = clutter(4, 0.6, 15.0, seed=21), clutter(4, 0.6, 15.0, seed=22)
+    changed = torch.where((torch.arange(N) < 56)[:, None], early, late)
+    found = link_phases(changed)
+    assert float(phase_rmse(found["phase_rad"], torch.zeros(4, N, dtype=F64)).max()) > 0.4  # far beyond 5 deviations
+    assert not bool(found.ok.any()) and bool(link_phases(early).ok.all())
+
+
+def test_copies_of_pulses_are_not_ok() -> None:
+    noise = normal(torch.Generator().manual_seed(5), 2, N // 2, ROWS)
+    assert not bool(link_phases(noise.repeat_interleave(2, dim=1)).ok.any())
+    assert not bool(autofocus(noise.repeat_interleave(2, dim=1)).ok.any())
+
+
 def test_the_likelihood_is_that_of_direct_evaluation() -> None:
     """The value for given phases: sum over the cells of ln det R + z^H D R^-1 D^H z."""
     generator = torch.Generator().manual_seed(10)

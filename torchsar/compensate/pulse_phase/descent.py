@@ -123,6 +123,7 @@ def sharpest_phase(
         moved = own.phase(found.x) if basis is not None else torch.where(present, found.x, first)
 
         def again(some: Tensor, _: Tensor, at: Tensor) -> Tensor:
+            at = moved + own.phase(own.coordinates(at - moved))  # without what the basis does not hold
             return at + own.phase(own.coordinates(on_the_circle(fixed_point(some, at, continued)[0] - at)))
 
         return moved, found.steps, again

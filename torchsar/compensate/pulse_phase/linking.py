@@ -48,6 +48,10 @@ _NOISE_NATS, _MARGIN = 2.0, 2.0
 # phase error hardly changes it, so that the rms error of a scene may exceed its standard deviation
 # by this factor.
 _SPREAD = 1.9
+# Share of the coherence across a boundary between pulses that the fitted spectra must find: of
+# homogeneous scenes the least one was 0.6 to 0.9 over all boundaries, of scenes that change at a
+# pulse 0.1 to 0.5. Boundaries in the first and last sixteenth of the pulses are left out.
+_LEAST_SHARE, _OUTER = 0.55, 16
 # the phases that sharpen a sparse scene, as in `autofocus`
 _SHARPEN = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)
 _BLOCK_BYTES = 64 << 20  # limits the memory of a block of trials
@@ -75,11 +79,14 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         of the likelihood that noise does not explain. `ok` is False where the Strehl ratio for 1.9
         times the standard deviation is below 0.8, the gain in likelihood below twice that of noise,
         a single range cell holds nearly all of the energy, the range profiles are not aligned (see
-        `Displacement`), adjacent pulses are not coherent in any ten range cells of similar power,
-        or a sparse description of the scene with the phases that sharpen it is more likely: in
-        sparse scenes the spectrum adapts to phase errors, which the standard deviation does not
-        contain. `info` holds, of shape (...,), "gain_nats" (log likelihood minus that of white
-        noise), "jitter_cells" and "migration_cells".
+        `Displacement`), the pulses before and after a boundary are less than 0.55 times as coherent
+        as the spectra predict (where the scene changes, or pulses are copies of each other),
+        adjacent pulses are not coherent in any ten range cells of similar power, or a sparse
+        description of the scene with the phases that sharpen it is more likely: in sparse scenes
+        the spectrum adapts to phase errors, which the standard deviation does not contain. `info`
+        holds, of shape (...,), "gain_nats" (log likelihood minus that of white noise),
+        "weakest_boundary" (the least coherence across a boundary relative to the prediction),
+        "jitter_cells" and "migration_cells".
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -113,7 +120,7 @@ def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
     rows, n = pulses.rows, pulses.n
     if not len(rows):
         none = torch.zeros(0, n, dtype=torch.float64, device=rows.device)
-        return _estimate(pulses, none, none, none[:, 0], Displacement(none[:, 0], none[:, 0]))
+        return _estimate(pulses, none, none, none[:, 0], none[:, 0], Displacement(none[:, 0], none[:, 0]))
     size = max(1, _BLOCK_BYTES // (16 * n * (6 * n + 2 * rows.shape[1])))
     parts = [slice(first, first + size) for first in range(0, len(rows), size)]
     done: dict[int, tuple[Tensor, ...]] = {}
@@ -130,11 +137,11 @@ def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
     else:
         with torch.no_grad():
             over_blocks(work, parts, rows)
-    phase, std, gain, *moved = (torch.cat([done[part.start][i] for part in parts]) for i in range(5))
-    return _estimate(pulses, phase, std, gain, Displacement(*moved))
+    phase, std, gain, share, *moved = (torch.cat([done[part.start][i] for part in parts]) for i in range(6))
+    return _estimate(pulses, phase, std, gain, share, Displacement(*moved))
 
 
-def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor, moved: Displacement) -> Estimate:
+def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor, share: Tensor, moved: Displacement) -> Estimate:
     real, trials = pulses.rows.real.dtype, pulses.trials
     noise = _NOISE_NATS * pulses.present.sum(-1)
     scene = (1 - noise / or_one(gain)).clamp(0, 1)
@@ -147,30 +154,53 @@ def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor, moved: D
         value={"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
         std={"phase_rad": std.reshape(*trials, pulses.n).to(real)},
         quality=(strehl * scene).reshape(trials).to(real),
-        ok=(fitted & moved.aligned).reshape(trials),
+        ok=(fitted & moved.aligned & (share > _LEAST_SHARE)).reshape(trials),
         info={
             "gain_nats": gain.reshape(trials),
+            "weakest_boundary": share.reshape(trials),
             "jitter_cells": moved.jitter.reshape(trials),
             "migration_cells": moved.migration.reshape(trials),
         },
     )
 
 
-def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Phase and standard deviation (trial, pulse) in rad, and gain (trial,) in nats, of a block."""
+def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Phase and standard deviation (trial, pulse) in rad, gain in nats and weakest boundary of a
+    block, (trial,) each.
+    """
     if rows.shape[-1] < 3:  # nothing to distinguish a phase error from a shift of the image
         zero = torch.zeros(present.shape, dtype=torch.float64, device=rows.device)
-        return zero, zero + torch.inf, zero[:, 0]
+        return zero, zero + torch.inf, zero[:, 0], zero[:, 0]
     with torch.no_grad():
         scene = _Scene.of(rows.detach(), present)
         u, fit = _refined(scene, _grown(scene) if start is None else cis(start.to(torch.float64)))
-        independent = scene.independent_share(u, fit)
+        information, independent = scene.information(fit), scene.independent_share(u, fit)
         gain = independent * scene.gain(u, fit)
-        std = _deviation(independent[:, None, None] * scene.information(fit))
+        std = _deviation(independent[:, None, None] * information)
+        share = _weakest_boundary(fit.matrix, u, information)
     if not rows.requires_grad or not torch.is_grad_enabled():
-        return torch.angle(u), std, gain
+        return torch.angle(u), std, gain, share
     step = _step(_Scene.of(rows, present).matrix(fit.inverses), u)
-    return torch.angle(u) + step - step.detach(), std, gain
+    return torch.angle(u) + step - step.detach(), std, gain, share
+
+
+def _weakest_boundary(matrix: Tensor, u: Tensor, information: Tensor) -> Tensor:
+    """Least coherence of the pulses before and after a boundary, over that of the model, (trial,).
+
+    It is the part of the log likelihood that pairs of pulses across the boundary contribute: it
+    would change its sign with the phases of all later pulses. Its expectation for a covariance R
+    is that of u^H (R^-T o C) u, which is half of the Fisher information.
+    """
+    skipped = u.shape[-1] // _OUTER
+
+    def across(pairs: Tensor) -> Tensor:
+        sums = pairs.cumsum(-2).cumsum(-1)
+        whole = sums[..., -1] - torch.diagonal(sums, dim1=-2, dim2=-1)
+        return whole[:, skipped : whole.shape[-1] - 1 - skipped]
+
+    found = across((u.conj()[:, :, None] * matrix * u[:, None, :]).real)
+    expected = across(information) / 2
+    return torch.where(expected < 0, found / torch.where(expected < 0, expected, -1), 1).amin(-1)
 
 
 def _grown(scene: _Scene) -> Tensor:

@@ -34,6 +34,16 @@ _STEADY, _LEAST_PULSES = 0.25, 32
 # of uniformly distributed phases is half of their error. In normal errors of the largest standard
 # deviation that is ok, 3 % of the differences are larger.
 _APART_RAD = 2.0
+# Phases from which halves of the rows start are apart by a walk of so many rad rms; they go on for
+# so many rounds at most, until a round moves them by less than this. Found by trial: what the scene
+# does not hold stays apart, and weak targets are found again.
+_DISTURBED_RAD, _RETURNED_RAD, _RETURNS = 0.4, 0.1, 6
+# Quarters of the pulses, and the least correlation of their images, found by trial: 0.4 to 1 in
+# scenes that stay, aircraft in flight included; 0 to 0.3 where the scene is another one from some
+# pulse on. The images are clear if so much of their variance is not noise.
+_QUARTERS, _ALIKE, _CLEAR = 4, 0.33, 0.75
+# variance of the modulus of circular noise above twice its median, over the square of its median
+_ABOVE_VARIANCE = 0.01086
 # limits of `_drift`, found by trial: more rounds, or rounds after smaller steps, cost time and
 # rarely change the result
 _ROUNDS = 6
@@ -124,7 +134,9 @@ def estimated(
 
     - Half of the rms difference between the phases from two halves of the rows (range cells), and
       the whole difference where it exceeds 2 rad, as in pulses that do not see the scene. The rows
-      are sorted by energy and taken alternately; the noise of the halves is independent. The result
+      are sorted by energy and taken alternately; the noise of the halves is independent. The halves
+      start from phases that a walk of 0.4 rad moves apart: what the scene does not hold, because
+      its scatterers change from pulse to pulse, stays apart. The result
       is divided by the square root of `occupied_band`, because rows that are sampled finer than
       their band requires are not independent. Where a single point makes the image sharp, it is the
       relative scatter of the modulus of its echo instead: noise and weaker scatterers change the
@@ -156,11 +168,12 @@ def estimated(
         from the standard deviation, times the share of the sharpness that noise does not explain.
         `ok` is False unless that Strehl ratio exceeds 0.8, the profiles are aligned (see
         `Displacement`; not examined without `compare`), the image is 1.5 times as sharp as
-        autofocus can make pure noise, more than one row contributes to the sharpness, and a
+        autofocus can make pure noise, more than one row contributes to the sharpness, a
         homogeneous description of the scene is not more likely (see `describe`), because sharpness
-        does not find the phases of homogeneous clutter. The last three need not hold for a single
-        point whose modulus scatters by less than 0.25, with 32 pulses or more. `info` holds
-        "present", shape (..., pulse), False for pulses that hold only zeros; and, of shape (...,),
+        does not find the phases of homogeneous clutter, and no quarter of the pulses shows another
+        scene than the others. The last four need not hold for a single point whose modulus scatters
+        by less than 0.25, with 32 pulses or more. `info` holds "present", shape (..., pulse), False
+        for pulses that hold only zeros; and, of shape (...,),
         "homogeneous" (True where that description is more likely), "sparse_gain_nats" (gain of the
         log likelihood of the sparse description over white noise), "jitter_cells" and
         "migration_cells" (see `Displacement`), "iterations", "sharpness_nats",
@@ -199,8 +212,8 @@ def _assessed(
 ) -> tuple[Tensor, ...]:
     """Phase, iterations, sharpness, effective rows of both, std, and the descriptions per trial.
 
-    The last three are True where a single point makes the image sharp, the jitter and the
-    migration.
+    The last four are True where a single point makes the image sharp, True where the scene stays
+    the same, the jitter and the migration.
     """
     phase, taken, again = find(rows, present, start)
     with torch.no_grad():
@@ -219,21 +232,22 @@ def _assessed(
             std = torch.maximum(std, _drift(rows, present, phase, again))
         scene = describe(rows, phase, occupied)
         moved = displacement(rows, present) if compare else Displacement(0 * sharp, 0 * sharp)
+        stays = _persists(rows, phase) if compare else torch.ones_like(lone)
     homogeneous = scene.homogeneous & compare & ~lone
     scene_rows = effective * occupied, sharpness_rows
-    return phase, taken, sharp, *scene_rows, std, scene.sparse, homogeneous, lone, moved.jitter, moved.migration
+    return phase, taken, sharp, *scene_rows, std, scene.sparse, homogeneous, lone, stays, moved.jitter, moved.migration
 
 
 def _no_estimate(rows: Tensor) -> tuple[Tensor, ...]:
     """The result of `_assessed` where no phase can be found: too few pulses, or no trials."""
     zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
     std, no = zero + math.pi / math.sqrt(3), zero > 0
-    return rows[:, 0].real * 0, zero.long(), zero, zero, zero, std, zero, no, no, zero, zero
+    return rows[:, 0].real * 0, zero.long(), zero, zero, zero, std, zero, no, no, no, zero, zero
 
 
 def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     """Estimate from the results of all blocks of trials."""
-    phase, taken, sharp, effective, sharpness_rows, std_rad, sparse, homogeneous, lone, jitter, migration = (
+    phase, taken, sharp, effective, sharpness_rows, std_rad, sparse, homogeneous, lone, stays, jitter, migration = (
         torch.cat(pieces) for pieces in zip(*parts, strict=True)
     )
     present, shape = pulses.present, pulses.trials
@@ -241,7 +255,7 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     enough_pulses = present.sum(-1) >= 3
     strehl = torch.exp(-std_rad.square())
     quality = torch.where(enough_pulses, strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1)), 0)
-    distinct = (sharp > _MARGIN * noise) & (sharpness_rows > LEAST_ROWS) & ~homogeneous
+    distinct = (sharp > _MARGIN * noise) & (sharpness_rows > LEAST_ROWS) & ~homogeneous & stays
     distinct = distinct | (lone & (sharp > noise))
     ok = enough_pulses & distinct & (strehl > LEAST_STREHL) & Displacement(jitter, migration).aligned
     phase = torch.where(enough_pulses[:, None], phase, 0)
@@ -314,10 +328,70 @@ def _half_difference(rows: Tensor, present: Tensor, phase: Tensor, again: Again,
         return unknown
     parts = halves(rows, phase)
     filled = torch.stack([(part != 0).flatten(1).any(-1) for part in parts]).all(0)
-    one, other = (again(part, present, phase) for part in parts)
+    if halves is not halves_of_rows:
+        one, other = (again(part, present, phase) for part in parts)
+    else:
+        one, other = _settled_apart(parts, present, phase, again)
     apart = residual_phase(one, other, present)
     apart = torch.where(apart.abs() > _APART_RAD, apart, apart / 2)
     return torch.where(filled, (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt(), unknown)
+
+
+def _settled_apart(parts: Sequence[Tensor], present: Tensor, phase: Tensor, again: Again) -> Sequence[Tensor]:
+    """Phases of two halves, (trial, pulse) each, that started on either side of the phase."""
+    walk = _disturbance(phase)
+    ends: Sequence[Tensor] = (phase + walk, phase - walk)
+    active = torch.ones_like(phase[:, 0], dtype=torch.bool)
+    every = 1 if phase.device.type == "cpu" else _RETURNS // 2  # waiting costs as much as a round
+    for number in range(1, _RETURNS + 1):
+        reached = [again(part, present, at) for part, at in zip(parts, ends, strict=True)]
+        far = torch.stack([phase_rmse(*pair, present) for pair in zip(reached, ends, strict=True)]) >= _RETURNED_RAD
+        ends = [torch.where(active[:, None], new, old) for new, old in zip(reached, ends, strict=True)]
+        active = active & far.any(0)
+        if number % every == 0 and number < _RETURNS and not bool(active.any()):
+            break
+    return ends
+
+
+def _persists(rows: Tensor, phase: Tensor) -> Tensor:
+    """Whether no quarter of the pulses shows another scene than the others, (trial,).
+
+    The moduli of the images of the quarters, above twice their median, are correlated, each pair at
+    its best displacement in Doppler. Where more than a quarter of a variance may be that of noise,
+    nothing can be told.
+    """
+    if rows.shape[-1] < _LEAST_PULSES:
+        return torch.ones_like(phase[:, 0], dtype=torch.bool)
+    x = rotate(rows, phase)
+    n = x.shape[-1] // _QUARTERS
+    spectra, variances, clear = [], [], torch.ones_like(phase[:, 0], dtype=torch.bool)
+    for first in range(0, _QUARTERS * n, n):
+        level = torch.fft.fft(x[..., first : first + n], 2 * n).abs()
+        median = level.flatten(1).median(-1).values[:, None, None]
+        above = (level - 2 * median).clamp_min(0)
+        above = above - above.mean((-2, -1), keepdim=True)
+        whole, noise = above.square().sum((-2, -1)), _ABOVE_VARIANCE * median[:, 0, 0].square() * above[0].numel()
+        spectra.append(torch.fft.rfft(above))
+        variances.append((whole - noise).clamp_min(0))
+        clear = clear & (variances[-1] > _CLEAR * whole)
+    alike = [
+        torch.fft.irfft((spectra[i].conj() * spectra[j]).sum(-2), 2 * n).amax(-1)
+        / or_one(variances[i].sqrt() * variances[j].sqrt())
+        for j in range(_QUARTERS)
+        for i in range(j)
+    ]
+    return ~clear | (torch.stack(alike).amin(0) > _ALIKE)
+
+
+def _disturbance(phase: Tensor) -> Tensor:
+    """Walk of phases in rad without a straight line, (pulse,): the same in every trial."""
+    pulse = torch.arange(phase.shape[-1], dtype=torch.float64, device=phase.device)
+    # steps that repeat nowhere: the angles are irrational parts of a turn times squares
+    walk = torch.cos(math.pi * (math.sqrt(5) - 1) * pulse.square()).cumsum(-1)
+    place = pulse - pulse.mean()
+    walk = walk - walk.mean()
+    walk = walk - place * (walk @ place) / place.square().sum()
+    return (_DISTURBED_RAD / walk.square().mean().sqrt() * walk).to(phase.dtype)
 
 
 def _drift(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:

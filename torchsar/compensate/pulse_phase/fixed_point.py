@@ -1,0 +1,77 @@
+"""Phase of every pulse by fixed-point iterations that lower the entropy of the image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from torchsar.compensate.pulse_phase.data import prepare, starting_phase
+from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
+from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, in_turn, settled
+from torchsar.compensate.pulse_phase.verdict import Found, estimated
+from torchsar.core import Estimate
+
+
+def entropy_fixed_point(
+    data: Tensor,
+    *,
+    start: Tensor | None = None,
+    floors: Sequence[tuple[Tensor | float, int]] = ((5.0, 12), (2.0, 12)),
+    relaxation: Tensor | float = 1.8,
+    tolerance_rad: float = 1e-3,
+    imaging: Imaging | None = None,
+) -> Estimate:
+    """Estimate the phase of each pulse by a fixed-point iteration that lowers the image entropy.
+
+    Each iteration forms the image and weights its cells with ln(max(p, floor) / floor), where p is
+    the power of a cell over the mean power. It transforms the weighted image back to pulses and
+    takes the phase of each pulse relative to the result. An iteration takes two transforms and,
+    unlike PGA, needs no peaks and no windows. Differentiable, also in the floors and the
+    relaxation, which may be tensors of one number.
+
+    Args:
+        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+        start: Phase to start from in rad, shape (..., pulse); by default that of the spatial
+            correlation algorithm (function `sca`). With this default the size of the phase errors
+            has no effect on the result.
+        floors: Pairs (floor, largest number of iterations), used one after another. A floor is a
+            multiple of the mean power. A trial proceeds to the next pair once its phase steps are
+            below `tolerance_rad`.
+        relaxation: Factor applied to the phase step. Above 1 it helps to pass local minima; at 2 or
+            more the iteration need not converge.
+        tolerance_rad: Phase step in rad, rms over the pulses, below which a trial ends its
+            iterations with a floor.
+        imaging: Image formation whose image is sharpened, by default a Fourier transform along
+            pulses; any object with the methods `image` and `adjoint` for profiles of shape (...,
+            pulse, range), such as `torchsar.focus.PolarOperator`.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
+        unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
+        cell or a single point makes the sharpness, and the Strehl ratio predicted from the standard
+        deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of
+        speckle.
+
+    Raises:
+        TypeError: If the data are not complex or the start is not a tensor.
+        ValueError: If the data are empty or not finite, the start does not have one phase per
+            pulse, or a floor, an iteration count or the relaxation is invalid.
+    """
+    pulses = prepare(data, "entropy_fixed_point")
+    if not floors or not all(floor > 0 and count >= 1 for floor, count in floors) or not 0 < relaxation < 2:
+        raise ValueError(
+            "entropy_fixed_point: floors must be pairs of a floor above 0 and a number of iterations of 1 or more, "
+            f"and relaxation must lie between 0 and 2, got floors {list(floors)} and relaxation {relaxation}"
+        )
+    operator = AlongPulses() if imaging is None else Through(imaging)
+    runs = [Run(LogAbove(floor), operator, count, relaxation, tolerance_rad) for floor, count in floors]
+
+    def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:
+        phase, taken = in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
+        return phase, taken, settled
+
+    begin = starting_phase(start, pulses, "entropy_fixed_point")
+    tuned = (relaxation, *(floor for floor, _ in floors))
+    return estimated(pulses, begin, find, at_rest=True, compare=imaging is None, tuned=tuned)
