@@ -478,7 +478,8 @@ class _Scene:
         square of their correlation. Correlations of independent cells of n pulses have a mean
         square of 1 / n.
         """
-        innovations, told = 0.0, 0.0
+        innovations = torch.zeros_like(self.groups[0][0])
+        told = torch.zeros_like(innovations[:, 0].real)
         for (own, *_), inverse, each in zip(self.groups, fit.inverses, self._information(fit), strict=True):
             lower = cholesky_factor(inverse.mT)
             innovations = innovations + lower.mH @ (own * u.conj()[..., None])
