@@ -232,6 +232,14 @@ def test_the_seen_part_of_the_aperture_has_its_own_ends(snr_db):
         assert 0.6 < rms(found[key] - true) / rms(found.std[key]) < 1.5, key
 
 
+def test_steps_that_have_not_reached_the_maximum_are_not_ok():
+    """A tone is the echo of a point that moves along with the receiver, far from the start."""
+    tone = torch.ones(1, 3, N, dtype=C128)
+    found = LikelihoodVelocity(RADAR, GATE)(Signal(tone + 0.1 * noise(1, 5), RADAR.axes(N)))
+    assert float((found["u_a_m_s"] - RADAR.speed_m_s).abs()) > 5 * float(found.std["u_a_m_s"])
+    assert float(found.info["snr_db"]) > 19 and not bool(found.ok)
+
+
 def test_a_short_dwell_resolves_the_ambiguity_or_says_that_it_does_not():
     """Of speeds lambda PRF apart a wrong one was returned, and ok, in 20 % of the trials."""
     radar, speed = published_radar(), torch.linspace(-11.0, 11.0, 12, dtype=F64).repeat(2)
