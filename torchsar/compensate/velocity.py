@@ -245,7 +245,8 @@ def minimum_entropy_velocity(
 
     Returns:
         The minimum. It is clear where it is not at an end of the searched interval, its depth is 8
-        standard deviations of the entropy of noise or more, and the record is not shorter than the
+        standard deviations of the entropy of noise or more (noise that has the powers and
+        correlations of the range cells), and the record is not shorter than the
         dwell of the beam, if that is known: in a shorter record every target is cut, differently,
         and the standard deviation does not hold. `most_m_s` is an eighth of
         `grid_step_m_s` or, if the dwell of the beam is not known (`integration_s` of the radar), of

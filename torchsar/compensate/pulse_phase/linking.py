@@ -72,9 +72,9 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed. The standard deviation of each pulse is
-        the Cramer-Rao bound for the estimated spectrum and for the number of independent range
-        cells (see `occupied_band`), raised by the share of the likelihood that the phases gain on
-        noise. A constant and a linear phase only add a phase to the image and shift it; they are
+        the Cramer-Rao bound for the estimated spectrum, in which range cells that depend on each
+        other count less, raised by the share of the likelihood that the phases gain on noise. A
+        constant and a linear phase only add a phase to the image and shift it; they are
         left out of the standard deviation. `quality` is the predicted Strehl ratio times the share
         of the likelihood that noise does not explain. `ok` is False where the Strehl ratio for 1.9
         times the standard deviation is below 0.8, the gain in likelihood below twice that of noise,
