@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -84,7 +85,8 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         adjacent pulses are not coherent in any ten range cells of similar power, or a sparse
         description of the scene with the phases that sharpen it is more likely: in sparse scenes
         the spectrum adapts to phase errors, which the standard deviation does not contain. `info`
-        holds, of shape (...,), "gain_nats" (log likelihood minus that of white noise),
+        holds, of shape (...,), "gain_nats" (log likelihood minus that of white noise), "fit_nats"
+        (the same as if range cells were independent, by which phases of one scene compare),
         "weakest_boundary" (the least coherence across a boundary relative to the prediction),
         "jitter_cells" and "migration_cells".
 
@@ -120,7 +122,7 @@ def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
     rows, n = pulses.rows, pulses.n
     if not len(rows):
         none = torch.zeros(0, n, dtype=torch.float64, device=rows.device)
-        return _estimate(pulses, none, none, none[:, 0], none[:, 0], Displacement(none[:, 0], none[:, 0]))
+        return _estimate(pulses, _Linked(none, none, *3 * [none[:, 0]]), Displacement(none[:, 0], none[:, 0]))
     size = max(1, _BLOCK_BYTES // (16 * n * (6 * n + 2 * rows.shape[1])))
     parts = [slice(first, first + size) for first in range(0, len(rows), size)]
     done: dict[int, tuple[Tensor, ...]] = {}
@@ -137,11 +139,31 @@ def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
     else:
         with torch.no_grad():
             over_blocks(work, parts, rows)
-    phase, std, gain, share, *moved = (torch.cat([done[part.start][i] for part in parts]) for i in range(6))
-    return _estimate(pulses, phase, std, gain, share, Displacement(*moved))
+    *found, jitter, migration = (torch.cat([done[part.start][i] for part in parts]) for i in range(7))
+    return _estimate(pulses, _Linked(*found), Displacement(jitter, migration))
 
 
-def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor, share: Tensor, moved: Displacement) -> Estimate:
+class _Linked(NamedTuple):
+    """Result of the linking of a block of trials.
+
+    Args:
+        phase: Phases in rad, (trial, pulse).
+        std: Their standard deviations in rad, (trial, pulse).
+        fit: Log likelihood minus that of white noise in nats, as if the range cells were
+            independent but for the band that they occupy, (trial,).
+        gain: The part of it that counts because range cells depend on each other, (trial,).
+        boundary: See `_weakest_boundary`, (trial,).
+    """
+
+    phase: Tensor
+    std: Tensor
+    fit: Tensor
+    gain: Tensor
+    boundary: Tensor
+
+
+def _estimate(pulses: Pulses, found: _Linked, moved: Displacement) -> Estimate:
+    phase, std, fit, gain, boundary = found
     real, trials = pulses.rows.real.dtype, pulses.trials
     noise = _NOISE_NATS * pulses.present.sum(-1)
     scene = (1 - noise / or_one(gain)).clamp(0, 1)
@@ -154,34 +176,33 @@ def _estimate(pulses: Pulses, phase: Tensor, std: Tensor, gain: Tensor, share: T
         value={"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
         std={"phase_rad": std.reshape(*trials, pulses.n).to(real)},
         quality=(strehl * scene).reshape(trials).to(real),
-        ok=(fitted & moved.aligned & (share > _LEAST_SHARE)).reshape(trials),
+        ok=(fitted & moved.aligned & (boundary > _LEAST_SHARE)).reshape(trials),
         info={
             "gain_nats": gain.reshape(trials),
-            "weakest_boundary": share.reshape(trials),
+            "fit_nats": fit.reshape(trials),
+            "weakest_boundary": boundary.reshape(trials),
             "jitter_cells": moved.jitter.reshape(trials),
             "migration_cells": moved.migration.reshape(trials),
         },
     )
 
 
-def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Phase and standard deviation (trial, pulse) in rad, gain in nats and weakest boundary of a
-    block, (trial,) each.
-    """
+def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> _Linked:
+    """Link the pulses of a block of trials."""
     if rows.shape[-1] < 3:  # nothing to distinguish a phase error from a shift of the image
         zero = torch.zeros(present.shape, dtype=torch.float64, device=rows.device)
-        return zero, zero + torch.inf, zero[:, 0], zero[:, 0]
+        return _Linked(zero, zero + torch.inf, *3 * [zero[:, 0]])
     with torch.no_grad():
         scene = _Scene.of(rows.detach(), present)
         u, fit = _refined(scene, _grown(scene) if start is None else cis(start.to(torch.float64)))
         information, independent = scene.information(fit), scene.independent_share(u, fit)
-        gain = independent * scene.gain(u, fit)
+        gain = scene.gain(u, fit)
         std = _deviation(independent[:, None, None] * information)
-        share = _weakest_boundary(fit.matrix, u, information)
+        judged = std, scene.independent * gain, independent * gain, _weakest_boundary(fit.matrix, u, information)
     if not rows.requires_grad or not torch.is_grad_enabled():
-        return torch.angle(u), std, gain, share
+        return _Linked(torch.angle(u), *judged)
     step = _step(_Scene.of(rows, present).matrix(fit.inverses), u)
-    return torch.angle(u) + step - step.detach(), std, gain, share
+    return _Linked(torch.angle(u) + step - step.detach(), *judged)
 
 
 def _weakest_boundary(matrix: Tensor, u: Tensor, information: Tensor) -> Tensor:

@@ -88,9 +88,9 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
 
 
 def _parts(found: Estimate) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Phase, gain, standard deviation and verdict; the first and third of shape (trial, pulse)."""
+    """Phase, likelihood, deviation and verdict; the first and third of shape (trial, pulse)."""
     double = torch.float64
-    return found["phase_rad"].to(double), found.info["gain_nats"], found.std["phase_rad"].to(double), found.ok
+    return found["phase_rad"].to(double), found.info["fit_nats"], found.std["phase_rad"].to(double), found.ok
 
 
 @torch.no_grad()
