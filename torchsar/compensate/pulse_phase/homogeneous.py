@@ -104,7 +104,7 @@ def sparse_gain_nats(power: Tensor) -> Tensor:
     """Compute the gain of the log likelihood if the strongest cells each have a power of their own.
 
     All other cells share one power. The number of strong cells, K of N, is the one of the greatest
-    gain, at most half of N. Each costs 2 + ln(N / K) nats, for its power and its place.
+    gain. Each costs 2 + ln(N / K) nats, for its power and its place.
 
     Args:
         power: Powers of the image with a mean of 1, shape (trial, range, Doppler).
@@ -114,8 +114,7 @@ def sparse_gain_nats(power: Tensor) -> Tensor:
     """
     total = power[0].numel() if len(power) else 1
     smallest = torch.finfo(power.dtype).tiny
-    # a third of the time of sorting all cells
-    strongest = power.flatten(1).topk(max(1, total // 2)).values.to(torch.float64)
+    strongest = power.flatten(1).sort(descending=True).values.to(torch.float64)[:, : max(1, total - 1)]
     count = torch.arange(1, strongest.shape[-1] + 1, dtype=torch.float64, device=power.device)
     whole = power.sum((-2, -1), dtype=torch.float64)[:, None]
     rest = ((whole - strongest.cumsum(-1)) / (total - count).clamp_min(1)).clamp_min(_LEAST_REST)

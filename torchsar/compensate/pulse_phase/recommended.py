@@ -27,6 +27,9 @@ _FIRST_FLOOR, _FIRST_ITERATIONS = 5.0, 6
 # on scenes at 30 dB, 3 of 32 trials of the entropy fixed point ended in a local minimum without
 # over-relaxation and none with this one
 _RELAXATION = 1.8
+# Standard deviation of the sharpest phases below which they are ok where only the dependence of
+# range cells speaks against linked phases: a third of the largest one that is ok elsewhere.
+_SURE_RAD = 0.15
 # lines of the image in a strip, by choice: more than the response of a point is wide
 _STRIP = 4
 _SLOPES = 48  # slopes tried over one turn per pulse, found by trial: spacing against time
@@ -142,8 +145,10 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
     """The estimate with the linked phases in trials whose scene is more likely homogeneous.
 
     Where that description turns out to be less likely with the linked phases, the sharpest phases
-    stay; they are not ok, because the descriptions contradict each other. They also stay in long
-    records.
+    stay; they are not ok, because the descriptions contradict each other. But where it is less
+    likely only because range cells depend on each other, as those that side lobes of few points
+    fill, the scene is sparse after all, and phases of small deviation are ok. The sharpest phases
+    also stay in long records.
     """
     if pulses.n > _MOST_LINKED:
         return sharpest
@@ -154,6 +159,11 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
     at = true_positions(homogeneous, count)
     some = linked(Pulses(pulses.rows[at], pulses.present[at], at.shape))
     likelier = some.info["gain_nats"] > sharpest.info["sparse_gain_nats"].flatten()[at]
+    sparse = at[~likelier & (some.info["fit_nats"] > sharpest.info["sparse_gain_nats"].flatten()[at])]
+    info, ok = dict(sharpest.info), sharpest.ok.flatten()
+    sure = info["ok_if_sparse"] & (sharpest.std["phase_rad"][..., 0] < _SURE_RAD)
+    ok = ok.index_copy(0, sparse, sure.flatten()[sparse]).reshape(sharpest.ok.shape)
+    info["homogeneous"] = homogeneous.index_fill(0, sparse, False).reshape(sharpest.ok.shape)
     at = at[likelier]
 
     def mixed(of_all: Tensor, of_some: Tensor) -> Tensor:
@@ -164,8 +174,8 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
         value={"phase_rad": mixed(sharpest["phase_rad"], some["phase_rad"])},
         std={"phase_rad": mixed(sharpest.std["phase_rad"], some.std["phase_rad"])},
         quality=mixed(sharpest.quality, some.quality),
-        ok=mixed(sharpest.ok, some.ok),
-        info=sharpest.info,
+        ok=mixed(ok, some.ok),
+        info=info,
     )
 
 

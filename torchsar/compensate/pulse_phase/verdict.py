@@ -37,7 +37,7 @@ _APART_RAD = 2.0
 # Phases from which halves of the rows start are apart by a walk of so many rad rms; they go on for
 # so many rounds at most, until a round moves them by less than this. Found by trial: what the scene
 # does not hold stays apart, and weak targets are found again.
-_DISTURBED_RAD, _RETURNED_RAD, _RETURNS = 0.4, 0.1, 6
+_DISTURBED_RAD, _RETURNED_RAD, _RETURNS = 0.4, 0.04, 6
 # Quarters of the pulses, and the least correlation of their images, found by trial: 0.4 to 1 in
 # scenes that stay, aircraft in flight included; 0 to 0.3 where the scene is another one from some
 # pulse on. The images are clear if so much of their variance is not noise.
@@ -173,9 +173,9 @@ def estimated(
         does not find the phases of homogeneous clutter, and no quarter of the pulses shows another
         scene than the others. The last four need not hold for a single point whose modulus scatters
         by less than 0.25, with 32 pulses or more. `info` holds "present", shape (..., pulse), False
-        for pulses that hold only zeros; and, of shape (...,),
-        "homogeneous" (True where that description is more likely), "sparse_gain_nats" (gain of the
-        log likelihood of the sparse description over white noise), "jitter_cells" and
+        for pulses that hold only zeros; and, of shape (...,), "homogeneous" (True where that
+        description is more likely), "ok_if_sparse" (what `ok` is if it is not), "sparse_gain_nats"
+        (gain of the log likelihood of the sparse description over white noise), "jitter_cells" and
         "migration_cells" (see `Displacement`), "iterations", "sharpness_nats",
         "noise_sharpness_nats" (the largest sharpness that noise can reach), "effective_rows"
         (number of rows over which the energy is spread) and "telling_rows" (number of rows over
@@ -255,9 +255,9 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     enough_pulses = present.sum(-1) >= 3
     strehl = torch.exp(-std_rad.square())
     quality = torch.where(enough_pulses, strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1)), 0)
-    distinct = (sharp > _MARGIN * noise) & (sharpness_rows > LEAST_ROWS) & ~homogeneous & stays
+    distinct = (sharp > _MARGIN * noise) & (sharpness_rows > LEAST_ROWS) & stays
     distinct = distinct | (lone & (sharp > noise))
-    ok = enough_pulses & distinct & (strehl > LEAST_STREHL) & Displacement(jitter, migration).aligned
+    if_sparse = enough_pulses & distinct & (strehl > LEAST_STREHL) & Displacement(jitter, migration).aligned
     phase = torch.where(enough_pulses[:, None], phase, 0)
     info = {
         "iterations": taken,
@@ -267,6 +267,7 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
         "telling_rows": sharpness_rows,
         "sparse_gain_nats": sparse,
         "homogeneous": homogeneous,
+        "ok_if_sparse": if_sparse,
         "jitter_cells": jitter,
         "migration_cells": migration,
     }
@@ -275,7 +276,7 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
         value={"phase_rad": phase.reshape(*shape, pulses.n)},
         std={"phase_rad": std.reshape(*shape, pulses.n)},
         quality=quality.reshape(shape).to(phase.dtype),
-        ok=ok.reshape(shape),
+        ok=(if_sparse & ~homogeneous).reshape(shape),
         info={
             "present": present.reshape(*shape, pulses.n),
             **{name: value.reshape(shape) for name, value in info.items()},
