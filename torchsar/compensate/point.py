@@ -152,14 +152,14 @@ def _tail(power: Tensor, floor: Tensor) -> Tensor:
     """Mean power (...,) of circular noise whose highest peaks are those of an image (..., azimuth,
     range) of noise and a few bright points, at least its mean power `floor` (...,).
 
-    The power of circular noise has an exponential distribution: 97 of 100 samples do not exceed the
-    median by more than the mean times ln(50 / 3). In noise with a longer tail, such as that of real
+    The power of circular noise has an exponential distribution: 99 of 100 samples do not exceed the
+    median by more than the mean times ln 50. In noise with a longer tail, such as that of real
     samples, they do.
     """
     ordered = power.flatten(-2)
-    few = 3 * ordered.shape[-1] // 100
+    few = ordered.shape[-1] // 100
     high = ordered.kthvalue(ordered.shape[-1] - few, -1).values.double() - ordered.median(-1).values.double()
-    return torch.maximum(floor, high / math.log(50 / 3))
+    return torch.maximum(floor, high / math.log(50))
 
 
 class PointDoppler(Stage):
