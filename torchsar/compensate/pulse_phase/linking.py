@@ -195,7 +195,8 @@ def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> _Linked:
     with torch.no_grad():
         scene = _Scene.of(rows.detach(), present)
         u, fit = _refined(scene, _grown(scene) if start is None else cis(start.to(torch.float64)))
-        information, independent = scene.information(fit), scene.independent_share(u, fit)
+        each = scene.information_each(fit)
+        information, independent = scene.summed(each), scene.independent_share(u, fit, each)
         gain = scene.gain(u, fit)
         std = _deviation(independent[:, None, None] * information)
         judged = std, scene.independent * gain, independent * gain, _weakest_boundary(fit.matrix, u, information)
@@ -479,38 +480,42 @@ class _Scene:
         """Fisher information of the phases in 1/rad^2, shape (trial, pulse, pulse), if all range
         cells are independent.
         """
-        each = self._information(fit)
+        return self.summed(self.information_each(fit))
+
+    def summed(self, each: list[Tensor]) -> Tensor:
+        """Sum over all range cells of what each cell of a group adds."""
         return sum(
             (cells[:, None, None] * own for (*_, cells), own in zip(self.groups, each, strict=True)),
             torch.zeros_like(each[0]),
         )
 
-    def _information(self, fit: _Fit) -> list[Tensor]:
+    def information_each(self, fit: _Fit) -> list[Tensor]:
         """Fisher information of the phases in a range cell of each group."""
         eye = torch.eye(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
         covariances = [self._toeplitz(torch.fft.ifft(spectrum)) for spectrum in fit.spectra]
         return [2 * ((one * other).real - eye) for one, other in zip(fit.inverses, covariances, strict=True)]
 
-    def independent_share(self, u: Tensor, fit: _Fit) -> Tensor:
+    def independent_share(self, u: Tensor, fit: _Fit, each: list[Tensor]) -> Tensor:
         """Share of the information that counts, because range cells depend on each other, (trial,).
 
         Cells that a point fills with its side lobes, or that are sampled finer than the band
         requires, have the same innovations. What the phases gain from two cells depends as the
         square of their correlation. Correlations of independent cells of n pulses have a mean
-        square of 1 / n.
+        square of 1 / n. each: Information of a range cell of each group, see `information_each`.
         """
         innovations = torch.zeros_like(self.groups[0][0])
-        told = torch.zeros_like(innovations[:, 0].real)
-        for (own, *_), inverse, each in zip(self.groups, fit.inverses, self._information(fit), strict=True):
+        of_cell = torch.zeros_like(innovations[:, 0].real)
+        for (own, *_), inverse, information in zip(self.groups, fit.inverses, each, strict=True):
             lower = cholesky_factor(inverse.mT)
             innovations = innovations + lower.mH @ (own * u.conj()[..., None])
             here = (own.real.square() + own.imag.square()).sum(-2) > 0
-            told = told + here * torch.diagonal(each, dim1=-2, dim2=-1).sum(-1).clamp_min(0)[:, None]
+            amount = torch.diagonal(information, dim1=-2, dim2=-1).sum(-1).clamp_min(0)
+            of_cell = of_cell + here * amount[:, None]
         level, count = torch.linalg.vector_norm(innovations, dim=-2), self.present.sum(-1).clamp_min(2)
         innovations = innovations / or_one(level)[:, None, :]
         alike = innovations.mH @ innovations
         excess = (alike.real.square() + alike.imag.square() - 1 / count[:, None, None]) / (1 - 1 / count)[:, None, None]
-        weight = told.sqrt()
+        weight = of_cell.sqrt()
         both = (weight[:, None, :] @ (excess @ weight[..., None]))[:, 0, 0] - (weight.square() * (level > 0)).sum(-1)
         total = weight.square().sum(-1)
         return torch.where(total > 0, total / or_one(total + both.clamp_min(0)), 1)

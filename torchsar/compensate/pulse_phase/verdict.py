@@ -136,9 +136,9 @@ def estimated(
       the whole difference where it exceeds 2 rad, as in pulses that do not see the scene. The rows
       are sorted by energy and taken alternately; the noise of the halves is independent. The halves
       start from phases that a walk of 0.4 rad moves apart: what the scene does not hold, because
-      its scatterers change from pulse to pulse, stays apart. The result
-      is divided by the square root of `occupied_band`, because rows that are sampled finer than
-      their band requires are not independent. Where a single point makes the image sharp, it is the
+      its scatterers change from pulse to pulse, stays apart. The result is divided by the square
+      root of `occupied_band`, because rows that are sampled finer than their band requires are not
+      independent. Where a single point makes the image sharp, it is the
       relative scatter of the modulus of its echo instead: noise and weaker scatterers change the
       modulus as much as the phase, and the phase error does not change it. The scatter of the phase
       that remains is added.
@@ -359,7 +359,7 @@ def _persists(rows: Tensor, phase: Tensor) -> Tensor:
 
     The moduli of the images of the quarters, above twice their median, are correlated, each pair at
     its best displacement in Doppler. Where more than a quarter of a variance may be that of noise,
-    nothing can be told.
+    they are taken to show the same scene.
     """
     if rows.shape[-1] < _LEAST_PULSES:
         return torch.ones_like(phase[:, 0], dtype=torch.bool)
