@@ -52,7 +52,7 @@ def main() -> None:
     loaded = load(options.config, options.overrides)
     trial = SweepTrial(loaded)
     grid = first_point(sweep_grid(loaded, trial))
-    automatic = rows_by_bytes(trial.bytes_per_trial(grid.cases()[0].fixed), "cpu")
+    automatic = rows_by_bytes(trial.bytes_per_trial(grid.cases()[0].fixed))
     chunks = {"one by one": 1, "one batch": options.trials, "automatic": automatic, "automatic, 2 workers": automatic}
     rates: dict[str, list[float]] = {name: [] for name in chunks}
     with engine(workers=2) as two:

@@ -1,31 +1,31 @@
-"""Stages, systems and metrics on a pretended accelerator: no operation mixes devices, results equal
-those of the CPU, and the host does not wait more often for more trials.
+"""Stages, systems and metrics on a pretended accelerator, and on a real one where there is one: no
+operation mixes devices, results equal those of the CPU, and the host does not wait more often for
+more trials.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from tests.contract.pretended import DEVICE, Counts, Pretended, pretended_device, to_device, to_host
+from tests.contract.pretended import DEVICE, Counts, pretended_device, to_device, to_host
+from tests.contract.places import PLACES, Place
 from tests.contract.test_stages import CASES, Case, entering, raw, results
 from tests.extremes.table import FUNCTIONS, NUMBERS, Entry, named, samples
 from tests.study.scenes import CORRECT, SCENES, TILES, loaded_as, world
 from torchsar.core import Axis, Draws, Signal
-from torchsar.focus import nufft
 from torchsar.multichannel import detect
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
-# stages that cost seconds here, and where else they or their parts run
+# stages that cost seconds on the pretended device, and where else they or their parts run there
 ELSEWHERE = {
     "alternate": "autofocus and rotation_coarse in turn",
     "autofocus": "in the chain of the system isal",
@@ -75,12 +75,17 @@ def compare(name: str, two: Counts, four: Counts) -> None:
     assert abs(growth) <= slack, f"{name}: {growth} more, at {dict(more.most_common(8))}"
 
 
-def equal(found: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float) -> None:
+@pytest.fixture(params=PLACES)
+def place(request: pytest.FixtureRequest) -> Place:
+    return PLACES[request.param]
+
+
+def equal(place: Place, found: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float) -> None:
     for name, value in expected.items():
         scale = 0.0 if value.dtype == torch.bool or not value.numel() else float(value.abs().nan_to_num().max())
-        assert isinstance(found[name], Pretended), name
+        assert place.holds(found[name]), name
         torch.testing.assert_close(
-            to_host(found[name]),
+            place.take(found[name]),
             value,
             atol=tolerance * scale,
             rtol=0,
@@ -89,41 +94,37 @@ def equal(found: dict[str, Tensor], expected: dict[str, Tensor], tolerance: floa
         )
 
 
-@contextmanager
-def counted() -> Iterator[Counts]:
-    """The device without what earlier runs have left there."""
-    nufft._polynomials.cache_clear()
-    with pretended_device() as counts:
-        yield counts
-    nufft._polynomials.cache_clear()
-
-
 def twice(x: Tensor) -> Tensor:
     return torch.cat([x, x]) if x.ndim else x
 
 
-STAGES = [case for case in CASES if case.name not in ELSEWHERE]
+STAGES = [
+    pytest.param(case, place, id=f"{name}-{case.name}")
+    for name, place in PLACES.items()
+    for case in CASES
+    if place.device != DEVICE or case.name not in ELSEWHERE
+]
 
 
-@pytest.mark.parametrize("case", STAGES, ids=[case.name for case in STAGES])
-def test_stages(case: Case) -> None:
+@pytest.mark.parametrize("case, place", STAGES)
+def test_stages(case: Case, place: Place) -> None:
     """Two trials, and the same two twice."""
     signal = entering(case, raw(2, n_range=case.n_range))
     values = case.values(signal)
     expected = results(case.build()(signal, **values))
     every = []
     for repeated in (lambda x: x, twice)[: 1 if case.name in _ONCE else 2]:
-        with counted() as counts:
-            stage = case.build().to(DEVICE)
-            given = to_device({name: repeated(value) for name, value in values.items()})
-            found = results(stage(signal.with_data(to_device(repeated(signal.data))), **given))
-        equal(found, {name: repeated(value) for name, value in expected.items()}, case.tolerance)
+        with place.counted() as counts:
+            stage = case.build().to(place.device)
+            given = place.put({name: repeated(value) for name, value in values.items()})
+            found = results(stage(signal.with_data(place.put(repeated(signal.data))), **given))
+        equal(place, found, {name: repeated(value) for name, value in expected.items()}, case.tolerance)
         every.append(counts)
     compare(case.name, every[0], every[-1])
 
 
 @pytest.mark.parametrize("system", SMALL)
-def test_systems(system: str, tmp_path: Path) -> None:
+def test_systems(system: str, place: Place, tmp_path: Path) -> None:
     """Simulation, recommended chain, metrics and bounds, of few trials and of the same twice."""
     few = [0] if system in _ONCE else [0, 1]
     processor = {**SCENES[system]["processor"], **CHAINS.get(system, {})}
@@ -139,8 +140,8 @@ def test_systems(system: str, tmp_path: Path) -> None:
     expected = run("cpu", few)
     every = []
     for trials in (few, few * 2)[: 1 if system in _ONCE else 2]:
-        with counted() as counts:
-            found = to_host(run(str(DEVICE), trials))
+        with place.counted() as counts:
+            found = place.take(run(str(place.device), trials))
         for name, value in expected.items():
             there = value if value.shape == found[name].shape else torch.cat([value] * (len(trials) // len(few)))
             torch.testing.assert_close(
@@ -154,7 +155,7 @@ def test_systems(system: str, tmp_path: Path) -> None:
 @torch.no_grad()
 def test_chains_wait_seldom(sweep: str) -> None:
     most, smaller = CHAIN_WAITS[sweep]
-    with counted() as counts:
+    with PLACES["pretended"].counted() as counts:
         bench = Bench(load(sweep, smaller), str(DEVICE))
         trials = bench.trials(Draws(3, "run", [0, 1]))
         before = waits(counts)
@@ -169,11 +170,11 @@ METRICS = [entry for entry in FUNCTIONS if entry.name.startswith("metrics.") and
 
 
 @pytest.mark.parametrize("entry", METRICS, ids=[entry.name for entry in METRICS])
-def test_metrics(entry: Entry) -> None:
+def test_metrics(entry: Entry, place: Place) -> None:
     x = samples(entry.kind, 2, torch.complex128)
-    with pretended_device():
-        found = named(entry.call(to_device(x)))
-    equal(found, named(entry.call(x)), 1e-9)
+    with place.counted():
+        found = named(entry.call(place.put(x)))
+    equal(place, found, named(entry.call(x)), 1e-9)
 
 
 # numbers of an instrument, the same for all trials
@@ -181,24 +182,24 @@ _SHARED = ("wavelength_m", "prf_hz", "duration_s", "rate_hz_s")
 
 
 @pytest.mark.parametrize("name", [name for name in NUMBERS if name.startswith("metrics.") and name not in _HELD])
-def test_bounds(name: str) -> None:
+def test_bounds(name: str, place: Place) -> None:
     function, numbers = NUMBERS[name]
     given = {
         key: torch.tensor([x, 1.1 * x], dtype=torch.float64) if isinstance(x, float) and key not in _SHARED else x
         for key, x in numbers.items()
     }
-    with pretended_device():
-        found = named(function(**to_device(given)))
-    equal(found, named(function(**given)), 1e-9)
+    with place.counted():
+        found = named(function(**place.put(given)))
+    equal(place, found, named(function(**given)), 1e-9)
 
 
-def test_detection() -> None:
+def test_detection(place: Place) -> None:
     data = torch.full((64, 48), 0.1, dtype=torch.complex128)
     data[20:24, 30:33] = 3.0
     axes = (Axis("azimuth", 64, 0.0, 10.0, "m"), Axis("range", 48, 0.0, 2.0, "m"))
     (expected,) = detect(Signal(data, axes))
-    with pretended_device():
-        (found,) = detect(Signal(to_device(data), axes))
+    with place.counted():
+        (found,) = detect(Signal(place.put(data), axes))
     assert found == expected
 
 

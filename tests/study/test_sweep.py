@@ -21,7 +21,7 @@ from torchsar.core import Draws
 from torchsar.study.montecarlo import Record, Stop, differences, read_sweep, sweep
 from torchsar.study.montecarlo.grid import address, make_grid
 from torchsar.study.montecarlo.loop import looks
-from torchsar.study.montecarlo.work import CACHE_BYTES, Work, cut, probed_bytes, rows_by_bytes
+from torchsar.study.montecarlo.work import CACHE_BYTES, Work, cut, probed_bytes, rows_by_bytes, rows_by_peak
 from torchsar.study.output import progress
 from torchsar.study.settings.errors import ConfigError
 
@@ -109,10 +109,16 @@ def test_automatic_chunks_follow_the_bytes_of_the_largest_tensor() -> None:
     bytes_per_trial = probed_bytes(work, 0)
     # the doubled complex64 row, or the float64 draws
     assert bytes_per_trial in (16 * 1024, 32 * 1024)
-    assert rows_by_bytes(bytes_per_trial, "cpu") == CACHE_BYTES // bytes_per_trial
-    assert rows_by_bytes(10 * CACHE_BYTES, "cpu") == 1
+    assert rows_by_bytes(bytes_per_trial) == CACHE_BYTES // bytes_per_trial
+    assert rows_by_bytes(10 * CACHE_BYTES) == 1
     trial.bytes_per_trial = lambda fixed: 12345
     assert probed_bytes(work, 0) == 12345
+
+
+def test_chunks_on_a_gpu_follow_measured_peaks() -> None:
+    """Peaks of 100 bytes and 20 bytes a trial."""
+    assert rows_by_peak({1: 120, 8: 260}, 1000) == 45
+    assert rows_by_peak({1: 120, 8: 260}, 10) == 1
 
 
 def test_chunks_are_equal_pieces_in_one_order() -> None:

@@ -21,7 +21,7 @@ from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_ungua
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.record import OK, Record
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
-from torchsar.study.montecarlo.work import Chunk, Computed, Trial, Work, cut, probed_bytes, rows_by_bytes
+from torchsar.study.montecarlo.work import Chunk, Computed, Trial, Work, cut, rows_of
 from torchsar.study.output.folder import ResultFolder, opened
 from torchsar.study.output.progress import Count, Ticker
 from torchsar.study.output.report import installed_version
@@ -324,7 +324,7 @@ class _Run:
         try:
             with Ticker(count.say):
                 for first, last in pairwise((0, *levels)):
-                    for chunk, computed in engine.results(self.work, self._tasks(first, last)):
+                    for chunk, computed in engine.results(self.work, self._tasks(first, last, engine.workers)):
                         self._enter(chunk, computed)
                         count.advance(self._written())
                         log.debug("%s", count.say())
@@ -343,7 +343,7 @@ class _Run:
                 sessions=[*self.record.about.get("sessions", []), session],
             )
 
-    def _tasks(self, first: int, last: int) -> Iterator[Task]:
+    def _tasks(self, first: int, last: int, workers: int) -> Iterator[Task]:
         """Chunks of one level without the rows that are done."""
         for number, case in enumerate(self.work.cases):
             done = self.record.done
@@ -351,7 +351,7 @@ class _Run:
             if all(done[(*at[p], slice(first, last))].all() for p in self.active[number]):
                 continue
             rows = self.plan.chunk or self.rows.get(number)
-            self.rows[number] = rows or rows_by_bytes(probed_bytes(self.work, number), self.plan.device)
+            self.rows[number] = rows or rows_of(self.work, number, (last - first) * len(case.points), workers)
             for whole in cut(number, case, self.active[number], first, last, self.rows[number]):
                 missing = [(p, t) for p, t in zip(whole.points, whole.trials) if not done[(*at[p], t)]]
                 if missing:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, LargestTensor, is_out_of_memory
+from torchsar.core import Draws, LargestTensor, PeakMemory, is_out_of_memory
 from torchsar.study.montecarlo.grid import Case, Grid
 from torchsar.study.montecarlo.record import OK
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -26,8 +26,8 @@ Numbers = dict[str, dict[str, list[float]]]
 BOUNDS, SAVED = "bounds", "saved"
 # larger batches do not fit the cache of a CPU and take more time per trial, as measured
 CACHE_BYTES = 12 << 20
-# of the free memory of a GPU, and tensors of the largest kind that chains hold at a time
-_GPU_SHARE, _LIVE_TENSORS = 0.5, 12
+# of the free memory of a GPU that a batch takes, and the trials of the batches that are measured first
+_GPU_SHARE, _MEASURED = 0.85, (1, 1, 8)
 
 
 @dataclass(frozen=True)
@@ -258,18 +258,50 @@ def probed_bytes(work: Work, case: int) -> int:
     return max(1, largest.bytes)
 
 
-def rows_by_bytes(bytes_per_trial: int, device: str) -> int:
-    """Return the number of trials in a batch, chosen by the memory.
+def rows_by_bytes(bytes_per_trial: int) -> int:
+    """Return the number of trials in a batch on a CPU.
 
     Args:
-        bytes_per_trial: Size in bytes of the largest tensor of one trial.
-        device: Device of the batch. On a CPU, this tensor for the whole batch takes at most 12 MiB,
-            the size of a cache; on a GPU, 12 such tensors take at most half of the free memory.
+        bytes_per_trial: Size in bytes of the largest tensor of one trial. For the whole batch, this
+            tensor takes at most 12 MiB, the size of a cache.
     """
-    if torch.device(device).type == "cuda":
-        free, _ = torch.cuda.mem_get_info(device)
-        return max(1, int(_GPU_SHARE * free / (_LIVE_TENSORS * bytes_per_trial)))
     return max(1, CACHE_BYTES // bytes_per_trial)
+
+
+def rows_by_peak(peaks: Mapping[int, int], free_bytes: int) -> int:
+    """Return the number of trials whose peak memory fits.
+
+    Args:
+        peaks: Peak memory in bytes of batches of two sizes, by the number of trials. It is taken to
+            grow linearly.
+        free_bytes: Memory that a batch may take.
+    """
+    (few, low), (many, high) = sorted(peaks.items())
+    each = max(1.0, (high - low) / (many - few))
+    return max(1, int((free_bytes - low) / each) + few)
+
+
+def rows_of(work: Work, case: int, trials: int, workers: int) -> int:
+    """Return the number of trials in a batch: on a CPU by its cache, on a GPU as many as fit.
+
+    Args:
+        work: The work.
+        case: Index of the case.
+        trials: Number of trials of the case.
+        workers: Number of processes that compute batches. Those that share a GPU share its memory,
+            and each gets a part of the trials.
+    """
+    if torch.device(work.device).type != "cuda":
+        return rows_by_bytes(probed_bytes(work, case))
+    peaks = {}
+    for rows in _MEASURED:  # the first batch also makes what later ones find made
+        with PeakMemory() as memory:
+            work.compute(Chunk(case, (0,) * rows, tuple(range(rows))))
+        peaks[rows] = memory.bytes or 0
+    torch.cuda.empty_cache()
+    free, _ = torch.cuda.mem_get_info(work.device)
+    sharing = -(-workers // torch.cuda.device_count())
+    return min(rows_by_peak(peaks, int(_GPU_SHARE * free / sharing)), -(-trials // workers))
 
 
 def cut(case: int, whole: Case, active: set[int], first: int, last: int, rows: int) -> Iterator[Chunk]:
