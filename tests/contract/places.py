@@ -1,4 +1,4 @@
-"""Devices on which the contract is checked: the pretended one, and a real one where there is one."""
+"""Devices on which the contract is checked: the pretended one, and a GPU where there is one."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ class Place:
         holds: Whether a tensor lies there.
         counted: A block in which the device is there, with the counts of what is done on it. A real
             device counts nothing.
+        tolerance: Least relative error that is allowed. A real device rounds differently from the
+            CPU, and ill-conditioned results show it.
     """
 
     device: torch.device
@@ -33,6 +35,11 @@ class Place:
     take: Callable[[Any], Any]
     holds: Callable[[Tensor], bool]
     counted: Callable[[], AbstractContextManager[Counts]]
+    tolerance: float
+
+    @property
+    def real(self) -> bool:
+        return self.device != DEVICE
 
 
 @contextmanager
@@ -53,8 +60,8 @@ def _moved(x: Any, device: str) -> Any:
     return tree_map(lambda leaf: leaf.to(device) if isinstance(leaf, Tensor) else leaf, x)
 
 
-PLACES = {"pretended": Place(DEVICE, to_device, to_host, lambda x: isinstance(x, Pretended), _pretended)}
+PLACES = {"pretended": Place(DEVICE, to_device, to_host, lambda x: isinstance(x, Pretended), _pretended, 0.0)}
 if torch.cuda.is_available():
     PLACES["cuda"] = Place(
-        torch.device("cuda"), lambda x: _moved(x, "cuda"), lambda x: _moved(x, "cpu"), lambda x: x.is_cuda, _real
+        torch.device("cuda"), lambda x: _moved(x, "cuda"), lambda x: _moved(x, "cpu"), lambda x: x.is_cuda, _real, 1e-5
     )

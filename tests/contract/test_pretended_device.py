@@ -13,8 +13,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.contract.pretended import DEVICE, Counts, pretended_device, to_device, to_host
 from tests.contract.places import PLACES, Place
+from tests.contract.pretended import DEVICE, Counts, pretended_device, to_device, to_host
 from tests.contract.test_stages import CASES, Case, entering, raw, results
 from tests.extremes.table import FUNCTIONS, NUMBERS, Entry, named, samples
 from tests.study.scenes import CORRECT, SCENES, TILES, loaded_as, world
@@ -81,17 +81,24 @@ def place(request: pytest.FixtureRequest) -> Place:
 
 
 def equal(place: Place, found: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float) -> None:
+    """A real device rounds differently, and what trials that are not ok hold may be anything."""
+    ok = expected.get("ok", torch.tensor(True))
     for name, value in expected.items():
+        there = place.take(found[name])
+        if place.real and value.shape[: ok.ndim] == ok.shape:
+            there, value = there[ok], value[ok]
         scale = 0.0 if value.dtype == torch.bool or not value.numel() else float(value.abs().nan_to_num().max())
         assert place.holds(found[name]), name
         torch.testing.assert_close(
-            place.take(found[name]),
+            there,
             value,
-            atol=tolerance * scale,
+            atol=max(tolerance, place.tolerance) * scale + (1e-18 if place.real else 0),
             rtol=0,
             equal_nan=True,
             msg=lambda m, n=name: f"{n}: {m}",
         )
+    if place.real and "ok" in expected:
+        assert place.take(found["ok"]).equal(ok)
 
 
 def twice(x: Tensor) -> Tensor:
@@ -102,7 +109,7 @@ STAGES = [
     pytest.param(case, place, id=f"{name}-{case.name}")
     for name, place in PLACES.items()
     for case in CASES
-    if place.device != DEVICE or case.name not in ELSEWHERE
+    if place.real or case.name not in ELSEWHERE
 ]
 
 
@@ -145,7 +152,12 @@ def test_systems(system: str, place: Place, tmp_path: Path) -> None:
         for name, value in expected.items():
             there = value if value.shape == found[name].shape else torch.cat([value] * (len(trials) // len(few)))
             torch.testing.assert_close(
-                found[name], there, rtol=1e-4, atol=1e-6, equal_nan=True, msg=lambda m, n=name: f"{n}: {m}"
+                found[name],
+                there,
+                rtol=1e-3 if place.real else 1e-4,
+                atol=1e-5,
+                equal_nan=True,
+                msg=lambda m, n=name: f"{n}: {m}",
             )
         every.append(counts)
     compare(system, every[0], every[-1])

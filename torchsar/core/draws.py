@@ -143,7 +143,7 @@ class Draws:
             purpose: Name of the quantity; different names give independent numbers.
             shape: Shape of the numbers of one trial.
             dtype: Real or complex dtype of the result.
-            device: Device of the result.
+            device: Device of the result; None for that of `torch.set_default_device`.
 
         Returns:
             Numbers of shape (trial, *shape) with mean zero and unit variance. For a complex dtype
@@ -169,7 +169,7 @@ class Draws:
             low: Lower limit.
             high: Upper limit.
             dtype: Dtype of the result.
-            device: Device of the result.
+            device: Device of the result; None for that of `torch.set_default_device`.
 
         Returns:
             Numbers of shape (trial, *shape).
@@ -184,7 +184,7 @@ class Draws:
             purpose: Name of the quantity; different names give independent numbers.
             n: Number of whole numbers to choose from.
             k: Number of whole numbers to choose.
-            device: Device of the result.
+            device: Device of the result; None for that of `torch.set_default_device`.
 
         Returns:
             Chosen numbers of shape (trial, k) in rising order, int64.
@@ -199,7 +199,7 @@ class Draws:
         Args:
             purpose: Name of the quantity; different names give independent numbers.
             n: Number of whole numbers: an int for all trials, or a sequence with one int per trial.
-            device: Device of the result.
+            device: Device of the result; None for that of `torch.set_default_device`.
 
         Returns:
             Numbers of shape (trial, largest n), int64. The row of a trial with a smaller n is
@@ -211,5 +211,5 @@ class Draws:
 
 
 def _device(device: torch.device | str | None) -> torch.device:
-    """The device; the CPU for None."""
-    return torch.device("cpu" if device is None else device)
+    """The device; that of `torch.set_default_device` for None."""
+    return torch.get_default_device() if device is None else torch.device(device)

@@ -68,22 +68,26 @@ def _of_c_library(name: str) -> Callable[..., int] | None:
 class PeakMemory:
     """Context manager that measures the peak memory added by the code inside its `with` block.
 
-    It measures the memory of the CUDA device if CUDA is in use, else that of the process. Memory
-    that the process keeps for reuse is returned to the system first.
+    Memory that the process or torch keeps for reuse is returned to the system first.
+
+    Args:
+        device: Device whose memory is measured: a CUDA device, or any other for the memory of the
+            process.
 
     Attributes:
         bytes: Peak minus the memory in use at the beginning, in bytes. None until the block ends,
             and on systems that do not report memory.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device | str = "cpu") -> None:
         self.bytes: int | None = None
+        self._device = torch.device(device)
 
     def __enter__(self) -> PeakMemory:
-        self._gpu = torch.cuda.is_available() and torch.cuda.is_initialized()
-        if self._gpu:
-            torch.cuda.reset_peak_memory_stats()
-            self._before: int | None = torch.cuda.memory_allocated()
+        if self._device.type == "cuda":
+            torch.cuda.empty_cache()
+            torch.cuda.reset_peak_memory_stats(self._device)
+            self._before: int | None = torch.cuda.memory_allocated(self._device)
         else:
             trim = _of_c_library("malloc_trim")
             if trim is not None:
@@ -92,7 +96,8 @@ class PeakMemory:
         return self
 
     def __exit__(self, *_: object) -> None:
-        peak = torch.cuda.max_memory_allocated() if self._gpu else _resident("VmHWM")
+        cuda = self._device.type == "cuda"
+        peak = torch.cuda.max_memory_allocated(self._device) if cuda else _resident("VmHWM")
         self.bytes = None if peak is None or self._before is None else max(0, peak - self._before)
 
 

@@ -20,10 +20,13 @@ from torch import Tensor
 from torchsar.core import Estimate, Signal, Stage, checked_samples, linear_phasor, unit_level
 from torchsar.repair.jitter import MIN_GAP, smallest_gap
 
-# conventions for the offset that no pilot can determine
+# Rounding of float64 in the sums over a record, relative to them: without it, rounding errors of
+# strong jitter in a record without noise would look like jitter of a longer period.
+_ROUNDING = 1e-13
 # Largest standard deviation of an offset that is ok, in samples: jitter below the threshold of
 # detection, about three standard deviations, then stays below -15 dB of the signal.
 _MOST_STD = 0.01
+# conventions for the offset that no pilot can determine
 ORIGINS = ("mean", "first")
 
 
@@ -105,14 +108,12 @@ class _Fit:
         """Mean power of the phasors."""
         return self.phasor.abs().square().mean(-1)
 
-    def significance(self, noise: Tensor) -> Tensor:
-        """Chi-squared statistic of the phases of the M converters; without jitter it has M - 1
-        degrees of freedom.
+    @property
+    def jitter(self) -> Tensor:
+        """Squares of the phases of the M converters, weighted so that without jitter their ratio to
+        the noise is chi-squared with M - 1 degrees of freedom.
         """
-        information = (
-            2 * self.count * self.phasor.abs().square() / noise.clamp_min(1e-30 * self.power + 1e-300)[..., None]
-        )
-        return (information * self.phase_rad.square()).sum(-1)
+        return (2 * self.count * self.phasor.abs().square() * self.phase_rad.square()).sum(-1)
 
 
 def _fit(x: Tensor, frequency: Tensor, m: int, steps: int = 5) -> _Fit:
@@ -139,8 +140,10 @@ def _choose(fits: list[_Fit]) -> Tensor:
 
     The threshold of 14 + 4 (M - 1) keeps false alarms below 1e-4 per trial.
     """
-    noise = torch.stack([fit.noise for fit in fits]).amin(0)
-    gain = [fit.significance(noise) - (14 + 4 * i if i else 0) for i, fit in enumerate(fits)]
+    jitter = torch.stack([fit.jitter for fit in fits])
+    noise = torch.stack([fit.noise for fit in fits]).amin(0).maximum(_ROUNDING * jitter.amax(0))
+    noise = noise.maximum(1e-30 * fits[0].power + 1e-300)
+    gain = [fit / noise - (14 + 4 * i if i else 0) for i, fit in enumerate(jitter)]
     return torch.stack(gain).argmax(0)
 
 

@@ -12,6 +12,10 @@ from torch import Tensor
 from torchsar.radar import StripmapRadar
 from torchsar.scene.trials import refuse_unless, with_dims
 
+# pulses at the ends of a dwell count as inside: so near, rounding would decide, and differently on
+# each processor
+_TIE = 1e-9
+
 
 class Path(Protocol):
     """Range history of a target on a straight path."""
@@ -219,7 +223,8 @@ class Dwell:
         Returns:
             Gain, shape (..., pulse, target), float64.
         """
-        return (since_s.abs() <= with_dims(self.dwell_s, 2, since_s) / 2).to(since_s.dtype)
+        half = with_dims(self.dwell_s, 2, since_s) / 2
+        return (since_s.abs() <= half * (1 + _TIE)).to(since_s.dtype)
 
 
 @dataclass(frozen=True)

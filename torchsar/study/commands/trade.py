@@ -101,7 +101,7 @@ def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> li
             measured = choice.measured()
         except _FAILURES as error:
             raise ConfigError(f"{bench.file}: {one_line(error)}") from error
-        found = [_Tried(one, measured) for one in order]
+        found = [_Tried(one, measured, bench.device) for one in order]
         for _ in range(repeats):
             for tried, name in zip(found, names, strict=True):
                 if not tried.failed:
@@ -120,6 +120,7 @@ class _Tried:
 
     one: Alternative
     measured: Measured
+    device: str = "cpu"
     times: list[tuple[float, float]] = field(default_factory=list)
     peak_bytes: int | None = None
     loss: dict[str, float] = field(default_factory=dict)
@@ -129,8 +130,8 @@ class _Tried:
         """Run the alternative once more; the first run measures its loss as well."""
         try:
             # kept memory is returned before memory is measured, which takes time
-            with nullcontext() if self.times else PeakMemory() as peak:
-                spent, result = _spent(lambda: self.measured.run(self.one), _LEAST_S if self.times else 0.0)
+            with nullcontext() if self.times else PeakMemory(self.device) as peak:
+                spent, result = _spent(self._run, _LEAST_S if self.times else 0.0)
             if peak is not None:
                 self.peak_bytes = peak.bytes
                 self.loss = {name: float(value) for name, value in self.measured.loss(self.one, result).items()}
@@ -143,6 +144,12 @@ class _Tried:
             self.failed = "" if wrong is None else f"{wrong} is not finite"
         if len(self.times) < 2:
             log.info("%s", self._line())
+
+    def _run(self) -> Any:
+        result = self.measured.run(self.one)
+        if torch.device(self.device).type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return result
 
     def row(self, tolerance: Mapping[str, float]) -> Row:
         """Return the row of the alternative in trade.json."""

@@ -26,7 +26,7 @@ Numbers = dict[str, dict[str, list[float]]]
 BOUNDS, SAVED = "bounds", "saved"
 # larger batches do not fit the cache of a CPU and take more time per trial, as measured
 CACHE_BYTES = 12 << 20
-# of the free memory of a GPU that a batch takes, and the trials of the batches that are measured first
+# share of the free memory of a GPU that a batch takes, and sizes of the batches that are measured
 _GPU_SHARE, _MEASURED = 0.85, (1, 1, 8)
 
 
@@ -295,7 +295,7 @@ def rows_of(work: Work, case: int, trials: int, workers: int) -> int:
         return rows_by_bytes(probed_bytes(work, case))
     peaks = {}
     for rows in _MEASURED:  # the first batch also makes what later ones find made
-        with PeakMemory() as memory:
+        with PeakMemory(work.device) as memory:
             work.compute(Chunk(case, (0,) * rows, tuple(range(rows))))
         peaks[rows] = memory.bytes or 0
     torch.cuda.empty_cache()
