@@ -134,7 +134,8 @@ def _filled(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """`torch.tensor` and the like by way of the CPU, since torch fills no tensor on `meta`."""
 
     def made(data: Any, *args: Any, device: Any = None, **kwargs: Any) -> Tensor:
-        if isinstance(data, Tensor) or device is None or torch.device(device) != DEVICE:
+        wanted = torch.empty(0).device if device is None else torch.device(device)
+        if isinstance(data, Tensor) or wanted != DEVICE:
             return make(data, *args, device=device, **kwargs)
         return make(data, *args, device=_CPU, **kwargs).to(DEVICE)
 

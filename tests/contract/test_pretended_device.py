@@ -20,6 +20,7 @@ from tests.extremes.table import FUNCTIONS, NUMBERS, Entry, named, samples
 from tests.study.scenes import CORRECT, SCENES, TILES, loaded_as, world
 from torchsar.core import Axis, Draws, Signal
 from torchsar.multichannel import detect
+from torchsar.study.settings.sections import Loaded
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 
@@ -130,25 +131,30 @@ def test_stages(case: Case, place: Place) -> None:
     compare(case.name, every[0], every[-1])
 
 
+def small(system: str, folder: Path) -> Loaded:
+    processor = {**SCENES[system]["processor"], **CHAINS.get(system, {})}
+    return loaded_as(folder, system, world=world(system, **SMALL[system]), processor=processor)
+
+
+def figures(loaded: Loaded, device: str, trials: list[int]) -> dict[str, Tensor]:
+    """Bounds and metrics of the recommended chain."""
+    bench = Bench(loaded, device)
+    batch = bench.batch(Draws(3, "run", trials), methods=["recommended"])
+    bounds = {f"{key} {of}": x for key, each in bench.system.bounds(bench, batch).items() for of, x in each.items()}
+    metrics = batch.outcomes["recommended"].metrics
+    return {**bounds, **{key: x for key, x in metrics.items() if key != "seconds"}}
+
+
 @pytest.mark.parametrize("system", SMALL)
 def test_systems(system: str, place: Place, tmp_path: Path) -> None:
     """Simulation, recommended chain, metrics and bounds, of few trials and of the same twice."""
     few = [0] if system in _ONCE else [0, 1]
-    processor = {**SCENES[system]["processor"], **CHAINS.get(system, {})}
-    loaded = loaded_as(tmp_path, system, world=world(system, **SMALL[system]), processor=processor)
-
-    def run(device: str, trials: list[int]) -> dict[str, Tensor]:
-        bench = Bench(loaded, device)
-        batch = bench.batch(Draws(3, "run", trials), methods=["recommended"])
-        bounds = {f"{key} {of}": x for key, each in bench.system.bounds(bench, batch).items() for of, x in each.items()}
-        metrics = batch.outcomes["recommended"].metrics
-        return {**bounds, **{key: x for key, x in metrics.items() if key != "seconds"}}
-
-    expected = run("cpu", few)
+    loaded = small(system, tmp_path)
+    expected = figures(loaded, "cpu", few)
     every = []
     for trials in (few, few * 2)[: 1 if system in _ONCE else 2]:
         with place.counted() as counts:
-            found = place.take(run(str(place.device), trials))
+            found = place.take(figures(loaded, str(place.device), trials))
         for name, value in expected.items():
             there = value if value.shape == found[name].shape else torch.cat([value] * (len(trials) // len(few)))
             torch.testing.assert_close(
@@ -161,6 +167,14 @@ def test_systems(system: str, place: Place, tmp_path: Path) -> None:
             )
         every.append(counts)
     compare(system, every[0], every[-1])
+
+
+@pytest.mark.parametrize("system", SMALL)
+def test_systems_work_where_a_device_is_the_default(system: str, place: Place, tmp_path: Path) -> None:
+    loaded = small(system, tmp_path)
+    with place.counted(), place.device:
+        found = figures(loaded, str(place.device), [0])
+    assert all(map(place.holds, found.values()))
 
 
 @pytest.mark.parametrize("sweep", CHAIN_WAITS)

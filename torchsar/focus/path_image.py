@@ -85,8 +85,9 @@ class PathImage(Stage):
         self.axes = azimuth, range_
         sin, cos = math.sin(range_axis_rad), math.cos(range_axis_rad)
         axes = torch.tensor([[-sin, cos, 0.0], [cos, sin, 0.0]], dtype=torch.float64)
-        origin = torch.tensor(starts, dtype=torch.float64) @ axes
-        origin[2] = height_m
+        along, across = starts
+        corner = (across * cos - along * sin, along * cos + across * sin, float(height_m))
+        origin = torch.tensor(corner, dtype=torch.float64)
         self.grid = ImageGrid(origin, axes, (azimuth.n, range_.n), float(step_m))
 
     def form(self, history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid) -> Tensor:

@@ -138,7 +138,8 @@ class TilePlan:
         if self._swapped:
             grid = grid.transposed()
         scene = Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid, self.lit)
-        self.choice = choice = choose(scene, self.error_db)
+        with torch.device("cpu"):  # tables of the choice lie there whatever the default device
+            self.choice = choice = choose(scene, self.error_db)
         self._size = size = choice.width, choice.depth
         self._band = Band.of(self.frequency_hz, LIGHT_M_S, choice.oversampling)
         self._tiles = tuple(-(-n // m) for n, m in zip(grid.counts, size, strict=True))
