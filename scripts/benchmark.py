@@ -1,7 +1,7 @@
 """Time of every stage, echo simulation, metric and draw of the packaged configs over a floor.
 
     python scripts/benchmark.py --out benchmark.json [--small] [--only NAME] [--threads 1 2]
-                                [--device cpu cuda]
+                                [--device cpu cuda] [--budget SECONDS]
 
 Every config runs in a process of its own, so that its peak memory is its own, and once per number
 of threads and device. A row holds
@@ -13,7 +13,8 @@ of threads and device. A row holds
 - `over_floor`: median of the ratio of this time to that of the floor, which is measured in turn
   with it: bare transforms of the same data, one two-dimensional FFT and its inverse. A machine that
   other programs use too slows both, so that runs can be compared by the ratio;
-- `peak_bytes`: largest resident memory of the process, of the part `memory` only.
+- `peak_bytes`: largest resident memory of the process, or its largest memory on the device, of the
+  part `memory` only.
 
 `scripts/compare_benchmarks.py OLD NEW` lists what became slower. Configs that need a recording are
 left out. The file is written after each config.
@@ -67,6 +68,8 @@ CONFIGS = {
     "sweeps/stripmap_doppler": 16,
 }
 SMALL = {"sweeps/sal_snr": 2}
+# on an accelerator sweeps process so many times as many trials at once
+MORE = 32
 # calls are repeated until so much time is spent, and at most so often
 BUDGET_S, MOST = 1.0, 15
 # random numbers are drawn by these methods of `Draws`; `subset` takes those of `permutation`
@@ -126,18 +129,16 @@ def seconds(work: Callable[[], Any], device: torch.device) -> float:
 
 
 @contextmanager
-def drawing() -> Iterator[list[float]]:
+def drawing(device: torch.device) -> Iterator[list[float]]:
     """Collect the times of the calls that draw random numbers."""
     spent: list[float] = []
     whole = {name: getattr(Draws, name) for name in DRAWN}
 
     def timed(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
         def call(*args: Any, **kwargs: Any) -> Tensor:
-            began = time.perf_counter()
-            try:
-                return method(*args, **kwargs)
-            finally:
-                spent.append(time.perf_counter() - began)
+            drawn: list[Tensor] = []
+            spent.append(seconds(lambda: drawn.append(method(*args, **kwargs)), device))
+            return drawn[0]
 
         return call
 
@@ -160,7 +161,7 @@ def measured(config: str, count: int, budget_s: float, threads: int, device: str
     batch = bench.batch(draws, keep=list(bench.chains))
     raw = batch.trials.recording.signal.data
 
-    with drawing() as spent:
+    with drawing(raw.device) as spent:
         found.time("echo", "", lambda: bench.trials(draws), raw)
     found.add("draws", "", seconds=sum(spent) / found.calls, over_floor=None)
     for method, outcome in batch.outcomes.items():
@@ -173,10 +174,16 @@ def measured(config: str, count: int, budget_s: float, threads: int, device: str
         judge = judging(bench, method, trace, batch.trials)
         found.time("metrics", method, judge, trace.signal.data)
     found.time("batch", "", lambda: bench.batch(draws, methods=["recommended"]), raw)
-    # kilobytes on Linux, bytes on macOS
-    unit = 1 if sys.platform == "darwin" else 1024
-    found.add("memory", "", peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
+    found.add("memory", "", peak_bytes=peak_bytes(bench.device))
     return found.rows
+
+
+def peak_bytes(device: str) -> int:
+    """Largest memory of the process on a CUDA device, or its largest resident memory."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    # kilobytes on Linux, bytes on macOS
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def again(bench: Bench, method: str, stage: str, trace: Trace) -> Callable[[], Any]:
@@ -218,9 +225,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", default="", help="configs whose name contains this")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="numbers of threads")
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+    parser.add_argument("--budget", type=float, default=BUDGET_S, help="seconds for the repetitions of a call")
     parser.add_argument("--device", nargs="+", default=devices, help="devices, by default all that there are")
     options = parser.parse_args(arguments)
-    counts, budget_s = (SMALL, 0.0) if options.small else (CONFIGS, BUDGET_S)
+    counts, budget_s = (SMALL, 0.0) if options.small else (CONFIGS, options.budget)
     chosen = [name for name in counts if options.only in name]
     if not chosen:
         parser.error(f"no config has {options.only!r} in its name; there are {', '.join(counts)}")
@@ -231,7 +239,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for device in options.device:
             for threads in options.threads[: 1 if options.small or device != "cpu" else None]:
                 received, sent = spawn.Pipe(duplex=False)
-                process = spawn.Process(target=worker, args=(sent, config, counts[config], budget_s, threads, device))
+                count = counts[config] * (MORE if device != "cpu" and counts[config] > 1 else 1)
+                process = spawn.Process(target=worker, args=(sent, config, count, budget_s, threads, device))
                 process.start()
                 sent.close()
                 try:
