@@ -64,11 +64,14 @@ class Counts:
         waits: Synchronisations.
         uploads: Copies from the host.
         kernels: Operations other than views.
+        faults: Operations with an index out of range. CUDA reports them later, and then computes
+            nothing more in this process.
     """
 
     waits: Counter[str] = field(default_factory=Counter)
     uploads: Counter[str] = field(default_factory=Counter)
     kernels: Counter[str] = field(default_factory=Counter)
+    faults: Counter[str] = field(default_factory=Counter)
 
 
 class Pretended(Tensor):
@@ -213,7 +216,12 @@ def _carried_out(func: Any, args: Any, kwargs: Mapping[str, Any]) -> Any:
         _count(_Counting.now, known, operands, on_device, args, kwargs)
     if wanted is not None:
         named["device"] = _CPU
-    made = func(*plain, **named)
+    try:
+        made = func(*plain, **named)
+    except (IndexError, RuntimeError) as error:
+        if _Counting.now is not None and "out of" in str(error):
+            _Counting.now.faults[_line()] += 1
+        raise
     if not on_device:
         return args[0] if known.packet is _aten.copy_ else made
     originals = {id(x.kept): x for x in here} if known.writes else {}
@@ -234,7 +242,7 @@ def _plain(x: Any, operands: list[Tensor]) -> Any:
 
 
 def _wrapped(x: Tensor, originals: Mapping[int, Pretended], packet: Any) -> Pretended:
-    if originals and id(x) in originals:
+    if originals and id(x) in originals and originals[id(x)].shape == x.shape:
         return originals[id(x)]
     if x.is_conj() or x.is_neg():
         # the wrapper has no bit for a lazy conjugate, which torch would resolve earlier

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -129,6 +130,28 @@ def test_stages(case: Case, place: Place) -> None:
         equal(place, found, {name: repeated(value) for name, value in expected.items()}, case.tolerance)
         every.append(counts)
     compare(case.name, every[0], every[-1])
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+def test_nan_becomes_no_index(case: Case) -> None:
+    """On a device a stage meets the NaN that its checks, which are read late, will refuse."""
+    if case.name in ELSEWHERE:
+        return
+    signal = entering(case, raw(2, n_range=case.n_range))
+    values = case.values(signal)
+    spoiled = [(_spoiled(signal.data), values)]
+    spoiled += [(signal.data, {**values, key: _spoiled(x)}) for key, x in values.items() if x.is_floating_point()]
+    for data, given in spoiled:
+        with PLACES["pretended"].counted() as counts, suppress(ValueError):
+            case.build().to(DEVICE)(signal.with_data(to_device(data)), **to_device(given))
+        assert not counts.faults
+
+
+def _spoiled(x: Tensor) -> Tensor:
+    """With a NaN in the last trial."""
+    bad = x.clone()
+    bad[-1].view(-1)[0] = torch.nan
+    return bad
 
 
 def small(system: str, folder: Path) -> Loaded:

@@ -205,7 +205,7 @@ def _whitened(samples: Tensor, covariance: Tensor) -> Tensor:
     replace pulses.
     """
     spectra = torch.fft.fft(samples, dim=-2, norm="ortho").movedim(-3, -2)
-    root = torch.linalg.cholesky(covariance.to(spectra.dtype))
+    root = torch.linalg.cholesky(covariance.to(spectra))
     return torch.linalg.solve_triangular(root, spectra, upper=False)
 
 

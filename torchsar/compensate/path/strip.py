@@ -124,8 +124,9 @@ def strip_autofocus(
     beam = ProcessedBeam(beam_deg, squint_deg)
     cos, sin = math.cos(range_axis_rad), math.sin(range_axis_rad)
     axes = torch.tensor([[-sin, cos, 0.0], [cos, sin, 0.0]], dtype=torch.float64, device=profiles.device)
-    middle = torch.tensor([centre_m[1], centre_m[0]], dtype=torch.float64, device=profiles.device) @ axes
-    middle[2] = height_m
+    across, along = centre_m
+    place = (across * cos - along * sin, along * cos + across * sin, height_m)
+    middle = torch.tensor(place, dtype=torch.float64, device=profiles.device)
 
     @torch.no_grad()
     def find(rows: Tensor, one: AntennaPath) -> Estimate:

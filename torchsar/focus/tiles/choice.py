@@ -472,8 +472,8 @@ class Scene:
 
 
 # Gauss-Legendre rule of three points for the mean from -1 to 1
-_GAUSS = torch.tensor([-math.sqrt(0.6), 0.0, math.sqrt(0.6)], dtype=torch.float64)
-_GAUSS_WEIGHT = torch.tensor([5 / 18, 8 / 18, 5 / 18], dtype=torch.float64)
+_GAUSS = torch.tensor([-math.sqrt(0.6), 0.0, math.sqrt(0.6)], dtype=torch.float64, device="cpu")
+_GAUSS_WEIGHT = torch.tensor([5 / 18, 8 / 18, 5 / 18], dtype=torch.float64, device="cpu")
 
 
 def _in_tile(n: int, size: int) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ _TAPS = range(3, 13)
 _ENTRIES = 97
 # distances from the last flat sample of a window at which its error is tabulated, in samples; a
 # pixel may lie up to one sample beyond it
-_DISTANCES = 0.5 * torch.arange(50, dtype=torch.float64) - 0.75
+_DISTANCES = 0.5 * torch.arange(50, dtype=torch.float64, device="cpu") - 0.75
 # ridge of the fit of the nodes, above the rounding of double precision; beta relative to that of a
 # kernel whose band just ends at the oversampling, found by trial; 1 - u^2
 # below which the slope of the kernel, which is infinite at its end, is cut for gradients

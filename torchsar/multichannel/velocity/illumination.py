@@ -139,7 +139,9 @@ class _Pulses:
         value, energy = ((echo.conj() * x).sum(-2) for x in filtered)
         energy = energy.real.clamp_min(0)
         before = energy.cumsum(-1) - energy / 2
-        part = (parts * before / energy.sum(-1, keepdim=True).clamp_min(_TINY)).floor().clamp(0, parts - 1).long()
+        # samples that are NaN are refused later, and until then must not become an index
+        share = (before / energy.sum(-1, keepdim=True).clamp_min(_TINY)).nan_to_num()
+        part = (parts * share).floor().clamp(0, parts - 1).long()
         return _Pulses(value, energy, part)
 
     def amplitudes(self, parts: int) -> Tensor:
