@@ -11,6 +11,11 @@ from torch import Tensor, nn
 
 from torchsar.core import Axis, Chain, Estimate, Signal, Stage, host_value, untraced, use
 
+pytestmark = pytest.mark.skipif(
+    tuple(map(int, torch.__version__.split("+")[0].split(".")[:2])) < (2, 12),
+    reason="torch.compile takes stages as arguments since a later version of torch",
+)
+
 
 class Gain(Stage):
     """Multiply by a tunable gain; the number of steps follows from the values of `step`."""

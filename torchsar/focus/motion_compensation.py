@@ -361,7 +361,7 @@ class MotionCompensation:
             change of the Fresnel ripple of the beam's edges over the swath; plus what leaks beyond
             the band.
         """
-        node, weight = _gauss(_RANGES)
+        node, weight = (x.to(self._pulse_m.device) for x in _gauss(_RANGES))
         low, high = self._closest_m
         closest = (low + high) / 2 + node * (high - low) / 2
         weight = weight * closest / (weight * closest).sum()
@@ -373,7 +373,7 @@ class MotionCompensation:
 
     def _phase_error(self, closest_m: Tensor, pattern: Callable[[Tensor], Tensor] | None) -> Tensor:
         """Mean of |exp(j phi) - 1|^2 at closest ranges, float64 (range,)."""
-        sine, share = self.beam.quadrature()
+        sine, share = (x.to(closest_m.device) for x in self.beam.quadrature())
         share = share if pattern is None else share * pattern(sine)
         some = slice(None, None, max(1, len(self._pulse_m) // _PULSES))
         # (pulse, range, angle)
