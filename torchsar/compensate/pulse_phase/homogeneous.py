@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import or_one, rotate
+from torchsar.compensate.pulse_phase.data import or_one, rising, rotate
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 
 # Range cells are grouped by power, because each group has its own spectrum: largest ratio of the
@@ -114,7 +114,7 @@ def sparse_gain_nats(power: Tensor) -> Tensor:
     """
     total = power[0].numel() if len(power) else 1
     smallest = torch.finfo(power.dtype).tiny
-    strongest = power.flatten(1).sort(descending=True).values.to(torch.float64)[:, : max(1, total - 1)]
+    strongest = rising(power.flatten(1)).flip(-1).to(torch.float64)[:, : max(1, total - 1)]
     count = torch.arange(1, strongest.shape[-1] + 1, dtype=torch.float64, device=power.device)
     whole = power.sum((-2, -1), dtype=torch.float64)[:, None]
     rest = ((whole - strongest.cumsum(-1)) / (total - count).clamp_min(1)).clamp_min(_LEAST_REST)

@@ -13,7 +13,7 @@ from torchsar.compensate.pulse_phase.data import Pulses, prepare, refuse_odd_cou
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.linking import linked
 from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
+from torchsar.compensate.pulse_phase.sharpen import WIENER_FACTORS, LogAbove, Run, Wiener, fixed_point, in_turn
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate, host_value, true_positions
 from torchsar.metrics import entropy
@@ -44,7 +44,7 @@ def autofocus(
     search: int = 120,
     polish: int = 20,
     search_tolerance_rad: float = 0.01,
-    tolerance_rad: float = 1e-3,
+    tolerance_rad: float = 2e-3,
     imaging: Imaging | None = None,
 ) -> Estimate:
     """Estimate the phase of each pulse; the recommended autofocus.
@@ -108,12 +108,16 @@ def autofocus(
     refuse_odd_counts("autofocus", 0, search=search, polish=polish)
     through = None if imaging is None else Through(imaging)
     coarse, fine = (AlongPulses(), AlongPulses(2)) if through is None else (through, through)
-    again = Run(Wiener(), fine, 6, 1.0, tolerance_rad) if polish else Run(LogAbove(_FLOOR), coarse, 4, _RELAXATION, 0.0)
+    again = (
+        Run(Wiener(), fine, 3, WIENER_FACTORS, tolerance_rad)
+        if polish
+        else Run(LogAbove(_FLOOR), coarse, 4, _RELAXATION, 0.0)
+    )
 
     def runs(coarse: Imaging, fine: Imaging) -> list[Run]:
         return [
             Run(LogAbove(_FLOOR), coarse, search, _RELAXATION, search_tolerance_rad),
-            Run(Wiener(), fine, polish, 1.0, tolerance_rad),
+            Run(Wiener(), fine, polish, WIENER_FACTORS, tolerance_rad),
         ]
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:

@@ -8,16 +8,20 @@ weighted image a Wiener estimate of the scene.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import rotate, safe_angle
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging
-from torchsar.core import cis, host_value
+from torchsar.core import cis, host_value, true_positions
 
 Weights = Callable[[Tensor, Tensor], Tensor]
+# Factors of three iterations with the weights `Wiener`. Without them an iteration removes 0.2 to
+# 1.1 of the parts of a phase error, the least in dense scenes; the factors are those for which
+# three iterations leave least of any such part (Chebyshev), in an order in which none grows much.
+WIENER_FACTORS = (0.96, 3.84, 1.54)
 # iterations on an accelerator between two decisions whether to stop, by choice
 _LOOK = 4
 
@@ -34,19 +38,29 @@ class Run:
             and its mean, shape (trial, 1, 1), and returns the real weights of the cells.
         imaging: Image formation.
         iterations: Largest number of iterations.
-        relaxation: Factor applied to the phase step.
-        tolerance_rad: Phase step in rad, rms over the pulses, below which the iterations of a trial
-            end.
+        relaxation: Factor applied to the phase step; several are taken in turn.
+        tolerance_rad: Phase step in rad, rms over the pulses and with the smallest factor, below
+            which the iterations of a trial end.
     """
 
     weights: Weights
     imaging: Imaging
     iterations: int
-    relaxation: Tensor | float
+    relaxation: Tensor | float | tuple[float, ...]
     tolerance_rad: float
 
+    @property
+    def is_divisible(self) -> bool:
+        """Whether some of the trials can go on without the others."""
+        return isinstance(self.imaging, AlongPulses) and not isinstance(self.relaxation, Tensor)
 
-def fixed_point(rows: Tensor, phase: Tensor, run: Run) -> tuple[Tensor, Tensor]:
+    def of(self, trials: Tensor) -> Run:
+        """The settings of some of the trials, given by their positions."""
+        floor = self.weights.floor if isinstance(self.weights, LogAbove) else None
+        return replace(self, weights=LogAbove(floor[trials])) if isinstance(floor, Tensor) and floor.ndim else self
+
+
+def fixed_point(rows: Tensor, phase: Tensor, run: Run, done: int = 0) -> tuple[Tensor, Tensor]:
     """Sharpen the image by fixed-point iterations of the phase psi of every pulse.
 
     Each iteration is psi <- psi + relaxation * arg sum_n x conj(A^H (w A x)). Here x = rows exp(-j
@@ -57,6 +71,7 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run) -> tuple[Tensor, Tensor]:
         rows: Pulses, shape (trial, range, pulse), complex.
         phase: Phase to start from in rad, shape (trial, pulse).
         run: Settings of the iterations.
+        done: Number of iterations made before.
 
     Returns:
         The phase in rad, shape (trial, pulse), and the number of iterations, shape (trial,).
@@ -66,13 +81,21 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run) -> tuple[Tensor, Tensor]:
     mirrored = rows.conj().resolve_conj()
     # on an accelerator waiting for the decision costs as much as iterations that change nothing
     every = 1 if rows.device.type == "cpu" else _LOOK
-    for number in range(1, run.iterations + 1):
-        step = run.relaxation * _phase_step(rows, mirrored, phase, run)
-        phase = torch.where(active[:, None], phase + step, phase)
+    factors = run.relaxation if isinstance(run.relaxation, tuple) else (run.relaxation,)
+    for number in range(done + 1, run.iterations + 1):
+        step = _phase_step(rows, mirrored, phase, run)
+        phase = torch.where(active[:, None], phase + factors[(number - 1) % len(factors)] * step, phase)
         taken = taken + active
-        active = active & (step.detach().square().mean(-1) > run.tolerance_rad**2)
-        if number % every == 0 and run.iterations - number >= every and not host_value(active.any(), True):
+        active = active & ((min(factors) * step).detach().square().mean(-1) > run.tolerance_rad**2)
+        if number % every or run.iterations - number < every:
+            continue
+        going = host_value(active.sum(), len(active))
+        if not going:
             break
+        if 2 * going <= len(active) and run.is_divisible and not phase.requires_grad:
+            some = true_positions(active, going)
+            ended, more = fixed_point(rows[some], phase[some], run.of(some), number)
+            return phase.index_copy(0, some, ended), taken.index_add(0, some, more)
     return phase, taken
 
 

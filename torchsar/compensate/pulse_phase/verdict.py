@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.alignment import Displacement, displacement
-from torchsar.compensate.pulse_phase.data import Pulses, or_one, rotate, safe_angle
+from torchsar.compensate.pulse_phase.data import Pulses, or_one, rising, rotate, safe_angle
 from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.core import Estimate, block_bytes_of, over_blocks
@@ -346,12 +346,21 @@ def _settled_apart(parts: Sequence[Tensor], present: Tensor, phase: Tensor, agai
     every = 1 if phase.device.type == "cpu" else _RETURNS // 2  # waiting costs as much as a round
     for number in range(1, _RETURNS + 1):
         reached = [again(part, present, at) for part, at in zip(parts, ends, strict=True)]
-        far = torch.stack([phase_rmse(*pair, present) for pair in zip(reached, ends, strict=True)]) >= _RETURNED_RAD
+        far = torch.stack([_moved(*pair) for pair in zip(reached, ends, strict=True)]) >= _RETURNED_RAD
         ends = [torch.where(active[:, None], new, old) for new, old in zip(reached, ends, strict=True)]
         active = active & far.any(0)
         if number % every == 0 and number < _RETURNS and not bool(active.any()):
             break
     return ends
+
+
+def _moved(new: Tensor, old: Tensor) -> Tensor:
+    """Rms of the change of phases (trial, pulse) about its mean and slope in rad, (trial,)."""
+    step = torch.remainder(new - old + math.pi, 2 * math.pi) - math.pi
+    place = torch.arange(step.shape[-1], dtype=step.dtype, device=step.device) - (step.shape[-1] - 1) / 2
+    step = step - step.mean(-1, keepdim=True)
+    slope = (step * place).sum(-1, keepdim=True) / place.square().sum()
+    return (step - slope * place).square().mean(-1).sqrt()
 
 
 def _persists(rows: Tensor, phase: Tensor) -> Tensor:
@@ -368,7 +377,8 @@ def _persists(rows: Tensor, phase: Tensor) -> Tensor:
     spectra, variances, clear = [], [], torch.ones_like(phase[:, 0], dtype=torch.bool)
     for first in range(0, _QUARTERS * n, n):
         level = torch.fft.fft(x[..., first : first + n], 2 * n).abs()
-        median = level.flatten(1).median(-1).values[:, None, None]
+        sizes = rising(level.flatten(1))
+        median = sizes[:, (sizes.shape[-1] - 1) // 2, None, None]
         above = (level - 2 * median).clamp_min(0)
         above = above - above.mean((-2, -1), keepdim=True)
         whole, noise = above.square().sum((-2, -1)), _ABOVE_VARIANCE * median[:, 0, 0].square() * above[0].numel()
