@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -32,7 +33,7 @@ from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.compensate.pulse_phase.gradient import _centred, _Rows, _solver, _view, _windowed
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.pairs import pair_products
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point
+from torchsar.compensate.pulse_phase.sharpen import WIENER_FACTORS, LogAbove, Run, Wiener, fixed_point
 from torchsar.core import Chain, Signal, use
 from torchsar.metrics import entropy, phase_rmse, residual_phase
 from torchsar.radar import InverseRadar
@@ -356,6 +357,29 @@ def test_transform_along_pulses_and_its_adjoint(oversampling):
     x, y = torch.randn(2, 3, 10, dtype=DOUBLE), torch.randn(2, 3, 10 * oversampling, dtype=DOUBLE)
     a = AlongPulses(oversampling)
     torch.testing.assert_close((a.image(x) * y.conj()).sum(), (x * a.adjoint(y).conj()).sum(), atol=1e-12, rtol=0)
+
+
+def test_factors_in_turn_leave_an_eighth_of_every_part_of_a_phase_error():
+    """An iteration with the factor f removes f times 0.2 to 1.1 of a part."""
+    removed = torch.linspace(0.2, 1.1, 100)
+    left = torch.stack([1 - factor * removed for factor in WIENER_FACTORS])
+    assert left.prod(0).abs().max() < 0.135  # with factors of 1: 0.51
+    assert left.cumprod(0).abs().max() < 1  # nothing grows on the way
+
+
+def test_trials_that_go_on_without_the_others_do_not_change():
+    """Half of the trials, and more, have converged: the rest goes on alone, with its own floor."""
+    x = noisy(still(5), 10.0).mT.contiguous()
+    walk = torch.randn(128, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).cumsum(0)
+    start = 0.05 * walk * torch.tensor([0.0, 0.0, 1.0, 0.0, 2.0], dtype=torch.float64)[:, None]
+    floor = torch.tensor([2.5, 2.5, 3.0, 2.5, 2.0], dtype=torch.float64)[:, None, None]
+    run = Run(LogAbove(floor), AlongPulses(), 60, (1.5, 1.8), 1e-4)
+    phase, taken = fixed_point(x, start, run)
+    assert 2 * int((taken == taken.max()).sum()) <= 5
+    for i in range(5):
+        alone, count = fixed_point(x[i : i + 1], start[i : i + 1], replace(run, weights=LogAbove(floor[i : i + 1])))
+        torch.testing.assert_close(phase[i], alone[0], rtol=0, atol=1e-9)
+        assert int(taken[i]) == int(count)
 
 
 def test_iterations_are_counted_and_a_converged_trial_stops():
