@@ -1,9 +1,9 @@
 """Write the record of a finished sweep, a small file that tests check: RMSE, intervals, bounds and
 shares of its errors (and of the metrics named), and the first trials of one point.
 
-python scripts/keep_sweep.py out/stripmap_doppler docs/sweeps/stripmap_doppler.json python
-scripts/keep_sweep.py out/isal_snr docs/sweeps/isal_snr.json residual_phase_rms_rad
-entropy_above_ideal_nats
+    python scripts/keep_sweep.py out/stripmap_doppler docs/sweeps/stripmap_doppler.json
+    python scripts/keep_sweep.py out/isal_snr docs/sweeps/isal_snr.json \\
+        residual_phase_rms_rad entropy_above_ideal_nats
 """
 
 from __future__ import annotations

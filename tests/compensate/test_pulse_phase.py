@@ -359,12 +359,31 @@ def test_transform_along_pulses_and_its_adjoint(oversampling):
     torch.testing.assert_close((a.image(x) * y.conj()).sum(), (x * a.adjoint(y).conj()).sum(), atol=1e-12, rtol=0)
 
 
-def test_factors_in_turn_leave_an_eighth_of_every_part_of_a_phase_error():
-    """An iteration with the factor f removes f times 0.2 to 1.1 of a part."""
-    removed = torch.linspace(0.2, 1.1, 100)
+def test_factors_in_turn_leave_a_seventh_of_every_part_of_a_phase_error():
+    """An iteration with the factor f removes f times 0.2 to 1.2 of a part."""
+    removed = torch.linspace(0.2, 1.2, 100)
     left = torch.stack([1 - factor * removed for factor in WIENER_FACTORS])
-    assert left.prod(0).abs().max() < 0.135  # with factors of 1: 0.51
+    assert left.prod(0).abs().max() < 0.155  # with factors of 1: 0.51
     assert left.cumprod(0).abs().max() < 1  # nothing grows on the way
+
+
+@pytest.mark.parametrize("n_pulse", [3, 4, 6, 8, 12, 16, 23, 24, 32, 64])
+def test_few_pulses_are_found_as_well_as_with_single_steps(n_pulse):
+    """With 3 pulses an iteration removes 1.7 of some parts; factors in turn would diverge."""
+    source = torch.Generator().manual_seed(n_pulse)
+    doppler = torch.rand(48, 16, 1, dtype=torch.float64, generator=source)
+    cell = torch.randint(0, 16, (48, 16, 1), generator=source).expand(-1, -1, n_pulse)
+    level = torch.randn(48, 16, 1, dtype=DOUBLE, generator=source)
+    tone = level * torch.exp(2j * math.pi * doppler * torch.arange(n_pulse, dtype=torch.float64))
+    x = torch.zeros(48, 16, n_pulse, dtype=DOUBLE).scatter_add(1, cell, tone)
+    x = (x + 0.03 * torch.randn(x.shape, dtype=DOUBLE, generator=source)).mT
+    truth = torch.randn(48, n_pulse, dtype=torch.float64, generator=source)
+    found = autofocus(turned(x, truth))["phase_rad"]
+    slow = Run(Wiener(), AlongPulses(2), 40, 1.0, 0.0)
+    settled = fixed_point(turned(x, truth).mT.contiguous(), found, slow)[0]
+    assert float(phase_rmse(settled, found).median()) < 0.01
+    # what is not settled is a matter of the scene, not of the steps
+    assert float(phase_rmse(found, truth).median()) < 1.1 * float(phase_rmse(settled, truth).median()) + 1e-3
 
 
 def test_trials_that_go_on_without_the_others_do_not_change():
@@ -380,6 +399,13 @@ def test_trials_that_go_on_without_the_others_do_not_change():
         alone, count = fixed_point(x[i : i + 1], start[i : i + 1], replace(run, weights=LogAbove(floor[i : i + 1])))
         torch.testing.assert_close(phase[i], alone[0], rtol=0, atol=1e-9)
         assert int(taken[i]) == int(count)
+
+
+def test_a_floor_of_one_number_serves_all_trials():
+    x = noisy(still(6), 10.0)
+    plain = entropy_fixed_point(x, floors=((2.0, 40),))["phase_rad"]
+    for floor in (torch.tensor(2.0), torch.tensor([2.0]), torch.tensor([[[2.0]]])):
+        torch.testing.assert_close(entropy_fixed_point(x, floors=((floor, 40),))["phase_rad"], plain)
 
 
 def test_iterations_are_counted_and_a_converged_trial_stops():

@@ -11,6 +11,7 @@ devices need a build of torch for them, or a registration that holds for the who
 
 from __future__ import annotations
 
+import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -219,7 +220,7 @@ def _carried_out(func: Any, args: Any, kwargs: Mapping[str, Any]) -> Any:
     try:
         made = func(*plain, **named)
     except (IndexError, RuntimeError) as error:
-        if _Counting.now is not None and "out of" in str(error):
+        if _Counting.now is not None and re.search("out of (range|bounds)", str(error)):
             _Counting.now.faults[_line()] += 1
         raise
     if not on_device:

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torchsar.core import Axis, Chain, Estimate, Signal, Stage, host_value, untraced, use
 
 pytestmark = pytest.mark.skipif(
-    tuple(map(int, torch.__version__.split("+")[0].split(".")[:2])) < (2, 12),
-    reason="torch.compile takes stages as arguments since a later version of torch",
+    tuple(map(int, torch.__version__.split("+")[0].split(".")[:2])) < (2, 13),
+    reason="torch.compile takes stages as arguments since torch 2.13",
 )
 
 

@@ -21,7 +21,7 @@ from torchsar.core import Draws
 from torchsar.study.montecarlo import Record, Stop, differences, read_sweep, sweep
 from torchsar.study.montecarlo.grid import address, make_grid
 from torchsar.study.montecarlo.loop import looks
-from torchsar.study.montecarlo.work import CACHE_BYTES, Work, cut, probed_bytes, rows_by_bytes, rows_by_peak
+from torchsar.study.montecarlo.work import CACHE_BYTES, Work, cut, probed_bytes, rows_by_bytes, rows_by_peak, rows_of
 from torchsar.study.output import progress
 from torchsar.study.settings.errors import ConfigError
 
@@ -119,6 +119,35 @@ def test_chunks_on_a_gpu_follow_measured_peaks() -> None:
     """Peaks of 100 bytes and 20 bytes a trial."""
     assert rows_by_peak({1: 120, 8: 260}, 1000) == 45
     assert rows_by_peak({1: 120, 8: 260}, 10) == 1
+
+
+@pytest.mark.parametrize("device, workers, expected", [("cuda", 1, 78), ("cuda", 4, 30), ("cuda:1", 4, 8)])
+def test_processes_share_the_memory_of_a_gpu(
+    monkeypatch: pytest.MonkeyPatch, device: str, workers: int, expected: int
+) -> None:
+    """Two GPUs with 10 GB free each, and trials of 100 MB beside 700 MB for any number of them."""
+    sizes: list[int] = []
+
+    def trial(parameters, draws):
+        sizes.append(len(draws.trials))
+        return {"m": draws.normal("x", (1,)).sum(-1)}
+
+    class Peak:
+        def __init__(self, device: object) -> None: ...
+
+        def __enter__(self) -> Peak:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            self.bytes = 700_000_000 + 100_000_000 * sizes[-1]
+
+    monkeypatch.setattr("torchsar.study.montecarlo.work.PeakMemory", Peak)
+    for name, value in {"empty_cache": None, "mem_get_info": (10_000_000_000, 0), "device_count": 2}.items():
+        monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
+    work = Work(trial, make_grid({}), Draws(1), device)
+    assert rows_of(work, 0, 1000, workers) == expected
+    assert sizes == [1, 1, 8]
+    assert rows_of(work, 0, workers, workers) == 1 and len(sizes) == 3
 
 
 def test_chunks_are_equal_pieces_in_one_order() -> None:

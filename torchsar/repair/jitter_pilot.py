@@ -20,9 +20,12 @@ from torch import Tensor
 from torchsar.core import Estimate, Signal, Stage, checked_samples, linear_phasor, unit_level
 from torchsar.repair.jitter import MIN_GAP, smallest_gap
 
-# Rounding of float64 in the sums over a record, relative to them: without it, rounding errors of
-# strong jitter in a record without noise would look like jitter of a longer period.
-_ROUNDING = 1e-13
+# Rounding of float64 in a record of up to 1024 samples without noise, relative to the squares of
+# phases of jitter and to the power: without it, rounding errors look like jitter of a longer
+# period. It grows with longer records.
+_OF_JITTER, _OF_POWER, _SAMPLES = 1e-13, 1e-28, 1024
+# steps after which the frequency is exact even in short records of strong jitter
+_STEPS = 12
 # Largest standard deviation of an offset that is ok, in samples: jitter below the threshold of
 # detection, about three standard deviations, then stays below -15 dB of the signal.
 _MOST_STD = 0.01
@@ -116,17 +119,17 @@ class _Fit:
         return (2 * self.count * self.phasor.abs().square() * self.phase_rad.square()).sum(-1)
 
 
-def _fit(x: Tensor, frequency: Tensor, m: int, steps: int = 5) -> _Fit:
+def _fit(x: Tensor, frequency: Tensor, m: int) -> _Fit:
     """Refine the frequency jointly with the M phasors by the phase slope that remains."""
     n = x.shape[-1]
     index = torch.arange(n, device=x.device) % m
     count = torch.bincount(index, minlength=m).to(torch.float64)
     position = torch.arange(n, dtype=torch.float64, device=x.device) - (n - 1) / 2
-    for step in range(steps):
+    for step in range(_STEPS):
         z = x * linear_phasor(-frequency, 0, n, x.dtype)
         phasor = torch.zeros((*x.shape[:-1], m), dtype=x.dtype, device=x.device).index_add(-1, index, z) / count
         aligned = z * phasor[..., index].conj()
-        if step < steps - 1:
+        if step < _STEPS - 1:
             scale = phasor.abs().square().sum(-1).clamp_min(1e-300) / m
             frequency = frequency + (position * aligned.imag).sum(-1) / scale / (2 * math.pi * position.square().sum())
     noise = (z - phasor[..., index]).abs().square().sum(-1) / max(1, n - m - 1)
@@ -140,10 +143,10 @@ def _choose(fits: list[_Fit]) -> Tensor:
 
     The threshold of 14 + 4 (M - 1) keeps false alarms below 1e-4 per trial.
     """
-    jitter = torch.stack([fit.jitter for fit in fits])
-    noise = torch.stack([fit.noise for fit in fits]).amin(0).maximum(_ROUNDING * jitter.amax(0))
-    noise = noise.maximum(1e-30 * fits[0].power + 1e-300)
-    gain = [fit / noise - (14 + 4 * i if i else 0) for i, fit in enumerate(jitter)]
+    jitter, longer = torch.stack([fit.jitter for fit in fits]), max(1.0, float(fits[0].count.sum()) / _SAMPLES)
+    noise = torch.stack([fit.noise for fit in fits]).amin(0).maximum(_OF_JITTER * longer * jitter.amax(0))
+    noise = noise.maximum(_OF_POWER * longer * fits[0].power + 1e-300)
+    gain = [squares / noise - (14 + 4 * i if i else 0) for i, squares in enumerate(jitter)]
     return torch.stack(gain).argmax(0)
 
 

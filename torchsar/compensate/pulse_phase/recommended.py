@@ -13,7 +13,15 @@ from torchsar.compensate.pulse_phase.data import Pulses, prepare, refuse_odd_cou
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.linking import linked
 from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import WIENER_FACTORS, LogAbove, Run, Wiener, fixed_point, in_turn
+from torchsar.compensate.pulse_phase.sharpen import (
+    LEAST_PULSES_OF_FACTORS,
+    WIENER_FACTORS,
+    LogAbove,
+    Run,
+    Wiener,
+    fixed_point,
+    in_turn,
+)
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate, host_value, true_positions
 from torchsar.metrics import entropy
@@ -72,8 +80,9 @@ def autofocus(
         polish: Largest number of iterations of the third step.
         search_tolerance_rad: Phase change in rad, rms over the pulses, below which the iterations
             of the second step end.
-        tolerance_rad: Phase change in rad, rms over the pulses, below which the iterations of the
-            third step end.
+        tolerance_rad: Phase step in rad, rms over the pulses, below which the iterations of the
+            third step end. With 24 pulses or more the steps are taken 0.88, 3.75 and 1.43 times in
+            turn, which converges faster; the tolerance holds for 0.88 times a step.
         imaging: Image formation that corrects range migration, for data in which scatterers migrate
             through range cells; see `entropy_fixed_point`. Its image, with the range as last
             dimension, must cover the whole unambiguous cross range. A slope of the phase over
@@ -108,16 +117,17 @@ def autofocus(
     refuse_odd_counts("autofocus", 0, search=search, polish=polish)
     through = None if imaging is None else Through(imaging)
     coarse, fine = (AlongPulses(), AlongPulses(2)) if through is None else (through, through)
-    again = (
-        Run(Wiener(), fine, 3, WIENER_FACTORS, tolerance_rad)
-        if polish
-        else Run(LogAbove(_FLOOR), coarse, 4, _RELAXATION, 0.0)
-    )
+    quick = through is None and pulses.n >= LEAST_PULSES_OF_FACTORS
+    factors, few = (WIENER_FACTORS, len(WIENER_FACTORS)) if quick else (1.0, 6)
+    if polish:
+        again = Run(Wiener(), fine, few, factors, tolerance_rad)
+    else:
+        again = Run(LogAbove(_FLOOR), coarse, 4, _RELAXATION, 0.0)
 
     def runs(coarse: Imaging, fine: Imaging) -> list[Run]:
         return [
             Run(LogAbove(_FLOOR), coarse, search, _RELAXATION, search_tolerance_rad),
-            Run(Wiener(), fine, polish, WIENER_FACTORS, tolerance_rad),
+            Run(Wiener(), fine, polish, factors, tolerance_rad),
         ]
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:

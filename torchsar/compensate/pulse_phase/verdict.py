@@ -13,7 +13,15 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.alignment import Displacement, displacement
-from torchsar.compensate.pulse_phase.data import Pulses, or_one, rising, rotate, safe_angle
+from torchsar.compensate.pulse_phase.data import (
+    Pulses,
+    on_the_circle,
+    or_one,
+    rising,
+    rotate,
+    safe_angle,
+    without_line,
+)
 from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.core import Estimate, block_bytes_of, over_blocks
@@ -346,7 +354,7 @@ def _settled_apart(parts: Sequence[Tensor], present: Tensor, phase: Tensor, agai
     every = 1 if phase.device.type == "cpu" else _RETURNS // 2  # waiting costs as much as a round
     for number in range(1, _RETURNS + 1):
         reached = [again(part, present, at) for part, at in zip(parts, ends, strict=True)]
-        far = torch.stack([_moved(*pair) for pair in zip(reached, ends, strict=True)]) >= _RETURNED_RAD
+        far = torch.stack([_moved(*pair, present) for pair in zip(reached, ends, strict=True)]) >= _RETURNED_RAD
         ends = [torch.where(active[:, None], new, old) for new, old in zip(reached, ends, strict=True)]
         active = active & far.any(0)
         if number % every == 0 and number < _RETURNS and not bool(active.any()):
@@ -354,13 +362,10 @@ def _settled_apart(parts: Sequence[Tensor], present: Tensor, phase: Tensor, agai
     return ends
 
 
-def _moved(new: Tensor, old: Tensor) -> Tensor:
+def _moved(new: Tensor, old: Tensor, present: Tensor) -> Tensor:
     """Rms of the change of phases (trial, pulse) about its mean and slope in rad, (trial,)."""
-    step = torch.remainder(new - old + math.pi, 2 * math.pi) - math.pi
-    place = torch.arange(step.shape[-1], dtype=step.dtype, device=step.device) - (step.shape[-1] - 1) / 2
-    step = step - step.mean(-1, keepdim=True)
-    slope = (step * place).sum(-1, keepdim=True) / place.square().sum()
-    return (step - slope * place).square().mean(-1).sqrt()
+    step = without_line(on_the_circle(new - old), present)
+    return (torch.where(present, step, 0).square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
 
 
 def _persists(rows: Tensor, phase: Tensor) -> Tensor:

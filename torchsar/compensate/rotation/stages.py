@@ -11,7 +11,7 @@ from torchsar.compensate.pulse_phase import autofocus
 from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, starting_phase
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import WIENER_FACTORS, LogAbove, Run, Wiener, fixed_point, in_turn
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.compensate.rotation.motion import SEARCH_EPS
 from torchsar.compensate.rotation.recommended import coarse_rotation, phase_fit_rotation, uneven_rotation
@@ -26,7 +26,7 @@ from torchsar.radar import InverseRadar
 # of the entropy fixed point: the relaxation of `autofocus`, and the last floor of
 # `entropy_fixed_point`
 _FLOOR, _RELAXATION = 2.0, 1.8
-_SEARCH_TOLERANCE_RAD, _TOLERANCE_RAD = 0.01, 2e-3  # the defaults of `autofocus`
+_SEARCH_TOLERANCE_RAD, _TOLERANCE_RAD = 0.01, 1e-3  # the defaults of `autofocus`
 
 
 class _Rotation(Stage):
@@ -288,9 +288,9 @@ def rotating_autofocus(
     )
     runs = [
         Run(LogAbove(_FLOOR), through, search, _RELAXATION, _SEARCH_TOLERANCE_RAD),
-        Run(Wiener(), through, polish, WIENER_FACTORS, _TOLERANCE_RAD),
+        Run(Wiener(), through, polish, 1.0, _TOLERANCE_RAD),
     ]
-    again = Run(Wiener(), through, 3, WIENER_FACTORS, _TOLERANCE_RAD)
+    again = Run(Wiener(), through, 6, 1.0, _TOLERANCE_RAD)
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:
         phase, taken = in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)

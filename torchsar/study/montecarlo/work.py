@@ -26,8 +26,9 @@ Numbers = dict[str, dict[str, list[float]]]
 BOUNDS, SAVED = "bounds", "saved"
 # larger batches do not fit the cache of a CPU and take more time per trial, as measured
 CACHE_BYTES = 12 << 20
-# share of the free memory of a GPU that a batch takes, and sizes of the batches that are measured
-_GPU_SHARE, _MEASURED = 0.85, (1, 1, 8)
+# Share of the free memory of a GPU that a batch takes, trials of a batch whose memory is measured
+# beside that of one, and memory that a process takes for itself.
+_GPU_SHARE, _MEASURED, _CONTEXT_BYTES = 0.85, 8, 600 << 20
 
 
 @dataclass(frozen=True)
@@ -282,26 +283,31 @@ def rows_by_peak(peaks: Mapping[int, int], free_bytes: int) -> int:
 
 
 def rows_of(work: Work, case: int, trials: int, workers: int) -> int:
-    """Return the number of trials in a batch: on a CPU by its cache, on a GPU as many as fit.
+    """Return the largest number of trials in a batch: on a CPU by its cache, on a GPU what fits.
 
     Args:
         work: The work.
         case: Index of the case.
         trials: Number of trials of the case.
-        workers: Number of processes that compute batches. Those that share a GPU share its memory,
-            and each gets a part of the trials.
+        workers: Number of processes that compute batches. Those that share a GPU share its memory.
     """
-    if torch.device(work.device).type != "cuda":
+    device = torch.device(work.device)
+    if device.type != "cuda":
         return rows_by_bytes(probed_bytes(work, case))
-    peaks = {}
-    for rows in _MEASURED:  # the first batch also makes what later ones find made
-        with PeakMemory(work.device) as memory:
-            work.compute(Chunk(case, (0,) * rows, tuple(range(rows))))
+    many, peaks = min(_MEASURED, -(-trials // workers)), {}
+    if many < 2:
+        return 1
+    for rows in (1, 1, many):  # the first batch also makes what later ones find made
+        with PeakMemory(device) as memory:
+            fits = work.compute(Chunk(case, (0,) * rows, tuple(range(rows)))).fits
+        if fits is not None:
+            return fits
         peaks[rows] = memory.bytes or 0
     torch.cuda.empty_cache()
-    free, _ = torch.cuda.mem_get_info(work.device)
-    sharing = -(-workers // torch.cuda.device_count())
-    return min(rows_by_peak(peaks, int(_GPU_SHARE * free / sharing)), -(-trials // workers))
+    free, _ = torch.cuda.mem_get_info(device)
+    sharing = workers if device.index is not None else -(-workers // torch.cuda.device_count())
+    others = _CONTEXT_BYTES * sharing if workers > 1 else 0
+    return rows_by_peak(peaks, int(_GPU_SHARE * max(0, free - others) / sharing))
 
 
 def cut(case: int, whole: Case, active: set[int], first: int, last: int, rows: int) -> Iterator[Chunk]:
