@@ -50,6 +50,25 @@ def test_what_is_displaced_is_not_believed(course: str, points: int, snr_db: flo
         assert not found.ok.any()
 
 
+@pytest.mark.parametrize("apart", [1, 2, 3])
+def test_scatterers_in_one_range_cell_are_no_displacement(apart: int) -> None:
+    """Their interference changes the power of the cell in both halves of the band alike, and the
+    mean profile of equal cells has hardly a slope: it looked like a displacement of a cell.
+    """
+    draws = torch.Generator().manual_seed(apart)
+    turn = torch.rand(4, CELLS // apart, 4, generator=draws, dtype=torch.float64)
+    level = torch.randn(turn.shape, generator=draws, dtype=torch.complex128)
+    tones = torch.exp(2j * math.pi * PULSES * (turn[..., None] - 0.5) * TIME)
+    data = torch.zeros(4, PULSES, CELLS, dtype=torch.complex128)
+    data[..., : CELLS // apart * apart : apart] = (level[..., None] * tones).sum(-2).mT
+    phase = 2 * math.pi * torch.rand(4, PULSES, generator=draws, dtype=torch.float64)
+    data = data * torch.exp(1j * phase)[..., None]
+    data = data + 0.3 * torch.randn(data.shape, generator=draws, dtype=torch.complex128)
+    found = autofocus(data)
+    assert found.ok.all() and float(phase_rmse(found["phase_rad"], phase).max()) < 0.1
+    assert not displacement(data.mT, torch.ones(4, PULSES, dtype=torch.bool)).jitter.any()
+
+
 def test_a_displacement_would_go_unnoticed_otherwise() -> None:
     """The standard deviation does not show it: both halves of the range cells agree."""
     data, phase = displaced(COURSES["jitter"], 6, 15.0, trials=1, seed=8)

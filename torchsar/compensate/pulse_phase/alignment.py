@@ -19,8 +19,9 @@ from torchsar.compensate.pulse_phase.data import or_one
 # ones. Found by trial on 2 to 300 scatterers: the phases may be wrong from 0.2 and 0.45 on, and
 # interference of scatterers that are not resolved displaces aligned profiles by 0.25 at most.
 _LARGEST_JITTER, _LARGEST_MIGRATION = 0.25, 0.4
-# standard deviations by which a displacement must differ from zero
-_SIGNIFICANT = 3.0
+# standard deviations by which a displacement must differ from zero, in halves of the band and in
+# halves of the range cells
+_SIGNIFICANT, _SIGNIFICANT_IN_RANGE = 3.0, 2.0
 # fewest range cells and pulses whose displacement is estimated; number of groups of pulses
 _LEAST_CELLS, _LEAST_PULSES, _GROUPS = 8, 8, 16
 # largest displacement between adjacent pulses of clutter, in cells, and the values that are tried
@@ -52,11 +53,12 @@ def displacement(rows: Tensor, present: Tensor) -> Displacement:
     The displacement of a pulse is the projection of its profile |s| on the derivative of the mean
     profile. It is estimated from each half of the band separately, because their noise and the
     speckle of unresolved scatterers are independent: only what both halves have in common is a
-    displacement. The jitter is that of pulses within 16 groups, the migration that of the mean
-    power of the groups, in which noise is weaker. Displacements of more than a cell are
-    underestimated, but remain above one cell. Displacements that weak echoes hide, such as a drift
-    by tens of cells of a dense scene at 0 dB, are not found; the standard deviation of the phases
-    is large there.
+    displacement. Both halves of the range cells must show it as well, because scatterers in one
+    range cell change its power in both halves of the band. The jitter is that of pulses within 16
+    groups, the migration that of the mean power of the groups, in which noise is weaker.
+    Displacements of more than a cell are underestimated, but remain above one cell. Displacements
+    that weak echoes hide, such as a drift by tens of cells of a dense scene at 0 dB, are not found;
+    the standard deviation of the phases is large there.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
@@ -76,13 +78,27 @@ def displacement(rows: Tensor, present: Tensor) -> Displacement:
         return torch.nn.functional.pad(x, (0, -n % length)).unflatten(-1, (-1, length))
 
     count = grouped(present).sum(-1)
-    slow = [_displacements(grouped(power).sum(-1), count > 0) for power in powers]
-    fast = []
-    for power in powers:
-        single = grouped(_displacements(power, present))
+
+    def fast(power: Tensor, cells: Tensor | None = None) -> Tensor:
+        single = grouped(_displacements(power, present, cells))
         within = single - (single.sum(-1) / count.clamp_min(1))[..., None]
-        fast.append(torch.where(grouped(present), within, 0).flatten(-2))
-    return Displacement(_common(fast, present.sum(-1) - (count > 0).sum(-1)), _common(slow, (count > 0).sum(-1)))
+        return torch.where(grouped(present), within, 0).flatten(-2)
+
+    def slow(power: Tensor, cells: Tensor | None = None) -> Tensor:
+        return _displacements(grouped(power).sum(-1), count > 0, cells)
+
+    whole = powers[0] + powers[1]
+    near = _near_half(whole)
+    free = present.sum(-1) - (count > 0).sum(-1), (count > 0).sum(-1)
+    found = [
+        torch.where(
+            _agreement([of(whole, near), of(whole, ~near)], values) > _SIGNIFICANT_IN_RANGE,
+            _common([of(power) for power in powers], values),
+            0,
+        )
+        for of, values in zip((fast, slow), free, strict=True)
+    ]
+    return Displacement(*found)
 
 
 @torch.no_grad()
@@ -139,19 +155,39 @@ def _about_centroid(rows: Tensor) -> tuple[Tensor, Tensor]:
 
 def _common(halves: list[Tensor], count: Tensor) -> Tensor:
     """Displacement in cells rms that both halves share, (trial,), of a number of free values."""
-    lower, upper = halves
-    scatter = (lower.square().sum(-1) * upper.square().sum(-1)).sqrt()
-    shared = (lower * upper).sum(-1)
-    correlation = (shared / or_one(scatter)).clamp(-1 + 1e-12, 1 - 1e-12)
-    significant = torch.atanh(correlation) * (count - 3).clamp_min(0).sqrt() > _SIGNIFICANT
+    shared = (halves[0] * halves[1]).sum(-1)
+    significant = _agreement(halves, count) > _SIGNIFICANT
     return torch.where(significant, (shared / count.clamp_min(1)).sqrt(), 0)
 
 
-def _displacements(power: Tensor, present: Tensor) -> Tensor:
-    """Displacements in cells, (trial, pulse), of mean zero, and zero where no pulse is present."""
+def _agreement(halves: list[Tensor], count: Tensor) -> Tensor:
+    """Correlation of a number of free values of both halves, in standard deviations, (trial,)."""
+    one, other = halves
+    scatter = (one.square().sum(-1) * other.square().sum(-1)).sqrt()
+    correlation = ((one * other).sum(-1) / or_one(scatter)).clamp(-1 + 1e-12, 1 - 1e-12)
+    return torch.atanh(correlation) * (count - 3).clamp_min(0).sqrt()
+
+
+def _profiles(power: Tensor) -> tuple[Tensor, Tensor]:
+    """Moduli of the pulses, each of unit energy, and the slope of their sum, (trial, cell)."""
     profile = power.sqrt() / or_one(power.sum(-2, keepdim=True)).sqrt()
     mean = profile.sum(-1)
-    slope = (mean.roll(-1, -1) - mean.roll(1, -1)) / 2
+    return profile, (mean.roll(-1, -1) - mean.roll(1, -1)) / 2
+
+
+def _near_half(power: Tensor) -> Tensor:
+    """The nearer range cells that hold half of what shows a displacement, (trial, cell), bool."""
+    weight = _profiles(power)[1].square()
+    return 2 * (weight.cumsum(-1) - weight / 2) < weight.sum(-1, keepdim=True)
+
+
+def _displacements(power: Tensor, present: Tensor, cells: Tensor | None = None) -> Tensor:
+    """Displacements in cells, (trial, pulse), of mean zero, and zero where no pulse is present.
+
+    cells: the range cells that are used, (trial, cell), bool; None for all.
+    """
+    profile, slope = _profiles(power)
+    slope = slope if cells is None else slope * cells
     count = present.sum(-1, keepdim=True).clamp_min(1)
     found = -(profile * slope[..., None]).sum(-2) * count / or_one(slope.square().sum(-1, keepdim=True))
     return torch.where(present, found - _mean(found, present)[:, None], 0)
