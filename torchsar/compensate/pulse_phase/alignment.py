@@ -21,7 +21,7 @@ from torchsar.compensate.pulse_phase.data import or_one
 _LARGEST_JITTER, _LARGEST_MIGRATION = 0.25, 0.4
 # standard deviations by which a displacement must differ from zero, in halves of the band and in
 # halves of the range cells
-_SIGNIFICANT, _SIGNIFICANT_IN_RANGE = 3.0, 2.0
+_SIGNIFICANT = 3.0
 # fewest range cells and pulses whose displacement is estimated; number of groups of pulses
 _LEAST_CELLS, _LEAST_PULSES, _GROUPS = 8, 8, 16
 # largest displacement between adjacent pulses of clutter, in cells, and the values that are tried
@@ -92,7 +92,7 @@ def displacement(rows: Tensor, present: Tensor) -> Displacement:
     free = present.sum(-1) - (count > 0).sum(-1), (count > 0).sum(-1)
     found = [
         torch.where(
-            _agreement([of(whole, near), of(whole, ~near)], values) > _SIGNIFICANT_IN_RANGE,
+            _agreement([of(whole, near), of(whole, ~near)], values) > _SIGNIFICANT,
             _common([of(power) for power in powers], values),
             0,
         )
