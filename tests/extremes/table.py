@@ -728,6 +728,7 @@ REASONS = {
     "core.is_out_of_memory": "takes an exception only",
     "core.take": "index arithmetic that callers inside the package have checked",
     "core.per_trial": "appends dimensions; no arithmetic",
+    "core.wait_for_devices": "takes nothing",
     "core.device_fault": "takes a device only; tests/core/test_host.py",
     "core.host_value": "reads one number",
     "core.host_values": "reads numbers",

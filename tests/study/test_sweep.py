@@ -18,10 +18,11 @@ import zarr
 
 from tests.study import toy
 from torchsar.core import Draws
+from torchsar.core.batches import CACHE_BYTES, rows_by_bytes, rows_by_peak
 from torchsar.study.montecarlo import Record, Stop, differences, read_sweep, sweep
 from torchsar.study.montecarlo.grid import address, make_grid
 from torchsar.study.montecarlo.loop import looks
-from torchsar.study.montecarlo.work import CACHE_BYTES, Work, cut, probed_bytes, rows_by_bytes, rows_by_peak, rows_of
+from torchsar.study.montecarlo.work import Work, cut, probed_bytes, rows_of
 from torchsar.study.output import progress
 from torchsar.study.settings.errors import ConfigError
 
@@ -141,7 +142,7 @@ def test_processes_share_the_memory_of_a_gpu(
         def __exit__(self, *_: object) -> None:
             self.bytes = 700_000_000 + 100_000_000 * sizes[-1]
 
-    monkeypatch.setattr("torchsar.study.montecarlo.work.PeakMemory", Peak)
+    monkeypatch.setattr("torchsar.core.batches.PeakMemory", Peak)
     for name, value in {"empty_cache": None, "mem_get_info": (10_000_000_000, 0), "device_count": 2}.items():
         monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
     work = Work(trial, make_grid({}), Draws(1), device)

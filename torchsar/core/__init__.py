@@ -35,7 +35,14 @@ from torchsar.core.host import (
 )
 from torchsar.core.libraries import library
 from torchsar.core.linear import cholesky_factor, linear_solve, matrix_inverse
-from torchsar.core.memory import LargestTensor, PeakMemory, is_out_of_memory, keep_freed_memory, machine_memory_bytes
+from torchsar.core.memory import (
+    LargestTensor,
+    PeakMemory,
+    is_out_of_memory,
+    keep_freed_memory,
+    machine_memory_bytes,
+    wait_for_devices,
+)
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
 from torchsar.core.replace import OwnFiles, remove_empty
@@ -129,4 +136,5 @@ __all__ = [
     "use",
     "validate",
     "validation",
+    "wait_for_devices",
 ]

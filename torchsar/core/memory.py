@@ -115,6 +115,12 @@ def _resident(field: str, reset: bool = False) -> int | None:
     return next((1024 * int(line.split()[1]) for line in text.splitlines() if line.startswith(f"{field}:")), None)
 
 
+def wait_for_devices() -> None:
+    """Wait until CUDA has computed what was asked of it, if it is in use."""
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
 class LargestTensor(TorchDispatchMode):
     """Context manager that records the largest tensor that any operation of torch returns.
 

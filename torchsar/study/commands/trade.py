@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from torchsar import plot
-from torchsar.core import PeakMemory
+from torchsar.core import PeakMemory, wait_for_devices
 from torchsar.study.commands.requires import aligned
 from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
@@ -131,7 +131,7 @@ class _Tried:
         try:
             # kept memory is returned before memory is measured, which takes time
             with nullcontext() if self.times else PeakMemory(self.device) as peak:
-                spent, result = _spent(self._run, _LEAST_S if self.times else 0.0)
+                spent, result = _spent(lambda: self.measured.run(self.one), _LEAST_S if self.times else 0.0)
             if peak is not None:
                 self.peak_bytes = peak.bytes
                 self.loss = {name: float(value) for name, value in self.measured.loss(self.one, result).items()}
@@ -144,12 +144,6 @@ class _Tried:
             self.failed = "" if wrong is None else f"{wrong} is not finite"
         if len(self.times) < 2:
             log.info("%s", self._line())
-
-    def _run(self) -> Any:
-        result = self.measured.run(self.one)
-        if torch.device(self.device).type == "cuda":
-            torch.cuda.synchronize(self.device)
-        return result
 
     def row(self, tolerance: Mapping[str, float]) -> Row:
         """Return the row of the alternative in trade.json."""
@@ -168,6 +162,7 @@ def _spent(work: Callable[[], Any], least_s: float) -> tuple[tuple[float, float]
     began, runs = (time.process_time(), time.perf_counter()), 0
     while True:
         result, runs = work(), runs + 1
+        wait_for_devices()
         spent = (time.process_time() - began[0], time.perf_counter() - began[1])
         if spent[0] >= least_s:
             return (spent[0] / runs, spent[1] / runs), result

@@ -345,32 +345,24 @@ class _Run:
 
     def _tasks(self, first: int, last: int, workers: int) -> Iterator[Task]:
         """Chunks of one level without the rows that are done."""
-        waiting = [number for number in range(len(self.work.cases)) if not self._is_done(number, first, last)]
-        on_gpu = torch.device(self.plan.device).type == "cuda"
-        if on_gpu:  # measured before the workers hold memory
-            for number in waiting:
-                self._most_rows(number, workers)
+        done, level = self.record.done, slice(first, last)
+        waiting = [
+            number
+            for number, (at, active) in enumerate(zip(self.points, self.active))
+            if not all(done[(*at[p], level)].all() for p in active)
+        ]
+        # all found before the first batch, since workers of a GPU hold its memory from then on
+        for number in set(waiting) - set(self.rows):
+            self.rows[number] = self.plan.chunk or rows_of(self.work, number, self.plan.trials, workers)
         for number in waiting:
-            rows = self._most_rows(number, workers)
-            if on_gpu and not self.plan.chunk:
-                rows = min(rows, max(1, -(-(last - first) * len(self.active[number]) // workers)))
-            done, at = self.record.done, self.points[number]
+            at, rows = self.points[number], self.rows[number]
+            if torch.device(self.plan.device).type == "cuda":  # a part for each process
+                rows = min(rows, -(-(last - first) * len(self.active[number]) // workers))
             for whole in cut(number, self.work.cases[number], self.active[number], first, last, rows):
                 missing = [(p, t) for p, t in zip(whole.points, whole.trials) if not done[(*at[p], t)]]
                 if missing:
                     points, trials = zip(*missing)
                     yield Chunk(number, points, trials), self.fits.get(number)
-
-    def _is_done(self, number: int, first: int, last: int) -> bool:
-        at = self.points[number]
-        return all(self.record.done[(*at[p], slice(first, last))].all() for p in self.active[number])
-
-    def _most_rows(self, number: int, workers: int) -> int:
-        """Largest number of trials in a batch of a case, found once."""
-        if number not in self.rows:
-            trials = self.plan.trials * len(self.work.cases[number].points)
-            self.rows[number] = self.plan.chunk or rows_of(self.work, number, trials, workers)
-        return self.rows[number]
 
     def _enter(self, chunk: Chunk, computed: Computed) -> None:
         """Enter a chunk into the record and the store, which writes when that is cheap.

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, LargestTensor, PeakMemory, is_out_of_memory
+from torchsar.core import Draws, LargestTensor, is_out_of_memory
+from torchsar.core.batches import rows_by_bytes, rows_by_trial
 from torchsar.study.montecarlo.grid import Case, Grid
 from torchsar.study.montecarlo.record import OK
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -24,11 +25,6 @@ log = logging.getLogger("torchsar")
 Trial = Callable[[Mapping[str, Any], Draws], Mapping[str, Any]]
 Numbers = dict[str, dict[str, list[float]]]
 BOUNDS, SAVED = "bounds", "saved"
-# larger batches do not fit the cache of a CPU and take more time per trial, as measured
-CACHE_BYTES = 12 << 20
-# Share of the free memory of a GPU that a batch takes, trials of a batch whose memory is measured
-# beside that of one, and memory that a process takes for itself.
-_GPU_SHARE, _MEASURED, _CONTEXT_BYTES = 0.85, 8, 600 << 20
 
 
 @dataclass(frozen=True)
@@ -259,55 +255,25 @@ def probed_bytes(work: Work, case: int) -> int:
     return max(1, largest.bytes)
 
 
-def rows_by_bytes(bytes_per_trial: int) -> int:
-    """Return the number of trials in a batch on a CPU.
-
-    Args:
-        bytes_per_trial: Size in bytes of the largest tensor of one trial. For the whole batch, this
-            tensor takes at most 12 MiB, the size of a cache.
-    """
-    return max(1, CACHE_BYTES // bytes_per_trial)
-
-
-def rows_by_peak(peaks: Mapping[int, int], free_bytes: int) -> int:
-    """Return the number of trials whose peak memory fits.
-
-    Args:
-        peaks: Peak memory in bytes of batches of two sizes, by the number of trials. It is taken to
-            grow linearly.
-        free_bytes: Memory that a batch may take.
-    """
-    (few, low), (many, high) = sorted(peaks.items())
-    each = max(1.0, (high - low) / (many - few))
-    return max(1, int((free_bytes - low) / each) + few)
-
-
 def rows_of(work: Work, case: int, trials: int, workers: int) -> int:
     """Return the largest number of trials in a batch: on a CPU by its cache, on a GPU what fits.
 
     Args:
         work: The work.
         case: Index of the case.
-        trials: Number of trials of the case.
+        trials: Number of trials of each point.
         workers: Number of processes that compute batches. Those that share a GPU share its memory.
     """
-    device = torch.device(work.device)
-    if device.type != "cuda":
-        return rows_by_bytes(probed_bytes(work, case))
-    many, peaks = min(_MEASURED, -(-trials // workers)), {}
-    if many < 2:
-        return 1
-    for rows in (1, 1, many):  # the first batch also makes what later ones find made
-        with PeakMemory(device) as memory:
-            fits = work.compute(Chunk(case, (0,) * rows, tuple(range(rows)))).fits
-        if fits is not None:
-            return fits
-        peaks[rows] = memory.bytes or 0
-    torch.cuda.empty_cache()
-    free, _ = torch.cuda.mem_get_info(device)
-    sharing = workers if device.index is not None else -(-workers // torch.cuda.device_count())
-    others = _CONTEXT_BYTES * sharing if workers > 1 else 0
-    return rows_by_peak(peaks, int(_GPU_SHARE * max(0, free - others) / sharing))
+    return (
+        rows_by_trial(
+            lambda rows: work.compute(Chunk(case, (0,) * rows, tuple(range(rows)))).fits,
+            work.device,
+            trials * len(work.cases[case].points),
+            workers,
+        )
+        if torch.device(work.device).type == "cuda"
+        else rows_by_bytes(probed_bytes(work, case))
+    )
 
 
 def cut(case: int, whole: Case, active: set[int], first: int, last: int, rows: int) -> Iterator[Chunk]:
