@@ -61,6 +61,9 @@ CHAINS = {
 # these cost seconds a run: results only. The stages waited as often for four trials when written;
 # scenes of geo_ocean are imaged one after another, and its waits hang on the targets in them
 _ONCE = ("estimate_balance", "link_phases", "signal_intensity", "geo_ocean")
+# Absolute differences of figures: velocities of ships, found by iterations, differ by 6e-6 m/s on a
+# processor with other vector instructions.
+LEEWAY = {"geo_ocean": 1e-5}
 
 
 def waits(counts: Counts) -> Counter[str]:
@@ -185,7 +188,7 @@ def test_systems(system: str, place: Place, tmp_path: Path) -> None:
                 found[name],
                 there,
                 rtol=1e-2 if place.real else 1e-4,
-                atol=1e-5,
+                atol=1e-5 if place.real else LEEWAY.get(system, 1e-6),
                 equal_nan=True,
                 msg=lambda m, n=name: f"{n}: {m}",
             )
