@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,6 +13,33 @@ from torchsar.radar.antenna_path import refuse_unusable
 # largest accepted difference of the products of the axes from 1 and 0, by choice: axes computed in
 # single precision pass
 _UNIT = 1e-6
+
+
+def level_plane(
+    range_axis_rad: float,
+    azimuth_m: float,
+    range_m: float,
+    height_m: float,
+    device: torch.device | str | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Return the axes of a level plane, and a point of it in local Cartesian coordinates.
+
+    Args:
+        range_axis_rad: Angle of the range axis from x towards y in rad; the azimuth axis lies a
+            right angle further.
+        azimuth_m: Position of the point along the azimuth axis in metres.
+        range_m: Position of the point along the range axis in metres.
+        height_m: Height z of the plane in metres.
+        device: Device of the results.
+
+    Returns:
+        The azimuth and the range axis, unit vectors (2, 3), and the point in metres, (3,), float64.
+    """
+    sin, cos = math.sin(range_axis_rad), math.cos(range_axis_rad)
+    point = (range_m * cos - azimuth_m * sin, azimuth_m * cos + range_m * sin, float(height_m))
+    axes = [[-sin, cos, 0.0], [cos, sin, 0.0]]
+    made = [torch.tensor(x, dtype=torch.float64, device=device) for x in (axes, point)]
+    return made[0], made[1]
 
 
 @dataclass(frozen=True, eq=False)

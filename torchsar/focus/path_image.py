@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsar.core import Axis, Signal, Stage, real_dtype, untraced
 from torchsar.focus.backprojection import backproject
-from torchsar.focus.image_grid import ImageGrid
+from torchsar.focus.image_grid import ImageGrid, level_plane
 from torchsar.focus.motion_compensation import ProcessedBeam, compensated_omega_k, refuse_bistatic
 from torchsar.focus.spotlight import window_weights
 from torchsar.focus.tiles import TilePlan
@@ -83,11 +83,7 @@ class PathImage(Stage):
             for name, n, start in zip(("azimuth", "range"), counts, starts, strict=True)
         )
         self.axes = azimuth, range_
-        sin, cos = math.sin(range_axis_rad), math.cos(range_axis_rad)
-        axes = torch.tensor([[-sin, cos, 0.0], [cos, sin, 0.0]], dtype=torch.float64)
-        along, across = starts
-        corner = (across * cos - along * sin, along * cos + across * sin, float(height_m))
-        origin = torch.tensor(corner, dtype=torch.float64)
+        axes, origin = level_plane(range_axis_rad, starts[0], starts[1], height_m)
         self.grid = ImageGrid(origin, axes, (azimuth.n, range_.n), float(step_m))
 
     def form(self, history: Tensor, frequency_hz: Tensor, antennas: AntennaPath, grid: ImageGrid) -> Tensor:

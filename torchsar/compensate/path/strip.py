@@ -17,6 +17,7 @@ from torchsar.compensate.pulse_phase.data import or_one, without_line
 from torchsar.compensate.pulse_phase.verdict import LEAST_STREHL
 from torchsar.core import Estimate, checked_samples, cis
 from torchsar.focus import ImageGrid, ProcessedBeam, TilePlan
+from torchsar.focus.image_grid import level_plane
 from torchsar.focus.spotlight import window_weights
 from torchsar.radar import LIGHT_M_S, AntennaPath, StraightTrack
 from torchsar.radar.antenna_path import refuse_unusable
@@ -122,11 +123,7 @@ def strip_autofocus(
             f"centre_m={tuple(centre_m)}, range_axis_rad={range_axis_rad}, height_m={height_m}"
         )
     beam = ProcessedBeam(beam_deg, squint_deg)
-    cos, sin = math.cos(range_axis_rad), math.sin(range_axis_rad)
-    axes = torch.tensor([[-sin, cos, 0.0], [cos, sin, 0.0]], dtype=torch.float64, device=profiles.device)
-    across, along = centre_m
-    place = (across * cos - along * sin, along * cos + across * sin, height_m)
-    middle = torch.tensor(place, dtype=torch.float64, device=profiles.device)
+    axes, middle = level_plane(range_axis_rad, centre_m[1], centre_m[0], height_m, profiles.device)
 
     @torch.no_grad()
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
