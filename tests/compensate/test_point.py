@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torchsar.compensate import PointDoppler, doppler_at
+from torchsar.compensate import PointDoppler, doppler_at, peak_time_s
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate, target_energy
 from torchsar.focus import OmegaK
@@ -115,3 +115,12 @@ def test_the_std_of_a_cut_aperture_follows_its_observed_part(at_m: float, inside
     rmse = float((found["doppler_hz"] - world.doppler_hz).square().mean().sqrt())
     assert bool((found.ok == inside).all()) and 0.6 * bound <= rmse <= 1.4 * bound
     assert float(found.std["doppler_hz"].median()) == pytest.approx(bound, rel=0.15)
+
+
+def test_a_point_beside_the_image_is_not_corrected_by_rounding() -> None:
+    """A column that the image does not hold has no history, so that the time stays as it was."""
+    image = Draws(3).normal("image", (64, 3), dtype=torch.complex64)
+    at = [torch.tensor(v, dtype=torch.float64) for v in (30.0, 0.0, 0.05)]
+    assert float(peak_time_s(image, 400.0, at[0], 20.0, (-0.05, 0.05), *at[1:])) == 0.05
+    inside = peak_time_s(image, 400.0, at[0] - 29, 20.0, (-0.05, 0.05), *at[1:])
+    assert float(inside) != 0.05

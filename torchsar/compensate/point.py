@@ -117,8 +117,12 @@ def _history(
     observed; and the phasor of its Doppler. The arguments are those of `peak_time_s`.
     """
     n = image.shape[-2]
-    weights = torch.sinc(torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - sample[..., None])
-    spectrum = torch.fft.fft((image * weights[..., None, :].to(image.real.dtype)).sum(-1).to(torch.complex128))
+    from_peak = torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - sample[..., None]
+    weights = torch.sinc(from_peak)
+    # zeros of the sinc exactly, lest rounding makes a history where the image holds none
+    weights = weights - torch.where((from_peak == from_peak.round()) & (from_peak != 0), weights.detach(), 0)
+    column = (image * weights[..., None, :].to(image.real.dtype)).sum(-1).to(torch.complex128)
+    spectrum = torch.fft.fft(column)
     offset = wrap_hz(
         torch.fft.fftfreq(n, 1 / prf_hz, dtype=torch.float64, device=image.device) - doppler_hz[..., None], prf_hz
     )
