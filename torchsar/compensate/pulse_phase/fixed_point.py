@@ -50,9 +50,9 @@ def entropy_fixed_point(
     Returns:
         `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
         unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
-        cell or a single point makes the sharpness, no quarter of the pulses shows another scene
-        than the others, and the Strehl ratio predicted from the standard deviation exceeds 0.8.
-        Sharpness is the amount by which the image entropy lies below that of speckle.
+        cell or a single point makes the sharpness, the quarters of the pulses show one scene, and
+        the Strehl ratio predicted from the standard deviation exceeds 0.8. Sharpness is the amount
+        by which the image entropy lies below that of speckle.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.

@@ -96,17 +96,17 @@ def autofocus(
         `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
         halves of the range cells, or of the image by `imaging`; for point targets it is close to
         the true error. `ok` is False unless the image is 1.5 times as sharp as autofocus can make
-        pure noise, more than one range cell or a single point makes the sharpness, no quarter of
-        the pulses shows another scene than the others, and the Strehl ratio predicted from the
-        standard deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies
-        below that of speckle. Where scatterers change within the record, no phase is common to all
-        pulses, and the standard deviation is up to 3 times too small. Phases of `link_phases` have
-        its standard deviations, `quality` and `ok`. `info` holds "homogeneous" of shape (...,),
-        bool, True where the homogeneous description is more likely; `ok` is False if linked phases
-        then do not confirm that. It also holds "jitter_cells" and "migration_cells", the
-        displacement of the range profiles from pulse to pulse and of groups of pulses in cells rms:
-        `ok` is False from 0.25 and 0.4 cell on, because the phases may then be wrong. `imaging`
-        corrects displacements, which are not examined then.
+        pure noise, more than one range cell or a single point makes the sharpness, the quarters of
+        the pulses show one scene, and the Strehl ratio predicted from the standard deviation
+        exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of speckle.
+        Where scatterers change within the record, no phase is common to all pulses: the standard
+        deviation of the few trials that are then ok is up to 3 times too small. Phases of
+        `link_phases` have its standard deviations, `quality` and `ok`. `info` holds "homogeneous"
+        of shape (...,), bool, True where the homogeneous description is more likely; `ok` is False
+        if linked phases then do not confirm that. It also holds "jitter_cells" and
+        "migration_cells", the displacement of the range profiles from pulse to pulse and of groups
+        of pulses in cells rms: `ok` is False from 0.25 and 0.4 cell on, because the phases may then
+        be wrong. `imaging` corrects displacements, which are not examined then.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -50,8 +51,14 @@ _DISTURBED_RAD, _RETURNED_RAD, _RETURNS = 0.4, 0.04, 6
 # scenes that stay, aircraft in flight included; 0 to 0.3 where the scene is another one from some
 # pulse on. The images are clear if so much of their variance is not noise.
 _QUARTERS, _ALIKE, _CLEAR = 4, 0.33, 0.75
-# variance of the modulus of circular noise above twice its median, over the square of its median
-_ABOVE_VARIANCE = 0.01086
+# variance of the modulus of circular noise above twice its median, and of the modulus of a stronger
+# signal in such noise, over the square of the median of the noise
+_ABOVE_VARIANCE, _MODULUS_VARIANCE = 0.01086, 1 / (2 * math.log(2))
+# Mean correlation of the quarters without the part of noise: 0.8 or more in scenes that stay, 0.76
+# in an aircraft in flight, 0.5 to 0.8 where scatterers change within the record. The deviation is
+# then too small: nothing is ok up to the first correlation, and the largest deviation that is ok
+# grows up to the second. Found by trial, so that one trial of a hundred is ok and wrong.
+_CHANGING, _STAYING = 0.71, 0.80
 # limits of `_drift`, found by trial: more rounds, or rounds after smaller steps, cost time and
 # rarely change the result
 _ROUNDS = 6
@@ -176,18 +183,18 @@ def estimated(
         from the standard deviation, times the share of the sharpness that noise does not explain.
         `ok` is False unless that Strehl ratio exceeds 0.8, the profiles are aligned (see
         `Displacement`; not examined without `compare`), the image is 1.5 times as sharp as
-        autofocus can make pure noise, more than one row contributes to the sharpness, a
-        homogeneous description of the scene is not more likely (see `describe`), because sharpness
-        does not find the phases of homogeneous clutter, and no quarter of the pulses shows another
-        scene than the others. The last four need not hold for a single point whose modulus scatters
-        by less than 0.25, with 32 pulses or more. `info` holds "present", shape (..., pulse), False
-        for pulses that hold only zeros; and, of shape (...,), "homogeneous" (True where that
-        description is more likely), "ok_if_sparse" (what `ok` is if it is not), "sparse_gain_nats"
-        (gain of the log likelihood of the sparse description over white noise), "jitter_cells" and
-        "migration_cells" (see `Displacement`), "iterations", "sharpness_nats",
-        "noise_sharpness_nats" (the largest sharpness that noise can reach), "effective_rows"
-        (number of rows over which the energy is spread) and "telling_rows" (number of rows over
-        which the sharpness is spread).
+        autofocus can make pure noise, more than one row contributes to the sharpness, a homogeneous
+        description of the scene is not more likely (see `describe`), because sharpness does not
+        find the phases of homogeneous clutter, and the quarters of the pulses show one scene: where
+        its scatterers change, the standard deviation is too small. The last four need not hold for
+        a single point whose modulus scatters by less than 0.25, with 32 pulses or more. `info`
+        holds "present", shape (..., pulse), False for pulses that hold only zeros; and, of shape
+        (...,), "homogeneous" (True where that description is more likely), "ok_if_sparse" (what
+        `ok` is if it is not), "sparse_gain_nats" (gain of the log likelihood of the sparse
+        description over white noise), "jitter_cells" and "migration_cells" (see `Displacement`),
+        "iterations", "sharpness_nats", "noise_sharpness_nats" (the largest sharpness that noise can
+        reach), "effective_rows" (number of rows over which the energy is spread) and "telling_rows"
+        (number of rows over which the sharpness is spread).
     """
     rows, present = pulses.rows, pulses.present
     if not len(rows) or pulses.n < 3:
@@ -240,7 +247,7 @@ def _assessed(
             std = torch.maximum(std, _drift(rows, present, phase, again))
         scene = describe(rows, phase, occupied)
         moved = displacement(rows, present) if compare else Displacement(0 * sharp, 0 * sharp)
-        stays = _persists(rows, phase) if compare else torch.ones_like(lone)
+        stays = _persists(rows, phase, std) if compare else torch.ones_like(lone)
     homogeneous = scene.homogeneous & compare & ~lone
     scene_rows = effective * occupied, sharpness_rows
     return phase, taken, sharp, *scene_rows, std, scene.sparse, homogeneous, lone, stays, moved.jitter, moved.migration
@@ -368,35 +375,40 @@ def _moved(new: Tensor, old: Tensor, present: Tensor) -> Tensor:
     return (torch.where(present, step, 0).square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
 
 
-def _persists(rows: Tensor, phase: Tensor) -> Tensor:
-    """Whether no quarter of the pulses shows another scene than the others, (trial,).
+def _persists(rows: Tensor, phase: Tensor, std_rad: Tensor) -> Tensor:
+    """Whether the quarters of the pulses show one scene, (trial,).
 
     The moduli of the images of the quarters, above twice their median, are correlated, each pair at
-    its best displacement in Doppler. Where more than a quarter of a variance may be that of noise,
-    they are taken to show the same scene.
+    its best displacement in Doppler. No quarter may show another scene than the others. Where more
+    than a quarter of a variance may be that of noise, they are taken to show the same scene. Where
+    the quarters are less alike than those of scenes that stay, the standard deviation must be small
+    as well: scatterers that change make it too small.
     """
     if rows.shape[-1] < _LEAST_PULSES:
         return torch.ones_like(phase[:, 0], dtype=torch.bool)
     x = rotate(rows, phase)
     n = x.shape[-1] // _QUARTERS
-    spectra, variances, clear = [], [], torch.ones_like(phase[:, 0], dtype=torch.bool)
+    spectra, variances, of_scene, clear = [], [], [], torch.ones_like(phase[:, 0], dtype=torch.bool)
     for first in range(0, _QUARTERS * n, n):
         level = torch.fft.fft(x[..., first : first + n], 2 * n).abs()
         sizes = rising(level.flatten(1))
         median = sizes[:, (sizes.shape[-1] - 1) // 2, None, None]
         above = (level - 2 * median).clamp_min(0)
+        bright = (above > 0).sum((-2, -1))
         above = above - above.mean((-2, -1), keepdim=True)
-        whole, noise = above.square().sum((-2, -1)), _ABOVE_VARIANCE * median[:, 0, 0].square() * above[0].numel()
+        whole, power = above.square().sum((-2, -1)), median[:, 0, 0].square()
         spectra.append(torch.fft.rfft(above))
-        variances.append((whole - noise).clamp_min(0))
+        variances.append((whole - _ABOVE_VARIANCE * power * above[0].numel()).clamp_min(0))
+        of_scene.append(torch.maximum(variances[-1] - _MODULUS_VARIANCE * power * bright, whole / 4))
         clear = clear & (variances[-1] > _CLEAR * whole)
-    alike = [
-        torch.fft.irfft((spectra[i].conj() * spectra[j]).sum(-2), 2 * n).amax(-1)
-        / or_one(variances[i].sqrt() * variances[j].sqrt())
-        for j in range(_QUARTERS)
-        for i in range(j)
-    ]
-    return ~clear | (torch.stack(alike).amin(0) > _ALIKE)
+    alike, of_moduli = [], []
+    for i, j in combinations(range(_QUARTERS), 2):
+        common = torch.fft.irfft((spectra[i].conj() * spectra[j]).sum(-2), 2 * n).amax(-1)
+        alike.append(common / or_one(variances[i].sqrt() * variances[j].sqrt()))
+        of_moduli.append(common / or_one(of_scene[i].sqrt() * of_scene[j].sqrt()))
+    steady = (torch.stack(of_moduli).mean(0) - _CHANGING) / (_STAYING - _CHANGING)
+    small = std_rad < math.sqrt(-math.log(LEAST_STREHL)) * steady
+    return ~clear | ((torch.stack(alike).amin(0) > _ALIKE) & small)
 
 
 def _disturbance(phase: Tensor) -> Tensor:
