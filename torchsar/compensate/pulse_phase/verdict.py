@@ -58,7 +58,7 @@ _ABOVE_VARIANCE, _MODULUS_VARIANCE = 0.01086, 1 / (2 * math.log(2))
 # in an aircraft in flight, 0.5 to 0.8 where scatterers change within the record. The deviation is
 # then too small: nothing is ok up to the first correlation, and the largest deviation that is ok
 # grows up to the second. Found by trial, so that one trial of a hundred is ok and wrong.
-_CHANGING, _STAYING = 0.72, 0.79
+_CHANGING, _STAYING = 0.74, 0.77
 # limits of `_drift`, found by trial: more rounds, or rounds after smaller steps, cost time and
 # rarely change the result
 _ROUNDS = 6
