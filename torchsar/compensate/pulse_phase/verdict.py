@@ -151,9 +151,10 @@ def estimated(
       the whole difference where it exceeds 2 rad, as in pulses that do not see the scene. The rows
       are sorted by energy and taken alternately; the noise of the halves is independent. The halves
       start from phases that a walk of 0.4 rad moves apart: what the scene does not hold, because
-      its scatterers change from pulse to pulse, stays apart. The result is divided by the square
-      root of `occupied_band`, because rows that are sampled finer than their band requires are not
-      independent. Where a single point makes the image sharp, it is the
+      its scatterers change from pulse to pulse, stays apart. (Through an image formation the method
+      settles too slowly for that, and the halves start from the phases themselves.) The result is
+      divided by the square root of `occupied_band`, because rows that are sampled finer than their
+      band requires are not independent. Where a single point makes the image sharp, it is the
       relative scatter of the modulus of its echo instead: noise and weaker scatterers change the
       modulus as much as the phase, and the phase error does not change it. The scatter of the phase
       that remains is added.
@@ -239,7 +240,8 @@ def _assessed(
         scatter, rest = _of_point(focused, present)
         lone = (sharpness_rows <= LEAST_ROWS) & (scatter < _STEADY) & (present.sum(-1) >= _LEAST_PULSES)
         lone = lone & (imaging is None) & (rows.shape[-2] > 1)
-        apart = _half_difference(rows, present, phase, again, halves or halves_of_rows)
+        disturbed = halves is None and imaging is None
+        apart = _half_difference(rows, present, phase, again, halves or halves_of_rows, disturbed)
         if halves is None:
             apart = apart / occupied.sqrt()
         std = torch.where(lone, torch.hypot(scatter, rest), apart)
@@ -334,20 +336,23 @@ def halves_of_rows(rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
     return one, other
 
 
-def _half_difference(rows: Tensor, present: Tensor, phase: Tensor, again: Again, halves: Halves) -> Tensor:
+def _half_difference(
+    rows: Tensor, present: Tensor, phase: Tensor, again: Again, halves: Halves, disturbed: bool
+) -> Tensor:
     """Std of the phase (rad) from the differences between two halves of the pulses, (trial,).
 
-    It is pi / sqrt(3), as for a random phase, if there is only one row or a half is empty.
+    It is pi / sqrt(3), as for a random phase, if there is only one row or a half is empty. The
+    halves start from the phase, or on either side of it.
     """
     unknown = torch.full(rows.shape[:1], math.pi / math.sqrt(3), dtype=torch.float64, device=rows.device)
     if rows.shape[-2] < 2:
         return unknown
     parts = halves(rows, phase)
     filled = torch.stack([(part != 0).flatten(1).any(-1) for part in parts]).all(0)
-    if halves is not halves_of_rows:
-        one, other = (again(part, present, phase) for part in parts)
-    else:
+    if disturbed:
         one, other = _settled_apart(parts, present, phase, again)
+    else:
+        one, other = (again(part, present, phase) for part in parts)
     apart = residual_phase(one, other, present)
     apart = torch.where(apart.abs() > _APART_RAD, apart, apart / 2)
     return torch.where(filled, (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt(), unknown)
