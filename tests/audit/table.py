@@ -72,22 +72,6 @@ LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
     "range cells shows: `ok` is False where a sparse description is more likely": [
         *(("compensate.LinkPhases", "own", snr_db) for snr_db in (20.0, 60.0)),
     ],
-    "scatterers that change within 16 pulses have no phase in common over 128: their own changes are "
-    "taken for those of the pulses, which both halves of the range cells then partly agree on": [
-        *(
-            (f"compensate.{name}", "scintillating 40 points", 20.0)
-            for name in (
-                "Autofocus",
-                "EntropyFixedPoint",
-                "PgaSca",
-                "PgaSca:synchronised",
-                "PhasePolish",
-                "SharpestPhase",
-                "TargetAutofocus",
-                "maximum_contrast",
-            )
-        ),
-    ],
     "a body has one velocity: two ships of nearly the same speed in one place count as one, of a speed "
     "between them, and what it does not explain shows only a part of the difference": [
         ("multichannel.MoversImage", "two ships in one place", 20.0),

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.audit.pulses import scintillating
 from torchsar.compensate import autofocus, correct_pulse_phase, entropy_fixed_point, pga, pga_sca, sca
 from torchsar.core import Draws, Recording, Truth
 from torchsar.echo import simulate_turntable
@@ -295,6 +296,15 @@ def test_pga_ends_near_its_best_iterate(name):
         best_iterate(x, true, begin, "lumv" if start == "zero" else "ml"),
     )
     assert error < 1.1 * best + 1e-4 and best < 0.5 * float(phase_rmse(begin, true))
+
+
+def test_scatterers_that_change_are_not_believed():
+    """Amplitudes that change within 8 of 128 pulses: a third of the trials was ok and wrong."""
+    batch = scintillating(20.0, 40, 8.0)(24, 5)
+    assert batch.truth is not None
+    found = autofocus(batch.data.data)
+    wrong = phase_rmse(found["phase_rad"].double(), batch.truth["phase_rad"]) > 0.5
+    assert int(wrong.sum()) > 12 and not (found.ok & wrong).any()
 
 
 # impairments put into any range-compressed recording
