@@ -30,8 +30,8 @@ def test_every_part_of_a_config_is_measured(result: Path) -> None:
     assert any(row["name"].startswith("recommended.") for row in stages)
     assert all(row["seconds"] > 0 and row["over_floor"] > 0 for row in stages)
     whole = {row["part"]: row["seconds"] for row in rows if row["part"] in ("echo", "draws", "batch")}
-    # each contains the one before; other processes may slow one of them down by a factor of three
-    assert 0 < whole["draws"] < 3 * whole["echo"] < 9 * whole["batch"]
+    # each contains the one before, about twice; other processes may slow one of them
+    assert 0 < whole["draws"] < 2 * whole["echo"] < 4 * whole["batch"]
     assert next(row for row in rows if row["part"] == "memory")["peak_bytes"] > 1e8
 
 

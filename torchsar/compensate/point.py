@@ -84,7 +84,8 @@ def peak_time_s(
     Args:
         image: Image, shape (..., azimuth, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
-        sample: Range position of the peak in samples, fractional, shape (...,).
+        sample: Range position of the peak in samples, fractional, shape (...,). The time of a point
+            beside the image stays as it is.
         rate_hz_s: Magnitude of the Doppler rate in Hz/s, shape (...,) or a number.
         seen_s: First and last time at which the record observed the point, in seconds from the time
             when the beam centre crosses it.
@@ -117,10 +118,10 @@ def _history(
     observed; and the phasor of its Doppler. The arguments are those of `peak_time_s`.
     """
     n = image.shape[-2]
-    from_peak = torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - sample[..., None]
-    weights = torch.sinc(from_peak)
-    # zeros of the sinc exactly, lest rounding makes a history where the image holds none
-    weights = weights - torch.where((from_peak == from_peak.round()) & (from_peak != 0), weights.detach(), 0)
+    columns = image.shape[-1]
+    weights = torch.sinc(torch.arange(columns, dtype=torch.float64, device=image.device) - sample[..., None])
+    # of a point beside the image, side lobes and rounding would be all of the history
+    weights = weights * ((sample > -1) & (sample < columns))[..., None]
     column = (image * weights[..., None, :].to(image.real.dtype)).sum(-1).to(torch.complex128)
     spectrum = torch.fft.fft(column)
     offset = wrap_hz(

@@ -99,14 +99,15 @@ def autofocus(
         pure noise, more than one range cell or a single point makes the sharpness, the quarters of
         the pulses show one scene, and the Strehl ratio predicted from the standard deviation
         exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of speckle.
-        Where scatterers change within the record, no phase is common to all pulses: the standard
-        deviation of the few trials that are then ok is up to 3 times too small. Phases of
-        `link_phases` have its standard deviations, `quality` and `ok`. `info` holds "homogeneous"
-        of shape (...,), bool, True where the homogeneous description is more likely; `ok` is False
-        if linked phases then do not confirm that. It also holds "jitter_cells" and
-        "migration_cells", the displacement of the range profiles from pulse to pulse and of groups
-        of pulses in cells rms: `ok` is False from 0.25 and 0.4 cell on, because the phases may then
-        be wrong. `imaging` corrects displacements, which are not examined then.
+        Where scatterers change within the record, no phase is common to all pulses: most trials are
+        not ok, and the standard deviation of the others is up to 3 times too small; at 0 dB, where
+        noise hides the change, one of ten is ok and wrong. Phases of `link_phases` have its
+        standard deviations, `quality` and `ok`. `info` holds "homogeneous" of shape (...,), bool,
+        True where the homogeneous description is more likely; `ok` is False if linked phases then
+        do not confirm that. It also holds "jitter_cells" and "migration_cells", the displacement of
+        the range profiles from pulse to pulse and of groups of pulses in cells rms: `ok` is False
+        from 0.25 and 0.4 cell on, because the phases may then be wrong. `imaging` corrects
+        displacements, which are not examined then.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.

@@ -54,11 +54,12 @@ _QUARTERS, _ALIKE, _CLEAR = 4, 0.33, 0.75
 # variance of the modulus of circular noise above twice its median, and of the modulus of a stronger
 # signal in such noise, over the square of the median of the noise
 _ABOVE_VARIANCE, _MODULUS_VARIANCE = 0.01086, 1 / (2 * math.log(2))
-# Mean correlation of the quarters without the part of noise: 0.8 or more in scenes that stay, 0.76
-# in an aircraft in flight, 0.5 to 0.8 where scatterers change within the record. The deviation is
-# then too small: nothing is ok up to the first correlation, and the largest deviation that is ok
-# grows up to the second. Found by trial, so that one trial of a hundred is ok and wrong.
-_CHANGING, _STAYING = 0.74, 0.77
+# Mean correlation of the quarters, and how much of a variance is that of the scene at least. It was
+# 0.8 or more in the aircraft and the 3 to 240 points measured (128 pulses), 0.76 in an aircraft in
+# flight, 0.5 to 0.8 where scatterers change over 8 to 64 of 128 pulses. Their deviation is too
+# small: nothing is ok below the first correlation, and the largest deviation that is ok grows from
+# 0 to its usual value at the second. Found by trial, so that one trial of a hundred is ok and wrong.
+_CHANGING, _STAYING, _LEAST_OF_SCENE = 0.74, 0.77, 0.25
 # limits of `_drift`, found by trial: more rounds, or rounds after smaller steps, cost time and
 # rarely change the result
 _ROUNDS = 6
@@ -151,7 +152,7 @@ def estimated(
       the whole difference where it exceeds 2 rad, as in pulses that do not see the scene. The rows
       are sorted by energy and taken alternately; the noise of the halves is independent. The halves
       start from phases that a walk of 0.4 rad moves apart: what the scene does not hold, because
-      its scatterers change from pulse to pulse, stays apart. (Through an image formation the method
+      its scatterers change from pulse to pulse, stays apart. (With `imaging` or `halves` the method
       settles too slowly for that, and the halves start from the phases themselves.) The result is
       divided by the square root of `occupied_band`, because rows that are sampled finer than their
       band requires are not independent. Where a single point makes the image sharp, it is the
@@ -341,8 +342,9 @@ def _half_difference(
 ) -> Tensor:
     """Std of the phase (rad) from the differences between two halves of the pulses, (trial,).
 
-    It is pi / sqrt(3), as for a random phase, if there is only one row or a half is empty. The
-    halves start from the phase, or on either side of it.
+    It is pi / sqrt(3), as for a random phase, if there is only one row or a half is empty.
+
+    disturbed: Whether the halves start on either side of the phase (see `_settled_apart`).
     """
     unknown = torch.full(rows.shape[:1], math.pi / math.sqrt(3), dtype=torch.float64, device=rows.device)
     if rows.shape[-2] < 2:
@@ -384,10 +386,12 @@ def _persists(rows: Tensor, phase: Tensor, std_rad: Tensor) -> Tensor:
     """Whether the quarters of the pulses show one scene, (trial,).
 
     The moduli of the images of the quarters, above twice their median, are correlated, each pair at
-    its best displacement in Doppler. No quarter may show another scene than the others. Where more
-    than a quarter of a variance may be that of noise, they are taken to show the same scene. Where
-    the quarters are less alike than those of scenes that stay, the standard deviation must be small
-    as well: scatterers that change make it too small.
+    its best displacement in Doppler. No quarter may show another scene than the others. Besides,
+    scatterers that change make the standard deviation too small: their quarters are less alike,
+    once the variance that noise gives the moduli is taken out. Below a mean correlation of
+    `_CHANGING` the scene does not count as one; up to `_STAYING` the largest standard deviation
+    that is accepted grows. Where more than a quarter of a variance may be that of noise, changes
+    cannot be seen, and the quarters are taken to show one scene.
     """
     if rows.shape[-1] < _LEAST_PULSES:
         return torch.ones_like(phase[:, 0], dtype=torch.bool)
@@ -404,7 +408,7 @@ def _persists(rows: Tensor, phase: Tensor, std_rad: Tensor) -> Tensor:
         whole, power = above.square().sum((-2, -1)), median[:, 0, 0].square()
         spectra.append(torch.fft.rfft(above))
         variances.append((whole - _ABOVE_VARIANCE * power * above[0].numel()).clamp_min(0))
-        of_scene.append(torch.maximum(variances[-1] - _MODULUS_VARIANCE * power * bright, whole / 4))
+        of_scene.append(torch.maximum(variances[-1] - _MODULUS_VARIANCE * power * bright, _LEAST_OF_SCENE * whole))
         clear = clear & (variances[-1] > _CLEAR * whole)
     alike, of_moduli = [], []
     for i, j in combinations(range(_QUARTERS), 2):
