@@ -58,7 +58,7 @@ _ABOVE_VARIANCE, _MODULUS_VARIANCE = 0.01086, 1 / (2 * math.log(2))
 # 0.8 or more in the aircraft and the 3 to 240 points measured (128 pulses), 0.76 in an aircraft in
 # flight, 0.5 to 0.8 where scatterers change over 8 to 64 of 128 pulses. Their deviation is too
 # small: nothing is ok below the first correlation, and the largest deviation that is ok grows from
-# 0 to its usual value at the second. Found by trial, so that one trial of a hundred is ok and wrong.
+# 0 to its usual value at the second. Found by trial: at most 1 % of the trials is ok and wrong.
 _CHANGING, _STAYING, _LEAST_OF_SCENE = 0.74, 0.77, 0.25
 # limits of `_drift`, found by trial: more rounds, or rounds after smaller steps, cost time and
 # rarely change the result
