@@ -224,7 +224,7 @@ def gain_error(found: Tensor, truth: Tensor) -> Tensor:
 PHASES = [Quantity("phase_rad", 0.5, phase_error, 0.005)]
 WORLDS = (
     *nothing((PULSES, CELLS), signal),
-    *(World("own", aircraft(snr), snr) for snr in (-30.0, -20.0, -10.0, 0.0, 20.0, 60.0)),
+    *(World("own", aircraft(snr), snr) for snr in (-30.0, -20.0, -10.0, -5.0, 0.0, 20.0, 60.0)),
     World("clutter 60 %", clutter(5.0, 0.6), 5.0),
     World("clutter 90 %", clutter(10.0, 0.9), 10.0),
     World("one point", one_point, -5.0),
@@ -238,7 +238,11 @@ WORLDS = (
     *(World("direct pulses", dechirped(snr), snr) for snr in (-5.0, 10.0)),
     *(World(f"displaced {points} points", displaced(15.0, points, 0.6), 15.0) for points in (6, 60)),
     *(World(f"another scene of {points} points", another(20.0, points), 20.0) for points in (8, 40)),
-    *(World(f"scintillating {points} points", scintillating(20.0, points, 16.0), 20.0) for points in (8, 40)),
+    *(
+        World(f"scintillating {points} points", scintillating(snr, points, 16.0), snr)
+        for points in (8, 40)
+        for snr in (0.0, 20.0)
+    ),
 )
 ALIGN_WORLDS = (
     *unlit(nothing((PULSES, 128))),

@@ -112,3 +112,18 @@ def test_cells_that_were_wrong(name: str, world: str, snr_db: float | None, leas
     (row,) = audit([cell], lambda entry, world: 24 if world.name in NOTHING else 6)
     assert row["ok"] >= least and row["false_ok"] == 0, row
     assert row["rms_over_std"] is None or row["rms_over_std"] < 3
+
+
+@pytest.mark.parametrize(
+    "name, world, snr_db",
+    [
+        ("compensate.EntropyFixedPoint", "own", -5.0),  # 7 % had not converged and were ok
+        ("compensate.Autofocus", "scintillating 40 points", 0.0),  # 6 % were wrong and ok
+        ("compensate.Autofocus", "scintillating 8 points", 0.0),  # 8 %
+    ],
+)
+def test_wrong_phases_in_noise_are_not_ok(name: str, world: str, snr_db: float) -> None:
+    entry = next(entry for entry in ENTRIES if entry.name == name)
+    cell = replace(entry, worlds=[w for w in entry.worlds if (w.name, w.snr_db) == (world, snr_db)])
+    (row,) = audit([cell], lambda entry, world: 60)
+    assert row["false_ok"] == 0, row

@@ -72,3 +72,24 @@ def test_registration_never_hides_what_does_not_agree() -> None:
         else:
             images = torch.randn(images.shape, dtype=torch.complex128, generator=made)
         assert float(registered_error_db(*images).min()) > -20
+
+
+def test_all_of_the_image_decides_on_the_slope_of_the_phase() -> None:
+    """Five bright points leave several slopes open, 300 weak ones do not; a small quadratic phase,
+    as a linear error of the path causes it, is removed.
+    """
+    made = torch.Generator().manual_seed(8)
+    size, middle = (240, 240), torch.tensor([119.5, 119.5], dtype=F64)
+    corners = torch.tensor([[0, 0], [75, -75], [-75, 75], [30, 55], [-62, -45]], dtype=F64)
+    off = torch.cat([corners, (torch.rand(300, 2, generator=made, dtype=F64) - 0.5) * 190])
+    amplitude = torch.randn(305, generator=made, dtype=torch.complex128)
+    amplitude[:5] = 40.0
+    image = points(middle + off, amplitude, size)
+    shift = torch.tensor([6.0, -2.4], dtype=F64)
+    x, y = ((torch.arange(240, dtype=F64) - m - d) / 240 for m, d in zip(middle, shift, strict=True))
+    x = x[:, None]
+    for turns in ([0.9, 0.3, 0.1, -0.25, 0.05], [-0.6, 1.4, -0.3, 0.5, 0.0], [1.2, -0.8, 0.55, -0.5, -0.1]):
+        phase = sum(t * z for t, z in zip(turns, (x, y, x * x, x * y, y * y), strict=True))
+        moved = points(middle + off + shift, amplitude, size) * torch.exp(2j * math.pi * phase)
+        found = float(registered_error_db(moved, image))
+        assert found < -35, (turns, found)

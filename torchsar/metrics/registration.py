@@ -14,20 +14,22 @@ from torchsar.metrics.image import error_db, pair_of
 _REFINED, _ROUNDS = 4, 3
 # chosen: steps of the affine registration, and rows of the image whose derivatives are held at once
 _STEPS, _BLOCK_ROWS = 4, 256
-# chosen: largest rotation, stretch and shear; largest change of the shift with them in samples; and
-# share of the energy of either image that must be compared
-_MOST_LINEAR, _MOST_SHIFT, _LEAST_SHOWN = 0.02, 1.0, 0.5
+# chosen: largest rotation, stretch and shear; largest change of the shift with them in samples;
+# largest quadratic phase at the edges in turns; and share of the energy of either image that must
+# be compared
+_MOST_LINEAR, _MOST_SHIFT, _MOST_BEND, _LEAST_SHOWN = 0.02, 1.0, 0.15, 0.5
 
 
 def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
     """Compute the relative error of an image, registered to its reference, of each trial.
 
     Registration removes what autofocus cannot observe of a path. Constant and linear errors of the
-    path shift the image, rotate, stretch and shear it slightly, add a linear phase over it, and
-    give it a complex gain. The shift is that of the largest correlation of the intensities, refined
-    with the phases of the images; rotation, stretch and shear, of up to 2 %, are fitted to the
-    difference of the images. The pixels that both images show after the shift are compared. Memory
-    and time are those of some twenty images, and of ten matrix products of the size of the image.
+    path shift the image, rotate, stretch and shear it slightly, add a linear phase over it and a
+    small quadratic one, and give it a complex gain. The shift is that of the largest correlation of
+    the intensities, refined with the phases of the images; rotation, stretch and shear, of up to 2
+    %, and a quadratic phase of up to 0.15 turns at the edges are fitted to the difference of the
+    images. The pixels that both images show after the shift are compared. Memory and time are those
+    of some twenty images, and of ten matrix products of the size of the image.
 
     Args:
         image: Image I, shape (..., azimuth, range), complex, or a Signal.
@@ -48,7 +50,7 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
     whole = b.abs().square().sum((-2, -1))
     spectrum = torch.fft.fft2(a)
     turns = [_turns(torch.fft.fft2(b), dim) for dim in (-2, -1)]
-    map_, slope = _shifted(a, b, spectrum, turns)
+    map_, phase = _shifted(a, b, spectrum, turns)
     first, most = map_, map_.new_tensor([_MOST_SHIFT, _MOST_LINEAR, _MOST_LINEAR])
     moved, seen = _displaced(spectrum, turns, map_)
     energy = a.abs().square().sum((-2, -1))
@@ -56,19 +58,20 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
     b = torch.where(seen, b, 0)
     hidden = torch.where(seen, moved, 0).abs().square().sum((-2, -1)) < _LEAST_SHOWN * energy
     hidden = hidden | (b.abs().square().sum((-2, -1)) < _LEAST_SHOWN * whole)
-    best = _error(moved, b, seen, slope)
+    best = _error(moved, b, seen, phase)
     for _ in range(_STEPS):
-        step_map, step_slope = _step(moved, b, seen, slope, turns)
-        trial_map, trial_slope = map_ + step_map, slope + step_slope
+        step_map, step_phase = _step(moved, b, seen, phase, turns)
+        trial_map, trial_phase = map_ + step_map, phase + step_phase
         trial_moved, trial_seen = _displaced(spectrum, turns, trial_map)
-        error = _error(trial_moved, b, trial_seen, trial_slope)
+        error = _error(trial_moved, b, trial_seen, trial_phase)
         small = ((trial_map - first).abs() <= most).flatten(1).all(-1)
+        small = small & (trial_phase[:, 2:].abs() <= 4 * _MOST_BEND).all(-1)
         better = (error < best) & small
 
         def chosen(new: Tensor, old: Tensor, better: Tensor = better) -> Tensor:
             return torch.where(better.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
 
-        map_, slope, best = chosen(trial_map, map_), chosen(trial_slope, slope), chosen(error, best)
+        map_, phase, best = chosen(trial_map, map_), chosen(trial_phase, phase), chosen(error, best)
         moved, seen = chosen(trial_moved, moved), chosen(trial_seen, seen)
     return torch.where(hidden, 0.0, best).reshape(lead)
 
@@ -79,11 +82,13 @@ def _from_middle(n: int, like: Tensor) -> Tensor:
 
 
 def _shifted(a: Tensor, b: Tensor, spectrum: Tensor, turns: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Displacement (trial, axis, 3) of image a, a shift only, and slope of its phase (trial, axis)
-    in turns per sample, that register it to b.
+    """Displacement (trial, axis, 3) of image a, a shift only, and its phase (trial, 5), a slope
+    only, that register it to b.
 
     The displacement along an axis is in samples of a; its coefficients are those of 1, of the
-    azimuth and of the range sample from the middle.
+    azimuth and of the range sample from the middle. The coefficients of the phase, in turns, are
+    those of x, y, x^2, x y and y^2: x and y are azimuth and range from the middle, as a share of
+    the size of the image.
     """
     size = a.shape[-2:]
     bright = [torch.fft.fft2(x.abs().square()) for x in (a, b)]
@@ -94,13 +99,17 @@ def _shifted(a: Tensor, b: Tensor, spectrum: Tensor, turns: list[Tensor]) -> tup
     slope = None
     for _ in range(_ROUNDS):
         moved = torch.fft.ifft2(spectrum * _ramp(turns, shift).conj())
-        slope = _peak((moved.conj() * b).conj(), place, slope)
+        common = moved * b.conj()
+        if slope is None:  # all of the image decides on the slope, not its few brightest points
+            size_of = common.abs()
+            slope = _peak(common / torch.where(size_of > 0, size_of, 1).sqrt(), place)
+        slope = _peak(common, place, slope)
         flat = b * _ramp(place, slope).conj()
         shift = _peak(spectrum.conj() * torch.fft.fft2(flat), turns, shift)
     assert slope is not None
     map_ = torch.zeros(len(a), 2, 3, dtype=torch.float64, device=a.device)
     map_[..., 0] = -torch.cat(shift, -1)[:, 0]
-    return map_, torch.cat(slope, -1)[:, 0] / torch.tensor(size, device=a.device)
+    return map_, torch.nn.functional.pad(torch.cat(slope, -1)[:, 0], (0, 3))
 
 
 def _displaced(spectrum: Tensor, turns: list[Tensor], map_: Tensor) -> tuple[Tensor, Tensor]:
@@ -135,38 +144,40 @@ def _stretched(spectrum: Tensor, turns: Tensor, at: Tensor, shift: Tensor, stret
     return waves @ (spectrum * torch.exp(2j * math.pi * turns * shift[:, None])) / n
 
 
-def _sloped(image: Tensor, slope: Tensor) -> Tensor:
-    """The image with a linear phase over its samples."""
-    u, v = (_from_middle(n, slope) for n in image.shape[-2:])
-    rows, columns = (torch.exp(2j * math.pi * slope[:, i, None] * x) for i, x in enumerate((u, v)))
-    return image * rows[..., None] * columns[:, None]
+def _turned(image: Tensor, phase: Tensor) -> Tensor:
+    """The image with a phase (trial, 5), see `_shifted`."""
+    x, y = (_from_middle(n, phase) / n for n in image.shape[-2:])
+    along, across = (phase[:, i, None] * at + phase[:, 2 + 2 * i, None] * at.square() for i, at in enumerate((x, y)))
+    total = along[..., None] + across[:, None] + phase[:, 3, None, None] * x[:, None] * y
+    return image * torch.exp(2j * math.pi * total)
 
 
-def _error(moved: Tensor, b: Tensor, seen: Tensor, slope: Tensor) -> Tensor:
+def _error(moved: Tensor, b: Tensor, seen: Tensor, phase: Tensor) -> Tensor:
     """Error in dB of the pixels that are seen, after the best gain, (trial,)."""
-    a = torch.where(seen, _sloped(moved, slope), 0)
+    a = torch.where(seen, _turned(moved, phase), 0)
     energy = a.abs().square().sum((-2, -1), keepdim=True)
     gain = (a.conj() * b).sum((-2, -1), keepdim=True) / torch.where(energy == 0, 1, energy)
     return error_db(gain * a, b)
 
 
-def _step(moved: Tensor, b: Tensor, seen: Tensor, slope: Tensor, turns: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Gauss-Newton step of the displacement (trial, axis, 3) and of the slope (trial, axis)."""
-    a = torch.where(seen, _sloped(moved, slope), 0)
+def _step(moved: Tensor, b: Tensor, seen: Tensor, phase: Tensor, turns: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Gauss-Newton step of the displacement (trial, axis, 3) and of the phase (trial, 5)."""
+    a = torch.where(seen, _turned(moved, phase), 0)
     energy = a.abs().square().sum((-2, -1), keepdim=True)
     gain = (a.conj() * b).sum((-2, -1), keepdim=True) / torch.where(energy == 0, 1, energy)
     spectrum = torch.fft.fft2(moved)
     along = [torch.fft.ifft2(spectrum * (2j * math.pi * t)) for t in turns]
-    along = [gain * torch.where(seen, _sloped(x, slope), 0) for x in along]
+    along = [gain * torch.where(seen, _turned(x, phase), 0) for x in along]
     a, left = gain * a, b - gain * a
     n, m = a.shape[-2:]
-    u, v = _from_middle(n, slope) / n, _from_middle(m, slope) / m  # of the order of 1, for the condition
+    u, v = _from_middle(n, phase) / n, _from_middle(m, phase) / m  # of the order of 1, for the condition
     normal, right = 0.0, 0.0
     for first in range(0, n, _BLOCK_ROWS):
         rows = slice(first, first + _BLOCK_ROWS)
         x, y = u[rows, None], v
         d0, d1, one = along[0][:, rows], along[1][:, rows], a[:, rows]
-        columns = [d0, d0 * x, d0 * y, d1, d1 * x, d1 * y, 1j * one * x, 1j * one * y, one, 1j * one]
+        bends = [1j * one * z for z in (x, y, x * x, x * y, y * y)]
+        columns = [d0, d0 * x, d0 * y, d1, d1 * x, d1 * y, *bends, one, 1j * one]
         part = torch.stack([column.flatten(1) for column in columns], -1)
         normal = normal + (part.mH @ part).real
         right = right + (part.mH @ left[:, rows].flatten(1)[..., None]).real
@@ -176,7 +187,7 @@ def _step(moved: Tensor, b: Tensor, seen: Tensor, slope: Tensor, turns: list[Ten
     ridge = torch.eye(normal.shape[-1], dtype=torch.float64, device=a.device) * torch.where(level > 0, 1e-9 * level, 1)
     step = torch.linalg.solve(normal + ridge, right)[..., 0]
     scale = step.new_tensor([1, n, m])
-    return step[:, :6].reshape(-1, 2, 3) / scale, step[:, 6:8] / (2 * math.pi * scale[1:])
+    return step[:, :6].reshape(-1, 2, 3) / scale, step[:, 6:11] / (2 * math.pi)
 
 
 def _ramp(turns: list[Tensor], at: list[Tensor]) -> Tensor:

@@ -49,6 +49,9 @@ _NOISE_NATS, _MARGIN = 2.0, 2.0
 # phase error hardly changes it, so that the rms error of a scene may exceed its standard deviation
 # by this factor.
 _SPREAD = 1.9
+# range cells from which on the errors are so predictable; with fewer the factor is larger. Found by
+# trial: in few cells the spectra of points that change adapt to slow phase errors.
+_CELLS = 24
 # Share of the coherence across a boundary between pulses that the fitted spectra must find: of
 # homogeneous scenes the least one was 0.6 to 0.9 over all boundaries, of scenes that change at a
 # pulse 0.1 to 0.5. Boundaries in the first and last sixteenth of the pulses are left out.
@@ -78,12 +81,13 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         constant and a linear phase only add a phase to the image and shift it; they are
         left out of the standard deviation. `quality` is the predicted Strehl ratio times the share
         of the likelihood that noise does not explain. `ok` is False where the Strehl ratio for 1.9
-        times the standard deviation is below 0.8, the gain in likelihood below twice that of noise,
-        a single range cell holds nearly all of the energy, the range profiles are not aligned (see
-        `Displacement`), the pulses before and after a boundary are less than 0.55 times as coherent
-        as the spectra predict (where the scene changes, or pulses are copies of each other),
-        adjacent pulses are not coherent in any ten range cells of similar power, or a sparse
-        description of the scene with the phases that sharpen it is more likely: in sparse scenes
+        times the standard deviation (more where fewer than 24 range cells hold the energy) is below
+        0.8, the gain in likelihood below twice that of noise, a single range cell holds nearly all
+        of the energy, the range profiles are not aligned (see `Displacement`), the pulses before
+        and after a boundary are less than 0.55 times as coherent as the spectra predict (where the
+        scene changes, or pulses are copies of each other), adjacent pulses are not coherent in any
+        ten range cells of similar power, or a sparse description of the scene with the phases that
+        sharpen it is more likely: in sparse scenes
         the spectrum adapts to phase errors, which the standard deviation does not contain. `info`
         holds, of shape (...,), "gain_nats" (log likelihood minus that of white noise), "fit_nats"
         (the same as if range cells were independent, by which phases of one scene compare),
@@ -171,7 +175,8 @@ def _estimate(pulses: Pulses, found: _Linked, moved: Displacement) -> Estimate:
     strehl = torch.exp(-(std.square() * pulses.present).sum(-1) / pulses.present.sum(-1).clamp_min(1))
     row = (pulses.rows.detach().real.square() + pulses.rows.detach().imag.square()).sum(-1, dtype=torch.float64)
     effective = row.sum(-1).square() / or_one(row.square().sum(-1))
-    fitted = (strehl ** (_SPREAD**2) > LEAST_STREHL) & (gain > _MARGIN * noise) & (effective > LEAST_ROWS)
+    spread = _SPREAD**2 * (_CELLS / effective.clamp_min(1)).clamp_min(1)
+    fitted = (strehl**spread > LEAST_STREHL) & (gain > _MARGIN * noise) & (effective > LEAST_ROWS)
     return Estimate(
         value={"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
         std={"phase_rad": std.reshape(*trials, pulses.n).to(real)},

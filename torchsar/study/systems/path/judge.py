@@ -23,7 +23,7 @@ _OF_POINT = (
     *("pslr_azimuth_db", "pslr_range_db"),
 )
 # half width of the search for a point, by choice; less if another point is near
-_SEARCH_M = 5.0
+_SEARCH_M = 10.0
 # most pulses * samples * scatterers for which a bound is computed, by choice: some seconds
 _MOST_WORK = 10_000_000
 
