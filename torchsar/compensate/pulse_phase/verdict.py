@@ -59,7 +59,7 @@ _QUARTERS, _SEEN, _ALIKE = 4, 0.17, 0.33
 # share of the scene in the moduli, the correlation of even and odd pulses. Found by trial: most of
 # the wrong estimates lie beyond, most of the right ones within. Changes of few scatterers do not
 # average out: the largest deviation is smaller where fewer rows than this make the sharpness.
-_CHANGING, _STAYING, _TELLING_ROWS = (0.62, 0.19), (0.94, -0.09), 8
+_CHANGING, _STAYING, _TELLING_ROWS = (0.62, 0.19), (0.94, -0.09), 6
 # With little noise bright scatterers may stay while weak ones change, as in an aircraft in flight.
 # It is enough if they are alike: the same limits for moduli above so many times their median, in
 # images with such a share of the scene. The correlation was below 0.71 in 95 % of the trials where
