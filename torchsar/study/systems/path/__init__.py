@@ -48,9 +48,9 @@ class AnyPath(System):
         "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
         "contrast": "standard deviation over mean of the intensity |I|^2",
         "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB, I0 from the reference method, after the shift, "
-        "rotation and stretch, the linear and small quadratic phase over the image and the complex gain g that fit best, "
-        "which autofocus cannot observe; in `trade`: of the image of white noise, without registration, relative to the direct sum "
-        "over the same pulses",
+        "rotation and stretch, the linear and small quadratic phase over the image and the complex gain g that fit "
+        "best, which autofocus cannot observe; in `trade`: of the image of white noise, without registration, "
+        "relative to the direct sum over the same pulses",
         "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
         "corrected minus true, without constant and linear terms; modulo half a wavelength where the path or phases of "
         "pulses are corrected; for a strip over the middle of the strip abeam, and over the pulses that see the image",
