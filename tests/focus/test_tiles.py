@@ -18,6 +18,7 @@ from tests.helpers import assert_forward_equals_backward
 from torchsar.focus import ImageGrid, TilePlan, backproject, image_tiles
 from torchsar.focus.tiles import plan as of_plan
 from torchsar.focus.tiles.choice import _pixel_rule
+from torchsar.radar import LIGHT_M_S
 
 
 @pytest.mark.parametrize("seed", range(1000, 1016))
@@ -292,26 +293,41 @@ def strip(pulses: int = 400, pixels: int = 400) -> tuple[Case, Callable[[Tensor]
     return drawn, lit
 
 
-def test_a_strip_sums_the_pulses_that_light_a_pixel() -> None:
-    drawn, lit = strip()
-    plan = TilePlan(drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m, drawn.grid, error_db=-70, lit=lit)
-    ranges = lit(drawn.grid.pixels_m().reshape(-1, 3)).view(*drawn.grid.counts, 2)
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_strip_sums_the_pulses_that_light_the_middle_of_a_tile(weighted: bool) -> None:
+    drawn, lit = strip(pixels=390)
+    x = drawn.transmitter_m[:, 0]
+
+    def weight(points: Tensor) -> Tensor:
+        return torch.cos((x - points[:, :1]) / 8)
+
+    given = drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m, drawn.grid
+    plan = TilePlan(*given, error_db=-70, lit=lit, weight=weight if weighted else None)
+    pixels = drawn.grid.pixels_m()
+    # the first axis of the image is across the range
+    width, (rows, columns) = plan.choice.width, drawn.grid.counts
+    first = torch.arange(rows) // width * width
+    middle = (first + (first + width).clamp(max=rows) - 1).to(F64) / 2
+    centres = (drawn.grid.origin_m + drawn.grid.step_m * middle[:, None] * drawn.grid.axes[0])[:, None]
+    centres = centres.expand(rows, columns, 3)
+    assert rows % width and rows > 2 * width
+    some = torch.arange(0, rows * columns, 53)
+    i, j = some // columns, some % columns
+    number, ends = torch.arange(len(x))[:, None], lit(centres[i, j])
+    shares = ((ends[:, 0] <= number) & (number < ends[:, 1])).to(F64)
+    if weighted:
+        shares = shares * weight(centres[i, j]).mT
+    way = 2 * torch.linalg.vector_norm(pixels[i, j] - drawn.transmitter_m[:, None], dim=-1) - drawn.reference_m[:, None]
+    waves = torch.exp(2j * math.pi * drawn.frequency_hz[:, None, None] * way / LIGHT_M_S)
+    truth = (drawn.history.mT[..., None] * shares * waves).sum((0, 1))
+    found = plan.image(drawn.history)
+    assert float((found[i, j] - truth).norm() / truth.norm()) < 10 ** (-67 / 20)
+    assert float((plan.exact(drawn.history, pixels[i, j]) - truth).norm() / truth.norm()) < 1e-7
     first, last = 180, 200
     history = torch.zeros_like(drawn.history)
     history[first:last] = drawn.history[first:last]
     found = plan.image(history)
-    seen = ((ranges[..., 0] <= first) & (ranges[..., 1] >= last)).nonzero()[::37]
-    assert len(seen) > 20
-    i, j = seen.unbind(-1)
-    truth = replace(drawn, history=history).direct(drawn.grid.pixels_m()[i, j])
-    assert float((found[i, j] - truth).norm() / truth.norm()) < 10 ** (-67 / 20)
-    assert not found[:40].any() and not found[-40:].any()
-    some = torch.arange(0, found.numel(), 53)
-    exact, made = (
-        plan.exact(drawn.history, drawn.grid.pixels_m().reshape(-1, 3)[some]),
-        plan.image(drawn.history).flatten()[some],
-    )
-    assert float((made - exact).norm() / exact.norm()) < 10 ** (-67 / 20)
+    assert found.any() and not found[:40].any() and not found[-40:].any()
     moved = plan.moved(drawn.transmitter_m, None, drawn.reference_m).image(history)
     torch.testing.assert_close(moved, found)
 

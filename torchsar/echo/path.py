@@ -68,6 +68,21 @@ def path_echo(
     return torch.cat(out, -2)
 
 
+def sample_frequencies_hz(radar: InverseRadar, n: int, device: torch.device | str | None = None) -> Tensor:
+    """Return the frequencies of the samples of a phase history.
+
+    Args:
+        radar: Carrier, that of sample n // 2, and bandwidth, which the samples share.
+        n: Number of samples.
+        device: Device of the result.
+
+    Returns:
+        Frequencies in Hz, float64 (n,).
+    """
+    number = torch.arange(n, dtype=torch.float64, device=device) - n // 2
+    return radar.carrier_hz + radar.bandwidth_hz / n * number
+
+
 @gathered_checks()
 def simulate_path(
     radar: InverseRadar,
@@ -138,9 +153,7 @@ def simulate_path(
     trials = () if draws.trials is None else (len(draws.trials),)
     # without random numbers the echo has no trials yet
     data = range_profiles(history.expand(*np.broadcast_shapes(history.shape[:-2], trials), -1, -1))
-    frequency = radar.carrier_hz + radar.bandwidth_hz / n_range * (
-        torch.arange(n_range, dtype=torch.float64, device=device) - n_range // 2
-    )
+    frequency = sample_frequencies_hz(radar, n_range, device)
     signal = Signal(data, radar.raw_axes(n_pulse, n_range))
     recorded, clean = (
         Recording(signal, radar, {"frequency_hz": frequency, **path.side_data()})

@@ -177,6 +177,28 @@ class ProcessedBeam:
         last = torch.searchsorted(pulse.flip(0).cummin(0).values.flip(0), high, right=True)
         return torch.stack([first, torch.maximum(first, last)], -1)
 
+    def pulse_weights(self, position_m: Tensor, points_m: Tensor) -> Tensor:
+        """Return the weights with which pulses see points.
+
+        Angles are those of `lit_pulses`.
+
+        Args:
+            position_m: Positions of the antenna in metres, float64 (pulse, 3).
+            points_m: Points in metres, float64 (point, 3).
+
+        Returns:
+            Weights, 0 to 1, float64 (point, pulse).
+
+        Raises:
+            TypeError: If the positions are not float64.
+            ValueError: If there are fewer than two positions, the antenna does not advance, or
+                values are not finite.
+        """
+        track = StraightTrack.fitted(position_m)
+        ahead = track.along_m(points_m)[:, None] - track.along_m(position_m)
+        closest = torch.linalg.vector_norm(track.across_m(points_m), dim=-1)
+        return self.weight(ahead / torch.hypot(ahead, closest[:, None]))
+
     def quadrature(self) -> tuple[Tensor, Tensor]:
         """Return sines of angles, and their shares of the power of an image of white noise.
 

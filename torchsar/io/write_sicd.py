@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsar.core import Recording, Signal, library, unit_phasor
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.path_image import PathImage
+from torchsar.focus.path_image import PathImage, spatial_band
 from torchsar.focus.spotlight import window_weights
 from torchsar.io.extras import quiet, write_whole
 from torchsar.io.geometry import antennas_of, frame_of, image_samples, pulse_time_s, single
@@ -219,16 +219,8 @@ class _Scene:
     def sides(self) -> tuple[_Side, _Side]:
         """Spatial frequencies along rows and columns."""
         points = torch.cat([self.pixels.at(self.rows, self.columns), self.scp_m[None]])
-        low, high = (torch.full((len(points), 2), sign * torch.inf, dtype=torch.float64) for sign in (1, -1))
-        axes = torch.stack([self.pixels.down, self.pixels.right])
-        for share in np.linspace(0, 1, 33):  # of the aperture, by choice
-            pulse = (self.lit[:, 0] + share * (self.lit[:, 1] - self.lit[:, 0])).round().long()
-            away = [points - place[pulse] for place in self.antennas.places]
-            unit = [v / torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in away]
-            slope = torch.stack(unit).mean(0) * 2 @ axes.T
-            for frequency in (self.frequency[0], self.frequency[-1]):
-                k = slope * frequency / LIGHT_M_S
-                low, high = torch.minimum(low, k), torch.maximum(high, k)
+        axes, ends = torch.stack([self.pixels.down, self.pixels.right]), self.lit + torch.tensor([0, 1])
+        low, high = spatial_band(points, axes, self.antennas, self.frequency, ends)
         return self._side(low[:, 0], high[:, 0]), self._side(low[:, 1], high[:, 1])
 
     def _side(self, low: Tensor, high: Tensor) -> _Side:

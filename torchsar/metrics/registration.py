@@ -7,13 +7,15 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, unit_level
+from torchsar.core import Signal, cis, unit_level
+from torchsar.focus.chirp_z import chirp_z
 from torchsar.metrics.image import error_db, pair_of
 
 # chosen: Newton steps that refine shift or slope of two images, and rounds of both in turn
 _REFINED, _ROUNDS = 4, 3
-# chosen: steps of the affine registration, and rows of the image whose derivatives are held at once
-_STEPS, _BLOCK_ROWS = 4, 256
+# chosen: most steps of the affine registration, gain in dB below which it ends, and rows of the
+# image whose derivatives are held at once
+_STEPS, _SETTLED_DB, _BLOCK_ROWS = 4, 0.01, 256
 # chosen: largest rotation, stretch and shear; largest change of the shift with them in samples;
 # largest quadratic phase at the edges in turns; and share of the energy of either image that must
 # be compared
@@ -28,8 +30,9 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
     small quadratic one, and give it a complex gain. The shift is that of the largest correlation of
     the intensities, refined with the phases of the images; rotation, stretch and shear, of up to 2
     %, and a quadratic phase of up to 0.15 turns at the edges are fitted to the difference of the
-    images. The pixels that both images show after the shift are compared. Memory and time are those
-    of some twenty images, and of ten matrix products of the size of the image.
+    images. The pixels that both images show after the shift are compared. The samples of both must
+    hold the spectrum (`PathImage.coarsest_step_m`): a displacement of coarser samples cannot be
+    removed. Memory and time are those of some twenty images.
 
     Args:
         image: Image I, shape (..., azimuth, range), complex, or a Signal.
@@ -66,13 +69,15 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
         error = _error(trial_moved, b, trial_seen, trial_phase)
         small = ((trial_map - first).abs() <= most).flatten(1).all(-1)
         small = small & (trial_phase[:, 2:].abs() <= 4 * _MOST_BEND).all(-1)
-        better = (error < best) & small
+        better, settled = (error < best) & small, ~small | (error > best - _SETTLED_DB)
 
         def chosen(new: Tensor, old: Tensor, better: Tensor = better) -> Tensor:
             return torch.where(better.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
 
         map_, phase, best = chosen(trial_map, map_), chosen(trial_phase, phase), chosen(error, best)
         moved, seen = chosen(trial_moved, moved), chosen(trial_seen, seen)
+        if bool(settled.all()):
+            break
     return torch.where(hidden, 0.0, best).reshape(lead)
 
 
@@ -139,9 +144,15 @@ def _stretched(spectrum: Tensor, turns: Tensor, at: Tensor, shift: Tensor, stret
     middle; shift: (trial, column); stretch: (trial,). The middle of the spectrum keeps its phase.
     """
     n = len(at)
-    grid = torch.fft.fftfreq(n, dtype=torch.float64, device=at.device) * (at[:, None] + (n - 1) / 2)
-    waves = torch.exp(2j * math.pi * (grid + stretch[:, None, None] * at[:, None] * turns.mT))
-    return waves @ (spectrum * torch.exp(2j * math.pi * turns * shift[:, None])) / n
+    rising, order = turns.sort(1)
+    first = rising[:, :1]
+    f = torch.fft.fftfreq(n, dtype=torch.float64, device=at.device)
+    middle = f[order[:, :1]] - first
+    displaced = shift[:, None] + (stretch * at[0])[:, None, None]
+    sorted_ = spectrum.gather(1, order.expand_as(spectrum)) * cis(2 * math.pi * rising * displaced)
+    image = chirp_z(sorted_, 0.0, -(1 + stretch[:, None]) / n, n, dim=1, centre=0) / n
+    place = at[:, None] - at[0]
+    return image * cis(2 * math.pi * (middle + first * (1 + stretch[:, None, None])) * place)
 
 
 def _turned(image: Tensor, phase: Tensor) -> Tensor:
@@ -149,7 +160,7 @@ def _turned(image: Tensor, phase: Tensor) -> Tensor:
     x, y = (_from_middle(n, phase) / n for n in image.shape[-2:])
     along, across = (phase[:, i, None] * at + phase[:, 2 + 2 * i, None] * at.square() for i, at in enumerate((x, y)))
     total = along[..., None] + across[:, None] + phase[:, 3, None, None] * x[:, None] * y
-    return image * torch.exp(2j * math.pi * total)
+    return image * cis(2 * math.pi * total)
 
 
 def _error(moved: Tensor, b: Tensor, seen: Tensor, phase: Tensor) -> Tensor:
@@ -192,7 +203,7 @@ def _step(moved: Tensor, b: Tensor, seen: Tensor, phase: Tensor, turns: list[Ten
 
 def _ramp(turns: list[Tensor], at: list[Tensor]) -> Tensor:
     """exp(2j pi (turns . at)), shape (..., n, m)."""
-    return torch.exp(2j * math.pi * (turns[0] * at[0] + turns[1] * at[1]))
+    return cis(2 * math.pi * turns[0] * at[0]) * cis(2 * math.pi * turns[1] * at[1])
 
 
 def _peak(z: Tensor, turns: list[Tensor], start: list[Tensor] | None = None) -> list[Tensor]:

@@ -24,8 +24,10 @@ from torchsar.focus.tiles.kernels import (
     window_length,
 )
 
-# function of positions (point, 3): first pulse that lights each, pulse after the last, (point, 2)
+# functions of positions (point, 3): first pulse that lights each, pulse after the last, (point, 2);
+# and weight of each pulse, (point, pulse)
 Lit = Callable[[Tensor], Tensor]
+Weight = Callable[[Tensor], Tensor]
 
 # sizes that are tried, by choice: powers of 2, and few oversamplings, so that few are judged
 _WIDTHS = (8, 16, 32, 64, 128)
@@ -245,6 +247,8 @@ class Scene:
         grid: Pixels, with the second axis nearer to the range direction.
         lit: Function of positions, float64 (point, 3), that returns the first pulse of each and the
             pulse after the last, int64 (point, 2); None if all pulses light the whole image.
+        weight: Function of positions that returns the weights of all pulses, float64 (point,
+            pulse); None for equal ones.
     """
 
     frequency_hz: Tensor
@@ -253,6 +257,7 @@ class Scene:
     judged: Sequence[Tensor]
     grid: ImageGrid
     lit: Lit | None = None
+    weight: Weight | None = None
 
     @functools.cached_property
     def farthest(self) -> list[Tensor]:
@@ -306,6 +311,30 @@ class Scene:
                 f"shape {tuple(found.shape)}"
             )
         return found.cpu().clamp(0, pulses).view(*points.shape[:-1], 2)
+
+    def shares(self, centres: Tensor, width: int, depth: int) -> Tensor | None:
+        """Weights with which pulses are summed in tiles of some centres (tile, 3), float64 (tile,
+        pulse): those of the middle of their part of the image, zero where a pulse does not light
+        it; None if all are one.
+        """
+        if self.lit is None and self.weight is None:
+            return None
+        grid = self.grid
+        at = ((centres - grid.origin_m) @ grid.axes.mT) / grid.step_m
+        beyond = at + (at.new_tensor([width, depth]) - 1) / 2 - (at.new_tensor(grid.counts) - 1)
+        centres = centres - beyond.clamp_min(0) / 2 * grid.step_m @ grid.axes
+        number = torch.arange(len(self.places[0]), device=centres.device)
+        first, last = self.lit_pulses(centres).to(centres.device)[..., None].unbind(-2)
+        lit = ((first <= number) & (number < last)).to(torch.float64)
+        if self.weight is None:
+            return lit
+        weight = self.weight(centres)
+        if weight.shape != lit.shape or weight.dtype != torch.float64:
+            raise ValueError(
+                f"weight must return float64 weights of shape {tuple(lit.shape)} for {len(centres)} points and all "
+                f"pulses, got {weight.dtype} of shape {tuple(weight.shape)}"
+            )
+        return lit * weight
 
     @functools.cached_property
     def most(self) -> tuple[float, float]:

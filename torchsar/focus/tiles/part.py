@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,6 +95,8 @@ class Part:
         centre: Centres of the tiles, float64 (tile, 3).
         grid: Pixels, with the second axis nearer to the range direction.
         relief_m: Largest height of a pixel above the plane of its tile in metres.
+        shares: Function of the centres of some tiles, (tile, 3), that returns the weights of all
+            pulses in their sums, (tile, pulse), or None if all are one.
     """
 
     def __init__(
@@ -107,8 +109,9 @@ class Part:
         centre: Tensor,
         grid: ImageGrid,
         relief_m: float = 0.0,
+        shares: Callable[[Tensor], Tensor | None] | None = None,
     ) -> None:
-        axes, self.relief_m = grid.axes, relief_m
+        axes, self.relief_m, self.shares = grid.axes, relief_m, shares
         self.band, self.choice, self.centre, self.axes = band, choice, centre, axes
         first, last = pulses
         self.pulses, self.count = slice(first, last), last - first
@@ -264,6 +267,9 @@ class Part:
         below = torch.ceil(position.detach() - taps / 2)
         away = (below - position)[..., None] + torch.arange(taps, device=device)
         weights = spread_kernel(away.to(real), taps)
+        shares = None if self.shares is None else self.shares(self.centre[rows])
+        if shares is not None:
+            weights = weights * shares[:, None, self.pulses, None].to(real)
         return Tables(first, before, after, *_spreading(below.long(), weights, self.nodes))
 
     def add_nodes(self, nodes: Tensor, profiles: Tensor, tables: Tables) -> None:

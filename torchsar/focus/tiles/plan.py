@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from torchsar.core import block_bytes_of, checked_samples, is_traced, over_blocks, untraced
 from torchsar.focus.backprojection import direct_sum, expanded_history
 from torchsar.focus.image_grid import ImageGrid
-from torchsar.focus.tiles.choice import Lit, Scene, choose, part_bounds, tile_centres, tile_heights
+from torchsar.focus.tiles.choice import Lit, Scene, Weight, choose, part_bounds, tile_centres, tile_heights
 from torchsar.focus.tiles.expansion import slopes
 from torchsar.focus.tiles.part import Band, Part, Tables
 from torchsar.radar.antenna_path import AntennaPath, refuse_unusable
@@ -89,16 +89,18 @@ class TilePlan:
         error_db: Largest rms error relative to the image of a history of white noise, in dB.
         lit: For a beam that lights a part of the image at a time: function of positions in metres,
             float64 (point, 3), that returns the first pulse that lights each point and the pulse
-            after the last, int64 (point, 2). It decides which pulses are summed for some tiles at a
-            time; pulses before and after those that light a pixel may be included. None for all
-            pulses.
+            after the last, int64 (point, 2). The pixels of a tile are summed over the pulses that
+            light its middle. None for all pulses.
+        weight: Function of positions that returns the weights of all pulses in the sum, float64
+            (point, pulse), such as those of a beam with smooth edges; that of the middle of a tile
+            serves for its pixels. None for equal ones.
 
     Raises:
         TypeError: If frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
-            equal steps, `lit` returns other shapes, no pulse lights any of 64 x 64 pixels that are
-            spread over the image, tiles do not reach the error in this geometry, or the geometry is
-            not constant in a program that is traced, as by `torch.export`.
+            equal steps, `lit` or `weight` returns other shapes, no pulse lights any of 64 x 64
+            pixels that are spread over the image, tiles do not reach the error in this geometry, or
+            the geometry is not constant in a program that is traced, as by `torch.export`.
     """
 
     def __init__(
@@ -110,8 +112,10 @@ class TilePlan:
         grid: ImageGrid,
         error_db: float = -70.0,
         lit: Lit | None = None,
+        weight: Weight | None = None,
     ) -> None:
-        self.frequency_hz, self.grid, self.error_db, self.lit = frequency_hz, grid, float(error_db), lit
+        self.frequency_hz, self.grid, self.error_db = frequency_hz, grid, float(error_db)
+        self.lit, self.weight = lit, weight
         _refuse_traced(frequency_hz, transmitter_m, receiver_m, reference_m, grid.origin_m, grid.axes, grid.height_m)
         with untraced():
             refuse_unusable(frequency_hz=frequency_hz)
@@ -137,7 +141,7 @@ class TilePlan:
         self._swapped = float(a.abs().mean()) > float(b.abs().mean())
         if self._swapped:
             grid = grid.transposed()
-        scene = Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid, self.lit)
+        self._scene = scene = Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid, self.lit, self.weight)
         with torch.device("cpu"):  # tables of the choice lie there whatever the default device
             self.choice = choice = choose(scene, self.error_db)
         self._size = size = choice.width, choice.depth
@@ -151,7 +155,7 @@ class TilePlan:
             self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
             centre = tile_centres(grid, *size, i, j, self._height_m)
             bounds = part_bounds(*pulses, choice.parts)
-            given = nominal, every, centre, grid, relief
+            given = nominal, every, centre, grid, relief, partial(scene.shares, width=size[0], depth=size[1])
             self._zones.append([Part(self._band, choice, ends, *given) for ends in bounds])
         parts = [part for zone in self._zones for part in zone]
         self._table_count = sum(part.table_count for part in parts)
@@ -238,19 +242,16 @@ class TilePlan:
         """
         history = checked_samples(history, "TilePlan.exact", "pulse, frequency", finite=False)
         history = expanded_history(history, self.antennas, self.frequency_hz, "TilePlan.exact")
-        device = pixels_m.device
-        ends = torch.zeros(*self._tiles, 2, dtype=torch.int64, device=device)
-        for zone, numbers in zip(self._zones, self._numbers, strict=True):
-            if zone:
-                ends.flatten(0, 1)[numbers] = torch.tensor([zone[0].pulses.start, zone[-1].pulses.stop], device=device)
         grid = self.grid.transposed() if self._swapped else self.grid
         at = ((pixels_m - grid.origin_m) @ grid.axes.mT / grid.step_m).round().long()
-        first, last = ends[at[:, 0] // self._size[0], at[:, 1] // self._size[1]].unbind(-1)
+        i, j = (torch.arange(n, device=at.device) for n in self._tiles)
+        centres = tile_centres(grid, *self._size, i, j, self._height_m)
+        tiles, of = torch.unique(at[:, 0] // self._size[0] * len(j) + at[:, 1] // self._size[1], return_inverse=True)
+        shares = self._scene.shares(centres[tiles], *self._size)
 
-        def path(pulses: slice, some: slice) -> tuple[Tensor, Tensor]:
-            number = torch.arange(pulses.start, pulses.stop, device=device)[:, None]
-            summed = (first[some] <= number) & (number < last[some])
-            return self.antennas.path_m(pixels_m[some], pulses), summed.to(torch.float64)
+        def path(pulses: slice, some: slice) -> tuple[Tensor, Tensor | None]:
+            weight = None if shares is None else shares[of[some], pulses].mT
+            return self.antennas.path_m(pixels_m[some], pulses), weight
 
         return direct_sum(history, self.frequency_hz, path, len(pixels_m), eps=eps)
 
@@ -375,6 +376,7 @@ def image_tiles(
     grid: ImageGrid,
     error_db: float = -70.0,
     lit: Lit | None = None,
+    weight: Weight | None = None,
 ) -> Tensor:
     """Form the image of a phase history by tiles; see `TilePlan`, which serves several histories.
 
@@ -387,6 +389,7 @@ def image_tiles(
         grid: Pixels.
         error_db: Largest rms error relative to the image of a history of white noise, in dB.
         lit: Pulses that light each point, see `TilePlan`; None for all.
+        weight: Weights of the pulses, see `TilePlan`; None for equal ones.
 
     Returns:
         Image, shape (..., i, j), complex.
@@ -394,7 +397,7 @@ def image_tiles(
     Raises:
         TypeError: If the history is not complex, or frequencies or positions are not float64.
         ValueError: If shapes do not match, values are not finite, the frequencies do not rise in
-            equal steps, `lit` returns other shapes, no pulse lights any of 64 x 64 pixels that are
-            spread over the image, or tiles do not reach the error in this geometry.
+            equal steps, `lit` or `weight` returns other shapes, no pulse lights any of 64 x 64
+            pixels that are spread over the image, or tiles do not reach the error in this geometry.
     """
-    return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit).image(history)
+    return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit, weight).image(history)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchsar.core import Draws, Recording, Trace
 from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
+from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.motion_compensation import possible_compensations
 from torchsar.io import read_history
 from torchsar.metrics import error_db, registered_error_db
@@ -22,7 +23,7 @@ from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.systems.path import figures
 from torchsar.study.systems.path import judge as judging
 from torchsar.study.systems.path.world import Flown, path_radar
-from torchsar.study.trials.batch import Judged, Outcome, Result, Trials
+from torchsar.study.trials.batch import IMAGE, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.system import Column, System
@@ -105,6 +106,31 @@ class AnyPath(System):
 
     bounds = staticmethod(judging.bounds)  # pyright: ignore[reportAssignmentType]
 
+    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
+        """Return the limits of the sample spacing of the images, by the nominal path."""
+        if bench.recording is not None:
+            antennas, frequency = AntennaPath.recorded(bench.recording.aux), bench.recording.aux["frequency_hz"]
+        else:
+            antennas, frequency = bench.world().nominal(bench.radar)
+        found: dict[Limit, list[str]] = {}
+        for name, chain in bench.chains.items():
+            image = next((one for one in reversed(list(chain.stages.values())) if isinstance(one, PathImage)), None)
+            steps = () if image is None else image.coarsest_step_m(antennas, frequency)
+            for axis, step in zip(IMAGE, steps, strict=False):
+                assert image is not None
+                limit = Limit(
+                    f"the sample spacing step_m of the image in {axis}",
+                    image.grid.step_m,
+                    step,
+                    "m",
+                    "warn",
+                    "the samples do not hold the spectrum of the image, so that it cannot be resampled, and "
+                    "image_error_db of displaced images is too large",
+                    "choose a finer step_m",
+                )
+                found.setdefault(limit, []).append(name)
+        return found
+
     def choices(self, bench: Bench) -> Sequence[Choice]:
         stages = bench.chains["recommended"].stages.values()
         stage = next((one for one in stages if isinstance(one, PathImage)), None)
@@ -119,7 +145,7 @@ class AnyPath(System):
         antennas, grid = AntennaPath.recorded(clean.aux), stage.grid
         geometry = (clean.aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
         # tiles sum the pulses of the recommended method
-        plan_of = partial(TilePlan, *geometry, grid, lit=stage.lit(antennas))
+        plan_of = partial(TilePlan, *geometry, grid, lit=stage.lit(antennas), weight=stage.weight(antennas))
         tiles: dict[float, float] = {}
         for error in _ERRORS_DB:
             try:
