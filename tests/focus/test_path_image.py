@@ -11,7 +11,7 @@ from tests.focus.geometries import case
 from torchsar.core import Signal
 from torchsar.focus import DirectImage, ProcessedBeam, TileImage
 from torchsar.metrics import error_db
-from torchsar.radar import InverseRadar, StraightTrack, range_profiles
+from torchsar.radar import LIGHT_M_S, AntennaPath, InverseRadar, StraightTrack, range_profiles
 
 DRAWN = case(1002)
 N = len(DRAWN.frequency_hz)
@@ -74,6 +74,23 @@ def test_tiles_sum_the_pulses_that_see_them_within_the_beam() -> None:
     assert float(error_db(one(signal(history), **values(**path)).data, exact)) < -75
     both = {**path, "transmitter_m": torch.stack([place, place + 0.01])}
     assert stage(signal(history), **values(**both)).data.shape == (2, 11, 11)
+
+
+def test_samples_must_hold_the_spectrum_of_a_point() -> None:
+    """Beside a straight track: the Doppler band of the beam, and the range band on the ground."""
+    y = 0.4 * torch.arange(-300.0, 300.0, dtype=torch.float64)
+    place = torch.stack([torch.full_like(y, -450.0), y, torch.full_like(y, 450.0)], -1)
+    antennas = AntennaPath(place, None, torch.zeros_like(y))
+    frequency = torch.linspace(9.4e9, 9.8e9, 65, dtype=torch.float64)
+    stage = TileImage(2.0, 2.0, 0.2, window="range", beam_deg=6.0)
+    azimuth, range_ = stage.sampling_limits(antennas, frequency)
+    wanted = LIGHT_M_S / (2 * 9.8e9 * 2 * 1.1 * math.sin(math.radians(3.0)))
+    assert azimuth.limit == pytest.approx(wanted, rel=0.01) and azimuth.verdict == "warn"
+    band = 2 / LIGHT_M_S * (9.8e9 - 9.4e9 * math.cos(math.radians(3.3))) * math.sqrt(0.5)
+    assert range_.limit == pytest.approx(1 / (0.76 * band), rel=0.02) and range_.ok
+    # no pulse sees the image, and any samples hold it
+    away = TileImage(2.0, 2.0, 0.2, centre_m=(0.0, 900.0), beam_deg=6.0).sampling_limits(antennas, frequency)
+    assert all(limit.limit == math.inf for limit in away)
 
 
 def test_the_beam_lights_the_pulses_with_a_weight() -> None:

@@ -12,6 +12,7 @@ import torch
 from tests.study.scenes import PATH, TILES, bench_of, loaded_as, run, world
 from torchsar.core import Draws
 from torchsar.radar import LIGHT_M_S
+from torchsar.study.commands.requires import refuse_beyond_limits
 from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.montecarlo import sweep
 from torchsar.study.settings.cases import cases_of
@@ -79,6 +80,15 @@ def test_packaged_configs_work_at_reduced_size(config: str) -> None:
     assert float(found["ideal"]["position_error_rms_m"]) < 0.02
     if config == "bistatic_fixed":
         assert float(found["recommended"]["image_error_db"]) < -75
+
+
+@pytest.mark.parametrize("config", ["airborne_spotlight", "bistatic_fixed", "drone_stripmap"])
+def test_samples_too_coarse_for_an_image_are_warned_of(config: str, caplog: pytest.LogCaptureFixture) -> None:
+    for changes in ([], ["processor.recommended.stages.image.step_m=0.9"]):
+        bench = Bench(next(iter(cases_of(load(config, changes)).values())))
+        refuse_beyond_limits(bench, "one")
+        warned = "step_m of the image in azimuth is 0.9 m" in caplog.text and "choose a finer step_m" in caplog.text
+        assert warned == bool(changes) == bool(caplog.text)
 
 
 def archive(folder: Path) -> Path:

@@ -68,17 +68,26 @@ def path_echo(
     return torch.cat(out, -2)
 
 
-def sample_frequencies_hz(radar: InverseRadar, n: int, device: torch.device | str | None = None) -> Tensor:
-    """Return the frequencies of the samples of a phase history.
+def nominal_geometry(radar: InverseRadar, world: PathWorld, n_pulse: int, n_range: int) -> tuple[AntennaPath, Tensor]:
+    """Return the paths of antennas that fly as planned, and the frequencies of the radar.
 
     Args:
-        radar: Carrier, that of sample n // 2, and bandwidth, which the samples share.
-        n: Number of samples.
-        device: Device of the result.
+        radar: Carrier, bandwidth and pulse repetition frequency.
+        world: Paths; their deviations are left out.
+        n_pulse: Number of pulses.
+        n_range: Number of frequencies.
 
     Returns:
-        Frequencies in Hz, float64 (n,).
+        Paths, whose reference is zero, and frequencies in Hz, float64 (n_range,).
     """
+    time_s = torch.arange(n_pulse, dtype=torch.float64) / radar.prf_hz
+    receiver = None if world.receiver is None else world.receiver.nominal.position_m(time_s)
+    path = AntennaPath(world.transmitter.nominal.position_m(time_s), receiver, torch.zeros_like(time_s))
+    return path, _frequencies_hz(radar, n_range)
+
+
+def _frequencies_hz(radar: InverseRadar, n: int, device: torch.device | str | None = None) -> Tensor:
+    """Frequencies of the n samples of a phase history, float64 (n,)."""
     number = torch.arange(n, dtype=torch.float64, device=device) - n // 2
     return radar.carrier_hz + radar.bandwidth_hz / n * number
 
@@ -153,7 +162,7 @@ def simulate_path(
     trials = () if draws.trials is None else (len(draws.trials),)
     # without random numbers the echo has no trials yet
     data = range_profiles(history.expand(*np.broadcast_shapes(history.shape[:-2], trials), -1, -1))
-    frequency = sample_frequencies_hz(radar, n_range, device)
+    frequency = _frequencies_hz(radar, n_range, device)
     signal = Signal(data, radar.raw_axes(n_pulse, n_range))
     recorded, clean = (
         Recording(signal, radar, {"frequency_hz": frequency, **path.side_data()})

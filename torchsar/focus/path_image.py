@@ -12,6 +12,7 @@ from torch import Tensor
 from torchsar.core import Axis, Signal, Stage, real_dtype, untraced
 from torchsar.focus.backprojection import backproject
 from torchsar.focus.image_grid import ImageGrid, level_plane
+from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.motion_compensation import ProcessedBeam, compensated_omega_k, refuse_bistatic
 from torchsar.focus.spotlight import window_weights
 from torchsar.focus.tiles import TilePlan
@@ -135,19 +136,19 @@ class PathImage(Stage):
         """
         return None if self.beam is None else partial(self.beam.pulse_weights, _mean_place(antennas))
 
-    def coarsest_step_m(self, antennas: AntennaPath, frequency_hz: Tensor) -> tuple[float, float]:
-        """Return the largest sample spacings that hold the spectrum of the image at a point.
+    def sampling_limits(self, antennas: AntennaPath, frequency_hz: Tensor) -> list[Limit]:
+        """Return the limits of the sample spacing, up to which samples hold the spectrum.
 
-        An image with coarser samples shows the same brightness, but it cannot be displaced,
-        resampled or compared with another one that is displaced.
+        The limit is the inverse of the widest spectrum of a point at nine points of the image, of
+        which a Hann window leaves 76 % (99.9 % of the energy). An image with coarser samples shows
+        the same brightness, but it cannot be resampled, or compared with a displaced one.
 
         Args:
             antennas: Path of the antennas.
             frequency_hz: Frequencies in Hz, float64 (frequency,).
 
         Returns:
-            Spacings along azimuth and range in metres: the inverse of the widest spectrum at nine
-            points of the image, of which a Hann window leaves 76 % (99.9 % of the energy).
+            Limits along azimuth and range.
         """
         rows, columns = (torch.linspace(0, n - 1, _POINTS).round().long() for n in self.grid.counts)
         points = self.grid.pixels_m()[rows][:, columns].reshape(-1, 3).to(antennas.reference_m.device)
@@ -156,8 +157,20 @@ class PathImage(Stage):
         seen = ends[:, 1] > ends[:, 0]
         low, high = spatial_band(points[seen], self.grid.axes, antennas, frequency_hz, ends[seen])
         held = torch.tensor([_HELD[name] for name in self.windows], dtype=torch.float64)
-        azimuth, range_ = (1 / ((high - low).cpu() * held).amax(0)).tolist() if bool(seen.any()) else [math.inf] * 2
-        return azimuth, range_
+        steps = (1 / ((high - low).cpu() * held).amax(0)).tolist() if bool(seen.any()) else [math.inf] * 2
+        return [
+            Limit(
+                f"the sample spacing step_m of the image in {axis.name}",
+                self.grid.step_m,
+                step,
+                "m",
+                "warn",
+                "samples do not hold the spectrum of the image, so that it cannot be resampled, and its error relative "
+                "to a displaced reference is too large",
+                "choose a finer step_m",
+            )
+            for axis, step in zip(self.axes, steps, strict=True)
+        ]
 
     def seen(self, antennas: AntennaPath) -> Tensor:
         """Return the pulses that see a part of the image.
@@ -252,10 +265,22 @@ def seen_in(stages: Iterable[object], antennas: AntennaPath) -> Tensor:
     Returns:
         bool (pulse,); True for all pulses if no stage forms an image.
     """
-    seen = torch.ones(antennas.pulses, dtype=torch.bool, device=antennas.reference_m.device)
-    for stage in stages:
-        seen = stage.seen(antennas) if isinstance(stage, PathImage) else seen
-    return seen
+    image = last_image(stages)
+    if image is None:
+        return torch.ones(antennas.pulses, dtype=torch.bool, device=antennas.reference_m.device)
+    return image.seen(antennas)
+
+
+def last_image(stages: Iterable[object]) -> PathImage | None:
+    """Find the last stage that images a path.
+
+    Args:
+        stages: Stages of a chain.
+
+    Returns:
+        The stage, or None if there is none.
+    """
+    return next((one for one in reversed(list(stages)) if isinstance(one, PathImage)), None)
 
 
 class TileImage(PathImage):

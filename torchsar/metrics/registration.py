@@ -31,7 +31,7 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
     the intensities, refined with the phases of the images; rotation, stretch and shear, of up to 2
     %, and a quadratic phase of up to 0.15 turns at the edges are fitted to the difference of the
     images. The pixels that both images show after the shift are compared. The samples of both must
-    hold the spectrum (`PathImage.coarsest_step_m`): a displacement of coarser samples cannot be
+    hold the spectrum (`PathImage.sampling_limits`): a displacement of coarser samples cannot be
     removed. Memory and time are those of some twenty images.
 
     Args:

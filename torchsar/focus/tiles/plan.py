@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -401,3 +401,23 @@ def image_tiles(
             pixels that are spread over the image, or tiles do not reach the error in this geometry.
     """
     return TilePlan(frequency_hz, transmitter_m, receiver_m, reference_m, grid, error_db, lit, weight).image(history)
+
+
+def possible_tiles(errors_db: Iterable[float], *given: Any, **lit: Any) -> dict[float, TilePlan]:
+    """Plan an image with several errors, from the largest on.
+
+    Args:
+        errors_db: Errors in dB, falling.
+        *given: Arguments of `TilePlan` before the error.
+        **lit: Arguments of `TilePlan` behind the error.
+
+    Returns:
+        Plans by error, up to the first that the geometry does not allow.
+    """
+    plans: dict[float, TilePlan] = {}
+    for error in errors_db:
+        try:
+            plans[error] = TilePlan(*given, error, **lit)
+        except ValueError:
+            break
+    return plans

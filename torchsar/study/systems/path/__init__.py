@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -11,9 +11,12 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Trace
+from torchsar.echo.path import nominal_geometry
 from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.motion_compensation import possible_compensations
+from torchsar.focus.path_image import last_image
+from torchsar.focus.tiles.plan import possible_tiles
 from torchsar.io import read_history
 from torchsar.metrics import error_db, registered_error_db
 from torchsar.metrics.direct_images import some_pixels, white_noise
@@ -23,7 +26,7 @@ from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.systems.path import figures
 from torchsar.study.systems.path import judge as judging
 from torchsar.study.systems.path.world import Flown, path_radar
-from torchsar.study.trials.batch import IMAGE, Judged, Outcome, Result, Trials
+from torchsar.study.trials.batch import Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.system import Column, System
@@ -108,58 +111,36 @@ class AnyPath(System):
 
     def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
         """Return the limits of the sample spacing of the images, by the nominal path."""
-        if bench.recording is not None:
-            antennas, frequency = AntennaPath.recorded(bench.recording.aux), bench.recording.aux["frequency_hz"]
-        else:
-            antennas, frequency = bench.world().nominal(bench.radar)
-        found: dict[Limit, list[str]] = {}
-        for name, chain in bench.chains.items():
-            image = next((one for one in reversed(list(chain.stages.values())) if isinstance(one, PathImage)), None)
-            steps = () if image is None else image.coarsest_step_m(antennas, frequency)
-            for axis, step in zip(IMAGE, steps, strict=False):
-                assert image is not None
-                limit = Limit(
-                    f"the sample spacing step_m of the image in {axis}",
-                    image.grid.step_m,
-                    step,
-                    "m",
-                    "warn",
-                    "the samples do not hold the spectrum of the image, so that it cannot be resampled, and "
-                    "image_error_db of displaced images is too large",
-                    "choose a finer step_m",
-                )
-                found.setdefault(limit, []).append(name)
-        return found
+        geometry = (
+            nominal_geometry(bench.radar, (world := bench.world()).of(), world.pulses, world.samples)
+            if bench.recording is None
+            else (AntennaPath.recorded(bench.recording.aux), bench.recording.aux["frequency_hz"])
+        )
+        images = {name: last_image(chain.stages.values()) for name, chain in bench.chains.items()}
+        found = [(limit, name) for name, one in images.items() if one for limit in one.sampling_limits(*geometry)]
+        return {limit: [name for other, name in found if other == limit] for limit, _ in found}
 
     def choices(self, bench: Bench) -> Sequence[Choice]:
-        stages = bench.chains["recommended"].stages.values()
-        stage = next((one for one in stages if isinstance(one, PathImage)), None)
+        stage = last_image(bench.chains["recommended"].stages.values())
         if stage is None:
             return []
-        if bench.recording is None:
-            clean = (
-                replace(bench.world(), impairments={}).trials_of(bench.radar, bench.draws(), bench.dtype, "cpu").clean
-            )
-        else:
-            clean = bench.recording
+        clean = (
+            replace(bench.world(), impairments={}).trials_of(bench.radar, bench.draws(), bench.dtype, "cpu").clean
+            if bench.recording is None
+            else bench.recording
+        )
         antennas, grid = AntennaPath.recorded(clean.aux), stage.grid
         geometry = (clean.aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
         # tiles sum the pulses of the recommended method
-        plan_of = partial(TilePlan, *geometry, grid, lit=stage.lit(antennas), weight=stage.weight(antennas))
-        tiles: dict[float, float] = {}
-        for error in _ERRORS_DB:
-            try:
-                tiles[error] = plan_of(error).choice.error_db
-            except ValueError:  # the geometry does not allow it
-                break
+        tiles = possible_tiles(_ERRORS_DB, *geometry, grid, lit=stage.lit(antennas), weight=stage.weight(antennas))
         alternatives = [
             Alternative(
                 f"tiles at {error:g} dB",
                 {"stage": "tile_image", "error_db": error},
-                {"image_error_db": predicted},
+                {"image_error_db": plan.choice.error_db},
                 "higher terms of the path within tiles",
             )
-            for error, predicted in tiles.items()
+            for error, plan in tiles.items()
         ]
         # by the beam of the method that uses omega-K, if there is one
         lit = None if bench.recording is not None else bench.world().beam
@@ -176,7 +157,7 @@ class AnyPath(System):
             for order, one in straight.items()
         ]
         every = [*compensated, *alternatives, Alternative("direct sum", {"stage": "direct_image"}, {})]
-        measured = partial(_measured, bench, geometry, plan_of, tiles, straight, stage)
+        measured = partial(_measured, bench, geometry, {**straight, **tiles}, stage)
         return [Choice("image", "stage", every, measured)]
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
@@ -190,9 +171,7 @@ class AnyPath(System):
 def _measured(
     bench: Bench,
     geometry: tuple[Tensor, Tensor, Tensor | None, Tensor],
-    plan_of: Callable[[float], TilePlan],
-    tiles: Iterable[float],
-    straight: Mapping[int, MotionCompensation],
+    plans: Mapping[float, MotionCompensation | TilePlan],
     stage: PathImage,
 ) -> Measured:
     """Images of white noise, at random pixels beside the direct sum."""
@@ -201,7 +180,7 @@ def _measured(
     some = some_pixels(draws, len(every))
     pixels = every[some]
     whole = backproject(noise, *geometry, pixels)
-    history, plans = noise.to(bench.dtype), {**straight, **{error: plan_of(error) for error in tiles}}
+    history = noise.to(bench.dtype)
 
     def plan(one: Alternative) -> MotionCompensation | TilePlan | None:
         return plans.get(one.keys.get("order", one.keys.get("error_db", 0)))

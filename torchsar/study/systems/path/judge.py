@@ -9,8 +9,7 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.core import Chain, Signal, Trace, per_trial
-from torchsar.focus import PathImage
-from torchsar.focus.path_image import seen_in
+from torchsar.focus.path_image import last_image, seen_in
 from torchsar.metrics import contrast, entropy, impulse_response, line_of_sight_bound_m, residual_phase
 from torchsar.radar import AntennaPath
 from torchsar.study.systems.isal.judge import estimated_phase, received
@@ -107,7 +106,7 @@ def _points(
     """Metrics of the named points in the image, the names of those outside it, and what their
     displacements have in common.
     """
-    stage = next((one for one in reversed(list(chain.stages.values())) if isinstance(one, PathImage)), None)
+    stage = last_image(chain.stages.values())
     if stage is None:
         return {}, [], {}
     (_, cos, _), (_, sin, _) = stage.grid.axes.tolist()  # azimuth and range axes of the image

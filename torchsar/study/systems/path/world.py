@@ -11,8 +11,7 @@ from torch import Tensor
 
 from torchsar.core import Draws
 from torchsar.echo import Impairment, simulate_path
-from torchsar.echo.path import sample_frequencies_hz
-from torchsar.radar import AntennaPath, InverseRadar
+from torchsar.radar import InverseRadar
 from torchsar.scene import (
     Flight,
     Navigation,
@@ -142,13 +141,6 @@ class Flown(World):
         recording, truth = simulate_path(radar, world, *size, draws, self.impairments, dtype, device)
         assert truth.clean is not None
         return Trials(recording, truth.clean, truth.values, len(draws.trials or (0,)), world)
-
-    def nominal(self, radar: InverseRadar) -> tuple[AntennaPath, Tensor]:
-        """Nominal paths of the antennas, without deviations, and the frequencies in Hz."""
-        time_s = torch.arange(self.pulses, dtype=torch.float64) / radar.prf_hz
-        flights = [one.flight().nominal.position_m(time_s) for one in (self.transmitter, self.receiver) if one]
-        path = AntennaPath(flights[0], flights[1] if len(flights) > 1 else None, torch.zeros_like(time_s))
-        return path, sample_frequencies_hz(radar, self.samples)
 
     @property
     def named_points(self) -> dict[str, tuple[Tensor | float, Tensor | float]]:
