@@ -230,7 +230,8 @@ def test_a_start_that_explains_the_samples_worse_widens_the_doubt_and_not_the_de
         image = torch.zeros(8, 8, dtype=torch.complex64)
         image[0, 0], image[1, 1] = 1.0, sharp
         value = torch.tensor(noise, dtype=F64)
-        return Found(line, torch.zeros(PULSES, 3), torch.full_like(line, 3e-5), image, value, value * 0)
+        motion = torch.nn.functional.pad(line[:, None], (0, 2))
+        return Found(motion, motion, torch.full_like(line, 3e-5), image, value, value * 0)
 
     best, near, far, lost = found(1, 0, 0.1), found(1.02, 2e-5, 0.2), found(1.3, 3e-4, 0.3), found(10, 3e-4, 0.4)
     cases = (

@@ -16,7 +16,7 @@ from torchsar.compensate.path.motion import Motion
 from torchsar.compensate.path.scene import scene_of
 from torchsar.core import Draws
 from torchsar.echo import simulate_path
-from torchsar.metrics import phase_rmse
+from torchsar.metrics import error_db, phase_rmse
 from torchsar.radar import AntennaPath, InverseRadar
 from torchsar.scene import Flight, PathWorld, Points, RandomPoints, StraightPath
 from torchsar.scene import Scene as Scatterers
@@ -115,6 +115,22 @@ def test_the_noise_of_samples_is_found_within_a_factor(snr_db: float) -> None:
     scene = scene.narrowed(scene.fitted()[0])
     noise = scene.noise_of(scene.fitted()[1])
     assert 0.6 < float(noise) / float(truth.values["noise_std"].square()) < 1.8
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_samples_change_with_a_motion_as_their_derivative_says(axis: int) -> None:
+    """Also across the line of sight, where the change depends on the place in the scene."""
+    rows, frequency, path = seen(RandomPoints(20, 18.0, 14.0), None)
+    operator = ground_image(frequency, path, 0.0, None, FINE_STEP)
+    scene = operator.image(rows[None])[0]
+    scene = scene * (scene.abs() > 0.3 * scene.abs().max())
+    axes = joint._axes(path, 0.0)
+    unit, _ = joint._units(operator, scene, axes)
+    step = 2e-4 * torch.cos(torch.arange(PULSES, dtype=F64))
+    echo = [joint._along(operator, sign * step[:, None] * axes[:, axis]).adjoint(scene[None])[0] for sign in (1, -1)]
+    # recorded minus true: the true path lies at the recorded one less the error
+    change = (echo[0] - echo[1]) / (2 * step[:, None])
+    assert error_db(unit[..., axis], change) < -33
 
 
 def test_errors_across_the_line_of_sight_are_found_in_two_rounds() -> None:

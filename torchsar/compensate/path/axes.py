@@ -17,9 +17,9 @@ from torchsar.focus import TileOperator
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.spotlight import frequency_samples
 
-# blocks of the image along either axis, by choice: several scatterers in each, yet blocks so far
-# apart that errors across the line of sight act differently on them
-_BLOCKS = 3
+# pixels of the image along either axis from which the effect of a motion over the scene is known,
+# as a polynomial of second order, by choice
+_KNOWN = 3
 # factor by which the variance of the line of sight exceeds that for a known scene, by trial
 _UNKNOWN = 1.1
 # share of the standard deviation of the phases by which the last round may change them, by choice
@@ -34,8 +34,8 @@ class Found:
     """Errors of the positions of one trial.
 
     Args:
-        line_of_sight_m: Half the path over the middle of the scene in metres, recorded minus true,
-            float64 (pulse,).
+        motion_m: Errors along the line of sight, over the middle of the scene, and along two axes
+            across it in metres, recorded minus true, float64 (pulse, axis).
         offset_m: Error of the positions in metres, recorded minus true, float64 (pulse, 3).
         std_m: Standard deviation of the line of sight in metres, float64 (pulse,).
         image: Image with the errors removed, complex (azimuth, range).
@@ -43,29 +43,36 @@ class Found:
         restless: Share of the pulses to which the last round still added fringes.
     """
 
-    line_of_sight_m: Tensor
+    motion_m: Tensor
     offset_m: Tensor
     std_m: Tensor
     image: Tensor
     noise: Tensor
     restless: Tensor
 
+    @property
+    def line_of_sight_m(self) -> Tensor:
+        """Error of half the path over the middle of the scene in metres, float64 (pulse,)."""
+        return self.motion_m[:, 0]
 
-def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, present: Tensor, rounds: int = 6) -> Found:
+
+def three_axes(rows: Tensor, imaging: TileOperator, motion_m: Tensor, present: Tensor, rounds: int = 6) -> Found:
     """Refine the line of sight, and find the errors across it, together with the scene.
 
     An error across the line of sight acts with opposite signs on the two sides of a scene. Each
     round estimates the scene and the motion in three axes jointly, linear about the motion found so
     far: a scene alone would adapt itself to the errors, and they would vanish slowly. The scene has
     independent cells, whose variances follow from a first fit to the samples; the motion acts on
-    the phases of nine blocks of the image. Then whole fringes are added to the line of sight of
+    their phases by a polynomial of the place. Then whole fringes are added to the line of sight of
     pulses whose envelopes match the scene so much better. The rounds end when the phases change by
     less than a share of their standard deviation.
 
     Args:
         rows: Range profiles, shape (pulse, range), complex.
         imaging: Image formation along the recorded path.
-        line_of_sight_m: Recorded minus true half path in metres as found so far, float64 (pulse,).
+        motion_m: Errors as found so far, recorded minus true: of half the path over the middle of
+            the scene, or besides along two axes across the line of sight, see `Found`, in metres,
+            float64 (pulse,) or (pulse, axis).
         present: True for the pulses of the profiles among all pulses.
         rounds: Largest number of rounds, at least 1.
 
@@ -74,16 +81,15 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, pre
     """
     plan = imaging.plan
     axes = _axes(plan.antennas, float(plan.grid.origin_m[2]))
-    found = torch.nn.functional.pad(line_of_sight_m[:, None], (0, 2))
-    masks = _masks(plan.grid.counts, rows.device)
+    found = torch.nn.functional.pad(motion_m[:, None], (0, 2)) if motion_m.ndim == 1 else motion_m
     fringe = LIGHT_M_S / (2 * float(plan.frequency_hz.mean()))
     noise = None
-    std = fringes = torch.zeros_like(line_of_sight_m)
+    std = fringes = torch.zeros_like(found[:, 0])
     for _ in range(rounds):
         scene = scene_of(rows, _along(imaging, (found[:, None] @ axes)[:, 0]), noise)
         cells, _ = scene.fitted()
         scene = scene.narrowed(cells)
-        unit, lever = _units(scene.imaging, cells * masks, axes)
+        unit, lever = _units(scene.imaging, cells, axes)
         motion = Motion(unit, found[:, 0], scene.noise)
         # the prior is that of the whole motion across; that along the line of sight has none
         across = torch.nn.functional.pad(found[:, 1:], (1, 0))
@@ -101,7 +107,7 @@ def three_axes(rows: Tensor, imaging: TileOperator, line_of_sight_m: Tensor, pre
     offset = (found[:, None] @ axes)[:, 0]
     image = _along(imaging, offset).image(rows[None])[0]
     assert noise is not None
-    return Found(found[:, 0], offset, std, image, noise, (fringes != 0).double().mean())
+    return Found(found, offset, std, image, noise, (fringes != 0).double().mean())
 
 
 def _along(imaging: TileOperator, offset_m: Tensor) -> TileOperator:
@@ -125,26 +131,29 @@ def _axes(antennas: AntennaPath, height_m: float) -> Tensor:
     return torch.stack([sight / sight.square().sum(-1, keepdim=True), level, other], 1)
 
 
-def _masks(counts: tuple[int, int], device: torch.device) -> Tensor:
-    """Blocks of the image, (block, azimuth, range)."""
-    number = [torch.arange(n, device=device) * _BLOCKS // n for n in counts]
-    block = number[0][:, None] * _BLOCKS + number[1]
-    return torch.stack([block == i for i in range(_BLOCKS**2)])
-
-
-def _units(operator: TileOperator, parts: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+def _units(operator: TileOperator, scene: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
     """Derivative of the samples by the motion along each axis, per metre, (pulse, range, axis), and
-    derivative of half the path over each block, (pulse, block, axis).
+    derivative of half the path over some places of the scene, (pulse, place, axis).
 
-    parts: blocks of the scene, (block, azimuth, range).
+    scene: cells, (azimuth, range).
     """
-    power = (parts.real.square() + parts.imag.square()).flatten(1).double()
-    places = (power @ operator.plan.grid.pixels_m().reshape(-1, 3)) / or_one(power.sum(-1, keepdim=True))
+    grid = operator.plan.grid
+    some = [torch.linspace(0, n - 1, _KNOWN).round().long() for n in grid.counts]
+    u, v = (torch.linspace(-1, 1, n, dtype=torch.float64, device=scene.device) for n in grid.counts)
+    terms = torch.stack(torch.broadcast_tensors(*_powers(u[:, None], v)))  # (term, azimuth, range)
+    known = terms[:, some[0]][..., some[1]].flatten(1)
+    places = grid.pixels_m()[some[0]][:, some[1]].reshape(-1, 3)
     lever = _levers(operator.plan.antennas, places, axes).movedim(0, 1)
+    share = torch.linalg.pinv(known.mT) @ lever  # (pulse, term, axis)
     radians = 4j * math.pi * float(operator.plan.frequency_hz.mean()) / LIGHT_M_S
     # one after another, with the tables of the other images
-    echo = torch.stack([operator.adjoint(part[None])[0] for part in parts], -1)
-    return echo @ (radians * lever).to(parts.dtype), lever
+    echo = torch.stack([operator.adjoint((scene * term)[None])[0] for term in terms.to(scene.real.dtype)], -1)
+    return echo @ (radians * share).to(scene.dtype), lever
+
+
+def _powers(u: Tensor, v: Tensor) -> tuple[Tensor, ...]:
+    """Terms of a polynomial of second order."""
+    return torch.ones_like(u), u, v, u.square(), u * v, v.square()
 
 
 def _fringes(rows: Tensor, model: Tensor, frequency_hz: Tensor, noise: Tensor) -> Tensor:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -48,6 +51,10 @@ _AS_WELL = 1.1
 # where the result was right, 19 % and 3 in a wrong minimum that all starts had in common; and share
 # of the power that a fit may leave without noise: fits of right results left up to 0.2 % at 40 dB
 _RESTLESS, _WORSE, _UNFIT = 0.1, 1.5, 0.003
+# noise as a share of the mean power of the samples below which the last rounds take finer cells,
+# their spacing in resolution cells, and most rounds, by trial: at 20 dB and errors of 5 cm the
+# error of the line of sight fell from 1.56 to 1.44 bounds, at 10 dB it did not change
+_CLEAR, _FINEST_STEP, _LAST_ROUNDS = 0.05, 0.33, 2
 
 
 def path_autofocus(
@@ -78,12 +85,13 @@ def path_autofocus(
     4. The phase of each pulse is compared with a Wiener estimate of the scene, without windows, in
        up to ten iterations. Then the scene and the motion in three axes are estimated jointly from
        the samples: the scene with a Gaussian prior whose variance follows from the image, the
-       motion by its phases in nine blocks of the image. Errors across the line of sight, which act
+       motion by its phases, which depend on the place. Errors across the line of sight, which act
        differently over the scene, are assumed to have the spectrum of those along it. Whole
        fringes are added to pulses whose envelopes match the scene so much better.
     5. Step 4 is repeated from another start: phases of the whole band, with envelopes at rest; and
        from a third one, half of the band in step 1, if the results differ or explain the samples
-       unequally well. The sharpest image counts.
+       unequally well. The sharpest image counts. Where there is little noise, its scene and
+       motion are estimated once more with finer cells.
 
     Not observable are a constant and a linear term, which shift the image, and rotate and stretch
     it slightly; they are zero in the result. Where the errors are rough from pulse to pulse,
@@ -141,10 +149,10 @@ def path_autofocus(
         coarse = ground_image(frequency_hz, seen, height_m, extent_m)
         if few:
             return _nothing(rows)
-        fine = ground_image(frequency_hz, seen, height_m, extent_m, FINE_STEP)
+        imaging = partial(ground_image, frequency_hz, seen, height_m, extent_m)
         some = rows[present]
         some = some / some.abs().amax()
-        return _spread(_judged(Search(some, frequency_hz, coarse, present), fine, rounds), present)
+        return _spread(_judged(Search(some, frequency_hz, coarse, present), imaging, rounds), present)
 
     return for_each(find, profiles, antennas, trials)
 
@@ -179,11 +187,12 @@ def _spread(found: Estimate, present: Tensor) -> Estimate:
     return Estimate(value, found.quality, found.ok, {name: of(x) for name, x in found.std.items()}, found.info)
 
 
-def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
+def _judged(search: Search, imaging: Callable[[float], TileOperator], rounds: int) -> Estimate:
     """The estimate of the sharpest image from two or three starts, and its verdict.
 
-    fine: Image formation of the last step.
+    imaging: Image formation with a spacing of pixels in resolution cells.
     """
+    fine = imaging(FINE_STEP)
 
     def refined(range_m: Tensor) -> Found:
         range_m = search.polished(range_m, fine)
@@ -210,9 +219,13 @@ def _judged(search: Search, fine: TileOperator, rounds: int) -> Estimate:
         found.restless <= _RESTLESS,
         found.noise <= least,
     ]
+    ok = torch.stack(sure).all()
+    if ok and found.noise < _CLEAR * search.rows.abs().square().double().mean():
+        last = three_axes(search.rows, imaging(_FINEST_STEP), found.motion_m, search.present, _LAST_ROUNDS)
+        found = replace(found, motion_m=last.motion_m, offset_m=last.offset_m)
     value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
     info = {"roughness": rough, "entropy_nats": entropy(found.image).double()}
-    return Estimate(value, quality, torch.stack(sure).all(), {"line_of_sight_m": std_m}, info)
+    return Estimate(value, quality, ok, {"line_of_sight_m": std_m}, info)
 
 
 def _sharpness(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
