@@ -56,7 +56,9 @@ class Found:
         return self.motion_m[:, 0]
 
 
-def three_axes(rows: Tensor, imaging: TileOperator, motion_m: Tensor, present: Tensor, rounds: int = 6) -> Found:
+def three_axes(
+    rows: Tensor, imaging: TileOperator, motion_m: Tensor, present: Tensor, rounds: int = 6, *, exact: bool = False
+) -> Found:
     """Refine the line of sight, and find the errors across it, together with the scene.
 
     An error across the line of sight acts with opposite signs on the two sides of a scene. Each
@@ -75,6 +77,7 @@ def three_axes(rows: Tensor, imaging: TileOperator, motion_m: Tensor, present: T
             float64 (pulse,) or (pulse, axis).
         present: True for the pulses of the profiles among all pulses.
         rounds: Largest number of rounds, at least 1.
+        exact: Whether the fits of the scene end later.
 
     Returns:
         The errors.
@@ -86,7 +89,7 @@ def three_axes(rows: Tensor, imaging: TileOperator, motion_m: Tensor, present: T
     noise = None
     std = fringes = torch.zeros_like(found[:, 0])
     for _ in range(rounds):
-        scene = scene_of(rows, _along(imaging, (found[:, None] @ axes)[:, 0]), noise)
+        scene = scene_of(rows, _along(imaging, (found[:, None] @ axes)[:, 0]), noise, exact)
         cells, _ = scene.fitted()
         scene = scene.narrowed(cells)
         unit, lever = _units(scene.imaging, cells, axes)

@@ -16,6 +16,8 @@ from torchsar.focus import TileOperator
 # may lower the cost, by trial: with .1 a fit left 70 times the noise at 40 dB, with .01 6
 # times, where 12 iterations left 50 times; at 0 dB the errors of the path were equal
 _STEPS, _LEFT = 40, 0.01
+# the same for the last rounds where there is little noise, by trial, see `path_autofocus`
+_EXACT_STEPS, _EXACT_LEFT = 120, 0.001
 # share of the mean variance that every cell of a scene keeps, and least share of the energy of the
 # samples that is taken as echo, by choice
 _FLOOR, _LEAST_ENERGY = 1e-4, 1e-3
@@ -35,6 +37,7 @@ class Scene:
         size: Standard deviations of the reflectivity of the cells, shape (azimuth, range).
         noise: Variance of the noise of a sample.
         pixels: Number of cells per resolution cell.
+        exact: Whether fits end later, nearer to the most probable scene.
     """
 
     rows: Tensor
@@ -42,6 +45,7 @@ class Scene:
     size: Tensor
     noise: Tensor
     pixels: Tensor
+    exact: bool = False
 
     def echo(self, cells: Tensor) -> Tensor:
         """Range profiles of a scene, given in units of its standard deviations."""
@@ -66,8 +70,9 @@ class Scene:
         left, cells = self.rows, torch.zeros_like(self.size, dtype=self.rows.dtype)
         gradient = self.image_of(without(left))
         toward, power = gradient, _energy(gradient)
-        enough = _LEFT * self.noise * left.numel()
-        for _ in range(_STEPS):
+        steps, share = (_EXACT_STEPS, _EXACT_LEFT) if self.exact else (_STEPS, _LEFT)
+        enough = share * self.noise * left.numel()
+        for _ in range(steps):
             echo = self.echo(toward)
             bend = (echo.conj() * without(echo)).sum().real + self.noise * _energy(toward)
             length = power / or_one(bend)
@@ -100,13 +105,14 @@ class Scene:
         return _scaled(power + _FLOOR * power.mean(), self)
 
 
-def scene_of(rows: Tensor, imaging: TileOperator, noise: Tensor | None = None) -> Scene:
+def scene_of(rows: Tensor, imaging: TileOperator, noise: Tensor | None = None, exact: bool = False) -> Scene:
     """The scene whose sizes follow from a Wiener estimate of the image of range profiles.
 
     Args:
         rows: Range profiles, shape (pulse, range), complex.
         imaging: Image formation along the assumed path.
         noise: Variance of the noise of a sample; by default of what the Wiener estimate leaves.
+        exact: Whether fits end later, nearer to the most probable scene.
 
     Returns:
         The scene.
@@ -120,7 +126,7 @@ def scene_of(rows: Tensor, imaging: TileOperator, noise: Tensor | None = None) -
         left = rows - echo * ((echo.conj() * rows).sum().real / or_one(_energy(echo)).to(power.dtype))
         noise = _floored(_energy(left) / (left.numel() * (1 - weight.double().mean()).square()), rows)
     size = torch.zeros_like(power)
-    return _scaled(_smoothed(power) * weight, Scene(rows, imaging, size, noise, _pixels(imaging, rows)))
+    return _scaled(_smoothed(power) * weight, Scene(rows, imaging, size, noise, _pixels(imaging, rows), exact))
 
 
 def _scaled(power: Tensor, scene: Scene) -> Scene:
