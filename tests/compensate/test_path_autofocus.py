@@ -174,7 +174,7 @@ def test_noise_and_too_few_pulses_are_not_ok() -> None:
     assert all(bool(torch.isfinite(x).all()) for x in (*found.value.values(), *found.std.values(), found.quality))
     with pytest.raises(ValueError, match="extent_m must be positive and finite, got -1"):
         path_autofocus(noise, frequency, antennas, extent_m=-1.0)
-    with pytest.raises(ValueError, match="at least one round, got rounds=0"):
+    with pytest.raises(ValueError, match="at least one, got rounds=0"):
         path_autofocus(noise, frequency, antennas, rounds=0)
 
 

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from tests.focus.geometries import C128, F64, C, Case, case
 from tests.helpers import assert_forward_equals_backward
-from torchsar.focus import ImageGrid, TilePlan, backproject, image_tiles
+from torchsar.focus import ImageGrid, ProcessedBeam, TilePlan, backproject, image_tiles
 from torchsar.focus.tiles import plan as of_plan
 from torchsar.focus.tiles.choice import _pixel_rule
 from torchsar.radar import LIGHT_M_S
@@ -355,8 +356,28 @@ def test_pixels_that_no_pulse_lights_are_zero() -> None:
     given = drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m
     image = image_tiles(drawn.history, *given, drawn.grid, -60.0, lit)
     assert image[200].abs().min() > 0 and not image[:40].any()
-    with pytest.raises(ValueError, match="lit must return int64 pulses"):
-        TilePlan(*given, drawn.grid, -60.0, lambda points: points)
+    for wrong in (lambda points: points, lambda points: [0, 9]):
+        with pytest.raises(ValueError, match="lit must return a tensor of torch.int64 of shape"):
+            TilePlan(*given, drawn.grid, -60.0, wrong)
+    number = len(drawn.transmitter_m)
+    for dtype, match in (
+        (F64, "finite weights"),
+        (torch.float32, "weight must return a tensor of torch.float64 of shape"),
+    ):
+
+        def weight(points: Tensor, dtype: torch.dtype = dtype) -> Tensor:
+            return torch.full((len(points), number), math.nan, dtype=dtype)
+
+        plan = TilePlan(*given, drawn.grid, -60.0, lit, weight)
+        with pytest.raises(ValueError, match=match):
+            plan.image(drawn.history)
+    plan = TilePlan(*given, drawn.grid, -60.0, lit)
+    for pixels, match in (
+        (torch.full((1, 3), 900.0, dtype=F64), "outside of it"),
+        (torch.zeros(3, dtype=F64), r"\(3,\)"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            plan.exact(drawn.history, pixels)
     with pytest.raises(ValueError, match="no pulse lights"):
         TilePlan(*given, drawn.grid, -60.0, lambda points: torch.zeros(len(points), 2, dtype=torch.int64))
 
@@ -375,6 +396,59 @@ def test_a_small_lit_part_between_the_corners_and_the_middle_is_found() -> None:
     found = plan.image(history)[inside]
     truth = replace(drawn, history=history).direct(drawn.grid.pixels_m()[inside])
     assert len(truth) > 50 and float((found - truth).norm() / truth.norm()) < 10 ** (-57 / 20)
+
+
+def test_a_tile_whose_middle_is_dark_shows_its_lit_part() -> None:
+    drawn, _ = strip(pulses=100)
+    plan = drawn.plan(-60.0)
+    edge = drawn.grid.origin_m[0] + drawn.grid.step_m * 0.3 * plan.choice.width
+
+    def lit(points: Tensor) -> Tensor:
+        return (points[:, :1] < edge) * torch.tensor([10, 90])
+
+    found = TilePlan(drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m, drawn.grid, -60.0, lit)
+    size = found.choice.width
+    assert 3 < 0.3 * plan.choice.width < size / 2 - 1
+    history = drawn.history.clone()
+    history[:10], history[90:] = 0, 0
+    truth = replace(drawn, history=history).direct(drawn.grid.pixels_m()[:3].reshape(-1, 3))
+    image = found.image(drawn.history)
+    assert float((image[:3].flatten() - truth).norm() / truth.norm()) < 10 ** (-57 / 20) and not image[size:].any()
+
+
+def beside_a_track(pulses: int, counts: tuple[int, int], squint_deg: float, height_m: float | None) -> Case:
+    """A straight path of half metres at 1.1 km beside pixels of one and of half a metre."""
+    x = (torch.arange(pulses, dtype=F64) - pulses / 2) / 2
+    place = torch.stack([x, torch.full_like(x, -1000.0), torch.full_like(x, 500.0)], -1)
+    ahead = 1118 * math.tan(math.radians(squint_deg))
+    origin = torch.tensor([ahead - counts[0] / 2, -counts[1] / 2, 0.0], dtype=F64)
+    height = None if height_m is None else torch.full(counts, height_m, dtype=F64)
+    grid = ImageGrid(origin, torch.eye(3, dtype=F64)[:2], counts, 1.0, height)
+    frequency = 9.6e9 + 3e6 * torch.arange(32, dtype=F64)
+    noise = torch.randn(pulses, 32, dtype=C128, generator=torch.Generator().manual_seed(5))
+    return Case(frequency, place, None, torch.full_like(x, 2236.0), grid, noise)
+
+
+def test_the_pulses_that_light_a_strip_decide_on_its_range_direction() -> None:
+    """Most pulses of a path of 6 km see the middle of a strip at 1.1 km far ahead or behind."""
+    drawn = beside_a_track(12_000, (128, 64), 0.0, None)
+    lit = partial(ProcessedBeam(3.0).lit_pulses, drawn.transmitter_m)
+    plan = TilePlan(drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m, drawn.grid, -40.0, lit)
+    some = drawn.grid.pixels_m().reshape(-1, 3)[::701]
+    exact = plan.exact(drawn.history, some)
+    found = plan.image(drawn.history).flatten()[::701]
+    assert float((found - exact).norm() / exact.norm()) < 10 ** (-37 / 20)
+
+
+@pytest.mark.parametrize("squint_deg", [-25.0, 25.0])
+def test_raised_pixels_are_sums_over_the_pulses_that_light_them(squint_deg: float) -> None:
+    drawn = beside_a_track(2400, (60, 70), squint_deg, 60.0)
+    lit = partial(ProcessedBeam(1.5, squint_deg).lit_pulses, drawn.transmitter_m)
+    plan = TilePlan(drawn.frequency_hz, drawn.transmitter_m, None, drawn.reference_m, drawn.grid, -60.0, lit)
+    some = drawn.grid.pixels_m().reshape(-1, 3)[::97]
+    exact = plan.exact(drawn.history, some)
+    found = plan.image(drawn.history).flatten()[::97]
+    assert float((found - exact).norm() / exact.norm()) < 10 ** (-57 / 20)
 
 
 class Program(torch.nn.Module):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 from torch import Tensor
 
+from torchsar.core import Axis, Signal
 from torchsar.metrics import error_db, registered_error_db
 
 F64 = torch.float64
@@ -93,3 +95,27 @@ def test_all_of_the_image_decides_on_the_slope_of_the_phase() -> None:
         moved = points(middle + off + shift, amplitude, size) * torch.exp(2j * math.pi * phase)
         found = float(registered_error_db(moved, image))
         assert found < -35, (turns, found)
+
+
+def test_images_of_nothing_and_numbers_that_are_none_are_no_agreement() -> None:
+    noise = torch.randn(2, 9, 7, dtype=torch.complex128)
+    none = torch.zeros_like(noise)
+    for pair in ((noise, none), (none, noise), (none, none)):
+        assert registered_error_db(*pair).tolist() == [0.0, 0.0]
+    with pytest.raises(ValueError, match="registered_error_db.*NaN"):
+        registered_error_db(noise * torch.nan, noise)
+    with pytest.raises(ValueError, match="trials broadcast"):
+        registered_error_db(noise.expand(2, 9, 7), noise[:1].expand(3, 9, 7))
+    one, other = (
+        Signal(noise, (Axis("azimuth", 9, 0.0, step, "m"), Axis("range", 7, 0.0, 1.0, "m"))) for step in (1, 2)
+    )
+    with pytest.raises(ValueError, match="equal axes"):
+        registered_error_db(one, other)
+
+
+def test_trials_do_not_depend_on_others_of_the_batch() -> None:
+    made = torch.Generator().manual_seed(9)
+    noise = torch.randn(6, 32, 24, dtype=torch.complex128, generator=made)
+    other = noise + torch.linspace(0.05, 1, 6)[:, None, None] * torch.randn(noise.shape, generator=made)
+    alone = torch.stack([registered_error_db(a, b) for a, b in zip(other, noise, strict=True)])
+    torch.testing.assert_close(registered_error_db(other, noise), alone, rtol=0, atol=1e-9)

@@ -13,6 +13,8 @@ from torchsar.radar.antenna_path import refuse_unusable
 # largest accepted difference of the products of the axes from 1 and 0, by choice: axes computed in
 # single precision pass
 _UNIT = 1e-6
+# most pixels of an image, by choice: 17 GB in single precision
+_MOST_PIXELS = 2**31
 
 
 def level_plane(
@@ -53,14 +55,15 @@ class ImageGrid:
         origin_m: Position of pixel (0, 0) in metres, float64 (3,).
         axes: Unit vectors along which the first and the second index grow, perpendicular to each
             other, float64 (2, 3).
-        counts: Number of pixels along either axis.
+        counts: Number of pixels along either axis, at most 2^31 together.
         step_m: Pixel spacing in metres.
         height_m: Heights of the pixels above the plane in metres, float64 (i, j); None for 0.
 
     Raises:
         TypeError: If the heights are not float64.
         ValueError: If a shape is wrong, the axes are not perpendicular unit vectors, a count is
-            below 1, the spacing is not positive and finite, or a height is not finite.
+            below 1, there are too many pixels, the spacing is not positive and finite, or a height
+            is not finite.
     """
 
     origin_m: Tensor
@@ -85,6 +88,11 @@ class ImageGrid:
         counts = tuple(self.counts)
         if len(counts) != 2 or not all(isinstance(n, int) and n >= 1 for n in counts):
             raise ValueError(f"an image grid needs two counts of at least 1 pixel, got {self.counts}")
+        if counts[0] * counts[1] > _MOST_PIXELS:
+            raise ValueError(
+                f"an image of {counts[0]} x {counts[1]} pixels is too large, at most {_MOST_PIXELS:g} are accepted; "
+                "choose a coarser spacing or a smaller extent"
+            )
         if not 0 < float(self.step_m) < float("inf"):
             raise ValueError(f"the pixel spacing step_m must be positive and finite, got {self.step_m} m")
         if self.height_m is not None:

@@ -99,16 +99,22 @@ class ProcessedBeam:
 
     Raises:
         ValueError: If a number is not finite, the width is not positive, or an edge lies 80 degrees
-            or more from broadside.
+            or more from broadside, or its slope as far as the track.
     """
 
     width_deg: float
     squint_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.width_deg > 0 and abs(self.squint_deg) + self.width_deg / 2 < 80):
+        numbers = (self.width_deg, self.squint_deg)
+        if (
+            not all(isinstance(x, int | float) for x in numbers)
+            or not (self.width_deg > 0 and abs(self.squint_deg) + self.width_deg / 2 < 80)
+            or abs(self.middle) + (1 + BAND_EDGE) * self.band / 2 >= 1
+        ):
             raise ValueError(
-                "a processed beam needs a positive width_deg and edges less than 80 degrees from broadside, got "
+                "a processed beam needs a positive width_deg, edges less than 80 degrees from broadside, and slopes of "
+                "the edges that do not reach the track; a narrower one will do. Got "
                 f"width_deg={self.width_deg}, squint_deg={self.squint_deg}"
             )
 

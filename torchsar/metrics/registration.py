@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, cis, unit_level
+from torchsar.core import Signal, checked_samples, cis, unit_level
 from torchsar.focus.chirp_z import chirp_z
 from torchsar.metrics.image import error_db, pair_of
 
@@ -36,19 +36,31 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
 
     Args:
         image: Image I, shape (..., azimuth, range), complex, or a Signal.
-        reference: Image I0, same size.
+        reference: Image I0 of the same size; its trials broadcast with those of I.
 
     Returns:
         Error |registered(I) - I0|^2 / |I0|^2 over the compared pixels in dB, shape (...,), float64;
-        0 dB where the images have nothing in common, or the compared pixels hold less than half of
-        the energy of either image.
+        0 dB where the images have nothing in common, one of them is zero, or the compared pixels
+        hold less than half of the energy of either image.
 
     Raises:
         TypeError: If one of them is not a tensor of numbers.
-        ValueError: If they are not complex images of equal size.
+        ValueError: If they are not complex images of equal size, their samples are not finite, they
+            are signals whose axes have other names or spacings, or their trials do not broadcast.
     """
-    a, b = (unit_level(x).to(torch.complex128) for x in pair_of(image, reference))
-    lead = torch.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    axes = [[(axis.name, axis.step) for axis in x.axes[-2:]] for x in (image, reference) if isinstance(x, Signal)]
+    if len(axes) == 2 and axes[0] != axes[1]:
+        raise ValueError(
+            f"only images on grids of equal axes and spacings can be compared, got {axes[0]} and {axes[1]}"
+        )
+    pair = (checked_samples(x, "registered_error_db", "azimuth, range") for x in pair_of(image, reference))
+    a, b = (unit_level(x).to(torch.complex128) for x in pair)
+    try:
+        lead = torch.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    except RuntimeError:
+        raise ValueError(
+            f"registered_error_db needs images whose trials broadcast, got {tuple(a.shape)} and {tuple(b.shape)}"
+        ) from None
     a, b = (x.expand(*lead, *x.shape[-2:]).reshape(-1, *x.shape[-2:]) for x in (a, b))
     whole = b.abs().square().sum((-2, -1))
     spectrum = torch.fft.fft2(a)
@@ -60,8 +72,9 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
     # what is compared is decided once, so that no step gains by moving pixels out of sight
     b = torch.where(seen, b, 0)
     hidden = torch.where(seen, moved, 0).abs().square().sum((-2, -1)) < _LEAST_SHOWN * energy
-    hidden = hidden | (b.abs().square().sum((-2, -1)) < _LEAST_SHOWN * whole)
+    hidden = hidden | (b.abs().square().sum((-2, -1)) < _LEAST_SHOWN * whole) | (whole == 0) | (energy == 0)
     best = _error(moved, b, seen, phase)
+    done = torch.zeros_like(best, dtype=torch.bool)
     for _ in range(_STEPS):
         step_map, step_phase = _step(moved, b, seen, phase, turns)
         trial_map, trial_phase = map_ + step_map, phase + step_phase
@@ -69,14 +82,15 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
         error = _error(trial_moved, b, trial_seen, trial_phase)
         small = ((trial_map - first).abs() <= most).flatten(1).all(-1)
         small = small & (trial_phase[:, 2:].abs() <= 4 * _MOST_BEND).all(-1)
-        better, settled = (error < best) & small, ~small | (error > best - _SETTLED_DB)
+        # a trial that has settled stays, whatever the others do
+        better, done = (error < best) & small & ~done, done | ~small | (error > best - _SETTLED_DB)
 
         def chosen(new: Tensor, old: Tensor, better: Tensor = better) -> Tensor:
             return torch.where(better.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
 
         map_, phase, best = chosen(trial_map, map_), chosen(trial_phase, phase), chosen(error, best)
         moved, seen = chosen(trial_moved, moved), chosen(trial_seen, seen)
-        if bool(settled.all()):
+        if bool(done.all()):
             break
     return torch.where(hidden, 0.0, best).reshape(lead)
 

@@ -138,8 +138,8 @@ def path_autofocus(
     trials = trials_of("path_autofocus", profiles, frequency_hz, antennas)
     if extent_m is not None and not 0 < extent_m < math.inf:
         raise ValueError(f"extent_m must be positive and finite, got {extent_m}")
-    if rounds < 1:
-        raise ValueError(f"path_autofocus needs at least one round, got rounds={rounds}")
+    if not isinstance(rounds, int) or rounds < 1:
+        raise ValueError(f"path_autofocus needs a whole number of rounds, at least one, got rounds={rounds}")
 
     @torch.no_grad()
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
@@ -223,7 +223,8 @@ def _judged(search: Search, imaging: Callable[[float], TileOperator], rounds: in
     if ok and found.noise < _CLEAR * search.rows.abs().square().double().mean():
         finest = imaging(_FINEST_STEP)
         last = three_axes(search.rows, finest, found.motion_m, search.present, _LAST_ROUNDS, exact=True)
-        found = replace(found, motion_m=last.motion_m, offset_m=last.offset_m)
+        if last.noise <= found.noise and last.restless <= _RESTLESS:
+            found = replace(found, motion_m=last.motion_m, offset_m=last.offset_m)
     value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
     info = {"roughness": rough, "entropy_nats": entropy(found.image).double()}
     return Estimate(value, quality, ok, {"line_of_sight_m": std_m}, info)

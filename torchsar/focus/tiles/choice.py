@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchsar.core import host_value
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.nufft import smooth_length
 from torchsar.focus.tiles.expansion import MOMENTS, Expansion, curvatures, slopes
@@ -74,8 +75,9 @@ _ZONES, _PARTS = 3, 32
 # window is averaged: means of ten times as many differed by 1 dB at most in 14 geometries
 _STRETCHES, _TURNS, _AWAY = 33, 33, 8
 # pixels along either axis at which the pulses that light them are asked for: the lit part of an
-# image is found if it is wider than the image over this, by choice
-_PROBES = 64
+# image is found if it is wider than the image over this, by choice; the same in a tile whose middle
+# is dark
+_PROBES, _TILE_PROBES = 64, 5
 # extent of a zone relative to that which a pulse lights, by choice: its tiles sum about a quarter
 # more pulses than light a pixel
 _ZONE_SHARE = 0.25
@@ -288,7 +290,8 @@ class Scene:
         if not bool(seen.any()):
             raise ValueError(
                 f"no pulse lights any of {len(at[0])} x {len(at[1])} pixels across the image; image the part "
-                "that is lit"
+                "that is lit, and check width and squint of the beam, the centre of the image, and that `lit` returns "
+                "the first pulse before the one after the last"
             )
         rows, columns = (v[seen.any(dim)] for dim, v in zip((1, 0), at, strict=True))
         return self._points(*(torch.linspace(int(v[0]), int(v[-1]), 3, dtype=torch.float64) for v in (rows, columns)))
@@ -305,35 +308,44 @@ class Scene:
             return torch.tensor([0, pulses]).expand(*points.shape[:-1], 2)
         flat = points.reshape(-1, 3)
         found = self.lit(flat)
-        if found.shape != (len(flat), 2) or found.dtype != torch.int64:
-            raise ValueError(
-                f"lit must return int64 pulses of shape {(len(flat), 2)} for {len(flat)} points, got {found.dtype} of "
-                f"shape {tuple(found.shape)}"
-            )
+        _refuse_other("lit", found, torch.int64, (len(flat), 2))
         return found.cpu().clamp(0, pulses).view(*points.shape[:-1], 2)
+
+    def seen_from(self, centres: Tensor, width: int, depth: int) -> tuple[Tensor, Tensor]:
+        """Points that decide on the pulses of tiles of some centres (tile, 3), float64 (tile, 3):
+        the middle of their part of the image, or, if no pulse lights it, the point of a lattice
+        that most pulses light. And the pulses that light them, int64 (tile, 2).
+        """
+        grid, half = self.grid, (centres.new_tensor([width, depth]) - 1) / 2
+        at = ((centres - grid.origin_m) @ grid.axes.mT) / grid.step_m
+        low, high = at - half, torch.minimum(at + half, at.new_tensor(grid.counts) - 1)
+        # the middle comes first, then the lattice
+        place = torch.linspace(0, 1, _TILE_PROBES, dtype=torch.float64, device=at.device)
+        place = torch.cat([place.new_full((1, 2), 0.5), torch.cartesian_prod(place, place)])
+        offset = low[:, None] + place * (high - low)[:, None] - at[:, None]
+        points = centres[:, None] + offset * grid.step_m @ grid.axes
+        ends = self.lit_pulses(points).to(at.device)
+        count = (ends[..., 1] - ends[..., 0]).clamp_min(0)
+        best = torch.where(count[:, 0] > 0, 0, count.argmax(-1))
+        each = torch.arange(len(at), device=at.device)
+        return points[each, best], ends[each, best]
 
     def shares(self, centres: Tensor, width: int, depth: int) -> Tensor | None:
         """Weights with which pulses are summed in tiles of some centres (tile, 3), float64 (tile,
-        pulse): those of the middle of their part of the image, zero where a pulse does not light
-        it; None if all are one.
+        pulse), zero where a pulse does not light a tile, see `seen_from`. None if all are one.
         """
         if self.lit is None and self.weight is None:
             return None
-        grid = self.grid
-        at = ((centres - grid.origin_m) @ grid.axes.mT) / grid.step_m
-        beyond = at + (at.new_tensor([width, depth]) - 1) / 2 - (at.new_tensor(grid.counts) - 1)
-        centres = centres - beyond.clamp_min(0) / 2 * grid.step_m @ grid.axes
+        points, ends = self.seen_from(centres, width, depth)
+        first, last = ends[..., None].unbind(-2)
         number = torch.arange(len(self.places[0]), device=centres.device)
-        first, last = self.lit_pulses(centres).to(centres.device)[..., None].unbind(-2)
         lit = ((first <= number) & (number < last)).to(torch.float64)
         if self.weight is None:
             return lit
-        weight = self.weight(centres)
-        if weight.shape != lit.shape or weight.dtype != torch.float64:
-            raise ValueError(
-                f"weight must return float64 weights of shape {tuple(lit.shape)} for {len(centres)} points and all "
-                f"pulses, got {weight.dtype} of shape {tuple(weight.shape)}"
-            )
+        weight = self.weight(points)
+        _refuse_other("weight", weight, torch.float64, tuple(lit.shape))
+        if not host_value(torch.isfinite(weight).all(), True):
+            raise ValueError("weight must return finite weights of pulses, got NaN or Inf; give 0 where none counts")
         return lit * weight
 
     @functools.cached_property
@@ -586,11 +598,20 @@ def choose(scene: Scene, error_db: float) -> Choice:
                 slope, window = found
                 return Choice(*sizes, taps, *slope, 20 * math.log10(math.hypot(error, kernel, window)))
         failed.append((sizes, error))
-    reach = f"{20 * math.log10(best):.0f} dB" if best < 1 else "no error below 0 dB"
+    reach = f"{20 * math.log10(best):.1f} dB" if best < 1 else "no error below 0 dB"
     raise ValueError(
-        f"tiles reach {reach} in this geometry, wanted were {error_db:g} dB; ask for a larger error_db, turn the "
-        "axes of the grid to the direction of the range, or use the direct sum"
+        f"tiles reach {reach} in this geometry, wanted were {error_db:g} dB; admit more, such as "
+        f"error_db={error_db + 20:g}, take a finer spacing of the pixels, turn the axes of the grid to the direction "
+        "of the range, or use the direct sum"
     )
+
+
+def _refuse_other(name: str, found: object, dtype: torch.dtype, size: tuple[int, int]) -> None:
+    """Raise ValueError unless what `lit` or `weight` has returned has a type and a size."""
+    if isinstance(found, Tensor) and found.dtype == dtype and found.shape == size:
+        return
+    what = f"a tensor of {found.dtype} of shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found)
+    raise ValueError(f"{name} must return a tensor of {dtype} of shape {size} for {size[0]} points, got {what}")
 
 
 def _choose_slope(scene: Scene, sampled: Sampled, error: float) -> tuple[tuple[int, float, float], float] | None:

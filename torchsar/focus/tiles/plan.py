@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -89,11 +90,12 @@ class TilePlan:
         error_db: Largest rms error relative to the image of a history of white noise, in dB.
         lit: For a beam that lights a part of the image at a time: function of positions in metres,
             float64 (point, 3), that returns the first pulse that lights each point and the pulse
-            after the last, int64 (point, 2). The pixels of a tile are summed over the pulses that
-            light its middle. None for all pulses.
-        weight: Function of positions that returns the weights of all pulses in the sum, float64
-            (point, pulse), such as those of a beam with smooth edges; that of the middle of a tile
-            serves for its pixels. None for equal ones.
+            after the last, int64 (point, 2), alike if there are none. All pixels of a tile are
+            summed over the pulses that light its middle, or if there are none, over those of the
+            point of a lattice in it that most pulses light. None for all pulses.
+        weight: Function of positions that returns the weights of all pulses in the sum, finite,
+            float64 (point, pulse), such as those of a beam with smooth edges; those at the same
+            point are used for all pixels of a tile. None for equal ones.
 
     Raises:
         TypeError: If frequencies or positions are not float64.
@@ -135,13 +137,16 @@ class TilePlan:
         """Choose the sizes and compute what does not depend on the history."""
         nominal = [place.mean(0) for place in every]
         grid = self.grid
-        middle = grid.pixels_m(*(slice(n // 2, n // 2 + 1) for n in grid.counts)).reshape(1, 3)
-        _, a, b = slopes(nominal, middle, grid.axes)
-        # the second axis of a tile is that of the range
+        scene = Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid, self.lit, self.weight)
+        # the second axis of a tile is that of the range, as the pulses see it that light the middle
+        middle = scene.spread[1, 1][None]
+        first, last = scene.lit_pulses(middle)[0].tolist()
+        _, a, b = slopes([v[first : max(last, first + 1)] for v in nominal], middle, grid.axes)
         self._swapped = float(a.abs().mean()) > float(b.abs().mean())
         if self._swapped:
             grid = grid.transposed()
-        self._scene = scene = Scene(self.frequency_hz, LIGHT_M_S, nominal, every, grid, self.lit, self.weight)
+            scene = replace(scene, grid=grid)
+        self._scene = scene
         with torch.device("cpu"):  # tables of the choice lie there whatever the default device
             self.choice = choice = choose(scene, self.error_db)
         self._size = size = choice.width, choice.depth
@@ -154,6 +159,10 @@ class TilePlan:
             i, j = (torch.arange(s.start, s.stop, device=grid.origin_m.device) for s in block)
             self._numbers.append((i[:, None] * self._tiles[1] + j).reshape(-1))
             centre = tile_centres(grid, *size, i, j, self._height_m)
+            if self.lit is not None:
+                _, ends = scene.seen_from(centre, *size)
+                ends = ends[ends[:, 1] > ends[:, 0]]
+                pulses = (int(ends[:, 0].min()), int(ends[:, 1].max())) if len(ends) else (0, 0)
             bounds = part_bounds(*pulses, choice.parts)
             given = nominal, every, centre, grid, relief, partial(scene.shares, width=size[0], depth=size[1])
             self._zones.append([Part(self._band, choice, ends, *given) for ends in bounds])
@@ -237,13 +246,18 @@ class TilePlan:
             Image, shape (..., pixel), complex.
 
         Raises:
-            TypeError: If the history is not complex64 or complex128.
-            ValueError: If its size is not that of the plan.
+            TypeError: If the history is not complex64 or complex128, or the pixels are not float64.
+            ValueError: If its size is not that of the plan, or a position is not that of a pixel.
         """
         history = checked_samples(history, "TilePlan.exact", "pulse, frequency", finite=False)
         history = expanded_history(history, self.antennas, self.frequency_hz, "TilePlan.exact")
         grid = self.grid.transposed() if self._swapped else self.grid
+        refuse_unusable(pixels_m=pixels_m)
+        if pixels_m.ndim != 2 or pixels_m.shape[-1] != 3 or not len(pixels_m):
+            raise ValueError(f"pixels_m must be positions of pixels (pixel, 3), got the shape {tuple(pixels_m.shape)}")
         at = ((pixels_m - grid.origin_m) @ grid.axes.mT / grid.step_m).round().long()
+        if bool(((at < 0) | (at >= at.new_tensor(grid.counts))).any()):
+            raise ValueError("pixels_m must be positions of pixels of the grid of the plan, got some outside of it")
         i, j = (torch.arange(n, device=at.device) for n in self._tiles)
         centres = tile_centres(grid, *self._size, i, j, self._height_m)
         tiles, of = torch.unique(at[:, 0] // self._size[0] * len(j) + at[:, 1] // self._size[1], return_inverse=True)
