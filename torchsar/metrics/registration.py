@@ -84,12 +84,11 @@ def registered_error_db(image: Tensor | Signal, reference: Tensor | Signal) -> T
         small = small & (trial_phase[:, 2:].abs() <= 4 * _MOST_BEND).all(-1)
         # a trial that has settled stays, whatever the others do
         better, done = (error < best) & small & ~done, done | ~small | (error > best - _SETTLED_DB)
-
-        def chosen(new: Tensor, old: Tensor, better: Tensor = better) -> Tensor:
-            return torch.where(better.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
-
-        map_, phase, best = chosen(trial_map, map_), chosen(trial_phase, phase), chosen(error, best)
-        moved, seen = chosen(trial_moved, moved), chosen(trial_seen, seen)
+        trial = trial_map, trial_phase, error, trial_moved, trial_seen
+        old = map_, phase, best, moved, seen
+        map_, phase, best, moved, seen = (
+            torch.where(better.reshape(-1, *(1,) * (a.ndim - 1)), new, a) for new, a in zip(trial, old, strict=True)
+        )
         if bool(done.all()):
             break
     return torch.where(hidden, 0.0, best).reshape(lead)

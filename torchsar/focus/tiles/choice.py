@@ -343,7 +343,7 @@ class Scene:
         if self.weight is None:
             return lit
         weight = self.weight(points)
-        _refuse_other("weight", weight, torch.float64, tuple(lit.shape))
+        _refuse_other("weight", weight, torch.float64, (len(points), len(number)))
         if not host_value(torch.isfinite(weight).all(), True):
             raise ValueError("weight must return finite weights of pulses, got NaN or Inf; give 0 where none counts")
         return lit * weight

@@ -431,7 +431,7 @@ def possible_tiles(errors_db: Iterable[float], *given: Any, **lit: Any) -> dict[
     plans: dict[float, TilePlan] = {}
     for error in errors_db:
         try:
-            plans[error] = TilePlan(*given, error, **lit)
+            plans[error] = TilePlan(*given, error_db=error, **lit)
         except ValueError:
             break
     return plans
