@@ -681,7 +681,9 @@ def _after_step(
     """
     motion, found, change, covariance, disagreement, witnesses, shares = taken
     least = _CERTAIN * threshold(_OVERSAMPLING * sampling.pulses * sampling.cells) * noise / sampling.pulses
-    certain = (shares * (found.amplitude.abs().square() > least[:, None])[..., None]).sum(1)
+    bright = found.amplitude.abs().square() > least[:, None]
+    # what depends on a bright scatterer counts with it: how they divide their share is arbitrary
+    certain = (shares * (found.alike() * bright[:, None]).amax(-1, keepdim=True)).sum(1)
     valid = (
         torch.isfinite(change).all(-1)
         & motion.possible(sampling)
