@@ -46,6 +46,7 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 import torch
@@ -108,7 +109,7 @@ class ProcessedBeam:
     def __post_init__(self) -> None:
         numbers = (self.width_deg, self.squint_deg)
         if (
-            not all(isinstance(x, int | float) for x in numbers)
+            not all(isinstance(x, Real) for x in numbers)
             or not (self.width_deg > 0 and abs(self.squint_deg) + self.width_deg / 2 < 80)
             or abs(self.middle) + (1 + BAND_EDGE) * self.band / 2 >= 1
         ):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from functools import partial
+from numbers import Real
 
 import torch
 from torch import Tensor
@@ -76,7 +77,7 @@ class PathImage(Stage):
         centre = tuple(centre_m) if isinstance(centre_m, Sequence) else (centre_m,)
         numbers = (azimuth_m, range_m, step_m, *centre, range_axis_rad, height_m)
         if (
-            not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)
+            not all(isinstance(x, Real) and math.isfinite(x) for x in numbers)
             or len(centre) != 2
             or not 0 < step_m <= min(azimuth_m, range_m)
         ):
@@ -155,21 +156,23 @@ class PathImage(Stage):
         Returns:
             Limits along azimuth and range; or one that refuses the image, if no pulse sees it.
         """
-        rows, columns = (torch.linspace(0, n - 1, _POINTS).round().long() for n in self.grid.counts)
-        points = self.grid.pixels_m()[rows][:, columns].reshape(-1, 3).to(antennas.reference_m.device)
+        grid = self.grid
+        i, j = (torch.linspace(0, n - 1, _POINTS, dtype=torch.float64)[:, None] * grid.step_m for n in grid.counts)
+        points = (grid.origin_m + (i * grid.axes[0])[:, None] + j * grid.axes[1]).reshape(-1, 3)
+        points = points.to(antennas.reference_m.device)
         lit = self.lit(antennas)
         ends = torch.tensor([[0, antennas.pulses]]).expand(len(points), 2) if lit is None else lit(points)
         seen = ends[:, 1] > ends[:, 0]
         if not bool(seen.any()):
             empty, remedy = "the image is empty", "check width and squint of the beam, and the centre of the image"
             return [Limit("the number of pulses that see the image", 0, 1, "", "refuse", empty, remedy, at_least=True)]
-        low, high = spatial_band(points[seen], self.grid.axes, antennas, frequency_hz, ends[seen])
+        low, high = spatial_band(points[seen], grid.axes, antennas, frequency_hz, ends[seen])
         held = _HELD if self.windows == ("hann", "hann") else 1.0
         steps = (1 / (held * (high.amax(0) - low.amin(0)))).tolist()
         return [
             Limit(
                 f"the sample spacing step_m of the image in {axis.name}",
-                self.grid.step_m,
+                grid.step_m,
                 step,
                 "m",
                 "warn",

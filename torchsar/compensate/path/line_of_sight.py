@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from numbers import Integral
 
 import torch
 from torch import Tensor
@@ -138,7 +139,7 @@ def path_autofocus(
     trials = trials_of("path_autofocus", profiles, frequency_hz, antennas)
     if extent_m is not None and not 0 < extent_m < math.inf:
         raise ValueError(f"extent_m must be positive and finite, got {extent_m}")
-    if not isinstance(rounds, int) or rounds < 1:
+    if not isinstance(rounds, Integral) or rounds < 1:
         raise ValueError(f"path_autofocus needs a whole number of rounds, at least one, got rounds={rounds}")
 
     @torch.no_grad()
