@@ -418,7 +418,7 @@ def test_a_tile_whose_middle_is_dark_shows_its_lit_part() -> None:
 
 
 def beside_a_track(pulses: int, counts: tuple[int, int], squint_deg: float, height_m: float | None) -> Case:
-    """A straight path of half metres at 1.1 km beside pixels of one and of half a metre."""
+    """White noise of a straight path in steps of 0.5 m, 1.1 km beside pixels of one metre."""
     x = (torch.arange(pulses, dtype=F64) - pulses / 2) / 2
     place = torch.stack([x, torch.full_like(x, -1000.0), torch.full_like(x, 500.0)], -1)
     ahead = 1118 * math.tan(math.radians(squint_deg))
