@@ -6,9 +6,9 @@
 Every config runs in a process of its own, so that its peak memory is its own, and once per number
 of threads and device. A row holds
 
-- `config`, `part` and `name`: what was measured. The parts are `echo` (the simulation of the data,
-  draws included), `draws` (random numbers alone), `stage` (METHOD.STAGE), `metrics` (METHOD),
-  `batch` (echo, recommended method and metrics) and `memory`;
+- `config` (its first case), `part` and `name`: what was measured. The parts are `echo` (the
+  simulation of the data, draws included), `draws` (random numbers alone), `stage` (METHOD.STAGE),
+  `metrics` (METHOD), `batch` (echo, recommended method and metrics) and `memory`;
 - `seconds`: median time of one call on all trials of the batch, and `trials`: how many these are;
 - `over_floor`: median of the ratio of this time to that of the floor, which is measured in turn
   with it: bare transforms of the same data, one two-dimensional FFT and its inverse. A machine that
@@ -41,6 +41,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Trace, keep_freed_memory
+from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.text import find_config
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
@@ -155,7 +156,7 @@ def measured(config: str, count: int, budget_s: float, threads: int, device: str
     """Rows of one config with so many trials, for one number of threads on one device."""
     torch.set_num_threads(threads)
     keep_freed_memory()  # as the commands do
-    bench = Bench(load(find_config(config)), device)
+    bench = Bench(next(iter(cases_of(load(find_config(config))).values())), device)
     found = Measured({"config": config, "threads": threads, "device": device, "trials": count}, budget_s)
     draws = bench.draws(trials=range(count))
     batch = bench.batch(draws, keep=list(bench.chains))

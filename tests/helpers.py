@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Sequence
 
+import pytest
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
@@ -22,6 +23,11 @@ from torchsar.scene import (
     Points,
     Polynomial,
     StripmapWorld,
+)
+
+compiles_stages = pytest.mark.skipif(
+    tuple(map(int, torch.__version__.split("+")[0].split(".")[:2])) < (2, 13),
+    reason="torch.compile takes stages as arguments since torch 2.13",
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
 import sys
@@ -66,6 +67,17 @@ def test_the_benchmark_of_sweeps_runs(printed: Printed) -> None:
     text = printed(ROOT / "scripts" / "sweep_speed.py", arguments)
     for name in ("one by one", "one batch", "automatic ", "automatic, 2 workers"):
         assert re.search(rf"^{name} +\d+ +\d+\.\d+", text, re.MULTILINE), text
+
+
+def test_the_share_of_time_in_which_sweeps_compute_is_measured(printed: Printed, tmp_path: Path) -> None:
+    fork_workers()
+    file = tmp_path / "busy.json"
+    arguments = ["stripmap_doppler", "--workers", "2", "--seconds", "0.1", "--device", "cpu", "--batch", "1"]
+    printed(ROOT / "scripts" / "sweep_busy.py", [*arguments, "--out", str(file)])
+    found = json.loads(file.read_text(encoding="utf-8"))
+    (row,) = found["rows"]
+    assert found["machine"]["workers"] == 2 and row["trials_per_s"] > 0
+    assert (row["sweep"], row["trials"], row["busy"]) == ("stripmap_doppler", 1, None)
 
 
 def test_autofocus_is_composed(printed: Printed, tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""Figures and tables from the records in docs/sweeps, docs/trade, docs/requires and docs/reproduce.
+"""Figures and tables from the records in docs/sweeps, docs/trade, docs/benchmark, docs/requires and
+docs/reproduce.
 
 A page names a record, what to show of it, and its words; every number comes from the record.
 """
@@ -172,6 +173,59 @@ class SweepTable(Sweep):
         ]
 
 
+class BenchmarkTable(SphinxDirective):
+    """Speed, memory and slowest stage of every config of a record of `scripts/benchmark.py`."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        name = self.arguments[0]
+        record = read(self, "benchmark", name)
+        lines = [
+            "| config | threads | trials at once | trials/s | draws | memory (GB) | slowest stage | over floor |",
+            "| --- | ---: | ---: | ---: | ---: | ---: | --- | ---: |",
+        ]
+        whole = [row for row in record["rows"] if row["part"] == "batch"]
+        for batch in whole:
+            same = {key: batch[key] for key in ("config", "threads", "device")}
+            rows = [row for row in record["rows"] if same.items() <= row.items()]
+            part = {row["part"]: row for row in rows}
+            stages = [row for row in rows if row["part"] == "stage" and row["name"].startswith("recommended.")]
+            slowest = max(stages, key=lambda row: row["seconds"])
+            cells = [
+                *(f"`{batch['config']}`", batch["threads"], batch["trials"]),
+                *(cell(batch["trials"] / batch["seconds"]), f"{part['draws']['seconds'] / batch['seconds']:.0%}"),
+                *(cell(part["memory"]["peak_bytes"] / 1e9), f"`{slowest['name'].partition('.')[2]}`"),
+                cell(slowest["over_floor"]),
+            ]
+            lines.append("| " + " | ".join(map(str, cells)) + " |")
+        machine = record["machine"]
+        where = machine["cuda"] if whole[0]["device"] == "cuda" else f"{machine['processor']}, {machine['cores']} cores"
+        note = f"{where}; torch {machine['torch']}; record: `docs/benchmark/{name}.json`."
+        return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
+
+
+class BusyTable(SphinxDirective):
+    """Speed of every sweep of a record of `scripts/sweep_busy.py`, and how busy the GPU was."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        name = self.arguments[0]
+        record = read(self, "benchmark", name)
+        lines = ["| sweep | trials at once | trials/s | busy |", "| --- | ---: | ---: | ---: |"]
+        lines += [
+            f"| `{row['sweep']}` | {row['trials']} | {cell(row['trials_per_s'])} | {row['busy']:.1%} |"
+            for row in record["rows"]
+        ]
+        machine = record["machine"]
+        note = (
+            f"{machine['gpu']}; torch {machine['torch']}; processes: {machine['workers']}; record: "
+            f"`docs/benchmark/{name}.json`."
+        )
+        return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
+
+
 class TradeTable(SphinxDirective):
     """Time and loss of every alternative of one system, and of every step that has some."""
 
@@ -268,6 +322,8 @@ def setup(app: Sphinx) -> dict[str, Any]:
     for name, directive in {
         "sweep-figure": SweepFigure,
         "sweep-table": SweepTable,
+        "benchmark-table": BenchmarkTable,
+        "busy-table": BusyTable,
         "trade-table": TradeTable,
         "requires-table": RequiresTable,
         "reproduced-table": ReproducedTable,

@@ -9,12 +9,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tests.helpers import compiles_stages
 from torchsar.core import Axis, Chain, Estimate, Signal, Stage, host_value, untraced, use
 
-pytestmark = pytest.mark.skipif(
-    tuple(map(int, torch.__version__.split("+")[0].split(".")[:2])) < (2, 13),
-    reason="torch.compile takes stages as arguments since torch 2.13",
-)
+pytestmark = compiles_stages
 
 
 class Gain(Stage):

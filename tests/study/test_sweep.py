@@ -18,7 +18,7 @@ import zarr
 
 from tests.study import toy
 from torchsar.core import Draws
-from torchsar.core.batches import CACHE_BYTES, rows_by_bytes, rows_by_peak
+from torchsar.core.batches import CACHE_BYTES, rows_by_bytes, rows_by_peak, rows_by_trial
 from torchsar.study.montecarlo import Record, Stop, differences, read_sweep, sweep
 from torchsar.study.montecarlo.grid import address, make_grid
 from torchsar.study.montecarlo.loop import looks
@@ -122,11 +122,20 @@ def test_chunks_on_a_gpu_follow_measured_peaks() -> None:
     assert rows_by_peak({1: 120, 8: 260}, 10) == 1
 
 
-@pytest.mark.parametrize("device, workers, expected", [("cuda", 1, 78), ("cuda", 4, 30), ("cuda:1", 4, 8)])
+@pytest.mark.parametrize(
+    "each, device, workers, expected, tried",
+    [
+        (100, "cuda", 1, 73, [1, 1, 8, 37]),
+        (100, "cuda", 4, 27, [1, 1, 8, 14]),
+        (100, "cuda:1", 4, 7, [1, 1, 8]),
+        (10, "cuda", 1, 730, [1, 1, 8, 64, 365]),
+        (1, "cuda", 1, 7300, [1, 1, 8]),  # more than there are
+    ],
+)
 def test_processes_share_the_memory_of_a_gpu(
-    monkeypatch: pytest.MonkeyPatch, device: str, workers: int, expected: int
+    monkeypatch: pytest.MonkeyPatch, each: int, device: str, workers: int, expected: int, tried: list[int]
 ) -> None:
-    """Two GPUs with 10 GB free each, and trials of 100 MB beside 700 MB for any number of them."""
+    """Two GPUs with 10 GB free each, and trials of `each` MB beside 700 MB for any number."""
     sizes: list[int] = []
 
     def trial(parameters, draws):
@@ -140,15 +149,36 @@ def test_processes_share_the_memory_of_a_gpu(
             return self
 
         def __exit__(self, *_: object) -> None:
-            self.bytes = 700_000_000 + 100_000_000 * sizes[-1]
+            self.bytes = 700_000_000 + each * 1_000_000 * sizes[-1]
 
     monkeypatch.setattr("torchsar.core.batches.PeakMemory", Peak)
     for name, value in {"empty_cache": None, "mem_get_info": (10_000_000_000, 0), "device_count": 2}.items():
         monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
     work = Work(trial, make_grid({}), Draws(1), device)
     assert rows_of(work, 0, 1000, workers) == expected
-    assert sizes == [1, 1, 8]
-    assert rows_of(work, 0, workers, workers) == 1 and len(sizes) == 3
+    assert sizes == tried
+    assert rows_of(work, 0, workers, workers) == 1 and len(sizes) == len(tried)
+
+
+def test_blocks_do_not_make_batches_on_a_gpu_too_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """10 GB, and trials of 10 MB beside blocks of 20 MB a trial that take 1 GB at most."""
+    sizes: list[int] = []
+
+    class Peak:
+        def __init__(self, device: object) -> None: ...
+
+        def __enter__(self) -> Peak:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            self.bytes = 10_000_000 * sizes[-1] + min(1_000_000_000, 20_000_000 * sizes[-1])
+
+    monkeypatch.setattr("torchsar.core.batches.PeakMemory", Peak)
+    for name, value in {"empty_cache": None, "mem_get_info": (10_000_000_000, 0), "device_count": 1}.items():
+        monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
+    found = rows_by_trial(sizes.append, "cuda", 100_000, 1)
+    # 8 GB of the 10, less those of the blocks; 1 and 8 trials, of 30 MB each, would make it 266
+    assert found == 700
 
 
 def test_chunks_are_equal_pieces_in_one_order() -> None:

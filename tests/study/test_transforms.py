@@ -15,6 +15,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from tests.helpers import compiles_stages
 from tests.study.scenes import SCENES, bench_of
 from torchsar.core import Chain, Draws, Recording
 
@@ -142,6 +143,7 @@ def test_an_exported_chain_gives_the_same_image(held: Held, values: str) -> None
     assert float((found - expected).abs().max()) < 1e-12 * float(expected.abs().max())
 
 
+@compiles_stages
 @torch.no_grad()
 def test_a_compiled_chain_is_one_graph(held: Held) -> None:
     """Data, values and side data are arguments of the graph, which serves other data as well."""

@@ -10,9 +10,10 @@ from torchsar.core.memory import PeakMemory
 
 # larger batches do not fit the cache of a CPU and take more time per trial, as measured
 CACHE_BYTES = 12 << 20
-# Share of the free memory of a GPU that a batch takes, trials of a batch whose memory is measured
-# beside that of one, and memory that a process takes for itself.
-_GPU_SHARE, _MEASURED, _CONTEXT_BYTES = 0.85, 8, 600 << 20
+# Share of the free memory of a GPU that a batch takes (with 0.9, gaps between tensors left no room
+# in two of four sweeps), ratio of the sizes of batches whose memory is measured one after the
+# other, and memory that a process takes for itself.
+_GPU_SHARE, _LARGER, _CONTEXT_BYTES = 0.8, 8, 600 << 20
 
 
 def rows_by_bytes(bytes_per_trial: int) -> int:
@@ -45,7 +46,10 @@ def rows_by_peak(peaks: Mapping[int, int], free_bytes: int) -> int:
 
 
 def rows_by_trial(run: Callable[[int], int | None], device: torch.device | str, trials: int, workers: int) -> int:
-    """Return the number of trials in a batch that fits a CUDA device, by trying two small batches.
+    """Return the number of trials in a batch that fits a CUDA device, by trying small batches.
+
+    Stages that work in blocks need less memory a trial in large batches than in small ones. Batches
+    of growing size are therefore tried, up to half of what fits, unless all trials fit.
 
     Args:
         run: Function that computes a batch of so many trials. It returns the number of trials that
@@ -57,17 +61,30 @@ def rows_by_trial(run: Callable[[int], int | None], device: torch.device | str, 
     Returns:
         The number, 1 or more.
     """
-    many, peaks = min(_MEASURED, -(-trials // workers)), {}
-    if many < 2:
+    share, peaks = -(-trials // workers), list[tuple[int, int]]()
+    if share < 2:
         return 1
-    for rows in (1, 1, many):  # the first batch also makes what later ones find made
+    run(1)  # makes what later batches find made
+    rows = 1
+    while True:
         with PeakMemory(device) as memory:
             fits = run(rows)
         if fits is not None:
             return fits
-        peaks[rows] = memory.bytes or 0
+        peaks = [*peaks[-1:], (rows, memory.bytes or 0)]
+        if len(peaks) == 1:
+            rows = min(_LARGER, share)
+            continue
+        fitting = rows_by_peak(dict(peaks), _room_bytes(device, workers))
+        if fitting >= share or fitting <= 2 * rows:
+            return fitting
+        rows = min(_LARGER * rows, -(-fitting // 2))
+
+
+def _room_bytes(device: torch.device | str, workers: int) -> int:
+    """Memory that a batch of each of the processes that share a device may take."""
     torch.cuda.empty_cache()
     free, _ = torch.cuda.mem_get_info(device)
     sharing = workers if torch.device(device).index is not None else -(-workers // torch.cuda.device_count())
     others = _CONTEXT_BYTES * sharing if workers > 1 else 0
-    return rows_by_peak(peaks, int(_GPU_SHARE * max(0, free - others) / sharing))
+    return int(_GPU_SHARE * max(0, free - others) / sharing)
