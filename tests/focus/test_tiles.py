@@ -204,6 +204,19 @@ def test_a_plan_moves_with_its_path() -> None:
     assert drawn.error_db(plan.image(drawn.history)) < -67
 
 
+@pytest.mark.parametrize("seed, size", [(1006, 1e-4), (1006, 3e-4), (1006, 1e-3), (1006, 3e-3), (1010, 3e-4)])
+def test_a_bent_path_keeps_the_error(seed: int, size: float) -> None:
+    """Small bends share the plan; larger ones, in ranges, do not even within its margins."""
+    drawn = case(seed)
+    plan = drawn.plan()
+    bend = torch.linspace(-1, 1, len(drawn.transmitter_m), dtype=F64)[:, None].square()
+    shift = size * float(drawn.reference_m.mean()) * bend * torch.tensor([1.0, 0.5, -0.3], dtype=F64)
+    moved = replace(drawn, transmitter_m=drawn.transmitter_m + shift)
+    following = plan.moved(moved.transmitter_m, moved.receiver_m, moved.reference_m)
+    assert moved.error_db(following.image(moved.history)) < -67
+    assert size > 1e-4 or following.choice is plan.choice
+
+
 def test_trials_with_and_without_a_path_of_their_own() -> None:
     drawn, lead = case(1004), {"path": (2, 1, 1), "history": (3, 2, 1, 2)}
     shift = 0.002 * torch.randn(*lead["path"], len(drawn.reference_m), 3, dtype=F64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import itertools
 import math
@@ -71,6 +72,8 @@ _HEIGHT_STEP = 1 / 16
 # choice. Errors change slowly from zone to zone, but those of one sub-aperture of a rough path were
 # found 13 dB above those of 15 others
 _ZONES, _PARTS = 3, 32
+# sub-apertures that a sample which is not dense has all
+_FEW_PARTS = 3
 # values of eps, frequencies, and positions along either axis of a tile over which the error of a
 # window is averaged: means of ten times as many differed by 1 dB at most in 14 geometries
 _STRETCHES, _TURNS, _AWAY = 33, 33, 8
@@ -102,6 +105,7 @@ class Choice:
         guard: Share of the band that the slopes of the window may fill.
         oversampling: Fineness of the range profiles relative to the resolution.
         error_db: Predicted error relative to the image of white noise in dB.
+        sampling_error: Part of it that kernel and window cause, relative to 1.
     """
 
     width: int
@@ -113,6 +117,7 @@ class Choice:
     guard: float
     oversampling: float
     error_db: float
+    sampling_error: float
 
 
 def profile_length(n: int, oversampling: float) -> int:
@@ -268,6 +273,17 @@ class Scene:
         apart = [torch.linalg.vector_norm(v - nominal, dim=-1).amax(-1) for v, nominal in pairs]
         trial = int(torch.stack(torch.broadcast_tensors(*apart)).sum(0).argmax())
         return [v[min(trial, len(v) - 1)] for v in self.judged]
+
+    def error_db(self, choice: Choice, judged: Sequence[Tensor]) -> float:
+        """Predicted error of sizes in dB for trials with other positions, (trial, pulse, 3) each,
+        in whose tiles the nominal path stays that of the scene.
+        """
+        other = copy.copy(self)  # with what it has found of the pulses that light the image
+        object.__setattr__(other, "judged", judged)
+        other.__dict__.pop("farthest", None)
+        sizes = choice.width, choice.depth, choice.parts, choice.order
+        error = other.sampled(*sizes, dense=choice.parts > _FEW_PARTS).error
+        return 20 * math.log10(math.hypot(error, choice.sampling_error))
 
     @functools.cached_property
     def probed(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -582,7 +598,7 @@ def choose(scene: Scene, error_db: float) -> Choice:
         if any(_hopeless(sizes, *other, wanted) for other in failed):
             continue
         sampled = scene.sampled(*sizes)
-        if sampled.error < wanted and sizes[2] > 3:
+        if sampled.error < wanted and sizes[2] > _FEW_PARTS:
             # the errors of a rough path differ from one sub-aperture to the next
             sampled = scene.sampled(*sizes, dense=True)
         error = sampled.error
@@ -596,7 +612,8 @@ def choose(scene: Scene, error_db: float) -> Choice:
             found = _choose_slope(scene, sampled, math.sqrt(left**2 - kernel**2))
             if found is not None:
                 slope, window = found
-                return Choice(*sizes, taps, *slope, 20 * math.log10(math.hypot(error, kernel, window)))
+                sampling = math.hypot(kernel, window)
+                return Choice(*sizes, taps, *slope, 20 * math.log10(math.hypot(error, sampling)), sampling)
         failed.append((sizes, error))
     reach = f"{20 * math.log10(best):.1f} dB" if best < 1 else "no error below 0 dB"
     raise ValueError(

@@ -31,6 +31,9 @@ _KEPT_BYTES = 3 << 27
 _GROUP = 16
 # bytes of profiles that are formed at once, by choice: it limits the memory of the padded spectra
 _PROFILE_BYTES = 1 << 25
+# predicted error above the wanted one for which a changed path needs no new plan, by choice: within
+# the 3 dB by which predictions may be off in all, since those of changed paths are within 1 dB
+_LEEWAY_DB = 2.0
 
 
 class _Kept(dict):
@@ -174,8 +177,8 @@ class TilePlan:
     def moved(self, transmitter_m: Tensor, receiver_m: Tensor | None, reference_m: Tensor) -> TilePlan:
         """Return the plan of a path that differs little, such as by a change of its motion errors.
 
-        It shares what this plan has computed, if the path does not leave its margins; otherwise a
-        new plan is made.
+        It shares what this plan has computed, if the path does not leave its margins and the
+        predicted error is at most 2 dB above `error_db`; otherwise a new plan is made.
 
         Args:
             transmitter_m: Positions of the transmitter in metres, float64 (..., pulse, 3).
@@ -197,11 +200,17 @@ class TilePlan:
             places = [place.detach() for place in plan._places]
             plan._tables = _Kept(len(places[0]) * plan._table_count)
             with torch.no_grad():
-                if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places] or not all(
-                    part.covers(places) for zone in self._zones for part in zone
-                ):
+                if not self._serves(places):
                     plan._plan(places)
         return plan
+
+    def _serves(self, places: Sequence[Tensor]) -> bool:
+        """Whether other positions, each float64 (path, pulse, 3), may share what is computed."""
+        return (
+            [v.shape[1:] for v in places] == [v.shape[1:] for v in self._places]
+            and all(part.covers(places) for zone in self._zones for part in zone)
+            and self._scene.error_db(self.choice, places) <= self.error_db + _LEEWAY_DB
+        )
 
     def image(self, history: Tensor) -> Tensor:
         """Form the images of phase histories.
