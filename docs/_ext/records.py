@@ -182,10 +182,10 @@ class BenchmarkTable(SphinxDirective):
         name = self.arguments[0]
         record = read(self, "benchmark", name)
         lines = [
-            "| config | threads | trials at once | trials/s | draws | memory (GB) | slowest stage | over floor |",
-            "| --- | ---: | ---: | ---: | ---: | ---: | --- | ---: |",
+            "| config | batch | trials/s | draws | GB | slowest stage | over floor |",
+            "| --- | ---: | ---: | ---: | ---: | --- | ---: |",
         ]
-        whole = [row for row in record["rows"] if row["part"] == "batch"]
+        whole = [row for row in record["rows"] if row["part"] == "batch" and row["threads"] == 1]
         for batch in whole:
             same = {key: batch[key] for key in ("config", "threads", "device")}
             rows = [row for row in record["rows"] if same.items() <= row.items()]
@@ -193,14 +193,14 @@ class BenchmarkTable(SphinxDirective):
             stages = [row for row in rows if row["part"] == "stage" and row["name"].startswith("recommended.")]
             slowest = max(stages, key=lambda row: row["seconds"])
             cells = [
-                *(f"`{batch['config']}`", batch["threads"], batch["trials"]),
+                *(f"`{batch['config'].removeprefix('sweeps/')}`", batch["trials"]),
                 *(cell(batch["trials"] / batch["seconds"]), f"{part['draws']['seconds'] / batch['seconds']:.0%}"),
                 *(cell(part["memory"]["peak_bytes"] / 1e9), f"`{slowest['name'].partition('.')[2]}`"),
                 cell(slowest["over_floor"]),
             ]
             lines.append("| " + " | ".join(map(str, cells)) + " |")
         machine = record["machine"]
-        where = machine["cuda"] if whole[0]["device"] == "cuda" else f"{machine['processor']}, {machine['cores']} cores"
+        where = machine["cuda"] if whole[0]["device"] == "cuda" else f"{machine['processor']}, one thread"
         note = f"{where}; torch {machine['torch']}; record: `docs/benchmark/{name}.json`."
         return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
 
