@@ -7,7 +7,7 @@ import logging
 import resource
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +122,23 @@ def test_chunks_on_a_gpu_follow_measured_peaks() -> None:
     assert rows_by_peak({1: 120, 8: 260}, 10) == 1
 
 
+def pretend_gpus(monkeypatch: pytest.MonkeyPatch, count: int, peak: Callable[[], int]) -> None:
+    """GPUs with 10 GB free each, on which batches take what `peak` says."""
+
+    class Peak:
+        def __init__(self, device: object) -> None: ...
+
+        def __enter__(self) -> Peak:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            self.bytes = peak()
+
+    monkeypatch.setattr("torchsar.core.batches.PeakMemory", Peak)
+    for name, value in {"empty_cache": None, "mem_get_info": (10_000_000_000, 0), "device_count": count}.items():
+        monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
+
+
 @pytest.mark.parametrize(
     "each, device, workers, expected, tried",
     [
@@ -135,25 +152,14 @@ def test_chunks_on_a_gpu_follow_measured_peaks() -> None:
 def test_processes_share_the_memory_of_a_gpu(
     monkeypatch: pytest.MonkeyPatch, each: int, device: str, workers: int, expected: int, tried: list[int]
 ) -> None:
-    """Two GPUs with 10 GB free each, and trials of `each` MB beside 700 MB for any number."""
+    """Two GPUs, and trials of `each` MB beside 700 MB for any number."""
     sizes: list[int] = []
 
     def trial(parameters, draws):
         sizes.append(len(draws.trials))
         return {"m": draws.normal("x", (1,)).sum(-1)}
 
-    class Peak:
-        def __init__(self, device: object) -> None: ...
-
-        def __enter__(self) -> Peak:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            self.bytes = 700_000_000 + each * 1_000_000 * sizes[-1]
-
-    monkeypatch.setattr("torchsar.core.batches.PeakMemory", Peak)
-    for name, value in {"empty_cache": None, "mem_get_info": (10_000_000_000, 0), "device_count": 2}.items():
-        monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
+    pretend_gpus(monkeypatch, 2, lambda: 700_000_000 + each * 1_000_000 * sizes[-1])
     work = Work(trial, make_grid({}), Draws(1), device)
     assert rows_of(work, 0, 1000, workers) == expected
     assert sizes == tried
@@ -161,21 +167,9 @@ def test_processes_share_the_memory_of_a_gpu(
 
 
 def test_blocks_do_not_make_batches_on_a_gpu_too_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """10 GB, and trials of 10 MB beside blocks of 20 MB a trial that take 1 GB at most."""
+    """Trials of 10 MB beside blocks of 20 MB a trial that take 1 GB at most."""
     sizes: list[int] = []
-
-    class Peak:
-        def __init__(self, device: object) -> None: ...
-
-        def __enter__(self) -> Peak:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            self.bytes = 10_000_000 * sizes[-1] + min(1_000_000_000, 20_000_000 * sizes[-1])
-
-    monkeypatch.setattr("torchsar.core.batches.PeakMemory", Peak)
-    for name, value in {"empty_cache": None, "mem_get_info": (10_000_000_000, 0), "device_count": 1}.items():
-        monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
+    pretend_gpus(monkeypatch, 1, lambda: 10_000_000 * sizes[-1] + min(1_000_000_000, 20_000_000 * sizes[-1]))
     found = rows_by_trial(sizes.append, "cuda", 100_000, 1)
     # 8 GB of the 10, less those of the blocks; 1 and 8 trials, of 30 MB each, would make it 266
     assert found == 700
