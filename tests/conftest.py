@@ -22,6 +22,12 @@ def _process() -> None:
         torch.set_num_threads(min(2, os.cpu_count() or 1))
 
 
+@pytest.fixture(autouse=True)
+def _same_numbers() -> None:
+    """Numbers that a test draws without a generator do not depend on the tests before it."""
+    torch.manual_seed(1)
+
+
 @pytest.fixture(scope="session")
 def recorded() -> Callable[[str], Path]:
     """Path of a recorded data set by file name; skips where the recordings are not at hand."""
