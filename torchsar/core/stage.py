@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchsar.core.arguments import names_arguments
 from torchsar.core.check import checked_samples, refuse_non_finite_values
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import gathered_checks
@@ -53,6 +54,11 @@ class Stage(nn.Module):
     takes_real: bool = False
     takes_empty: bool = True
     fixed: tuple[str, ...] = ()
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "__init__" in vars(cls):
+            names_arguments(cls)
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
         if torch.compiler.is_dynamo_compiling():

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import linear_phasor, unit_level
+from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.chip import Chip, Extraction, Picture, centred_motion, chip_about
@@ -54,6 +55,7 @@ _WIDE_ROUNDS = 2
 _NEAR_U_R_M_S, _NEAR_U_A_M_S, _LAST_U_R_M_S = 2.0, 1.0, 1.0
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Body:
     """Extended moving target (body) that was found in the data.

@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import matrix_inverse, unit_phasor
+from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.migration import Frame, StaticBulk, correct_migration
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.model import point_phasor
@@ -49,6 +50,7 @@ _BRIGHT, _BRIGHT_SHARE = 12.0, 0.01
 _CLEAR = 2.0
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Extraction:
     """Extent of the data that are extracted for one body, an extended moving target.

@@ -9,8 +9,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from torchsar.core import Signal, checked_samples, unit_level
+from torchsar.core.arguments import names_arguments
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Detection:
     """Position of one detection in an image.

@@ -24,6 +24,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import Signal, Stage, block_bytes_of, checked_samples, linear_phasor, per_trial, unit_phasor
+from torchsar.core.arguments import names_arguments
 from torchsar.focus import keystone
 from torchsar.focus.nufft import nufft_type2
 from torchsar.multichannel.motion import Number, PointMotion
@@ -35,6 +36,7 @@ from torchsar.radar import BistaticRadar, receive_range
 _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-10}
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Frame:
     """Radar and axes of data (..., channel, pulse, range), from which range histories follow.
@@ -170,6 +172,7 @@ class Migration(Protocol):
         ...
 
 
+@names_arguments
 @dataclass(frozen=True)
 class NoMigration:
     """No range migration correction."""
@@ -183,6 +186,7 @@ class NoMigration:
         return _moved_m(integration_s, motion).abs().amax(0)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class StaticBulk:
     """Migration correction by a shift of every pulse along range by a reference range history.
@@ -211,6 +215,7 @@ class StaticBulk:
         )
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Keystone:
     """Migration correction that removes the range walk of all targets by a keystone transform.

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import linear_phasor, linear_solve, unit_phasor
+from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.motion import PointMotion
 from torchsar.radar import BistaticRadar
 
@@ -170,6 +171,7 @@ class Prior(Protocol):
         ...
 
 
+@names_arguments
 @dataclass(frozen=True)
 class ElementPattern:
     """Expected power over Doppler by the one-way antenna pattern of a channel.
@@ -185,6 +187,7 @@ class ElementPattern:
         return torch.sinc(radar.element_m * offset_hz / motion.along_m_s[(...,) + (None,) * offset_hz.ndim]).square()
 
 
+@names_arguments
 @dataclass(frozen=True)
 class FlatBand:
     """Expected power that is equal within a band about the Doppler centre and zero outside.
@@ -240,6 +243,7 @@ def _check_bands(bands: int) -> None:
         raise ValueError(f"a reconstruction needs a whole number of Doppler bands, at least one, got bands={bands}")
 
 
+@names_arguments
 @dataclass(frozen=True)
 class LeastSquares:
     """Reconstruction of Doppler bands by the pseudo-inverse of the channel responses.
@@ -285,6 +289,7 @@ class LeastSquares:
         return few if self.bands > channels else None
 
 
+@names_arguments
 @dataclass(frozen=True)
 class MinimumMeanSquare:
     """Reconstruction of Doppler bands with least mean square error, for an expected power.

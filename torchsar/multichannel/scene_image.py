@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Stage, fft_lines, linear_phasor
+from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.body import Body, body_echo, body_image, find_body, known_body
 from torchsar.multichannel.chip import Extraction
 from torchsar.multichannel.detection import Detection, detect
@@ -47,6 +48,7 @@ _BINS_AVERAGED = 4  # neighbouring Doppler bins over which the covariance of all
 _HALF_QUALITY_LEVEL = 100.0  # level (20 dB) at which the quality of a target is one half: convention
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Detector:
     """Settings of the detection of moving targets in images.
@@ -83,6 +85,7 @@ class Detector:
         return detect(image, self.threshold_db, self.extent_m, self.apart_m, self.most)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class SceneImage:
     """Images of a scene with moving targets.

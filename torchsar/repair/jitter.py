@@ -31,6 +31,7 @@ from torchsar.core import (
     real_dtype,
     refuse_non_finite_values,
 )
+from torchsar.core.arguments import names_arguments
 
 # Smallest distance of sample instants, in samples. Limit of conditioning, by choice: noise grows
 # about as 1 / gap.
@@ -298,6 +299,7 @@ def jittered(x: Tensor, offset_samples: Tensor) -> Tensor:
     return out
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Lagrange:
     """Correction of jitter by Lagrange interpolation: fast, but inaccurate near the band edges.
@@ -321,6 +323,7 @@ class Lagrange:
         return correct_jitter_lagrange(y, offset_samples, self.points)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class BandLimited:
     """Correction of jitter by the best local weights for a band-limited signal.
@@ -349,6 +352,7 @@ class BandLimited:
         return correct_jitter_band_limited(y, offset_samples, self.points, self.band)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Exact:
     """Correction of jitter by exact periodic non-uniform reconstruction."""

@@ -10,6 +10,7 @@ from typing import Literal, Protocol, get_args
 import torch
 from torch import Tensor
 
+from torchsar.core.arguments import names_arguments
 from torchsar.radar import TriangularLadar
 from torchsar.scene.fluctuation import LogAmplitude, RandomMotion
 from torchsar.scene.targets import Scatterers, Scene
@@ -24,6 +25,7 @@ _TIMES_A_PERIOD, _MOST_TIMES = 16, 1 << 22
 _SHORT_S = 1e-6
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Extremes:
     """Largest ranges and motions of a scene, from which neglected phases are predicted.
@@ -127,6 +129,7 @@ def omitted_phase_rad(without: Sequence[Effect], radar: TriangularLadar, extreme
     return {effect: phases[effect] for effect in without}
 
 
+@names_arguments
 @dataclass(frozen=True)
 class RangeHistory:
     """Range of scatterers relative to the reference range as a function of slow time.
@@ -269,6 +272,7 @@ class _Level:
         _refuse_effects(self.without)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class EverySample(_Level):
     """Range evaluated at every sample: the exact model, and the slowest.
@@ -305,6 +309,7 @@ class EverySample(_Level):
         return omitted_phase_rad(self.without, radar, extremes)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class QuadraticInSweep(_Level):
     """Quadratic phase of each scatterer in each sweep, with one curvature for all scatterers.
@@ -351,6 +356,7 @@ class QuadraticInSweep(_Level):
         return {"level": jerk + band, **omitted_phase_rad(self.without, radar, extremes)}
 
 
+@names_arguments
 @dataclass(frozen=True)
 class LinearInSweep(_Level):
     """Linear phase of each scatterer in each sweep: the range follows a straight line. The default.
@@ -396,6 +402,7 @@ class LinearInSweep(_Level):
         return {"level": bend + band, **omitted_phase_rad(self.without, radar, extremes)}
 
 
+@names_arguments
 @dataclass(frozen=True)
 class OnePerSweep(_Level):
     """Stop-and-go approximation: the range is constant during each sweep.
@@ -441,6 +448,7 @@ class OnePerSweep(_Level):
         }
 
 
+@names_arguments
 @dataclass(frozen=True)
 class OnePerPeriod(_Level):
     """Stop-and-go approximation by period, with the range at the turning point for both sweeps.
@@ -503,6 +511,7 @@ class SweepError(Protocol):
         ...
 
 
+@names_arguments
 @dataclass(frozen=True)
 class CalibrationFibre:
     """Internal channel that mixes the sweep with a copy of itself from a fibre of known delay.
@@ -532,6 +541,7 @@ class CalibrationFibre:
         refuse_unless_finite("snr_db of a calibration fibre", self.snr_db)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class LadarWorld:
     """Scene, motion, propagation, laser errors and noise of a ladar acquisition.

@@ -9,6 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchsar.core.arguments import names_arguments
 from torchsar.radar import StripmapRadar
 from torchsar.scene.trials import refuse_unless, with_dims
 
@@ -47,6 +48,7 @@ class Path(Protocol):
         ...
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Hyperbola:
     """Exact range history of a straight path, r(t) = sqrt(r0^2 + v^2 t^2), constant during a pulse.
@@ -87,6 +89,7 @@ class Hyperbola:
         return 2 * math.pi * closing / radar.wavelength_m * radar.pulse.duration_s
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Parabola:
     """Second-order range history, r(t) = r0 + v^2 t^2 / (2 r0).
@@ -173,6 +176,7 @@ class Beam(Protocol):
         ...
 
 
+@names_arguments
 @dataclass(frozen=True)
 class AlwaysLit:
     """Beam that illuminates every target in every pulse."""
@@ -193,6 +197,7 @@ class AlwaysLit:
         return torch.ones_like(since_s)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Dwell:
     """Beam of constant gain and limited dwell time.
@@ -227,6 +232,7 @@ class Dwell:
         return (since_s.abs() <= half * (1 + _TIE)).to(since_s.dtype)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Antenna:
     """Beam of a uniform aperture, side lobes included.

@@ -30,6 +30,7 @@ from torchsar.compensate.pulse_phase.pairs import pair_phase, pair_products, run
 from torchsar.compensate.pulse_phase.sharpen import settled
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate, unit_phasor
+from torchsar.core.arguments import names_arguments
 
 Kernel = Literal["lumv", "ml", "synchronised", "eigenvector"]
 _POWER_STEPS = 6  # steps of the power method, found by trial: accuracy against time
@@ -57,6 +58,7 @@ class Windows(Protocol):
         ...
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Shrinking:
     """A PGA window that narrows by a constant factor per iteration.
@@ -97,6 +99,7 @@ class Shrinking:
         return torch.tensor([max(self.floor, self.first * n * self.factor**iteration)])
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Measured:
     """A PGA window that follows the width of the blur.
@@ -137,6 +140,7 @@ class Measured:
         return (self.margin * (2.0 * reach + 1)).clamp(self.floor, n)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Listed:
     """A list of PGA window widths, one per iteration; the last serves all further iterations.

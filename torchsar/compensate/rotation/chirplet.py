@@ -23,6 +23,7 @@ from torchsar.core import (
     take,
     unit_phasor,
 )
+from torchsar.core.arguments import names_arguments
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.radar import InverseRadar
@@ -31,6 +32,7 @@ _PARTS = 4  # samples that a segment keeps in the fine search, found by trial: r
 _PAD = 2  # zero-padding of the transforms: a peak between two bins loses little power
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Chirplets:
     """Chirps found in every range cell, in the order in which they were found, and their image.

@@ -17,12 +17,14 @@ from torchsar.compensate.rotation.motion import Motion, Sampling
 from torchsar.compensate.rotation.unknowns import RotationParameters, Unknowns, Variables
 from torchsar.compensate.rotation.verdicts import warp_phase_error
 from torchsar.core import Signal, block_bytes_of, checked_samples, unit_level
+from torchsar.core.arguments import names_arguments
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier, range_phase
 from torchsar.focus.transforms import Gridding
 from torchsar.radar import InverseRadar
 
 
+@names_arguments
 @dataclass(frozen=True)
 class EntropyObjective:
     """Settings of the image entropy as a function of the rotation of a target, see `ImageEntropy`.

@@ -8,6 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.motion import PointMotion
 from torchsar.radar import BistaticRadar
 
@@ -32,6 +33,7 @@ class Aperture(Protocol):
         ...
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Dwell:
     """Expected amplitude 1 for a duration centred on the time at broadside, 0 outside.
@@ -60,6 +62,7 @@ class Dwell:
         return (since.abs() < self.duration_s / 2).to(torch.float64)
 
 
+@names_arguments
 @dataclass(frozen=True)
 class ElementBeam:
     """Expected amplitude by the one-way antenna pattern of a channel.

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import host_values, level_of, per_trial, take, unit_phasor
+from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
@@ -26,6 +27,7 @@ _BLOCK_BYTES = 64 << 20  # limits the memory of a block of hypotheses
 _TINY = torch.finfo(torch.float32).tiny  # keeps divisions by zero finite
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Search:
     """Extent and steps of a search over the velocities and the position of a point.

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import cholesky_factor, matrix_inverse
+from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.response import shared_response
@@ -41,6 +42,7 @@ _EVIDENCE = 2.0
 _TAPER = 16
 
 
+@names_arguments
 @dataclass(frozen=True)
 class Whitening:
     """Matrices that whiten the channels in each Doppler bin of the unitary FFT over pulses.

@@ -1,0 +1,84 @@
+"""Constructors name the argument whose type does not fit."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+
+from torchsar import compensate, focus, multichannel, radar, repair, scene
+from torchsar.core.arguments import names_arguments
+
+FACES = (compensate, focus, multichannel, radar, repair, scene)
+NUMBERS = {"int", "float", "float | None", "int | None", "Tensor | float", "Tensor | float | None"}
+
+
+def constructors() -> Iterator[tuple[type, dict[str, object], str]]:
+    """Public classes that can be made of ones, these arguments, and the name of one more number."""
+    for face in FACES:
+        for name in face.__all__:
+            cls = getattr(face, name)
+            if not inspect.isclass(cls):
+                continue
+            parameters = inspect.signature(cls).parameters.values()
+            needed = {p.name: 1.0 for p in parameters if p.default is p.empty and p.kind is not p.VAR_POSITIONAL}
+            try:
+                cls(**needed)
+            except Exception:
+                continue
+            for p in parameters:
+                if str(p.annotation) in NUMBERS:
+                    yield cls, needed, p.name
+
+
+@pytest.mark.parametrize("value", ["abc", {}, object()], ids=["word", "mapping", "object"])
+def test_no_constructor_fails_with_an_error_of_python_about_a_number(value: object) -> None:
+    raw = re.compile(r"not supported between|unsupported operand|must be real number|bad operand|has no attribute")
+    wrong, tried = [], 0
+    for cls, needed, name in constructors():
+        tried += 1
+        try:
+            cls(**{**needed, name: value})
+        except Exception as error:
+            if raw.search(str(error)):
+                wrong.append(f"{cls.__name__}({name}): {error}")
+    assert not wrong and tried > 200, wrong
+
+
+@names_arguments
+@dataclass(frozen=True)
+class Limits:
+    """Two limits in order."""
+
+    low: float
+    high: float | None = None
+    words: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.high is not None and not self.low < self.high:
+            raise ValueError("low must be below high")
+        "".join(self.words)
+
+
+def test_the_argument_is_named_only_if_it_is_the_cause() -> None:
+    with pytest.raises(TypeError, match=r"^Limits: low must be a number, got 'a'$"):
+        Limits("a", 2.0)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"^Limits: high must be a number or None, got \[\]$"):
+        Limits(1.0, high=[])  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="low must be below high"):
+        Limits(2.0, 1.0)
+    with pytest.raises(TypeError, match="missing 1 required"):
+        Limits()  # pyright: ignore[reportCallIssue]
+    with pytest.raises(TypeError, match="expected str instance"):
+        Limits(1.0, 2.0, (3,))  # pyright: ignore[reportArgumentType]
+    assert Limits(None).low is None  # pyright: ignore[reportArgumentType]
+
+
+def test_signature_equality_and_copies_stay() -> None:
+    assert list(inspect.signature(Limits).parameters) == ["low", "high", "words"]
+    assert pickle.loads(pickle.dumps(Limits(1.0, 2.0))) == Limits(1.0, 2.0)
+    assert str(inspect.signature(repair.DropInterference)).startswith("(threshold: ")
