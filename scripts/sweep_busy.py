@@ -25,7 +25,7 @@ from typing import Any
 
 import torch
 
-from torchsar.core import keep_freed_memory
+from torchsar.core import device_fault, keep_freed_memory
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo.engines import Engine, Task, engine
 from torchsar.study.montecarlo.grid import Grid
@@ -96,6 +96,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--batch", type=int, default=256, help="trials of a batch at most")
     parser.add_argument("--device", default="cuda")
     options = parser.parse_args(arguments)
+    unknown = [name for name in options.sweeps if name not in names]
+    if unknown:
+        parser.error(f"{unknown[0]!r} is no packaged sweep; there are {', '.join(names)}")
+    if min(options.workers, options.batch) < 1 or not options.seconds > 0:
+        parser.error("--workers, --batch and --seconds must be above 0")
+    reason = device_fault(options.device)
+    if reason:
+        parser.error(f"the device {options.device!r} cannot be used here: {reason}")
     keep_freed_memory()  # as the commands do
     on_gpu = options.device.startswith("cuda")
     gpu = torch.cuda.get_device_name() if on_gpu else None

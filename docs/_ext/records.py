@@ -215,7 +215,8 @@ class BusyTable(SphinxDirective):
         record = read(self, "benchmark", name)
         lines = ["| sweep | trials at once | trials/s | busy |", "| --- | ---: | ---: | ---: |"]
         lines += [
-            f"| `{row['sweep']}` | {row['trials']} | {cell(row['trials_per_s'])} | {row['busy']:.1%} |"
+            f"| `{row['sweep']}` | {row['trials']} | {cell(row['trials_per_s'])} | "
+            f"{'-' if row['busy'] is None else format(row['busy'], '.1%')} |"
             for row in record["rows"]
         ]
         machine = record["machine"]

@@ -8,7 +8,9 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
+import torch
 
 from torchsar import compensate, focus, multichannel, radar, repair, scene
 from torchsar.core.arguments import names_arguments
@@ -76,6 +78,33 @@ def test_the_argument_is_named_only_if_it_is_the_cause() -> None:
     with pytest.raises(TypeError, match="expected str instance"):
         Limits(1.0, 2.0, (3,))  # pyright: ignore[reportArgumentType]
     assert Limits(None).low is None  # pyright: ignore[reportArgumentType]
+
+
+def test_own_sentences_and_what_numbers_may_be_stay() -> None:
+    @names_arguments
+    @dataclass
+    class Own:
+        gain: float = 1.0
+        count: int = 1
+        rest: tuple[int, ...] = ()
+
+        def __post_init__(self) -> None:
+            if self.count > 3:
+                raise TypeError("count must be at most 3")
+            sum(self.rest)
+
+    with pytest.raises(TypeError, match="^count must be at most 3$"):
+        Own(None, 5)  # pyright: ignore[reportArgumentType]
+    for number in (np.float32(2), np.bool_(True), torch.tensor(2), True):
+        with pytest.raises(TypeError, match="not iterable"):
+            Own(number, number, 3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"^Own: gain must be a number, got 1j$"):
+        Own(1j, 1, 3)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_compiled_function_may_make_one() -> None:
+    compiled = torch.compile(lambda x: Limits(x.numel(), 9.0).low * x, fullgraph=True, backend="eager")
+    assert compiled(torch.ones(2)).tolist() == [2, 2]
 
 
 def test_signature_equality_and_copies_stay() -> None:

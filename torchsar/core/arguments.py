@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import inspect
 import numbers
+import traceback
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,24 +29,25 @@ _RAW = (TypeError, AttributeError, IndexError, RuntimeError)
 def names_arguments(cls: type[_Class]) -> type[_Class]:
     """Let the constructor of a class that fails name the argument whose type does not fit.
 
-    Arguments are looked at only after an error, so that whatever a constructor accepts stays
-    accepted. Annotations of other types than numbers, words and tensors are not judged.
+    Arguments are looked at only after an error that the code does not raise itself, so that
+    whatever a constructor accepts stays accepted, and its own sentences stay. Only annotations of
+    numbers, words and tensors are judged, as texts; tensors fit where numbers do.
 
     Args:
         cls: Class with an `__init__` of its own, such as a dataclass.
 
     Returns:
-        The class. Its constructor raises TypeError with one sentence if an argument does not fit
-        its annotation, else the error itself.
+        The class. Its constructor raises TypeError with one sentence in place of a TypeError,
+        AttributeError, IndexError or RuntimeError if an argument does not fit its annotation.
     """
-    init, signature = cls.__init__, inspect.signature(cls.__init__)
+    init = cls.__init__
 
     @functools.wraps(init)
     def explained(self: Any, *args: Any, **kwargs: Any) -> None:
         try:
             init(self, *args, **kwargs)
         except _RAW as error:
-            sentence = _fault(signature, self, *args, **kwargs)
+            sentence = "" if _is_own(error) else _fault(init, self, *args, **kwargs)
             if sentence:
                 raise TypeError(f"{type(self).__name__}: {sentence}") from error
             raise
@@ -53,17 +56,27 @@ def names_arguments(cls: type[_Class]) -> type[_Class]:
     return cls
 
 
-def _fault(signature: inspect.Signature, *args: Any, **kwargs: Any) -> str:
+def _is_own(error: Exception) -> bool:
+    """Whether an error comes from a statement `raise`."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return (last.line or "").startswith("raise ")
+
+
+def _fault(init: Callable[..., None], *args: Any, **kwargs: Any) -> str:
     """What is wrong with the first argument that does not fit; empty if all do."""
+    signature = inspect.signature(init)
     try:
         given = signature.bind(*args, **kwargs).arguments
     except TypeError:  # one is missing or unknown, as the error of the call says
         return ""
     for name, value in given.items():
-        kinds = [kind.strip() for kind in str(signature.parameters[name].annotation).split("|")]
+        parameter = signature.parameters[name]
+        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+            continue
+        kinds = [kind.strip() for kind in str(parameter.annotation).split("|")]
         if set(kinds) <= _WORDS.keys() and not _fits(value, kinds):
             expected = " or ".join(_WORDS[kind] for kind in kinds)
-            return f"{name} must be {expected}, got {repr(value)[:60]}"
+            return f"{name} must be {expected}, got {' '.join(repr(value).split())[:60]}"
     return ""
 
 
@@ -71,8 +84,7 @@ def _fits(value: Any, kinds: list[str]) -> bool:
     """Whether a value may be of one of the kinds."""
     if value is None or isinstance(value, str):
         return ("None" if value is None else "str") in kinds
-    if isinstance(value, numbers.Number):
-        return bool({"int", "float", "bool", "Tensor"} & set(kinds))
-    if isinstance(value, (Tensor, np.ndarray, list, tuple)):
-        return "Tensor" in kinds or (isinstance(value, (Tensor, np.ndarray)) and "float" in kinds)
-    return False
+    if isinstance(value, (list, tuple, complex)):
+        return "Tensor" in kinds
+    number = isinstance(value, (numbers.Number, np.generic, np.ndarray, Tensor))
+    return number and bool({"int", "float", "bool", "Tensor"} & set(kinds))

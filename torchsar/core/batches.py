@@ -49,7 +49,7 @@ def rows_by_trial(run: Callable[[int], int | None], device: torch.device | str, 
     """Return the number of trials in a batch that fits a CUDA device, by trying small batches.
 
     Stages that work in blocks need less memory a trial in large batches than in small ones. Batches
-    of growing size are therefore tried, up to half of what fits, unless all trials fit.
+    of growing size are therefore tried, up to a third or more of what fits, unless all trials fit.
 
     Args:
         run: Function that computes a batch of so many trials. It returns the number of trials that
@@ -76,7 +76,7 @@ def rows_by_trial(run: Callable[[int], int | None], device: torch.device | str, 
             rows = min(_LARGER, share)
             continue
         fitting = rows_by_peak(dict(peaks), _room_bytes(device, workers))
-        if fitting >= share or fitting <= 2 * rows:
+        if fitting >= share or fitting <= 3 * rows:
             return fitting
         rows = min(_LARGER * rows, -(-fitting // 2))
 

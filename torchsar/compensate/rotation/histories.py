@@ -250,5 +250,5 @@ def inverted(normal: Tensor) -> tuple[Tensor, Tensor]:
     poles = [_NO_INFORMATION * cmath.exp(1j * cmath.pi * turn) for turn in (0.25, 0.75)]
     inverse = torch.linalg.inv_ex(torch.stack([unit - pole * one for pole in poles])).inverse.real.mean(0)
     # diagonal of the projection to the directions that are left out
-    lost = 1 - (unit * inverse).sum(-1) > _SHARE_LOST
+    lost = ~(1 - (unit * inverse).sum(-1) <= _SHARE_LOST)  # also where it is no number
     return inverse * root[:, :, None] * root[:, None], lost

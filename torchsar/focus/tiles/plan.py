@@ -200,17 +200,21 @@ class TilePlan:
             places = [place.detach() for place in plan._places]
             plan._tables = _Kept(len(places[0]) * plan._table_count)
             with torch.no_grad():
-                if not self._serves(places):
+                error_db = self._error_db(places)
+                if error_db <= self.error_db + _LEEWAY_DB:
+                    plan.choice = replace(self.choice, error_db=error_db)
+                else:
                     plan._plan(places)
         return plan
 
-    def _serves(self, places: Sequence[Tensor]) -> bool:
-        """Whether other positions, each float64 (path, pulse, 3), may share what is computed."""
-        return (
-            [v.shape[1:] for v in places] == [v.shape[1:] for v in self._places]
-            and all(part.covers(places) for zone in self._zones for part in zone)
-            and self._scene.error_db(self.choice, places) <= self.error_db + _LEEWAY_DB
-        )
+    def _error_db(self, places: Sequence[Tensor]) -> float:
+        """Predicted error for other positions, each float64 (path, pulse, 3), that share what is
+        computed; infinite where they cannot.
+        """
+        if [v.shape[1:] for v in places] != [v.shape[1:] for v in self._places]:
+            return math.inf
+        covered = all(part.covers(places) for zone in self._zones for part in zone)
+        return self._scene.error_db(self.choice, places) if covered else math.inf
 
     def image(self, history: Tensor) -> Tensor:
         """Form the images of phase histories.
