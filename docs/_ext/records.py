@@ -173,14 +173,27 @@ class SweepTable(Sweep):
         ]
 
 
-class BenchmarkTable(SphinxDirective):
-    """Speed, memory and slowest stage of every config of a record of `scripts/benchmark.py`."""
+class RecordTable(SphinxDirective):
+    """A table of a record, and below it what the numbers depend on."""
 
     required_arguments = 1
+    folder = "benchmark"
+
+    def record(self) -> dict[str, Any]:
+        """The record, on which the page depends."""
+        return read(self, self.folder, self.arguments[0])
+
+    def shown(self, lines: list[str], note: str) -> list[nodes.Node]:
+        """The lines of the table, and the note with the file of the record."""
+        note = f"{note}; record: `docs/{self.folder}/{self.arguments[0]}.json`."
+        return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
+
+
+class BenchmarkTable(RecordTable):
+    """Speed, memory and slowest stage of every config of a record of `scripts/benchmark.py`."""
 
     def run(self) -> list[nodes.Node]:
-        name = self.arguments[0]
-        record = read(self, "benchmark", name)
+        record = self.record()
         lines = [
             "| config | batch | trials/s | draws | GB | slowest stage | over floor |",
             "| --- | ---: | ---: | ---: | ---: | --- | ---: |",
@@ -201,18 +214,14 @@ class BenchmarkTable(SphinxDirective):
             lines.append("| " + " | ".join(map(str, cells)) + " |")
         machine = record["machine"]
         where = machine["cuda"] if whole[0]["device"] == "cuda" else f"{machine['processor']}, one thread"
-        note = f"{where}; torch {machine['torch']}; record: `docs/benchmark/{name}.json`."
-        return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
+        return self.shown(lines, f"{where}; torch {machine['torch']}")
 
 
-class BusyTable(SphinxDirective):
+class BusyTable(RecordTable):
     """Speed of every sweep of a record of `scripts/sweep_busy.py`, and how busy the GPU was."""
 
-    required_arguments = 1
-
     def run(self) -> list[nodes.Node]:
-        name = self.arguments[0]
-        record = read(self, "benchmark", name)
+        record = self.record()
         lines = ["| sweep | trials at once | trials/s | busy |", "| --- | ---: | ---: | ---: |"]
         lines += [
             f"| `{row['sweep']}` | {row['trials']} | {cell(row['trials_per_s'])} | "
@@ -220,21 +229,16 @@ class BusyTable(SphinxDirective):
             for row in record["rows"]
         ]
         machine = record["machine"]
-        note = (
-            f"{machine['gpu']}; torch {machine['torch']}; processes: {machine['workers']}; record: "
-            f"`docs/benchmark/{name}.json`."
-        )
-        return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
+        return self.shown(lines, f"{machine['gpu']}; torch {machine['torch']}; processes: {machine['workers']}")
 
 
-class TradeTable(SphinxDirective):
+class TradeTable(RecordTable):
     """Time and loss of every alternative of one system, and of every step that has some."""
 
-    required_arguments = 1
+    folder = "trade"
 
     def run(self) -> list[nodes.Node]:
-        name = self.arguments[0]
-        record = read(self, "trade", name)
+        record = self.record()
         lines = ["| step | alternative | CPU time (ms) | loss | recommended |", "| --- | --- | ---: | --- | --- |"]
         for choice, alternatives in {record["choice"]: record["alternatives"], **record["others"]}.items():
             losses = list(dict.fromkeys(name for row in alternatives for name in row["loss"]))
@@ -248,10 +252,7 @@ class TradeTable(SphinxDirective):
                 lines.append(f"| {first} | {row['name']} | {time} | {loss} | {'yes' if row['recommended'] else ''} |")
         limits = ", ".join(f"`{name}` {value:g}" for name, value in record["tolerance"].items())
         with_ = f"torch {record['machine']['torch']}, threads: {record['machine']['threads']}"
-        note = (
-            f"Config `{record['config']}`; largest loss accepted: {limits}; {with_}; record: `docs/trade/{name}.json`."
-        )
-        return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
+        return self.shown(lines, f"Config `{record['config']}`; largest loss accepted: {limits}; {with_}")
 
 
 class RequiresTable(SphinxDirective):
