@@ -37,6 +37,9 @@ class Stage(nn.Module):
     - `takes_empty`: False if it refuses a batch without trials. Otherwise the result is empty, or a
       function that it calls refuses the batch.
 
+    If a constructor fails because of the type of an argument, the error names it
+    (`core.arguments`).
+
     If a value that the stage provides is also one of the arguments of the call, such as a start or
     a value known a priori, this argument is the neutral value.
 
