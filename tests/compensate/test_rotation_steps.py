@@ -24,12 +24,12 @@ from tests.compensate.turning import (
     target,
 )
 from tests.direct.turntable import Turntable
-from torchsar.compensate.rotation.couplings import Pairs
+from torchsar.compensate.rotation.couplings import Neighbours, inner_products
 from torchsar.compensate.rotation.histories import change_by_histories, inverted, refined_by_histories
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of, without_range_term
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.compensate.rotation.range_response import RangeResponse
-from torchsar.compensate.rotation.scatterers import Fit, Scatterers, _Step, _Unknowns
+from torchsar.compensate.rotation.scatterers import Fit, Scatterers, _Factor, _Step, _Unknowns
 from torchsar.core.warp import warp
 
 SAMPLING = Sampling(WAVELENGTH, PRF, PULSES, len(RANGE_M), float(RANGE_M[0]), CELL)
@@ -234,10 +234,14 @@ def fit_of(motion: Motion, found: Scatterers) -> Fit:
     return Fit(motion, found, response, covariance, zero, zero, zero, one, never.long(), never, zero)
 
 
+def near_of(found: Scatterers) -> Neighbours:
+    return Neighbours.find(found.amplitude, found.cell)
+
+
 def step_of(data: Tensor, present: Tensor) -> tuple[Tensor, _Step]:
     found, motion = few()
     fit = fit_of(motion, found)
-    return _Step.of(data, SMALL, fit, present, _Unknowns(2, True), 8)
+    return _Step.of(data, SMALL, fit, near_of(found), present, _Unknowns(2, True), 8)
 
 
 @pytest.mark.parametrize("gaps", [False, True])
@@ -289,14 +293,42 @@ def test_steps_explain_all_energy_of_noise_free_data() -> None:
     left = []
     for _ in range(5):
         fit = fit_of(motion, found)
-        residual, step = _Step.of(data, SMALL, fit, present, _Unknowns(2, True), 8)
+        residual, step = _Step.of(data, SMALL, fit, near_of(found), present, _Unknowns(2, True), 8)
         left.append(float(residual.abs().square().sum() / data.abs().square().sum()))
         _, found, _, covariance, *_ = step.taken()
         assert (covariance.diagonal(dim1=1, dim2=2) > 0).all()
     assert left[0] > 1e-4 and left[-1] < 1e-3 * left[0]
 
 
-def test_pairs_just_below_the_largest_separation() -> None:
-    cell = torch.tensor([[0.0, math.nextafter(64.0, 0.0)]], dtype=F64)
-    found = Pairs.find(SMALL, K[None], torch.ones_like(cell, dtype=torch.complex128), cell, torch.ones(1, 1, SHORT))
-    assert len(found.first) == 4
+def test_only_scatterers_less_than_64_cells_apart_are_coupled() -> None:
+    """Also just below; those a little farther apart are pairs, because they may come nearer."""
+    cell = torch.tensor([[0.0, math.nextafter(64.0, 0.0), 64.0, 69.0, math.nan]], dtype=F64)
+    one = torch.ones_like(cell, dtype=torch.complex128)
+    near = Neighbours.find(one, cell)
+    value = inner_products(near, SMALL, K[None], one, cell, torch.ones(1, 1, SHORT))[(0, 0)]
+    coupled = {(p, q) for p, q, v in zip(near.first.tolist(), near.second.tolist(), value) if v != 0}
+    assert coupled == {(p, q) for p in range(4) for q in range(4) if abs(cell[0, p] - cell[0, q]) < 64}
+    assert len(near.first) == len(coupled) + 2, "(0, 2) and (2, 0), of 64 cells"
+
+
+def test_neighbours_are_numbered_as_by_nonzero() -> None:
+    source = torch.Generator().manual_seed(5)
+    cell = 400 * torch.rand(3, 30, dtype=F64, generator=source)
+    used = torch.rand(3, 30, generator=source) < 0.7
+    used[:, 27:] = False
+    near = Neighbours.find(used.to(torch.complex128), cell)
+    apart = (cell[:, :, None] - cell[:, None]).abs()
+    wanted = ((apart < 69) & used[:, :, None] & used[:, None]).nonzero(as_tuple=True)
+    assert all(torch.equal(a, b) for a, b in zip((near.trial, near.first, near.second), wanted))
+    assert near.shape == (3, int(used.any(0).nonzero().max()) + 1)
+    assert Neighbours.find(torch.zeros(2, 5), torch.zeros(2, 5)).shape == (2, 1)
+
+
+def test_an_indefinite_curvature_moves_every_scatterer_on_its_own() -> None:
+    """And only in its own trial."""
+    right = torch.randn(2, 8, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
+    matrix = (2.0 * torch.eye(8, dtype=F64)).repeat(2, 1, 1)
+    matrix[1, 0, 1] = matrix[1, 1, 0] = 3.0  # the amplitudes of both scatterers
+    found = _Factor.of(matrix)
+    assert found.failed.tolist() == [False, True]
+    torch.testing.assert_close(found.solve(right), right / 2)

@@ -42,7 +42,7 @@ CHAIN_WAITS = {
     "sal_snr": (5, []),
     "isal_snr": (15, []),
     "geo_velocity_scnr": (26, ["world.pulses=512"]),
-    "isal_rotation_snr": (25, ["world.pulses=1000"]),
+    "isal_rotation_snr": (9, ["world.pulses=1000"]),
 }
 
 SMALL = {

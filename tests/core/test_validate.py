@@ -100,6 +100,14 @@ def test_deferred_checks_of_a_chain_are_made_with_one_reading() -> None:
         assert counts.waits.total() == waits, mode
 
 
+def test_a_number_on_the_host_makes_no_check_wait_for_the_device() -> None:
+    with pretended_device() as counts, pytest.raises(ValueError, match="NaN"), gathered_checks():
+        refuse_non_finite(to_device(torch.tensor([1.0, torch.nan])), "samples")
+        assert host_value(torch.ones(()), 0.0) == 1.0
+        assert not counts.waits.total()
+        host_value(to_device(torch.ones(())), 0.0)
+
+
 def test_checks_of_a_block_are_made_at_its_end() -> None:
     made, _ = chain()
     with (

@@ -117,8 +117,8 @@ def validation() -> Validation:
 def host_value(x: Tensor, otherwise: Number) -> Number:
     """Read a number from a tensor, which waits for its device.
 
-    Checks that wait for values (see `gathered_checks`) are made in the same wait. Inside
-    `torch.func.vmap` a tensor stands for many trials, and while a program is traced, as by
+    Checks that wait for values of this device (see `gathered_checks`) are made in the same wait.
+    Inside `torch.func.vmap` a tensor stands for many trials, and while a program is traced, as by
     `torch.export`, for any data: its value cannot be read.
 
     Args:
@@ -148,7 +148,8 @@ def host_values(x: Tensor, otherwise: Number) -> list[Number]:
         The numbers in the order of the elements.
     """
     read: list[float] | None = []
-    if _gathered.waiting and not _is_mapped(x) and not is_traced(x):
+    beside = any(each.x.device == x.device for each in _gathered.waiting)
+    if beside and not _is_mapped(x) and not is_traced(x):
         _make([*_taken(), _Waiting(x.detach(), lambda *numbers: read.extend(numbers))])
     else:
         read = _read(x)

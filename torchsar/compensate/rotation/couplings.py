@@ -17,6 +17,8 @@ from torchsar.focus.transforms import Gridding
 # Doppler cells beyond which the coupling of scatterers is neglected, found by trial: accuracy of a
 # step against time
 _NEAR_CELLS = 64
+# more Doppler cells from which two scatterers may come that near in the steps after they were found
+_MARGIN_CELLS = 5
 # added, relative, to what a scatterer tells about itself and the rotation: the curvature stays
 # positive definite where scatterers nearly cancel each other, and one alone is damped by no more
 _RIDGE = 1e-3
@@ -24,71 +26,47 @@ _TABLE = 16  # steps of the table per Doppler cell, enough for linear interpolat
 
 
 @dataclass(frozen=True)
-class Pairs:
-    """Pairs of neighbouring scatterers, with the inner products of their echoes.
+class Neighbours:
+    """Pairs of scatterers of one trial that are neighbours in Doppler, or may become so.
 
-    A pair consists of two scatterers of one trial that lie less than 64 Doppler cells apart. Each
-    scatterer also forms a pair with itself.
+    They lie less than 69 Doppler cells apart. Each scatterer also forms a pair with itself.
 
     Args:
         trial: Trial of each pair, shape (pair,).
         first: Index p of the first scatterer of each pair, shape (pair,).
         second: Index q of the second scatterer of each pair, shape (pair,).
         shape: Shape (trial, scatterer) of tensors with one value per scatterer.
-        products: Inner products of the echoes over slow time, weighted with basis functions b_0,
-            b_1, ... of slow time. The entry (n, m), shape (pair,), is the sum over pulses of b_n
-            b_m conj(s_p e_p) s_q e_q, where s is the amplitude of a scatterer and e its echo of
-            unit amplitude, and is 0.1 % larger for a scatterer with itself.
     """
 
     trial: Tensor
     first: Tensor
     second: Tensor
     shape: torch.Size
-    products: Mapping[tuple[int, int], Tensor]
 
     @staticmethod
-    def find(sampling: Sampling, k: Tensor, amplitude: Tensor, cell: Tensor, bases: Tensor) -> Pairs:
-        """Find the pairs of scatterers less than 64 Doppler cells apart, and their inner products.
+    def find(amplitude: Tensor, cell: Tensor) -> Neighbours:
+        """Find the pairs, which waits for the device once.
 
         Args:
-            sampling: Sampling of the data.
-            k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
-                1/s^2, ..., shape (trial, order - 1).
             amplitude: Amplitudes, shape (trial, scatterer), complex; 0 where there is no scatterer.
             cell: Doppler of the scatterers in Doppler cells, shape (trial, scatterer).
-            bases: Basis functions of slow time, shape (trial, base, pulse); zero in missing pulses.
 
         Returns:
-            The pairs with their inner products.
+            The pairs. The last columns without a scatterer in any trial, but not the first column,
+            are left out of `shape`.
         """
-        separation = cell[:, :, None] - cell[:, None]
-        used = amplitude != 0
-        trial, first, second = ((separation.abs() < _NEAR_CELLS) & used[:, :, None] & used[:, None]).nonzero(
-            as_tuple=True
+        used, n = amplitude != 0, cell.shape[1]
+        near = (cell[:, :, None] - cell[:, None]).abs() < _NEAR_CELLS + _MARGIN_CELLS
+        near = (near & used[:, :, None] & used[:, None]).flatten()
+        number = torch.arange(1, n + 1, device=cell.device)
+        pairs, width = torch.stack([near.sum(), (used * number).amax()]).tolist() if n else (0, 0)
+        # the indices where `near` is true; all others are written to one entry more
+        place = torch.where(near, near.cumsum(0) - 1, pairs)
+        every = torch.arange(len(near), device=cell.device)
+        index = every.new_empty(pairs + 1).scatter_(0, place, every)[:pairs]
+        return Neighbours(
+            index // (n * n), index // n % n, index % n, torch.Size([cell.shape[0], min(n, max(1, width))])
         )
-        position = separation[trial, first, second] * _TABLE + _NEAR_CELLS * _TABLE
-        # a separation just below the limit rounds to the last entry
-        whole = position.floor().long().clamp_max(2 * _NEAR_CELLS * _TABLE - 1)
-        weight = amplitude[trial, first].conj() * amplitude[trial, second] * (1 + _RIDGE * (first == second))
-        index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
-        table = _product_tables(sampling, k, bases)
-        low, high = table[trial, whole], table[trial, whole + 1]
-        values = ((low + (position - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
-        products = {pair: value for (n, m), value in zip(index, values) for pair in {(n, m), (m, n)}}
-        return Pairs(trial, first, second, cell.shape, products)
-
-    def of(self, values: Tensor, side: int) -> Tensor:
-        """Select the value of the first or of the second scatterer of each pair.
-
-        Args:
-            values: One value per scatterer, shape (trial, scatterer).
-            side: 0 for the first scatterer, 1 for the second.
-
-        Returns:
-            The values, shape (pair,).
-        """
-        return values[self.trial, self.second if side else self.first]
 
     def matrix(self, blocks: list[list[Tensor]]) -> Tensor:
         """Assemble a matrix of blocks, each of which has one entry for each pair of scatterers.
@@ -131,6 +109,42 @@ class Pairs:
             The sums, shape (trial, n, m).
         """
         return values.new_zeros(self.shape[0], *values.shape[1:]).index_add(0, self.trial, values)
+
+
+def inner_products(
+    near: Neighbours, sampling: Sampling, k: Tensor, amplitude: Tensor, cell: Tensor, bases: Tensor
+) -> Mapping[tuple[int, int], Tensor]:
+    """Compute the inner products of the echoes of neighbouring scatterers over slow time.
+
+    They are weighted with basis functions b_0, b_1, ... of slow time.
+
+    Args:
+        near: The pairs of scatterers.
+        sampling: Sampling of the data.
+        k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s, 1/s^2,
+            ..., shape (trial, order - 1).
+        amplitude: Amplitudes, shape (trial, scatterer), complex; 0 where there is no scatterer.
+        cell: Doppler of the scatterers in Doppler cells, shape (trial, scatterer).
+        bases: Basis functions of slow time, shape (trial, base, pulse); zero in missing pulses.
+
+    Returns:
+        Under (n, m) the sum over pulses of b_n b_m conj(s_p e_p) s_q e_q for each pair (p, q),
+        where s is the amplitude of a scatterer and e its echo of unit amplitude, shape (pair,). It
+        is 0.1 % larger for a scatterer with itself, and 0 where two scatterers lie 64 Doppler cells
+        or more apart.
+    """
+    separation = cell[near.trial, near.first] - cell[near.trial, near.second]
+    coupled = separation.abs() < _NEAR_CELLS
+    position = torch.where(coupled, separation, 0) * _TABLE + _NEAR_CELLS * _TABLE
+    # a separation just below the limit rounds to the last entry
+    whole = position.floor().long().clamp_max(2 * _NEAR_CELLS * _TABLE - 1)
+    weight = amplitude[near.trial, near.first].conj() * amplitude[near.trial, near.second]
+    weight = torch.where(coupled, weight * (1 + _RIDGE * (near.first == near.second)), 0)
+    index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
+    table = _product_tables(sampling, k, bases)
+    low, high = table[near.trial, whole], table[near.trial, whole + 1]
+    values = ((low + (position - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
+    return {pair: value for (n, m), value in zip(index, values) for pair in {(n, m), (m, n)}}
 
 
 def _product_tables(sampling: Sampling, k: Tensor, bases: Tensor) -> Tensor:

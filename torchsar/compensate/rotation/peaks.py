@@ -38,11 +38,10 @@ class Peaks:
             count: Number of peaks to keep, shape (trial,).
 
         Returns:
-            The kept peaks, brightest first; power 0 where a trial has fewer.
+            The peaks, brightest first; power 0 of those that are not kept.
         """
-        power = torch.where(torch.arange(self.power.shape[-1], device=count.device) < count[:, None], self.power, 0)
-        width = max(1, int((power > 0).sum(-1).max()))
-        return Peaks(power[:, :width], self.line[:, :width], self.cell[:, :width])
+        kept = torch.arange(self.power.shape[-1], device=count.device) < count[:, None]
+        return Peaks(torch.where(kept, self.power, 0), self.line, self.cell)
 
 
 def noise_power(power: Tensor) -> Tensor:

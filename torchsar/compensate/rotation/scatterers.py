@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
@@ -25,12 +25,12 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
-from torchsar.compensate.rotation.couplings import Pairs
+from torchsar.compensate.rotation.couplings import Neighbours, inner_products
 from torchsar.compensate.rotation.histories import inverted
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.compensate.rotation.range_response import Envelopes, RangeResponse
-from torchsar.core import host_value, real_dtype, reduced_turns
+from torchsar.core import real_dtype, reduced_turns
 from torchsar.core.warp import least_rate
 
 _OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
@@ -62,6 +62,7 @@ _AGREES = 5.0
 _MODEL = 1e-4
 # power over the detection threshold beyond which a scatterer cannot be a peak of the noise
 _CERTAIN = 2.0
+_LOOK = 2  # rounds after which an accelerator is asked whether all trials have ended
 _SETTLED = 0.2  # steps of the motion below this share of its standard deviation end a trial
 
 
@@ -111,6 +112,17 @@ class Scatterers:
             torch.cat([self.cell, new.cell], -1),
             torch.cat([self.row, new.row], -1),
         )
+
+    def first(self, count: int) -> Scatterers:
+        """Keep the first scatterers of every trial.
+
+        Args:
+            count: Number of scatterers to keep.
+
+        Returns:
+            The scatterers, shape (trial, count).
+        """
+        return Scatterers(self.amplitude[:, :count], self.cell[:, :count], self.row[:, :count])
 
     def apart(self) -> Scatterers:
         """Remove scatterers that lie within the resolution of a brighter one.
@@ -247,7 +259,7 @@ def fit_scatterers(
     zero = covariance.new_zeros(trials, unknowns.size)
     none = Scatterers.none(data)
     fit = Fit(start, none, response, covariance, zero, zero, zero, noise, never.long(), never, zero)
-    residual, step = data, None
+    residual, step, near = data, None, Neighbours.find(none.amplitude, none.cell)
     for iteration in range(rounds + 1):
         new, noise = None, fit.noise
         if iteration in _SEARCHES:
@@ -266,11 +278,14 @@ def fit_scatterers(
                 search_over=iteration > max(_SEARCHES),
             )
         if new is not None:
-            fit = replace(fit, scatterers=fit.scatterers.joined(new, fit.settled).apart(), noise=noise)
-        # no trial settles before the search is over
-        if iteration == rounds or (iteration > max(_SEARCHES) and bool(fit.settled.all())):
+            found = fit.scatterers.joined(new, fit.settled).apart()
+            near = Neighbours.find(found.amplitude, found.cell)
+            fit = replace(fit, scatterers=found.first(near.shape[1]), noise=noise)
+        # no trial settles before the search is over; an accelerator should not wait in every round
+        looks = iteration > max(_SEARCHES) and (device.type == "cpu" or iteration % _LOOK == 0)
+        if iteration == rounds or (looks and bool(fit.settled.all())):
             break
-        residual, step = _Step.of(data, sampling, fit, present, unknowns, count)
+        residual, step = _Step.of(data, sampling, fit, near, present, unknowns, count)
     return fit
 
 
@@ -370,7 +385,8 @@ class _Step:
     unknowns: _Unknowns
     moments: Tensor
     shift: Tensor
-    pairs: Pairs
+    near: Neighbours
+    products: Mapping[tuple[int, int], Tensor]
     gram: Tensor
     response: RangeResponse
     envelopes: Envelopes
@@ -379,7 +395,13 @@ class _Step:
 
     @staticmethod
     def of(
-        data: Tensor, sampling: Sampling, fit: Fit, present: Tensor, unknowns: _Unknowns, count: int
+        data: Tensor,
+        sampling: Sampling,
+        fit: Fit,
+        near: Neighbours,
+        present: Tensor,
+        unknowns: _Unknowns,
+        count: int,
     ) -> tuple[Tensor, _Step]:
         """Subtract the model of all scatterers from the data and prepare the Gauss-Newton step.
 
@@ -390,6 +412,7 @@ class _Step:
             data: Range-compressed pulses, shape (trial, pulse, range), complex.
             sampling: Sampling of the data.
             fit: Current rotation and scatterers.
+            near: Pairs of neighbouring scatterers.
             present: False for pulses without samples, shape (trial, pulse), bool.
             unknowns: Parameters of the rotation that are estimated.
             count: Largest number of scatterers.
@@ -436,7 +459,8 @@ class _Step:
             unknowns,
             moments.mT,
             shifts,
-            Pairs.find(sampling, motion.k, found.amplitude, found.cell, bases),
+            near,
+            inner_products(near, sampling, motion.k, found.amplitude, found.cell, bases),
             bases @ bases.mT,
             fit.response,
             envelopes,
@@ -554,12 +578,8 @@ class _Step:
         The unknowns are relative amplitude, phase, Doppler cell and range cell.
         """
         overlap, slope, back, bend = self._overlaps
-        pairs = self.pairs
-        flat, line, bent = (
-            pairs.products[(0, 0)],
-            2 * math.pi * pairs.products[(0, 1)],
-            4 * math.pi**2 * pairs.products[(1, 1)],
-        )
+        products = self.products
+        flat, line, bent = products[(0, 0)], 2 * math.pi * products[(0, 1)], 4 * math.pi**2 * products[(1, 1)]
         a, u, s, us, b, ub = (x * y for x, y in itertools.product((overlap, slope, back), (flat, line)))
         rows = [
             [a.real, -a.imag, u.imag, s.real],
@@ -567,7 +587,7 @@ class _Step:
             [-u.imag, -u.real, (bent * overlap).real, -us.imag],
             [b.real, -b.imag, ub.imag, (flat * bend).real],
         ]
-        local = pairs.matrix(rows)
+        local = self.near.matrix(rows)
         diagonal = local.diagonal(dim1=-2, dim2=-1)
         # zero without a scatterer, or with one range cell, which does not determine range
         diagonal += torch.where(diagonal > 0, _RIDGE * diagonal, 1.0)
@@ -586,13 +606,13 @@ class _Step:
 
     def _over_range(self, first: Tensor, second: Tensor) -> Tensor:
         """Inner product of functions (trial, scatterer, range) of the scatterers of each pair."""
-        return (first.conj() @ second.mT)[self.pairs.trial, self.pairs.first, self.pairs.second]
+        return (first.conj() @ second.mT)[self.near.trial, self.near.first, self.near.second]
 
     def changed_response(self) -> RangeResponse:
         """Fit the share of the periodic range response to the residual by least squares."""
         apart = self.envelopes.difference
-        energy = (self.pairs.products[(0, 0)] * self._over_range(apart, apart)).real[:, None, None]
-        total = self.pairs.per_trial(energy)[:, 0, 0]
+        energy = (self.products[(0, 0)] * self._over_range(apart, apart)).real[:, None, None]
+        total = self.near.per_trial(energy)[:, 0, 0]
         return self.response.moved(self.share / total)
 
     def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
@@ -601,13 +621,13 @@ class _Step:
         (trial, 4 scatterer, unknown) and, as sums over the pairs of each scatterer, (trial,
         scatterer, unknown, unknown).
         """
-        pairs, bases = self.pairs, range(2, slopes.shape[-1])
+        near, bases = self.near, range(2, slopes.shape[-1])
         overlap, _, back, _ = self._overlaps
-        columns = slopes[pairs.trial, pairs.second].unbind(-1)[2:]
+        columns = slopes[near.trial, near.second].unbind(-1)[2:]
 
         def summed(base: int, part: Callable[[Tensor], Tensor], envelopes: Tensor = overlap) -> Tensor:
-            weighted = (part(pairs.products[(base, n)] * envelopes)[:, None] * columns[n - 2] for n in bases)
-            return pairs.per_scatterer(sum(weighted, torch.zeros_like(columns[0])))
+            weighted = (part(self.products[(base, n)] * envelopes)[:, None] * columns[n - 2] for n in bases)
+            return near.per_scatterer(sum(weighted, torch.zeros_like(columns[0])))
 
         parts = [
             -summed(0, torch.imag),
@@ -641,29 +661,30 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Factor:
-    """Symmetric matrices (trial, n, n), factorised.
+    """Curvature of the scatterers' unknowns (trial, 4 scatterer, 4 scatterer), factorised.
 
-    factor: their Cholesky factors. failed: True for matrices that rounding has made indefinite;
-    None if there are none.
+    factor: Cholesky factors. own: inverse curvature of each scatterer alone, (trial, scatterer, 4,
+    4). failed: True for trials whose matrix rounding has made indefinite.
     """
 
-    matrix: Tensor
     factor: Tensor
-    failed: Tensor | None
+    own: Tensor
+    failed: Tensor
 
     @staticmethod
     def of(matrix: Tensor) -> _Factor:
         """Factorise matrices."""
         factor, info = torch.linalg.cholesky_ex(matrix)
-        failed = info != 0
-        return _Factor(matrix, factor, failed if host_value(failed.any(), True) else None)
+        own = matrix.unflatten(2, (4, -1)).unflatten(1, (4, -1)).diagonal(dim1=2, dim2=4).movedim(-1, 1)
+        return _Factor(factor, torch.linalg.inv_ex(own).inverse, info != 0)
 
     def solve(self, right: Tensor) -> Tensor:
-        """Solutions for right-hand sides; how one is found does not depend on the other trials."""
-        solution = torch.cholesky_solve(right, self.factor)
-        if self.failed is not None:
-            solution[self.failed] = torch.linalg.solve(self.matrix[self.failed], right[self.failed])
-        return solution
+        """Solutions for right-hand sides (trial, 4 scatterer, n).
+
+        In trials that failed those of each scatterer on its own.
+        """
+        alone = torch.einsum("bpij,bjpn->bipn", self.own, right.unflatten(1, (4, -1))).flatten(1, 2)
+        return torch.where(self.failed[:, None, None], alone, torch.cholesky_solve(right, self.factor))
 
 
 def _after_step(

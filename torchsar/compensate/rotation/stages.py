@@ -53,7 +53,7 @@ class _Rotation(Stage):
         Returns:
             The arguments by name.
         """
-        range_m = signal.axis("range").values(signal.data.device)
+        range_m = signal.axis("range").values(torch.device("cpu"))  # only their spacing is read, by the host
         centre = self.yc_m if yc_m is None else yc_m
         return {
             "wavelength_m": self.radar.wavelength_m,
