@@ -135,6 +135,27 @@ def test_devices_that_cannot_compute_are_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
+@pytest.mark.parametrize(
+    "words, said",
+    [([], "random=philox"), (["random=philox"], "with --workers 6\n"), (["--workers", "2"], ""), (["cpu"], "")],
+)
+def test_a_sweep_of_one_process_on_a_gpu_tells_of_workers(
+    words: list[str],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from torchsar.study.commands import sweep
+
+    monkeypatch.setattr("torchsar.core.device_fault", lambda device: "")
+    monkeypatch.setattr(sweep, "sweep", lambda *_: "no sweep")
+    device, words = ("cpu", []) if words == ["cpu"] else ("cuda", words)
+    assert main(["sweep", "isal_snr", "--device", device, "--out", str(tmp_path / "out"), *words]) == 0
+    found = capsys.readouterr()
+    assert said in found.err and ("busy only in part" in found.err) == bool(said)
+
+
 def test_a_warning_is_shown_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -239,6 +239,11 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
     elif options.command == "sweep":
         from torchsar.study.commands.sweep import sweep
 
+        if torch.device(options.device).type != "cpu" and not options.workers and not options.cluster:
+            drawn = "" if loaded.config.random == "philox" else ", and draw the random numbers there with random=philox"
+            logging.getLogger("torchsar").info(
+                "one process keeps %s busy only in part; let several share it with --workers 6%s", options.device, drawn
+            )
         engine = (options.resume, options.workers, options.cluster, options.threads or 1, options.device)
         print(sweep(loaded, out, *engine, command))
     else:
