@@ -7,13 +7,17 @@ import.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from operator import index
 from typing import Any
 
 import torch
 import torch._dynamo
 from torch import Tensor
+from torch._guards import active_fake_mode
+from torch._subclasses.fake_tensor import is_fake
 from torch.utils import _pytree as pytree
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchsar.core.host import untraced
 
@@ -50,17 +54,35 @@ def call_as_one(stage: Any, args: Sequence[Any], values: Mapping[str, Any]) -> A
 @torch.compiler.disable
 def _call(stage: Any, args: Sequence[Any], values: Mapping[str, Any], fixed: Sequence[str]) -> Any:
     """Call a stage with the constants that `fixed` holds in place of the values given."""
-    known = {}
-    for name, digits in map(str.split, fixed):
-        x = values[name]
-        with untraced():
-            known[name] = torch.frombuffer(bytearray.fromhex(digits), dtype=x.dtype).reshape(x.shape).to(x.device)
-        torch.ops.aten._assert_async.msg(
-            (x == known[name]).all(),
-            f"{type(stage).__name__}: {name} is not that of the first call, which the compiled program holds as a "
-            "constant; compile a new one",
-        )
-    return stage(*args, **{**values, **known})
+    with nullcontext() if active_fake_mode() is None else _Constants():
+        known = {}
+        for name, digits in map(str.split, fixed):
+            x = values[name]
+            with untraced():
+                known[name] = torch.frombuffer(bytearray.fromhex(digits), dtype=x.dtype).reshape(x.shape).to(x.device)
+            torch.ops.aten._assert_async.msg(
+                (x == known[name]).all(),
+                f"{type(stage).__name__}: {name} is not that of the first call, which the compiled program holds as a "
+                "constant; compile a new one",
+            )
+        return stage(*args, **{**values, **known})
+
+
+class _Constants(TorchDispatchMode):
+    """Makes tensors of the host, such as tables that a stage keeps, values of a traced program.
+
+    "inductor" takes them in no other form.
+    """
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        def lifted(x: Any) -> Any:
+            return torch.ops.aten.lift_fresh_copy(x) if type(x) is Tensor and not is_fake(x) else x
+
+        if func is not torch.ops.aten.lift_fresh_copy.default:
+            args, kwargs = pytree.tree_map(lifted, (args, kwargs or {}))
+        return func(*args, **(kwargs or {}))
 
 
 @torch.compiler.disable(reason="with constants of a program in its plan, a stage has no derivatives in one graph")

@@ -244,8 +244,8 @@ def with_wavelength(radar: type) -> Callable[..., Any]:
     first = [inspect.Parameter(name, optional, default=None) for name in ("carrier_hz", "wavelength_m")]
     made.__signature__, made.__doc__ = (  # pyright: ignore[reportAttributeAccessIssue]
         signature.replace(parameters=[*first, *rest]),
-        (radar.__doc__ or "").replace(
-            "carrier_hz:", "wavelength_m: Wavelength in metres, in place of `carrier_hz`.\n        carrier_hz:", 1
+        inspect.cleandoc(radar.__doc__ or "").replace(
+            "carrier_hz:", "wavelength_m: Wavelength in metres, in place of `carrier_hz`.\n    carrier_hz:", 1
         ),
     )
     hints = typing.get_type_hints(radar.__init__)
