@@ -119,7 +119,7 @@ def scene_of(rows: Tensor, imaging: TileOperator, noise: Tensor | None = None, e
     """
     image = imaging.image(rows[None])[0]
     power = image.abs().square()
-    weight = Wiener().filter(power, or_one(power.mean()), -1)
+    weight = Wiener.filter(power, Wiener.level * or_one(power.mean()), -1)
     if noise is None:
         # without its mean the weight leaves out what each pulse adds to its own model
         echo = imaging.adjoint((image * (weight - weight.mean(-2, keepdim=True)))[None])[0]

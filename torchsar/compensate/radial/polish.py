@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
-from torchsar.compensate.pulse_phase.sharpen import Run, in_turn
+from torchsar.compensate.pulse_phase.sharpen import Run, Wiener, bright, in_turn
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate
 
@@ -22,10 +22,8 @@ from torchsar.core import Estimate
 ENOUGH_STD_RAD = 0.5
 # over-relaxation, found by trial: larger values converge faster, at 2 or more need not converge
 _RELAXATION = 1.7
-# level of the Wiener weights, found by trial: this share of the power of a typical bright cell, and
-# at least so many times the mean power; higher levels exclude weak scatterers, lower ones include
-# noise
-_SHARE, _LEVEL = 0.02, 4.0
+# found by trial: higher levels exclude weak scatterers, lower ones include noise
+_SCENE = Wiener(level=4.0, share=0.02)
 
 
 def phase_polish(
@@ -82,7 +80,7 @@ def phase_polish(
 
     def find(rows: Tensor, present: Tensor, at: Tensor | None) -> Found:
         phase, taken = sharpened(rows, at, iterations, tolerance_rad)
-        again = [Run(_scene, AlongPulses(), 4, _RELAXATION, 0.0), Run(_near_peak, AlongPulses(2), 5, 1.0, 0.0)]
+        again = [Run(_SCENE, AlongPulses(), 4, _RELAXATION, 0.0), Run(_near_peak, AlongPulses(2), 5, 1.0, 0.0)]
         return phase, taken, lambda some, _, here: in_turn(some, here, again)[0]
 
     found = estimated(pulses, begin, find, at_rest=True)
@@ -105,7 +103,7 @@ def sharpened(rows: Tensor, start: Tensor | None, iterations: int, tolerance_rad
     along = AlongPulses()
     runs = [
         Run(_single_points, along, 1, 1.0, 0.0),
-        Run(_scene, along, iterations, _RELAXATION, tolerance_rad),
+        Run(_SCENE, along, iterations, _RELAXATION, tolerance_rad),
         Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 2),
     ]
     return in_turn(rows, start, runs)
@@ -136,35 +134,14 @@ def scene_cells(rows: Tensor) -> tuple[Tensor, Tensor]:
     )
 
 
-def _bright(power: Tensor) -> Tensor:
-    """Power of a typical bright cell, (trial, 1, 1): the mean power weighted with the power."""
-    return power.square().sum((-2, -1), keepdim=True) / power.sum((-2, -1), keepdim=True).clamp_min(
-        torch.finfo(power.dtype).tiny
-    )
-
-
 def _single_points(power: Tensor, mean: Tensor) -> Tensor:
-    """Power over the maximum of the range cell, for trials of few scatterers; else as `_scene`.
+    """Power over the maximum of the range cell, for trials of few scatterers; else as `_SCENE`.
 
     Trials of few scatterers are those whose typical bright cell is within 3 dB of the brightest.
     """
     peak = power.amax(-1, keepdim=True)
-    few = _bright(power) > 0.5 * peak.amax(-2, keepdim=True)
-    return torch.where(few, power / torch.where(peak > 0, peak, 1), _scene(power, mean))
-
-
-def _scene(power: Tensor, mean: Tensor) -> Tensor:
-    """(p / (p + level))^2 of powers averaged over three range cells, minus the mean of its row.
-
-    Without the mean, a pulse does not contribute to the scene with which it is compared.
-    """
-    pairs = power + power.roll(1, -2)
-    local = (pairs + pairs.roll(-1, -2)) / 4
-    share = local / (local + torch.maximum(_LEVEL * mean, _SHARE * _bright(power))).clamp_min(
-        torch.finfo(power.dtype).tiny
-    )
-    weight = share.square()
-    return weight - weight.mean(-1, keepdim=True)
+    few = bright(power) > 0.5 * peak.amax(-2, keepdim=True)
+    return torch.where(few, power / torch.where(peak > 0, peak, 1), _SCENE(power, mean))
 
 
 def _near_peak(power: Tensor, mean: Tensor) -> Tensor:
