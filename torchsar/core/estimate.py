@@ -33,7 +33,9 @@ class Estimate(Shown):
             it in, see `Stage`.
 
     Raises:
-        ValueError: If `ok` is not a bool tensor with the shape of `quality`.
+        TypeError: If `value` or `std` is not a mapping of tensors.
+        ValueError: If `ok` is not a bool tensor with the shape of `quality`, or a standard
+            deviation does not have the name and the shape of a value.
     """
 
     value: Mapping[str, Tensor]
@@ -49,6 +51,20 @@ class Estimate(Shown):
                 f"an Estimate needs a bool tensor `ok` of the shape of `quality`, got `ok` of {self.ok.dtype} with "
                 f"shape {tuple(self.ok.shape)} and `quality` with shape {tuple(self.quality.shape)}"
             )
+        for field_name, table in (("value", self.value), ("std", self.std)):
+            if not isinstance(table, Mapping) or not all(isinstance(x, Tensor) for x in table.values()):
+                got = (
+                    {k: type(x).__name__ for k, x in table.items()}
+                    if isinstance(table, Mapping)
+                    else type(table).__name__
+                )
+                raise TypeError(f"an Estimate needs tensors by name in `{field_name}`, got {got}")
+        for name, x in self.std.items():
+            if name not in self.value or x.shape != self.value[name].shape:
+                raise ValueError(
+                    f"the standard deviation {name!r} of an Estimate has the shape {tuple(x.shape)}; give one with the "
+                    f"name and the shape of a value: { {k: tuple(v.shape) for k, v in self.value.items()} }"
+                )
 
     def __getitem__(self, name: str) -> Tensor:
         """Return the value of a name; raise KeyError with the names that exist if there is none."""
