@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import json
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -15,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchsar.core import fingerprint
+from torchsar.core import Chain, Stage, fingerprint, own_code
 
 PROGRAM = """
 import argparse, math, torch
@@ -147,3 +150,30 @@ def test_wrapped_functions_are_seen() -> None:
 
     assert fingerprint(wrapped(1)) != fingerprint(wrapped(2))
     assert fingerprint(Setting(3).__eq__) != fingerprint(Setting(4).__eq__)
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A package of the user with a stage, which uses a number of another module."""
+    folder = tmp_path / "louder_package"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("from louder_package.stage import Louder\n")
+    (folder / "gain.py").write_text("GAIN = 2.0\n")
+    (folder / "stage.py").write_text(
+        "from torchsar.core import Stage\nfrom louder_package.gain import GAIN\nclass Louder(Stage):\n"
+        "    def forward(self, signal): return signal.with_data(GAIN * signal.data)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield folder
+    for name in [name for name in sys.modules if name.partition(".")[0] == "louder_package"]:
+        del sys.modules[name]
+
+
+def test_the_code_of_own_stages_counts_with_all_of_their_package(package: Path) -> None:
+    Louder = importlib.import_module("louder_package").Louder
+    chain = Chain(first=Louder(), second=Stage())
+    was = own_code([chain])
+    assert list(was) == ["louder_package"] and own_code([chain]) == was
+    assert own_code([Chain(second=Stage())]) == {}
+    (package / "gain.py").write_text("GAIN = 3.0\n")
+    assert own_code([chain]) != was

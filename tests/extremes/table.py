@@ -717,6 +717,7 @@ REASONS = {
     "core.library": "imports a package by its name",
     "core.canonical": "writes parameters as text; tests/core/test_fingerprint.py",
     "core.fingerprint": "describes code; tests/core/test_fingerprint.py",
+    "core.own_code": "describes code; tests/core/test_fingerprint.py",
     "core.checksum": "works on the bytes of a store; tests/study/test_store_faults.py",
     "core.sealed": "works on documents of a store; tests/study/test_store_faults.py",
     "core.is_sealed": "works on documents of a store; tests/study/test_store_faults.py",

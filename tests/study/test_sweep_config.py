@@ -15,6 +15,7 @@ import yaml
 
 from tests.study.tiny import TINY, write_tiny
 from torchsar.cli import main
+from torchsar.study.commands import sweep as sweep_module
 from torchsar.study.commands.sweep import SweepTrial, identity, sweep_grid
 from torchsar.study.montecarlo import Record, differences, read_sweep
 from torchsar.study.montecarlo.engines import InProcess
@@ -184,6 +185,16 @@ def test_titles_and_trials_do_not_stop_a_resume() -> None:
     same = config.changed({"title": "another", "processor.sca.title": "another", "sweep.trials": 3})
     assert identity(config) == identity(same)
     assert identity(config) != identity(config.changed({"world.pulses": 77}))
+
+
+def test_the_code_of_own_stages_is_part_of_the_identity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sweep whose own stage has changed since would mix the results of two stages."""
+    config = load("isal_snr")
+    bench = SweepTrial(config).bench({})
+    assert identity(config, bench) == identity(config)
+    for stage in ("one", "another"):
+        monkeypatch.setattr(sweep_module, "own_code", lambda chains, code=stage: {"mine": code} if chains else {})
+        assert identity(config, bench) == {**identity(config), "code of mine": stage}
 
 
 def test_the_source_of_random_numbers_is_part_of_the_identity() -> None:

@@ -19,7 +19,7 @@ from torchsar.core.fft import (
     to_frequency,
     transform_in_blocks,
 )
-from torchsar.core.fingerprint import fingerprint
+from torchsar.core.fingerprint import fingerprint, own_code
 from torchsar.core.host import (
     Validation,
     check_value,
@@ -116,6 +116,7 @@ __all__ = [
     "numbers_on",
     "outer_phasor",
     "over_blocks",
+    "own_code",
     "per_trial",
     "phasor_tables",
     "real_dtype",

@@ -1,4 +1,4 @@
-"""Fingerprints of functions: digests of their code and of all values that the code uses."""
+"""Fingerprints of functions and modules: digests of their code and of all values that it uses."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import dis
 import functools
 import hashlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from operator import itemgetter
+from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 # packages whose functions are known by name, beside the standard library and installed packages
 _LIBRARIES = ("torchsar", "torch", "numpy")
@@ -58,6 +59,26 @@ def fingerprint(function: Callable[..., Any]) -> dict[str, Any]:
     kind = reader.text(function if isinstance(function, (FunctionType, type)) else type(function))
     uses = {name: _short(reader.text(value)) for name, value in sorted(used.items())}
     return {"name": name, "code": _digest(code or kind), "uses": uses}
+
+
+def own_code(modules: Iterable[nn.Module]) -> dict[str, str]:
+    """Describe the code of modules that do not belong to this library, such as stages of the user.
+
+    Args:
+        modules: Modules. Those inside them count as well.
+
+    Returns:
+        A digest of the source files by the name of the package: those of the package that this
+        process has imported. Empty if all modules belong to torchsar or torch.
+    """
+    tops = {type(part).__module__.partition(".")[0] for module in modules for part in module.modules()}
+    found = {}
+    for top in sorted(tops - {"torchsar", "torch"}):
+        names = sorted(name for name in sys.modules if name == top or name.startswith(f"{top}."))
+        files = [getattr(sys.modules[name], "__file__", None) or "" for name in names]
+        texts = [Path(file).read_bytes() for file in files if file.endswith(".py") and Path(file).is_file()]
+        found[top] = _digest(b"\0".join(texts))
+    return found
 
 
 class _Reader:

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torchsar.core import Draws
+from torchsar.core import Draws, own_code
 from torchsar.study.montecarlo.engines import engine
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.loop import (
@@ -146,7 +146,7 @@ def sweep(
     _announce(grid, settings.trials)
     try:
         with opened(out, "sweep", SWEEP_FILES) as folder, _terminated_like_interrupted():
-            store = open_store(folder, plan, identity(loaded), resume)
+            store = open_store(folder, plan, identity(loaded, trial.bench(grid.cases()[0].fixed)), resume)
             store.note(**about)
             record = run_plan(plan, trial, store, engine(workers, cluster, threads))
             record.about = {**record.about, **about}
@@ -210,13 +210,15 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     return grid
 
 
-def identity(loaded: Loaded) -> dict[str, Any]:
+def identity(loaded: Loaded, bench: Bench | None = None) -> dict[str, Any]:
     """Return what the results depend on besides the grid: the seed and the source of the random
-    numbers, and all other keys of the config that change results.
+    numbers, all other keys of the config that change results, and the code of the user's own stages
+    in a bench of the config.
     """
     return {
         **identity_of_draws(loaded.config.seed, loaded.config.random),
         "config": loaded.config.model_dump(exclude=_NOT_IDENTITY),
+        **{f"code of {name}": code for name, code in own_code(bench.chains.values() if bench else ()).items()},
     }
 
 
