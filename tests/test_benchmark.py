@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers import compiles_stages
 from tests.scripting import ROOT, script
 
 
@@ -48,3 +49,15 @@ def test_what_became_slower_is_listed(result: Path, tmp_path: Path, capsys: pyte
     slower, faster = capsys.readouterr().out.split("parts became faster")
     assert "1 of" in slower and slow["name"] in slower and slow["name"] not in faster
     assert compare([str(changed), str(result), "--limit", "1.6"]) == 0
+
+
+@compiles_stages
+def test_the_gain_of_compiled_chains_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By a compiler that takes a moment; what cannot be compiled is named."""
+    file = tmp_path / "compiled.json"
+    chosen = ["isal_table1", "sweeps/nowhere", "--backend", "aot_eager", "--seconds", "0"]
+    script("compiled_speed").main(["--out", str(file), *chosen])
+    found = json.loads(file.read_text(encoding="utf-8"))
+    assert [row["config"] for row in found["rows"]] == ["isal_table1"] and list(found["failed"]) == ["sweeps/nowhere"]
+    row = found["rows"][0]
+    assert row["difference"] < 1e-5 and min(row["seconds"], row["gain"], row["compile_s"]) > 0

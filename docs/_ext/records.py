@@ -232,6 +232,24 @@ class BusyTable(RecordTable):
         return self.shown(lines, f"{machine['gpu']}; torch {machine['torch']}; processes: {machine['workers']}")
 
 
+class CompiledTable(RecordTable):
+    """Gain of every program of a record of `scripts/compiled_speed.py`."""
+
+    def run(self) -> list[nodes.Node]:
+        record = self.record()
+        lines = [
+            "| config | method | ms | gain | difference | compile s |",
+            "| --- | --- | ---: | ---: | ---: | ---: |",
+        ]
+        lines += [
+            f"| `{row['config'].removeprefix('sweeps/')}` | `{row['method']}` | {cell(1e3 * row['seconds'])} | {cell(row['gain'])} | "
+            f"{row['difference']:.0e} | {cell(row['compile_s'])} |"
+            for row in record["rows"]
+        ]
+        machine = record["machine"]
+        return self.shown(lines, f"{machine['processor']}, one thread; torch {machine['torch']}, {machine['backend']}")
+
+
 class TradeTable(RecordTable):
     """Time and loss of every alternative of one system, and of every step that has some."""
 
@@ -326,6 +344,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
         "sweep-table": SweepTable,
         "benchmark-table": BenchmarkTable,
         "busy-table": BusyTable,
+        "compiled-table": CompiledTable,
         "trade-table": TradeTable,
         "requires-table": RequiresTable,
         "reproduced-table": ReproducedTable,

@@ -105,6 +105,10 @@ class PointPatches:
     def exact(self, signal: Signal, doppler_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
         """Focus only the patches, by exact backprojection of raw data over one PRF of Doppler.
 
+        The sum over pulses grows with their number, in proportion to the range of the target. The
+        amplitude in an image by transforms grows with the square root of this number. The sum is
+        divided by the root of the range, so that both images have the same gain over range.
+
         Args:
             signal: Raw data.
             doppler_hz: Doppler centroid in Hz.
@@ -119,5 +123,6 @@ class PointPatches:
             stage = Backproject(
                 self.radar, "matched", velocity_m_s, doppler_hz, lines=lines, cells=cells, aperture=band
             )
-            parts.append(stage(signal).data)
+            range_m = signal.axis("range").start + spot[1] * signal.axis("range").step
+            parts.append(stage(signal).data / math.sqrt(range_m))
         return torch.stack(parts).to(torch.complex128)

@@ -311,7 +311,9 @@ def points_of_a_strip(
         # an image may have several lines per pulse
         lambda made: made[:: made.shape[0] // pulses][index[0], index[1]] * unit_phasor(turns, made.dtype),
         len(slant) / (pulses * n),
-        wave_speed_m_s=radar.wave_speed_m_s,
+        # as in `PointPatches.exact`; x is the closest range
+        lambda some, points: points[:, 0].rsqrt().expand(len(place[some]), -1),
+        radar.wave_speed_m_s,
     )
 
 
