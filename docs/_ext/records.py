@@ -242,8 +242,8 @@ class CompiledTable(RecordTable):
             "| --- | --- | ---: | ---: | ---: | ---: |",
         ]
         lines += [
-            f"| `{row['config'].removeprefix('sweeps/')}` | `{row['method']}` | {cell(1e3 * row['seconds'])} | {cell(row['gain'])} | "
-            f"{row['difference']:.0e} | {cell(row['compile_s'])} |"
+            f"| `{row['config'].removeprefix('sweeps/')}` | `{row['method']}` | {cell(1e3 * row['seconds'])} | "
+            f"{cell(row['gain'])} | {row['difference']:.0e} | {cell(row['compile_s'])} |"
             for row in record["rows"]
         ]
         machine = record["machine"]
