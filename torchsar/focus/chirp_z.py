@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import centred_fft, checked_samples, linear_phasor, per_trial, unit_phasor
+from torchsar.core import centred_fft, checked_samples, host_value, linear_phasor, per_trial, unit_phasor
 from torchsar.focus.nufft import smooth_length
 
 
@@ -101,7 +101,7 @@ def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: T
             f"frequency_hz must hold one frequency per range frequency of the data, shape {tuple(data.shape[-1:])}, "
             f"got shape {tuple(frequency_hz.shape)}"
         )
-    if not (carrier_hz > 0 and bool((frequency_hz > -carrier_hz).all())):
+    if not (carrier_hz > 0 and host_value((frequency_hz > -carrier_hz).all(), True)):
         raise ValueError(
             "carrier_hz must be positive and every frequency_hz above minus the carrier, got frequencies down to "
             f"{float(frequency_hz.min()):g} Hz with a carrier of {carrier_hz:g} Hz"
