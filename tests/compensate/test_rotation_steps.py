@@ -321,14 +321,24 @@ def test_neighbours_are_numbered_as_by_nonzero() -> None:
     wanted = ((apart < 69) & used[:, :, None] & used[:, None]).nonzero(as_tuple=True)
     assert all(torch.equal(a, b) for a, b in zip((near.trial, near.first, near.second), wanted))
     assert near.shape == (3, int(used.any(0).nonzero().max()) + 1)
-    assert Neighbours.find(torch.zeros(2, 5), torch.zeros(2, 5)).shape == (2, 1)
+    for trials, scatterers in ((2, 5), (0, 5), (2, 0)):
+        none = torch.zeros(trials, scatterers, dtype=F64)
+        assert Neighbours.find(none, none).shape == (trials, min(1, scatterers))
 
 
 def test_an_indefinite_curvature_moves_every_scatterer_on_its_own() -> None:
-    """And only in its own trial."""
-    right = torch.randn(2, 8, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
-    matrix = (2.0 * torch.eye(8, dtype=F64)).repeat(2, 1, 1)
-    matrix[1, 0, 1] = matrix[1, 1, 0] = 3.0  # the amplitudes of both scatterers
-    found = _Factor.of(matrix)
+    """And only in its own trial. Unknowns of two scatterers, in the order of `_Step._local`."""
+    source = torch.Generator().manual_seed(1)
+    right = torch.randn(2, 8, 3, dtype=F64, generator=source)
+    root = torch.randn(8, 8, dtype=F64, generator=source)
+    good = root @ root.mT + torch.eye(8, dtype=F64)
+    # unknown i of scatterer p is row 2 i + p
+    own = [good[p::2, p::2] for p in range(2)]
+    bad = good.clone()
+    bad[0, 1] = bad[1, 0] = 2 * good[0, 0].maximum(good[1, 1])
+    found = _Factor.of(torch.stack([good, bad]))
     assert found.failed.tolist() == [False, True]
-    torch.testing.assert_close(found.solve(right), right / 2)
+    solved = found.solve(right)
+    torch.testing.assert_close(solved[0], torch.linalg.solve(good, right[0]))
+    for p in range(2):
+        torch.testing.assert_close(solved[1, p::2], torch.linalg.solve(own[p], right[1, p::2]))

@@ -8,6 +8,9 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch._dynamo.backends.common import aot_autograd
+from torch._functorch.aot_autograd import make_boxed_func
+from torch._inductor import compile_fx
 
 from tests.helpers import compiles_stages
 from torchsar.core import Axis, Chain, Estimate, Signal, Stage, host_value, untraced, use
@@ -136,3 +139,39 @@ def test_derivatives_pass_through_a_compiled_chain() -> None:
     for signal, form in ((x, compiled(chain)), (y, chain)):
         form(signal).data.abs().pow(3).sum().backward()
     torch.testing.assert_close(x.data.grad, y.data.grad)
+
+
+class Table(Stage):
+    """Multiplies by a table that it keeps, or writes into it."""
+
+    def __init__(self, writes: bool = False) -> None:
+        super().__init__()
+        self.table, self.writes = torch.arange(1.0, 5.0), writes
+
+    def forward(self, signal: Signal) -> Signal:
+        return signal.with_data(signal.data * (self.table.add_(1) if self.writes else self.table))
+
+
+@torch.no_grad()
+def test_a_table_is_a_value_of_the_program() -> None:
+    """inductor propagates shapes in this way, and takes no tensor of the host."""
+
+    def propagated(graph: torch.fx.GraphModule, inputs: list[Any]) -> Any:
+        compile_fx.fake_tensor_prop(graph, inputs)
+        return make_boxed_func(graph.forward)
+
+    x = signal_of()
+    program = torch.compile(Table(), fullgraph=True, backend=aot_autograd(fw_compiler=propagated))
+    for other in (x, x.with_data(2 * x.data)):
+        torch.testing.assert_close(program(other).data, Table()(other).data)
+
+
+@torch.no_grad()
+def test_a_program_does_not_write_into_its_constants() -> None:
+    """What it writes would be lost; such a stage runs between two graphs."""
+    x = signal_of()
+    with pytest.raises(torch._dynamo.exc.TorchDynamoException):
+        compiled(Table(writes=True))(x)
+    program, stage = compiled(Table(writes=True), fullgraph=False), Table(writes=True)
+    for _ in range(2):
+        torch.testing.assert_close(program(x).data, stage(x).data)

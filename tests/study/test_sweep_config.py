@@ -187,14 +187,19 @@ def test_titles_and_trials_do_not_stop_a_resume() -> None:
     assert identity(config) != identity(config.changed({"world.pulses": 77}))
 
 
-def test_the_code_of_own_stages_is_part_of_the_identity(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sweep whose own stage has changed since would mix the results of two stages."""
-    config = load("isal_snr")
-    bench = SweepTrial(config).bench({})
-    assert identity(config, bench) == identity(config)
-    for stage in ("one", "another"):
-        monkeypatch.setattr(sweep_module, "own_code", lambda chains, code=stage: {"mine": code} if chains else {})
-        assert identity(config, bench) == {**identity(config), "code of mine": stage}
+def test_a_sweep_does_not_go_on_with_other_code_of_own_stages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, load_tree
+) -> None:
+    """It would mix the results of two stages. A sweep without own stages has no such entry."""
+    config = load_tree({**TINY, "sweep": {**SWEEP, "trials": 1}})
+    assert identity(config, SweepTrial(config).bench({}).chains.values()) == identity(config)
+    for code in ("one", "another"):
+        monkeypatch.setattr(sweep_module, "own_code", lambda chains, code=code: {"mine": code} if list(chains) else {})
+        if code == "one":
+            sweep_module.sweep(config, tmp_path / "out")
+            sweep_module.sweep(config, tmp_path / "out", resume=True)
+    with pytest.raises(ConfigError, match="code of mine"):
+        sweep_module.sweep(config, tmp_path / "out", resume=True)
 
 
 def test_the_source_of_random_numbers_is_part_of_the_identity() -> None:

@@ -71,18 +71,28 @@ def _call(stage: Any, args: Sequence[Any], values: Mapping[str, Any], fixed: Seq
 class _Constants(TorchDispatchMode):
     """Makes tensors of the host, such as tables that a stage keeps, values of a traced program.
 
-    "inductor" takes them in no other form.
+    "inductor" takes them in no other form. What is written into such a tensor would be lost.
     """
 
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        def lifted(x: Any) -> Any:
-            return torch.ops.aten.lift_fresh_copy(x) if type(x) is Tensor and not is_fake(x) else x
+        kwargs = kwargs or {}
+        if func is torch.ops.aten.lift_fresh_copy.default:
+            return func(*args, **kwargs)
+        for i, one in enumerate(func._schema.arguments if func._schema.is_mutable else ()):
+            written = one.alias_info is not None and one.alias_info.is_write
+            if written and any(map(_of_host, pytree.tree_leaves(args[i] if i < len(args) else kwargs.get(one.name)))):
+                raise RuntimeError(
+                    f"a compiled program cannot write into a tensor that it holds as a constant ({func})"
+                )
+        lifted = pytree.tree_map(lambda x: torch.ops.aten.lift_fresh_copy(x) if _of_host(x) else x, (args, kwargs))
+        return func(*lifted[0], **lifted[1])
 
-        if func is not torch.ops.aten.lift_fresh_copy.default:
-            args, kwargs = pytree.tree_map(lifted, (args, kwargs or {}))
-        return func(*args, **(kwargs or {}))
+
+def _of_host(x: Any) -> bool:
+    """Whether a value is a tensor with numbers, and not one of a traced program."""
+    return type(x) is Tensor and not is_fake(x)
 
 
 @torch.compiler.disable(reason="with constants of a program in its plan, a stage has no derivatives in one graph")

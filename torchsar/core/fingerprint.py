@@ -68,15 +68,17 @@ def own_code(modules: Iterable[nn.Module]) -> dict[str, str]:
         modules: Modules. Those inside them count as well.
 
     Returns:
-        A digest of the source files by the name of the package: those of the package that this
-        process has imported. Empty if all modules belong to torchsar or torch.
+        A digest of all source files by the name of the package. A package without source files,
+        such as one in an archive, counts by its name. Empty if all modules belong to torchsar or
+        torch.
     """
     tops = {type(part).__module__.partition(".")[0] for module in modules for part in module.modules()}
     found = {}
     for top in sorted(tops - {"torchsar", "torch"}):
-        names = sorted(name for name in sys.modules if name == top or name.startswith(f"{top}."))
-        files = [getattr(sys.modules[name], "__file__", None) or "" for name in names]
-        texts = [Path(file).read_bytes() for file in files if file.endswith(".py") and Path(file).is_file()]
+        here = sys.modules[top]
+        files = [file for folder in getattr(here, "__path__", ()) for file in sorted(Path(folder).rglob("*.py"))]
+        files = files or [Path(getattr(here, "__file__", None) or "")]
+        texts = [file.name.encode() + file.read_bytes() for file in files if file.is_file()]
         found[top] = _digest(b"\0".join(texts))
     return found
 

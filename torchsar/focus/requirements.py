@@ -312,8 +312,8 @@ def requirements(
     )
     one_centroid = row(
         "one Doppler centroid for all range frequencies",
-        f"skew of the spectrum; it adds {skew_hz(radar, doppler):.2g} Hz to the {aperture.doppler_band_hz:.4g} Hz "
-        f"that an aperture spans, the PRF is {radar.prf_hz:g} Hz",
+        f"skew of the spectrum; an aperture spans {aperture.doppler_band_hz + skew_hz(radar, doppler):.4g} Hz, "
+        f"{skew_hz(radar, doppler):.2g} Hz of them by the skew, the PRF is {radar.prf_hz:g} Hz",
         skewed,
         math.nan,
         "use omega_k_stolt",

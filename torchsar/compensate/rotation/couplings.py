@@ -17,7 +17,8 @@ from torchsar.focus.transforms import Gridding
 # Doppler cells beyond which the coupling of scatterers is neglected, found by trial: accuracy of a
 # step against time
 _NEAR_CELLS = 64
-# more Doppler cells from which two scatterers may come that near in the steps after they were found
+# more Doppler cells from which two scatterers may come that near in later steps: in each of seven
+# they move by at most 0.3; those from farther away are not coupled
 _MARGIN_CELLS = 5
 # added, relative, to what a scatterer tells about itself and the rotation: the curvature stays
 # positive definite where scatterers nearly cancel each other, and one alone is damped by no more
@@ -59,7 +60,7 @@ class Neighbours:
         near = (cell[:, :, None] - cell[:, None]).abs() < _NEAR_CELLS + _MARGIN_CELLS
         near = (near & used[:, :, None] & used[:, None]).flatten()
         number = torch.arange(1, n + 1, device=cell.device)
-        pairs, width = torch.stack([near.sum(), (used * number).amax()]).tolist() if n else (0, 0)
+        pairs, width = torch.stack([near.sum(), (used * number).amax()]).tolist() if len(near) else (0, 0)
         # the indices where `near` is true; all others are written to one entry more
         place = torch.where(near, near.cumsum(0) - 1, pairs)
         every = torch.arange(len(near), device=cell.device)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from torchsar.core import Draws, own_code
+from torchsar.core import Chain, Draws, own_code
 from torchsar.study.montecarlo.engines import engine
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.loop import (
@@ -146,7 +146,12 @@ def sweep(
     _announce(grid, settings.trials)
     try:
         with opened(out, "sweep", SWEEP_FILES) as folder, _terminated_like_interrupted():
-            store = open_store(folder, plan, identity(loaded, trial.bench(grid.cases()[0].fixed)), resume)
+            store = open_store(
+                folder,
+                plan,
+                identity(loaded, (one for case in grid.cases() for one in trial.bench(case.fixed).chains.values())),
+                resume,
+            )
             store.note(**about)
             record = run_plan(plan, trial, store, engine(workers, cluster, threads))
             record.about = {**record.about, **about}
@@ -210,15 +215,15 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     return grid
 
 
-def identity(loaded: Loaded, bench: Bench | None = None) -> dict[str, Any]:
+def identity(loaded: Loaded, chains: Iterable[Chain] = ()) -> dict[str, Any]:
     """Return what the results depend on besides the grid: the seed and the source of the random
     numbers, all other keys of the config that change results, and the code of the user's own stages
-    in a bench of the config.
+    in the chains.
     """
     return {
         **identity_of_draws(loaded.config.seed, loaded.config.random),
         "config": loaded.config.model_dump(exclude=_NOT_IDENTITY),
-        **{f"code of {name}": code for name, code in own_code(bench.chains.values() if bench else ()).items()},
+        **{f"code of {name}": code for name, code in own_code(chains).items()},
     }
 
 
