@@ -75,7 +75,7 @@ def own_code(modules: Iterable[nn.Module]) -> dict[str, str]:
     tops = {type(part).__module__.partition(".")[0] for module in modules for part in module.modules()}
     found = {}
     for top in sorted(tops - {"torchsar", "torch"}):
-        here = sys.modules[top]
+        here = sys.modules.get(top)  # none if it was loaded in another way
         files = [file for folder in getattr(here, "__path__", ()) for file in sorted(Path(folder).rglob("*.py"))]
         files = files or [Path(getattr(here, "__file__", None) or "")]
         texts = [file.name.encode() + file.read_bytes() for file in files if file.is_file()]
