@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -183,21 +183,23 @@ class RecordTable(SphinxDirective):
         """The record, on which the page depends."""
         return read(self, self.folder, self.arguments[0])
 
-    def shown(self, lines: list[str], note: str) -> list[nodes.Node]:
-        """The lines of the table, and the note with the file of the record."""
+    def shown(self, columns: Sequence[str], rows: Iterable[Sequence[Any]], note: str) -> list[nodes.Node]:
+        """The table, and the note with the file of the record.
+
+        columns: their names; numbers stand on the right, in columns whose names begin with ">".
+        """
+        rule = ["---:" if name.startswith(">") else "---" for name in columns]
+        lines = ([name.removeprefix(">") for name in columns], rule, *rows)
+        table = "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in lines)
         note = f"{note}; record: `docs/{self.folder}/{self.arguments[0]}.json`."
-        return [*self.parse_text_to_nodes("\n".join(lines)), *self.parse_text_to_nodes(note)]
+        return [*self.parse_text_to_nodes(table), *self.parse_text_to_nodes(note)]
 
 
 class BenchmarkTable(RecordTable):
     """Speed, memory and slowest stage of every config of a record of `scripts/benchmark.py`."""
 
     def run(self) -> list[nodes.Node]:
-        record = self.record()
-        lines = [
-            "| config | batch | trials/s | draws | GB | slowest stage | over floor |",
-            "| --- | ---: | ---: | ---: | ---: | --- | ---: |",
-        ]
+        record, lines = self.record(), []
         whole = [row for row in record["rows"] if row["part"] == "batch" and row["threads"] == 1]
         for batch in whole:
             same = {key: batch[key] for key in ("config", "threads", "device")}
@@ -211,10 +213,11 @@ class BenchmarkTable(RecordTable):
                 *(cell(part["memory"]["peak_bytes"] / 1e9), f"`{slowest['name'].partition('.')[2]}`"),
                 cell(slowest["over_floor"]),
             ]
-            lines.append("| " + " | ".join(map(str, cells)) + " |")
+            lines.append(cells)
         machine = record["machine"]
+        columns = ("config", ">batch", ">trials/s", ">draws", ">GB", "slowest stage", ">over floor")
         where = machine["cuda"] if whole[0]["device"] == "cuda" else f"{machine['processor']}, one thread"
-        return self.shown(lines, f"{where}; torch {machine['torch']}")
+        return self.shown(columns, lines, f"{where}; torch {machine['torch']}")
 
 
 class BusyTable(RecordTable):
@@ -222,14 +225,16 @@ class BusyTable(RecordTable):
 
     def run(self) -> list[nodes.Node]:
         record = self.record()
-        lines = ["| sweep | trials at once | trials/s | busy |", "| --- | ---: | ---: | ---: |"]
-        lines += [
-            f"| `{row['sweep']}` | {row['trials']} | {cell(row['trials_per_s'])} | "
-            f"{'-' if row['busy'] is None else format(row['busy'], '.1%')} |"
+        rows = [
+            (
+                *(f"`{row['sweep']}`", row["trials"], cell(row["trials_per_s"])),
+                "-" if row["busy"] is None else format(row["busy"], ".1%"),
+            )
             for row in record["rows"]
         ]
         machine = record["machine"]
-        return self.shown(lines, f"{machine['gpu']}; torch {machine['torch']}; processes: {machine['workers']}")
+        note = f"{machine['gpu']}; torch {machine['torch']}; processes: {machine['workers']}"
+        return self.shown(("sweep", ">trials at once", ">trials/s", ">busy"), rows, note)
 
 
 class CompiledTable(RecordTable):
@@ -237,17 +242,16 @@ class CompiledTable(RecordTable):
 
     def run(self) -> list[nodes.Node]:
         record = self.record()
-        lines = [
-            "| config | method | ms | gain | difference | compile s |",
-            "| --- | --- | ---: | ---: | ---: | ---: |",
-        ]
-        lines += [
-            f"| `{row['config'].removeprefix('sweeps/')}` | `{row['method']}` | {cell(1e3 * row['seconds'])} | "
-            f"{cell(row['gain'])} | {row['difference']:.0e} | {cell(row['compile_s'])} |"
+        rows = [
+            (
+                *(f"`{row['config']}`", f"`{row['method']}`", cell(1e3 * row["seconds"]), cell(row["gain"])),
+                *(f"{row['difference']:.0e}", cell(row["compile_s"])),
+            )
             for row in record["rows"]
         ]
         machine = record["machine"]
-        return self.shown(lines, f"{machine['processor']}, one thread; torch {machine['torch']}, {machine['backend']}")
+        note = f"{machine['processor']}, one thread; torch {machine['torch']}, {machine['backend']}"
+        return self.shown(("config", "method", ">ms", ">gain", ">difference", ">compile s"), rows, note)
 
 
 class TradeTable(RecordTable):
@@ -256,8 +260,7 @@ class TradeTable(RecordTable):
     folder = "trade"
 
     def run(self) -> list[nodes.Node]:
-        record = self.record()
-        lines = ["| step | alternative | CPU time (ms) | loss | recommended |", "| --- | --- | ---: | --- | --- |"]
+        record, lines = self.record(), []
         for choice, alternatives in {record["choice"]: record["alternatives"], **record["others"]}.items():
             losses = list(dict.fromkeys(name for row in alternatives for name in row["loss"]))
             for i, row in enumerate(alternatives):
@@ -267,10 +270,11 @@ class TradeTable(RecordTable):
                 loss = ", ".join(named) or "failed"
                 only = f" (`{losses[0]}`)" if len(losses) == 1 else ""  # the same of every alternative
                 first = f"{choice}{only}" if i == 0 else ""
-                lines.append(f"| {first} | {row['name']} | {time} | {loss} | {'yes' if row['recommended'] else ''} |")
+                lines.append((first, row["name"], time, loss, "yes" if row["recommended"] else ""))
         limits = ", ".join(f"`{name}` {value:g}" for name, value in record["tolerance"].items())
         with_ = f"torch {record['machine']['torch']}, threads: {record['machine']['threads']}"
-        return self.shown(lines, f"Config `{record['config']}`; largest loss accepted: {limits}; {with_}")
+        columns = ("step", "alternative", ">CPU time (ms)", "loss", "recommended")
+        return self.shown(columns, lines, f"Config `{record['config']}`; largest loss accepted: {limits}; {with_}")
 
 
 class RequiresTable(SphinxDirective):
