@@ -165,7 +165,7 @@ def test_the_readme_is_short_and_leads_to_every_tutorial() -> None:
 
 
 def test_the_reference_has_every_public_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("sphinx", reason="the extra `docs` is not installed")
+    pytest.importorskip("sphinx.application", reason="the extra `docs` is not installed")
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
     import importlib
 
@@ -181,7 +181,7 @@ def test_the_reference_has_every_public_name(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_docstrings_become_restructured_text(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("sphinx", reason="the extra `docs` is not installed")
+    pytest.importorskip("sphinx.application", reason="the extra `docs` is not installed")
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
     import importlib
 
@@ -192,7 +192,7 @@ def test_docstrings_become_restructured_text(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_what_loads_from_a_network_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("sphinx", reason="the extra `docs` is not installed")
+    pytest.importorskip("sphinx.application", reason="the extra `docs` is not installed")
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
     import importlib
 

@@ -53,6 +53,7 @@ _APART = 0.5  # Doppler and range cells within which scatterers are not resolved
 _BRIGHT = 0.1  # share of the largest amplitude from which a scatterer limits a step, found by trial
 _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
 _RIDGE = 1e-9  # added to the diagonal, relative: above the rounding of a matrix of float64
+_ALIKE = 1e-6  # share of the energy of an echo by which the two range responses have to differ
 _LEAST_RATE = 0.05  # least rate over that at the start; slower motions would nearly reverse
 # standard deviations by which the phase of a scatterer may differ before it loses weight, found by
 # trial
@@ -609,9 +610,13 @@ class _Step:
         return (first.conj() @ second.mT)[self.near.trial, self.near.first, self.near.second]
 
     def changed_response(self) -> RangeResponse:
-        """Fit the share of the periodic range response to the residual by least squares."""
-        apart = self.envelopes.difference
-        energy = (self.products[(0, 0)] * self._over_range(apart, apart)).real[:, None, None]
+        """Fit the share of the periodic range response to the residual by least squares.
+
+        Both responses are the same where scatterers lie in the middle of their cells, as all do
+        after the first search: the share then stays as it is, instead of following rounding.
+        """
+        apart, (overlap, *_) = self.envelopes.difference, self._overlaps
+        energy = (self.products[(0, 0)] * (self._over_range(apart, apart) + _ALIKE * overlap)).real[:, None, None]
         total = self.near.per_trial(energy)[:, 0, 0]
         return self.response.moved(self.share / total)
 

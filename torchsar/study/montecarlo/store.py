@@ -12,6 +12,7 @@ of the metadata of all arrays, and of the attributes themselves.
 from __future__ import annotations
 
 import json
+import math
 import time
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -23,7 +24,17 @@ import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec
 
-from torchsar.core import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
+from torchsar.core import (
+    SEAL,
+    address,
+    array_metadata,
+    canonical,
+    checksum,
+    document,
+    group_attributes,
+    machine_memory_bytes,
+    sealed,
+)
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.record import OK, Labels, Record
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -234,6 +245,9 @@ def empty(labels: Labels, trials: int) -> Record:
     """
     shape = (*map(len, labels.values()), trials)
     try:
+        # where the system promises more memory than there is, the array can be made, but not used
+        if math.prod(shape) > (machine_memory_bytes() or math.inf):
+            raise MemoryError
         return Record((), dict(labels), np.zeros(shape, bool), np.zeros((0, *shape), bool))
     except (MemoryError, ValueError):
         raise ConfigError(
