@@ -61,9 +61,9 @@ CHAINS = {
 # these cost seconds a run: results only. The stages waited as often for four trials when written;
 # scenes of geo_ocean are imaged one after another, and its waits hang on the targets in them
 _ONCE = ("estimate_balance", "link_phases", "signal_intensity", "geo_ocean")
-# Absolute differences of figures, in metres, m/s and dB: velocities of ships are found by iterations
-# that end at a thousandth of what noise leaves, and rounding sets where. Sums that round in another
-# way change positions, which are 0.3 m off, by up to 1.4 mm.
+# Absolute differences of figures, in metres, m/s and dB: the iterations that find velocities of
+# ships end at a thousandth of what noise leaves, and rounding sets where. Sums that round in
+# another way change positions, which are 0.3 m off, by up to 1.4 mm.
 LEEWAY = {"geo_ocean": 5e-3}
 
 
