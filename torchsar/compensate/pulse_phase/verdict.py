@@ -25,7 +25,7 @@ from torchsar.compensate.pulse_phase.data import (
 )
 from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.compensate.pulse_phase.imaging import Imaging
-from torchsar.core import Estimate, block_bytes_of, over_blocks
+from torchsar.core import Estimate, block_bytes_of, host_value, over_blocks, true_positions
 from torchsar.metrics.phase import phase_rmse, residual_phase
 
 # difference of the entropies of a uniform row and of speckle, whose power has an exponential
@@ -53,19 +53,25 @@ _DISTURBED_RAD, _RETURNED_RAD, _RETURNS = 0.4, 0.04, 6
 _QUARTERS, _SEEN, _ALIKE = 4, 0.17, 0.33
 # Mean correlation of the quarters, without noise: 0.93 to 1.06 in 90 % of the trials measured with
 # up to 300 points that stay, 0.76 to 0.88 with the aircraft and where points are not resolved, 0.58
-# to 0.78 where 40 or 120 scatterers change within 8 to 16 of 128 pulses. The deviation is too small
-# where scatterers change: nothing is ok below the first correlation, and the largest deviation that
-# is ok grows from 0 to its usual value at the second. Both are lines (value at 0, slope) over the
-# share of the scene in the moduli, the correlation of even and odd pulses. Found by trial: most of
-# the wrong estimates lie beyond, most of the right ones within. Changes of few scatterers do not
-# average out: the largest deviation is smaller where fewer rows than this make the sharpness.
-_CHANGING, _STAYING, _TELLING_ROWS = (0.62, 0.19), (0.94, -0.09), 6
+# to 0.78 where 40 or 120 scatterers change within 8 to 16 of 128 pulses, where the deviation is too
+# small. The largest deviation that is surely ok grows from 0 at the first correlation to its usual
+# value at the second. Both are lines (value at 0, slope) over the share of the scene in the moduli,
+# the correlation of even and odd pulses. Found by trial: most of the wrong estimates lie beyond.
+_CHANGING, _STAYING = (0.62, 0.19), (0.94, -0.09)
+# Changes of few scatterers do not average out. Where fewer rows than the first number make the
+# sharpness, the largest deviation that is ok is smaller; where fewer than the second do, nothing is
+# sure below this correlation, which four points that change within 32 pulses reach in 10 % of the
+# trials.
+_TELLING_ROWS, _MANY_ROWS, _STILL = 6, 30, 0.95
 # With little noise bright scatterers may stay while weak ones change, as in an aircraft in flight.
 # It is enough if they are alike: the same limits for moduli above so many times their median, in
 # images with such a share of the scene. The correlation was below 0.71 in 95 % of the trials where
 # 40 scatterers change, 0.75 in the recorded flight and 0.81 to 0.85 with the aircraft.
 _BRIGHT, _LITTLE_NOISE = 3.0, 0.8
 _BRIGHT_CHANGING, _BRIGHT_STAYING = 0.68, 0.76
+# Largest deviation that is ok where this is not sure, but halves of the rows from which phases are
+# found anew agree, as in dense scenes whose scatterers the quarters do not resolve.
+_UNSURE_RAD, _UNSURE_ROWS = 0.25, 20
 # limits of `_drift`, found by trial: more rounds, or rounds after smaller steps, cost time and
 # rarely change the result
 _ROUNDS = 6
@@ -194,13 +200,17 @@ def estimated(
         `Displacement`; not examined without `compare`), the image is 1.5 times as sharp as
         autofocus can make pure noise, more than one row contributes to the sharpness, a homogeneous
         description of the scene is not more likely (see `describe`), because sharpness does not
-        find the phases of homogeneous clutter, and the quarters of the pulses show one scene: where
-        its scatterers change, the standard deviation is too small. The last four need not hold for
-        a single point whose modulus scatters by less than 0.25, with 32 pulses or more. `info`
-        holds "present", shape (..., pulse), False for pulses that hold only zeros; and, of shape
-        (...,), "homogeneous" (True where that description is more likely), "ok_if_sparse" (what
-        `ok` is if it is not), "sparse_gain_nats" (gain of the log likelihood of the sparse
-        description over white noise), "jitter_cells" and "migration_cells" (see `Displacement`),
+        find the phases of homogeneous clutter, and the pulses show one scene: where its scatterers
+        change, the standard deviation is too small. That is sure where the images of quarters of
+        the pulses are alike. Otherwise the quarters may show scatterers that change, or stay and
+        are not resolved. The phases are then found anew from two halves of the rows without a
+        common scatterer, and the standard deviation is at least half of their difference; it must
+        be below 0.3 rad. The last four conditions need not hold for a single point whose modulus
+        scatters by less than 0.25, with 32 pulses or more. `info` holds "present", shape (...,
+        pulse), False for pulses that hold only zeros; and, of shape (...,), "homogeneous" (True
+        where that description is more likely), "ok_if_sparse" (what `ok` is if it is not),
+        "sparse_gain_nats" (gain of the log likelihood of the sparse description over white noise),
+        "jitter_cells" and "migration_cells" (see `Displacement`),
         "iterations", "sharpness_nats", "noise_sharpness_nats" (the largest sharpness that noise can
         reach), "effective_rows" (number of rows over which the energy is spread) and "telling_rows"
         (number of rows over which the sharpness is spread).
@@ -257,7 +267,15 @@ def _assessed(
             std = torch.maximum(std, _drift(rows, present, phase, again))
         scene = describe(rows, phase, occupied)
         moved = displacement(rows, present) if compare else Displacement(0 * sharp, 0 * sharp)
-        stays = _persists(rows, phase, std, sharpness_rows) if compare else torch.ones_like(lone)
+        largest = math.sqrt(-math.log(LEAST_STREHL)) * (sharpness_rows / _TELLING_ROWS).clamp_max(1)
+        if compare:
+            one, sure = _one_scene(rows, phase, std, largest, sharpness_rows)
+            least = _UNSURE_RAD * (sharpness_rows / _UNSURE_ROWS).clamp_max(1)
+            unsure = one & ~sure & ~lone & (std < least)
+            std = torch.maximum(std, _found_anew(rows, present, start, phase, find, unsure) / occupied.sqrt())
+            stays = one & (sure | (unsure & (std < least)))
+        else:
+            stays = torch.ones_like(lone)
     homogeneous = scene.homogeneous & compare & ~lone
     scene_rows = effective * occupied, sharpness_rows
     return phase, taken, sharp, *scene_rows, std, scene.sparse, homogeneous, lone, stays, moved.jitter, moved.migration
@@ -363,11 +381,17 @@ def _half_difference(
         one, other = _settled_apart(parts, present, phase, again)
     else:
         one, other = (again(part, present, phase) for part in parts)
+    return torch.where(filled, _half_of(one, other, phase, present), unknown)
+
+
+def _half_of(one: Tensor, other: Tensor, phase: Tensor, present: Tensor) -> Tensor:
+    """Half of the difference between the phases of two halves, or their distance from the phase of
+    both if that is more, in rad rms, (trial,).
+    """
     apart = residual_phase(one, other, present)
     moved = phase_rmse(one - apart / 2, phase, present)
     apart = torch.where(apart.abs() > _APART_RAD, apart, apart / 2)
-    apart = (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
-    return torch.where(filled, torch.maximum(apart, moved), unknown)
+    return torch.maximum((apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt(), moved)
 
 
 def _settled_apart(parts: Sequence[Tensor], present: Tensor, phase: Tensor, again: Again) -> Sequence[Tensor]:
@@ -392,15 +416,19 @@ def _moved(new: Tensor, old: Tensor, present: Tensor) -> Tensor:
     return (torch.where(present, step, 0).square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
 
 
-def _persists(rows: Tensor, phase: Tensor, std_rad: Tensor, telling_rows: Tensor) -> Tensor:
-    """Whether the quarters of the pulses show one scene, as far as the deviation needs it.
+def _one_scene(
+    rows: Tensor, phase: Tensor, std_rad: Tensor, largest_rad: Tensor, telling_rows: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Whether the quarters of the pulses may show one scene, and whether this is sure.
 
-    Quarters that noise hides are left out. The result is a bool per trial.
+    It is sure as far as the deviation needs it. Quarters that noise hides are left out. The results
+    are bools per trial.
 
-    telling_rows: effective number of rows over which the sharpness is spread, (trial,).
+    largest_rad: largest deviation that is ok; telling_rows: effective number of rows over which the
+    sharpness is spread; (trial,) each.
     """
     if rows.shape[-1] < _LEAST_PULSES:
-        return torch.ones_like(phase[:, 0], dtype=torch.bool)
+        return torch.ones_like(phase[:, 0], dtype=torch.bool), std_rad < largest_rad
     x = rotate(rows, phase)
     n = rows.shape[-1] // _QUARTERS // 2 * 2
     parts = [[x[..., first + k : first + n : 2] for k in (0, 1)] for first in range(0, _QUARTERS * n, n)]
@@ -411,8 +439,34 @@ def _persists(rows: Tensor, phase: Tensor, std_rad: Tensor, telling_rows: Tensor
     bright, _, _ = _likeness([[_above(image) for image in pair] for pair in images])
     steady_bright = (bright - _BRIGHT_CHANGING) / (_BRIGHT_STAYING - _BRIGHT_CHANGING)
     steady = torch.where(share > _LITTLE_NOISE, torch.maximum(steady, steady_bright), steady)
-    largest = math.sqrt(-math.log(LEAST_STREHL)) * (telling_rows / _TELLING_ROWS).clamp_max(1)
-    return least.isinf() | ((least > _ALIKE) & (std_rad < largest * steady))
+    sure = (std_rad < largest_rad * steady) & ((alike > _STILL) | (telling_rows > _MANY_ROWS))
+    hidden = least.isinf()
+    return hidden | (least > _ALIKE), sure | (hidden & (std_rad < largest_rad))
+
+
+def _found_anew(
+    rows: Tensor, present: Tensor, start: Tensor | None, phase: Tensor, find: Find, unsure: Tensor
+) -> Tensor:
+    """Std of the phase (rad) from phases that are found from two halves of the rows, (trial,).
+
+    Zero for trials that are not unsure. The halves have no scatterer in common, unlike those of
+    `halves_of_rows`: rows between two minima of the energy, which one scatterer fills, stay
+    together.
+    """
+    std = torch.zeros_like(phase[:, 0], dtype=torch.float64)
+    count = host_value(unsure.sum(), len(unsure))
+    if not count:
+        return std
+    at = true_positions(unsure, count)
+    rows, present, phase, start = rows[at], present[at], phase[at], None if start is None else start[at]
+    energy = (rows.real.square() + rows.imag.square()).sum(-1)
+    edge = torch.full_like(energy[:, :1], -1.0)
+    before, after = torch.cat([edge, energy[:, :-1]], -1), torch.cat([energy[:, 1:], edge], -1)
+    group = ((energy < before) & (energy <= after)).long().cumsum(-1)
+    of_group = torch.zeros_like(energy).scatter_add(-1, group, energy)
+    half = of_group.argsort(-1, descending=True).argsort(-1).gather(-1, group) % 2
+    one, other = (find(torch.where((half == k)[..., None], rows, 0), present, start)[0] for k in (0, 1))
+    return torch.where(unsure, std.index_copy(0, at, _half_of(one, other, phase, present)), 0)
 
 
 def _above(image: Tensor) -> Tensor:
