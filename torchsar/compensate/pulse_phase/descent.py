@@ -98,7 +98,7 @@ def sharpest_phase(
         not pass through it. Pulses without samples have the phase of the start or, with a basis,
         that of the fitted functions. `ok` is False unless the image is 1.5 times as sharp as
         autofocus can make pure noise, more than one range cell or a single point makes the
-        sharpness, the quarters of the pulses show one scene, and the Strehl ratio predicted from
+        sharpness, the pulses show one scene (see `autofocus`), and the Strehl ratio predicted from
         the standard deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies
         below that of speckle. info["iterations"] is the number of steps.
 

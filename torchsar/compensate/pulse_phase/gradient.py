@@ -210,7 +210,7 @@ def pga(
     Returns:
         `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
         unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
-        cell or a single point makes the sharpness, the quarters of the pulses show one scene, and
+        cell or a single point makes the sharpness, the pulses show one scene (see `autofocus`), and
         the Strehl ratio predicted from the standard deviation exceeds 0.8. Sharpness is the amount
         by which the image entropy lies below that of speckle.
 

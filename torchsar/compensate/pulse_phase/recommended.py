@@ -100,13 +100,15 @@ def autofocus(
         `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
         halves of the range cells, or of the image by `imaging`; for point targets it is close to
         the true error. `ok` is False unless the image is 1.5 times as sharp as autofocus can make
-        pure noise, more than one range cell or a single point makes the sharpness, the quarters of
-        the pulses show one scene, and the Strehl ratio predicted from the standard deviation
-        exceeds 0.8. Sharpness is the amount by which the image entropy lies below that of speckle.
-        Where scatterers change within the record, no phase is common to all pulses: most trials are
-        not ok, and the standard deviation of the others is up to 3 times too small; at 0 dB, where
-        noise hides the change, one of ten is ok and wrong. Phases of `link_phases` have its
-        standard deviations, `quality` and `ok`. `info` holds "homogeneous" of shape (...,), bool,
+        pure noise, more than one range cell or a single point makes the sharpness, the pulses show
+        one scene, and the Strehl ratio predicted from the standard deviation exceeds 0.8. Sharpness
+        is the amount by which the image entropy lies below that of speckle. The pulses show one
+        scene where the images of quarters of them are alike; where these are not alike enough,
+        because scatterers change or are not resolved in a quarter, phases found anew from two
+        halves of the range cells must agree to 0.25 rad, less where few range cells make the
+        sharpness. The standard deviation then is at least half of their difference. Phases of
+        `link_phases` have its standard deviations, `quality` and `ok`; where sharp phases of small
+        deviation contradict them, these stay. `info` holds "homogeneous" of shape (...,), bool,
         True where the homogeneous description is more likely; `ok` is False if linked phases then
         do not confirm that. It also holds "jitter_cells" and "migration_cells", the displacement of
         the range profiles from pulse to pulse and of groups of pulses in cells rms: `ok` is False

@@ -32,7 +32,7 @@ def sca(data: Tensor) -> Estimate:
         At a pulse of zeros the phase stays that of the pulse before; the next pulse is paired with
         the last one that holds samples. `ok` is False unless the image is 1.5 times as sharp as
         autofocus can make pure noise, more than one range cell or a single point makes the
-        sharpness, the quarters of the pulses show one scene, and the Strehl ratio predicted from
+        sharpness, the pulses show one scene (see `autofocus`), and the Strehl ratio predicted from
         the standard deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies
         below that of speckle.
 

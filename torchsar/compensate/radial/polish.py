@@ -66,7 +66,7 @@ def phase_polish(
         halves of the range cells. `quality`, `ok` and `info` are those of `autofocus`: `ok` is
         False unless the image is clearly sharper than autofocus can make pure noise, more than one
         range cell or a single point makes the sharpness, the standard deviation is below 0.47 rad,
-        the quarters of the pulses show one scene, and a homogeneous description of the scene is not
+        the pulses show one scene, and a homogeneous description of the scene is not
         more likely, because sharpness does not find the phases of homogeneous clutter.
 
     Raises:
