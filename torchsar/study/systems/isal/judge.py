@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -42,7 +44,8 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials) -> Judged:
 
 def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
     """Return lower bounds of the rms residual phase in rad, (trial,): one for a known scene, and
-    one for unknown amplitudes of its scatterers.
+    one for unknown amplitudes of its scatterers. Both are without the constant and the linear term
+    of the phase, as the residual phase is.
 
     The ratio of the second bound to the first is computed for a single scene of the case; it
     differs by about one percent between scenes.
@@ -51,7 +54,7 @@ def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
     if not bool((std > 0).all()):
         return {}
     power = (torch.view_as_real(data).double().square().sum(-1).mean((-2, -1)) - std.square()).clamp_min(1e-300)
-    known = pulse_phase_bound_rad(power / std.square(), data.shape[-1])
+    known = _known_scene_rad(power / std.square(), *data.shape[-2:])
     ratio = bench.memo("bound ratio", lambda: _bound_ratio(bench))
     free = {} if ratio is None else {"amplitudes unknown (Cramer-Rao)": known * ratio}
     return {"residual_phase_rms_rad": {"scene known": known, **free}}
@@ -100,4 +103,9 @@ def _bound_ratio(bench: Bench) -> float | None:
     azimuth, response = turntable_responses(radar, rate, scene.azimuth_m, scene.range_m, size.pulses, size.samples)
     power = ((azimuth * scene.amplitude) @ response).abs().square().mean()
     whole = pulse_phase_bound_of_scene_rad(azimuth, response, scene.amplitude, 1.0)
-    return float(whole / pulse_phase_bound_rad(power, size.samples))
+    return float(whole / _known_scene_rad(power, size.pulses, size.samples))
+
+
+def _known_scene_rad(snr: Tensor, pulses: int, samples: int) -> Tensor:
+    """Bound for a known scene of the phases without two of their parameters."""
+    return pulse_phase_bound_rad(snr, samples) * math.sqrt(max(0.0, 1 - 2 / pulses))
