@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.audit.pulses import scintillating
 from torchsar.compensate import LinkPhases, autofocus, entropy_fixed_point, link_phases, pga, sca
 from torchsar.compensate.pulse_phase.homogeneous import describe, sparse_gain_nats
 from torchsar.compensate.pulse_phase.linking import _grown, _Scene
@@ -87,6 +88,15 @@ def test_no_part_of_a_long_record_slips() -> None:
     found = link_phases(clutter(2, 0.8, 10.0, 0, points=5, n=2 * N))
     assert bool(found.ok.all())
     assert float(phase_rmse(found["phase_rad"], torch.zeros(2, 2 * N)).max()) < 0.1
+
+
+@pytest.mark.parametrize("points", [1, 2])
+def test_linked_phases_of_few_points_need_a_confirmation(points: int) -> None:
+    """Up to 7 % of such trials were ok and wrong by more than five standard deviations."""
+    batch = scintillating(10.0, points, 1e12)(60, 3000)
+    found = link_phases(batch.data.data)
+    error, std = phase_rmse(found["phase_rad"], batch.truth["phase_rad"]), found.std["phase_rad"].mean(-1)
+    assert found.ok.sum() > 5 and (error < 5 * std)[found.ok].all()
 
 
 def test_blocks_without_a_neighbour_are_joined() -> None:
