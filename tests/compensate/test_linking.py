@@ -95,7 +95,7 @@ def test_linked_phases_of_two_points_need_a_confirmation() -> None:
     batch = scintillating(10.0, 2, 1e12)(32, 3000)
     found = link_phases(batch.data.data)
     error, std = phase_rmse(found["phase_rad"], batch.truth["phase_rad"]), found.std["phase_rad"]
-    assert found.ok.sum() > 10 and (error < 4 * std.square().mean(-1).sqrt())[found.ok].all()
+    assert found.ok.sum() > 10 and (error < 5 * std.square().mean(-1).sqrt())[found.ok].all()
 
 
 def test_blocks_without_a_neighbour_are_joined() -> None:
