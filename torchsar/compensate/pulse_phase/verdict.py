@@ -43,6 +43,7 @@ _STEADY, _LEAST_PULSES = 0.25, 32
 # of uniformly distributed phases is half of their error. In normal errors of the largest standard
 # deviation that is ok, 3 % of the differences are larger.
 _APART_RAD = 2.0
+_UNKNOWN_RAD = math.pi / math.sqrt(3)  # standard deviation of a random phase
 # Phases from which halves of the rows start are apart by a walk of so many rad rms; they go on for
 # so many rounds at most, until a round moves them by less than this. Found by trial: what the scene
 # does not hold stays apart, and weak targets are found again.
@@ -290,7 +291,7 @@ def _assessed(
 def _no_estimate(rows: Tensor) -> tuple[Tensor, ...]:
     """The result of `_assessed` where no phase can be found: too few pulses, or no trials."""
     zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
-    std, no = zero + math.pi / math.sqrt(3), zero > 0
+    std, no = zero + _UNKNOWN_RAD, zero > 0
     return rows[:, 0].real * 0, zero.long(), zero, zero, zero, std, zero, no, no, no, zero, zero
 
 
@@ -378,26 +379,27 @@ def _half_difference(
 
     disturbed: Whether the halves start on either side of the phase (see `_settled_apart`).
     """
-    unknown = torch.full(rows.shape[:1], math.pi / math.sqrt(3), dtype=torch.float64, device=rows.device)
     if rows.shape[-2] < 2:
-        return unknown
+        return torch.full_like(phase[:, 0], _UNKNOWN_RAD, dtype=torch.float64)
     parts = halves(rows, phase)
-    filled = torch.stack([(part != 0).flatten(1).any(-1) for part in parts]).all(0)
     if disturbed:
-        one, other = _settled_apart(parts, present, phase, again)
+        ends = _settled_apart(parts, present, phase, again)
     else:
-        one, other = (again(part, present, phase) for part in parts)
-    return torch.where(filled, _half_of(one, other, phase, present), unknown)
+        ends = [again(part, present, phase) for part in parts]
+    return _half_of(parts, ends, phase, present)
 
 
-def _half_of(one: Tensor, other: Tensor, phase: Tensor, present: Tensor) -> Tensor:
+def _half_of(parts: Sequence[Tensor], ends: Sequence[Tensor], phase: Tensor, present: Tensor) -> Tensor:
     """Half of the difference between the phases of two halves, or their distance from the phase of
-    both if that is more, in rad rms, (trial,).
+    both if that is more, in rad rms, (trial,); that of a random phase if a half is empty.
     """
+    filled = torch.stack([(part != 0).flatten(1).any(-1) for part in parts]).all(0)
+    one, other = ends
     apart = residual_phase(one, other, present)
     moved = phase_rmse(one - apart / 2, phase, present)
     apart = torch.where(apart.abs() > _APART_RAD, apart, apart / 2)
-    return torch.maximum((apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt(), moved)
+    apart = (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
+    return torch.where(filled, torch.maximum(apart, moved), _UNKNOWN_RAD)
 
 
 def _settled_apart(parts: Sequence[Tensor], present: Tensor, phase: Tensor, again: Again) -> Sequence[Tensor]:
@@ -471,8 +473,9 @@ def _found_anew(
     group = ((energy < before) & (energy <= after)).long().cumsum(-1)
     of_group = torch.zeros_like(energy).scatter_add(-1, group, energy)
     half = of_group.argsort(-1, descending=True).argsort(-1).gather(-1, group) % 2
-    one, other = (find(torch.where((half == k)[..., None], rows, 0), present, start)[0] for k in (0, 1))
-    return torch.where(unsure, std.index_copy(0, at, _half_of(one, other, phase, present)), 0)
+    parts = [torch.where((half == k)[..., None], rows, 0) for k in (0, 1)]
+    ends = [find(part, present, start)[0] for part in parts]
+    return torch.where(unsure, std.index_copy(0, at, _half_of(parts, ends, phase, present)), 0)
 
 
 def _above(image: Tensor) -> Tensor:
