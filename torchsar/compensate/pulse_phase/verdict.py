@@ -71,10 +71,9 @@ _TELLING_ROWS, _MANY_ROWS, _STILL = 6, 30, 0.95
 _BRIGHT, _LITTLE_NOISE = 3.0, 0.8
 _BRIGHT_CHANGING, _BRIGHT_STAYING = 0.68, 0.76
 # Largest deviation that is ok where this is not sure, but halves of the rows from which phases are
-# found anew agree, as in dense scenes whose scatterers the quarters do not resolve; smaller where
-# fewer rows than this make the sharpness. Found by trial: with 0.3, and fewer rows, 1.7 % were
-# wrong and ok where 40 scatterers change within 16 of 128 pulses, 0.7 % with these.
-_UNSURE_RAD, _UNSURE_ROWS = 0.25, 12
+# found anew agree, as in dense scenes whose scatterers the quarters do not resolve. Found by trial:
+# with 0.3, 1.7 % were wrong and ok where 40 scatterers change within 16 of 128 pulses.
+_UNSURE_RAD = 0.25
 # factor of the deviation of these: halves agree by chance in some of those that are ok, which were
 # 0.9 times (dense scenes) to 1.4 times (40 points that change) as wrong as the deviation said
 _BY_CHANCE = 1.15
@@ -273,10 +272,11 @@ def _assessed(
             std = torch.maximum(std, _drift(rows, present, phase, again))
         scene = describe(rows, phase, occupied)
         moved = displacement(rows, present) if compare else Displacement(0 * sharp, 0 * sharp)
-        largest = math.sqrt(-math.log(LEAST_STREHL)) * (sharpness_rows / _TELLING_ROWS).clamp_max(1)
         if compare:
+            few = (sharpness_rows / _TELLING_ROWS).clamp_max(1)
+            largest = math.sqrt(-math.log(LEAST_STREHL)) * few
             one, sure = _one_scene(rows, phase, std, largest, sharpness_rows)
-            least = _UNSURE_RAD * (sharpness_rows / _UNSURE_ROWS).clamp_max(1)
+            least = _UNSURE_RAD * few
             unsure = one & ~sure & ~lone & (std < least)
             std = torch.maximum(std, _found_anew(rows, present, start, phase, find, unsure) / occupied.sqrt())
             stays = one & (sure | (unsure & (std < least)))
