@@ -178,6 +178,7 @@ def test_bound_of_a_known_scene():
     power = ((azimuth * amplitude[..., None, :]) @ range_).abs().square().mean()
     unknown, known = (
         pulse_phase_bound_of_scene_rad(azimuth, range_, amplitude, 0.1)[0],
-        pulse_phase_bound_rad(power / 0.01, 16),
+        pulse_phase_bound_rad(power / 0.01, 16, 40),
     )
-    assert 0.95 * known < unknown < 1.5 * known
+    assert known < unknown < 1.5 * known
+    assert float(known / pulse_phase_bound_rad(power / 0.01, 16)) == pytest.approx(math.sqrt(38 / 40))

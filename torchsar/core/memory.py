@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -55,6 +57,26 @@ def machine_memory_bytes() -> int | None:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         return None
+
+
+def all_false(shape: tuple[int, ...]) -> np.ndarray:
+    """Make an array of False that fits the main memory.
+
+    Some systems promise more memory than there is: the array could be made there, but not used.
+
+    Args:
+        shape: Shape of the array.
+
+    Returns:
+        The array, bool.
+
+    Raises:
+        MemoryError: If it does not fit.
+        ValueError: If it has more elements than an array can have.
+    """
+    if math.prod(shape) > (machine_memory_bytes() or math.inf):
+        raise MemoryError
+    return np.zeros(shape, bool)
 
 
 def _of_c_library(name: str) -> Callable[..., int] | None:

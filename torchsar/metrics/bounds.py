@@ -153,17 +153,21 @@ def velocity_bound_m_s(q: Value, dwell_s: Value, velocity_m_s: Value, wavelength
     return curvature * nonnegative(wavelength_m) * nonnegative(range_m) / (4 * math.pi * nonnegative(velocity_m_s))
 
 
-def pulse_phase_bound_rad(snr: Value, n_range: int) -> Tensor:
+def pulse_phase_bound_rad(snr: Value, n_range: int, n_pulse: int | None = None) -> Tensor:
     """Compute the bound of the phase of one pulse where the scene is known, 1 / sqrt(2 N SNR).
 
     Args:
         snr: Mean signal power of all samples over the noise variance.
         n_range: Number N of range samples of a pulse.
+        n_pulse: Number of pulses K, if the constant and the linear term of the phases over the
+            pulses are left out of the error: the bound is sqrt(1 - 2 / K) as large. By default
+            they count.
 
     Returns:
         Standard deviation in rad.
     """
-    return 1 / torch.sqrt(2 * n_range * nonnegative(snr))
+    free = 1.0 if n_pulse is None else max(0.0, 1 - 2 / n_pulse)
+    return torch.sqrt(free / (2 * n_range * nonnegative(snr)))
 
 
 def pulse_phase_bound_of_scene_rad(azimuth: Tensor, range_: Tensor, amplitude: Tensor, noise_std: Value) -> Tensor:

@@ -12,7 +12,6 @@ of the metadata of all arrays, and of the attributes themselves.
 from __future__ import annotations
 
 import json
-import math
 import time
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -24,17 +23,8 @@ import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec
 
-from torchsar.core import (
-    SEAL,
-    address,
-    array_metadata,
-    canonical,
-    checksum,
-    document,
-    group_attributes,
-    machine_memory_bytes,
-    sealed,
-)
+from torchsar.core import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
+from torchsar.core.memory import all_false
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.record import OK, Labels, Record
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -245,10 +235,7 @@ def empty(labels: Labels, trials: int) -> Record:
     """
     shape = (*map(len, labels.values()), trials)
     try:
-        # where the system promises more memory than there is, the array can be made, but not used
-        if math.prod(shape) > (machine_memory_bytes() or math.inf):
-            raise MemoryError
-        return Record((), dict(labels), np.zeros(shape, bool), np.zeros((0, *shape), bool))
+        return Record((), dict(labels), all_false(shape), np.zeros((0, *shape), bool))
     except (MemoryError, ValueError):
         raise ConfigError(
             f"sweep: the results of {' x '.join(map(str, shape))} trials do not fit into memory; "

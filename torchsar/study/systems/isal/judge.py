@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -54,7 +52,7 @@ def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
     if not bool((std > 0).all()):
         return {}
     power = (torch.view_as_real(data).double().square().sum(-1).mean((-2, -1)) - std.square()).clamp_min(1e-300)
-    known = _known_scene_rad(power / std.square(), *data.shape[-2:])
+    known = pulse_phase_bound_rad(power / std.square(), data.shape[-1], data.shape[-2])
     ratio = bench.memo("bound ratio", lambda: _bound_ratio(bench))
     free = {} if ratio is None else {"amplitudes unknown (Cramer-Rao)": known * ratio}
     return {"residual_phase_rms_rad": {"scene known": known, **free}}
@@ -102,10 +100,7 @@ def _bound_ratio(bench: Bench) -> float | None:
     rate = float((radar.rotation_rad_s if world.rotation_rad_s is None else world.rotation_rad_s) or 0.0)
     azimuth, response = turntable_responses(radar, rate, scene.azimuth_m, scene.range_m, size.pulses, size.samples)
     power = ((azimuth * scene.amplitude) @ response).abs().square().mean()
-    whole = pulse_phase_bound_of_scene_rad(azimuth, response, scene.amplitude, 1.0)
-    return float(whole / _known_scene_rad(power, size.pulses, size.samples))
-
-
-def _known_scene_rad(snr: Tensor, pulses: int, samples: int) -> Tensor:
-    """Bound for a known scene of the phases without two of their parameters."""
-    return pulse_phase_bound_rad(snr, samples) * math.sqrt(max(0.0, 1 - 2 / pulses))
+    return float(
+        pulse_phase_bound_of_scene_rad(azimuth, response, scene.amplitude, 1.0)
+        / pulse_phase_bound_rad(power, size.samples, size.pulses)
+    )
