@@ -61,9 +61,9 @@ _QUARTERS, _SEEN, _ALIKE = 4, 0.17, 0.33
 _CHANGING, _STAYING = (0.62, 0.19), (0.94, -0.09)
 # Changes of few scatterers do not average out. Where fewer rows than the first number make the
 # sharpness, the largest deviation that is ok is smaller; where fewer than the second do, nothing is
-# sure below this correlation, which four points that change within 32 pulses reach in 10 % of the
-# trials.
-_TELLING_ROWS, _MANY_ROWS, _STILL = 6, 30, 0.95
+# sure below this correlation, which a few percent of the trials reach where four points change
+# within 32 pulses, and most where few points stay.
+_TELLING_ROWS, _MANY_ROWS, _STILL = 6, 30, 0.92
 # With little noise bright scatterers may stay while weak ones change, as in an aircraft in flight.
 # It is enough if they are alike: the same limits for moduli above so many times their median, in
 # images with such a share of the scene. The correlation was below 0.71 in 95 % of the trials where
