@@ -107,8 +107,9 @@ def autofocus(
         because scatterers change or are not resolved in a quarter, phases found anew from two
         halves of the range cells must agree to 0.25 rad, less where few range cells make the
         sharpness. The standard deviation then is at least half of their difference. Where
-        scatterers change within an eighth of the record, up to one trial of hundred was ok and
-        wrong in measurements, and deviations were up to 1.4 times too small. Phases of
+        scatterers change within an eighth of the record, most trials are not ok, and one of hundred
+        was ok and wrong. Where many that are equally bright all change within a tenth, the scene
+        looks homogeneous: one of five was ok and wrong, by linked phases. Phases of
         `link_phases` have its standard deviations, `quality` and `ok`; where sharp phases of small
         deviation contradict them, these stay. `info` holds "homogeneous" of shape (...,), bool,
         True where the homogeneous description is more likely; `ok` is False if linked phases then
