@@ -11,7 +11,8 @@ from torch import Tensor
 from tests.audit.pulses import scintillating
 from torchsar.compensate import LinkPhases, autofocus, entropy_fixed_point, link_phases, pga, sca
 from torchsar.compensate.pulse_phase.homogeneous import describe, sparse_gain_nats
-from torchsar.compensate.pulse_phase.linking import _grown, _Scene
+from torchsar.compensate.pulse_phase.likelihood import Speckle
+from torchsar.compensate.pulse_phase.linking import _grown
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 from torchsar.core import Axis, LargestTensor, Signal
 from torchsar.metrics.phase import phase_rmse
@@ -90,18 +91,49 @@ def test_no_part_of_a_long_record_slips() -> None:
     assert float(phase_rmse(found["phase_rad"], torch.zeros(2, 2 * N)).max()) < 0.1
 
 
-def test_linked_phases_of_two_points_need_a_confirmation() -> None:
+def test_few_points_are_not_linked() -> None:
     """Two of these trials were ok with .78 and .05 rad, and deviations of .06 and .006 rad."""
     batch = scintillating(10.0, 2, 1e12)(32, 3000)
-    found = link_phases(batch.data.data)
-    error, std = phase_rmse(found["phase_rad"], batch.truth["phase_rad"]), found.std["phase_rad"]
-    assert found.ok.sum() > 10 and (error < 5 * std.square().mean(-1).sqrt())[found.ok].all()
+    assert not bool(link_phases(batch.data.data).ok.any())
+    found = autofocus(batch.data.data)
+    assert found.ok.sum() > 28 and float(phase_rmse(found["phase_rad"], batch.truth["phase_rad"])[found.ok].max()) < 0.3
+
+
+def changing(trials: int, points: int, pulses: float, seed: int) -> tuple[Tensor, Tensor]:
+    """Equal points in a fifth of the band at 15 dB, which change within so many of 96 pulses."""
+    generator, n = torch.Generator().manual_seed(seed), 96
+    time, cell = torch.arange(n, dtype=F64), torch.arange(ROWS, dtype=F64)
+    spectrum = torch.exp(-((math.pi * torch.fft.fftfreq(4 * n, dtype=F64) * pulses) ** 2))
+    spectrum = spectrum / spectrum.square().mean().sqrt()
+    history = torch.fft.ifft(spectrum * normal(generator, trials, points, 4 * n), norm="ortho")[..., :n]
+    doppler, place = (torch.rand(2, trials, points, generator=generator, dtype=F64) - 0.5).unbind()
+    history = history * torch.exp(0.4j * math.pi * doppler[..., None] * time)
+    away = torch.remainder(cell[:, None] - ROWS * place[:, None], ROWS)
+    response = torch.sinc(torch.where(away > ROWS / 2, away - ROWS, away))
+    scene = (response.to(history.dtype) @ history).mT
+    scene = scene + math.sqrt(points / ROWS) * 10 ** (-15 / 20) * normal(generator, trials, n, ROWS)
+    phase = 2 * math.pi * torch.rand(trials, n, generator=generator, dtype=F64)
+    return scene * torch.exp(1j * phase)[..., None], phase
+
+
+@pytest.mark.parametrize(("points", "pulses", "least_ok"), [(3, 10.0, 0.0), (10, 10.0, 0.0), (100, 10.0, 0.8)])
+def test_points_that_change_are_not_sure_and_wrong(points: int, pulses: float, least_ok: float) -> None:
+    """46 % of 3 points were ok and wrong, 29 % of 10; the error of 100 was 2.1 deviations."""
+    data, phase = changing(24, points, pulses, 31)
+    for method in (link_phases, autofocus):
+        found = method(data)
+        error, std = phase_rmse(found["phase_rad"], phase), found.std["phase_rad"].square().mean(-1).sqrt()
+        ok = found.ok
+        assert float(ok.double().mean()) >= least_ok
+        assert int((ok & (error > 5 * std)).sum()) == 0
+        if least_ok:
+            assert 0.67 < float(error[ok].square().mean().sqrt() / std[ok].square().mean().sqrt()) < 1.4
 
 
 def test_blocks_without_a_neighbour_are_joined() -> None:
     n = 513  # 31 blocks of 17 pulses
     data = clutter(1, 0.4, 15.0, 5, n=n)[..., ::6]
-    phase = torch.angle(_grown(_Scene.of(data.mT, torch.ones(1, n, dtype=torch.bool))))
+    phase = torch.angle(_grown(Speckle.of(data.mT, torch.ones(1, n, dtype=torch.bool))))
     assert float(phase_rmse(phase, torch.zeros(1, n, dtype=F64)).max()) < 0.3
 
 
@@ -219,7 +251,7 @@ def test_the_likelihood_is_that_of_direct_evaluation() -> None:
     present = torch.ones(2, 10, dtype=torch.bool)
     present[1, 4] = False
     rows = rows * present[:, None]
-    scene, u = _Scene.of(rows, present), torch.exp(1j * torch.randn(2, 10, generator=generator, dtype=F64))
+    scene, u = Speckle.of(rows, present), torch.exp(1j * torch.randn(2, 10, generator=generator, dtype=F64))
     spectra = [1 + torch.rand(2, 20, generator=generator, dtype=F64) for _ in scene.groups]
     fit = scene.fit(spectra)
     adapted = scene.adapted(u, fit)

@@ -160,6 +160,25 @@ def test_phases_samples_and_factorisations_are_checked_with_one_reading() -> Non
     torch.testing.assert_close(to_host(made), expected)
 
 
+def test_large_matrices_of_a_batch_are_solved() -> None:
+    """LU factors of a batch of them with two threads are wrong on some processors."""
+    generator = torch.Generator().manual_seed(1)
+    matrix = torch.eye(160, dtype=torch.float64) + torch.randn(2, 3, 160, 160, generator=generator, dtype=torch.float64)
+    right = torch.randn(3, 160, 2, generator=generator, dtype=torch.float64)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        solution, inverse = linear_solve(matrix, right), matrix_inverse(matrix)
+        vector = linear_solve(matrix, matrix[..., 0])
+        slope = torch.func.jvp(matrix_inverse, (matrix,), (matrix,))[1]
+    finally:
+        torch.set_num_threads(threads)
+    torch.testing.assert_close(matrix @ solution, right.expand(2, -1, -1, -1))
+    torch.testing.assert_close(inverse @ matrix, torch.eye(160, dtype=torch.float64).expand_as(matrix))
+    torch.testing.assert_close(slope, -inverse)
+    torch.testing.assert_close(vector, torch.eye(160, dtype=torch.float64)[0].expand(2, 3, -1))
+
+
 @pytest.mark.parametrize("factor", [matrix_inverse, cholesky_factor, lambda x: linear_solve(x, x)])
 def test_singular_matrices_are_refused(factor: Callable[[Tensor], Tensor]) -> None:
     matrix = torch.zeros(2, 3, 3, dtype=torch.float64)

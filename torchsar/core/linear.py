@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from torchsar.core.host import check_value, flat_index
+
+_LARGEST_IN_BATCH = 128  # rows of matrices that are factorised in a batch
 
 
 def linear_solve(matrix: Tensor, right: Tensor) -> Tensor:
@@ -24,7 +28,15 @@ def linear_solve(matrix: Tensor, right: Tensor) -> Tensor:
     Raises:
         torch.linalg.LinAlgError: If a matrix is singular.
     """
-    solution, info = torch.linalg.solve_ex(matrix, right)
+    if not _large_batch(matrix):
+        solution, info = torch.linalg.solve_ex(matrix, right)
+    else:
+        vectors = right.ndim == 1 or right.shape == matrix.shape[:-1]
+        columns = right[..., None] if vectors else right
+        trials = torch.broadcast_shapes(matrix.shape[:-2], columns.shape[:-2])
+        pairs = zip(*(x.expand(*trials, *x.shape[-2:]).flatten(0, -3) for x in (matrix, columns)), strict=True)
+        solution, info = _joined([torch.linalg.solve_ex(*pair) for pair in pairs], trials)
+        solution = solution.squeeze(-1) if vectors else solution
     _check(info, "linear_solve: a matrix is singular")
     return solution
 
@@ -41,7 +53,10 @@ def matrix_inverse(matrix: Tensor) -> Tensor:
     Raises:
         torch.linalg.LinAlgError: If a matrix is singular.
     """
-    made, info = torch.linalg.inv_ex(matrix)
+    if not _large_batch(matrix):
+        made, info = torch.linalg.inv_ex(matrix)
+    else:
+        made, info = _joined([torch.linalg.inv_ex(one) for one in matrix.flatten(0, -3)], matrix.shape[:-2])
     _check(info, "matrix_inverse: a matrix is singular")
     return made
 
@@ -61,6 +76,20 @@ def cholesky_factor(matrix: Tensor) -> Tensor:
     factor, info = torch.linalg.cholesky_ex(matrix)
     _check(info, "cholesky_factor: a matrix is not positive definite")
     return factor
+
+
+def _large_batch(matrix: Tensor) -> bool:
+    """Whether matrices are factorised one by one, although they are a batch.
+
+    With several threads torch's LU factors of a batch of more than 150 x 150 on a CPU are wrong on
+    some processors, with or without an error (https://github.com/pytorch/pytorch/issues/142815).
+    """
+    return matrix.device.type == "cpu" and matrix.shape[-1] > _LARGEST_IN_BATCH and matrix.shape[:-2].numel() > 1
+
+
+def _joined(results: Sequence[tuple[Tensor, Tensor]], trials: Sequence[int]) -> tuple[Tensor, ...]:
+    """Batch of results that were found one by one."""
+    return tuple(torch.stack(parts).unflatten(0, trials) for parts in zip(*results, strict=True))
 
 
 def _check(info: Tensor, what: str) -> None:

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import check_value, host_value
+from torchsar.core import check_value, host_value, linear_solve, matrix_inverse
 from torchsar.radar import BistaticRadar, InverseRadar
 
 Value = Tensor | float
@@ -200,13 +200,13 @@ def pulse_phase_bound_of_scene_rad(azimuth: Tensor, range_: Tensor, amplitude: T
     )  # A^H times the derivative by each phase, (..., pulse, target), without a factor j
     scale = gram.diagonal(dim1=-2, dim2=-1).real.mean(-1)[..., None, None]
     ridge = 1e-9 * scale * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
-    explained = (cross.conj() @ torch.linalg.solve(gram + ridge, cross.mT)).real
+    explained = (cross.conj() @ linear_solve(gram + ridge, cross.mT)).real
     known = echo.abs().square().sum(-1)
     information = 2 * (torch.diag_embed(known) - explained) / nonnegative(noise_std).square()[..., None, None]
     n = echo.shape[-2]
     k = torch.arange(n, dtype=torch.float64, device=echo.device)
     free = torch.linalg.qr(torch.stack([torch.ones_like(k), k - k.mean()], -1), mode="complete").Q[:, 2:]
-    variance = torch.linalg.inv(free.mT @ information @ free)
+    variance = matrix_inverse(free.mT @ information @ free)
     return torch.sqrt(variance.diagonal(dim1=-2, dim2=-1).sum(-1) / n)
 
 

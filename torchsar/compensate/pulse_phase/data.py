@@ -240,3 +240,23 @@ def rising(x: Tensor) -> Tensor:
     if x.device.type == "cpu" and is_plain(x):
         return torch.from_numpy(np.sort(x.detach().resolve_neg().numpy(), axis=-1))
     return x.detach().sort(-1).values
+
+
+def dealt(energy: Tensor, parts: int) -> Tensor:
+    """Deal range cells into parts of similar energy that have no scatterer in common.
+
+    Cells between two minima of the energy, which one scatterer fills, stay together. These groups
+    are dealt in turn, the strongest first.
+
+    Args:
+        energy: Energy of the range cells, shape (trial, range).
+        parts: Number of parts.
+
+    Returns:
+        Number of the part of each cell, 0 or more, shape (trial, range), int64.
+    """
+    edge = torch.full_like(energy[:, :1], -1.0)
+    before, after = torch.cat([edge, energy[:, :-1]], -1), torch.cat([energy[:, 1:], edge], -1)
+    group = ((energy < before) & (energy <= after)).long().cumsum(-1)
+    of_group = torch.zeros_like(energy).scatter_add(-1, group, energy)
+    return of_group.argsort(-1, descending=True).argsort(-1).gather(-1, group) % parts

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare, refuse_odd_counts, rotate, starting_phase
+from torchsar.compensate.pulse_phase.data import Pulses, prepare, refuse_odd_counts, rotate, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.linking import linked
 from torchsar.compensate.pulse_phase.pairs import pair_phase
@@ -24,7 +24,7 @@ from torchsar.compensate.pulse_phase.sharpen import (
 )
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate, host_value, true_positions
-from torchsar.metrics import entropy, phase_rmse
+from torchsar.metrics import entropy
 
 # floor of the entropy fixed point in mean powers, found by trial: a lower floor includes noise, a
 # higher one excludes weak scatterers
@@ -190,17 +190,12 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
     likelier = some.info["gain_nats"] > info["sparse_gain_nats"].flatten()[at]
     fits = some.info["fit_nats"] > info["sparse_gain_nats"].flatten()[at]
     if_sparse, sharp = info["ok_if_sparse"].flatten()[at], std[:, 0] < _SURE_RAD
-    apart = phase_rmse(some["phase_rad"], sharpest["phase_rad"].reshape(-1, pulses.n)[at], pulses.present[at])
-    most = _APART * torch.hypot(*(x.double().square().mean(-1).sqrt() for x in (std, some.std["phase_rad"])))
-    contradicted = likelier & (if_sparse | sharp) & (apart > most)
-    sparse = contradicted | (~likelier & fits)
-    sure = if_sparse & (contradicted | sharp)
+    better = likelier & if_sparse & ~some.ok
+    sparse = better | (~likelier & fits)
+    sure = if_sparse & (better | sharp)
     ok = ok.index_copy(0, at[sparse], sure[sparse]).reshape(sharpest.ok.shape)
     info["homogeneous"] = homogeneous.index_fill(0, at[sparse], False).reshape(sharpest.ok.shape)
-    likelier = likelier & ~contradicted
-    few = (_FEW_ROWS / or_one(info["telling_rows"].flatten()[at])).clamp_max(1)
-    least = torch.where(if_sparse | sharp, few * apart, 0)[:, None].to(some.std["phase_rad"].dtype)
-    some = replace(some, std={"phase_rad": torch.maximum(some.std["phase_rad"], least)})
+    likelier = likelier & ~better
     at = at[likelier]
 
     def mixed(of_all: Tensor, of_some: Tensor) -> Tensor:

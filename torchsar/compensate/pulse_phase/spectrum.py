@@ -10,6 +10,7 @@ from torch import Tensor
 # details within so many standard deviations are taken for noise: among thousands of details about
 # one exceeds it by chance
 _THRESHOLD = 3.3
+_WINDOW = 4  # half width of the Hann window in bins
 
 
 def smoothed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
@@ -42,3 +43,18 @@ def smoothed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
     for level, detail in reversed(list(enumerate(details))):
         mean = (mean + detail + (mean - detail).roll(-(2**level), -1)) / 2
     return torch.exp(mean)
+
+
+def windowed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
+    """Smooth a mean periodogram by a Hann window of 9 bins, for phases that are still far off.
+
+    Args:
+        power: Mean power, shape (trial, bin); the first and the last bin are neighbours.
+        looks: Not used, see `smoothed_spectrum`.
+
+    Returns:
+        The smoothed power, same shape.
+    """
+    window = torch.hann_window(2 * _WINDOW + 3, periodic=False, dtype=power.dtype, device=power.device)[1:-1]
+    padded = torch.nn.functional.pad(power[:, None], (_WINDOW, _WINDOW), mode="circular")
+    return torch.nn.functional.conv1d(padded, (window / window.sum())[None, None])[:, 0]

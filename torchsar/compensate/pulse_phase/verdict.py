@@ -16,6 +16,7 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.alignment import Displacement, displacement
 from torchsar.compensate.pulse_phase.data import (
     Pulses,
+    dealt,
     on_the_circle,
     or_one,
     rising,
@@ -468,11 +469,7 @@ def _found_anew(
     at = true_positions(unsure, count)
     rows, present, phase, start = rows[at], present[at], phase[at], None if start is None else start[at]
     energy = (rows.real.square() + rows.imag.square()).sum(-1)
-    edge = torch.full_like(energy[:, :1], -1.0)
-    before, after = torch.cat([edge, energy[:, :-1]], -1), torch.cat([energy[:, 1:], edge], -1)
-    group = ((energy < before) & (energy <= after)).long().cumsum(-1)
-    of_group = torch.zeros_like(energy).scatter_add(-1, group, energy)
-    half = of_group.argsort(-1, descending=True).argsort(-1).gather(-1, group) % 2
+    half = dealt(energy, 2)
     parts = [torch.where((half == k)[..., None], rows, 0) for k in (0, 1)]
     ends = [find(part, present, start)[0] for part in parts]
     return torch.where(unsure, std.index_copy(0, at, _half_of(parts, ends, phase, present)), 0)

@@ -1,0 +1,419 @@
+"""Likelihood of the phases of the pulses of a homogeneous scene.
+
+The samples z of a range cell over the pulses are z = D a, where D = diag(exp(j phi)) holds the
+phase errors and a is circular Gaussian with a Toeplitz covariance R that the Doppler spectrum
+fixes. The negative log likelihood of a cell is
+
+    ln det R + tr(R^-1 D^H C D) = ln det R + u^H (R^-T o C) u,    u = exp(j phi),
+
+where C is the covariance of the samples and "o" the product of elements.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.pulse_phase.data import dealt, or_one
+from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, SPECTRAL_FLOOR, power_groups
+from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
+from torchsar.compensate.pulse_phase.verdict import occupied_band
+from torchsar.core import cholesky_factor, cis, linear_solve, matrix_inverse
+
+_IN_BAND = 0.85  # share of the power in the band of a first guess
+_STEPS = 4  # Newton steps of the phases after each estimate of the spectrum
+# least density of an adapted spectrum relative to its mean, which rounding allows
+_LEAST_FLOOR = 1e-8
+PRIOR = 3 / math.pi**2  # information in 1/rad^2 of a phase that is uniform over a turn
+# parts of the range cells, each judged by the spectra of the others; found by trial: 2 to 8 predict
+# about the same
+_PARTS = 4
+# Share of the energy that the cells must hold which share their spectrum with others: cells with
+# the side lobes of few points do so too. It is a quarter in clutter with five points of +15 dB.
+_LEAST_ENERGY = 0.2
+
+Smooth = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Likelihood of the phases for given spectra.
+
+    Args:
+        spectra: Doppler spectrum of each group at twice as many bins as pulses, (trial, bin).
+        inverses: R^-T of each group, shape (trial, pulse, pulse).
+        matrix: R^-T o C, summed over the range cells, shape (trial, pulse, pulse), Hermitian.
+        constant: ln det R, summed over the range cells, shape (trial,).
+    """
+
+    spectra: list[Tensor]
+    inverses: list[Tensor]
+    matrix: Tensor
+    constant: Tensor
+
+
+class Crossed(NamedTuple):
+    """What the range cells tell that share their spectrum with others, by spectra of others.
+
+    These are the groups of ten or more independent cells.
+
+    Args:
+        std: Standard deviation of each phase by their Fisher information in rad, (trial, pulse).
+        excess: Factor by which the scatter of the cells exceeds it, (trial,); about 1 where they
+            do have the same spectrum, infinite where their curvature does not hold the phases.
+        shift: Distance in rad rms by which they move the phases, (trial,).
+        rows: Effective number of these cells, (trial,).
+    """
+
+    std: Tensor
+    excess: Tensor
+    shift: Tensor
+    rows: Tensor
+
+
+@dataclass(frozen=True)
+class Speckle:
+    """Samples of the range cells in groups of similar power.
+
+    Args:
+        groups: Samples with zeros in the cells of other groups, shape (trial, pulse, range); their
+            products z z^H summed over the cells, shape (trial, pulse, pulse); and the number of
+            cells, shape (trial,).
+        present: Pulses that were received, shape (trial, pulse), bool.
+        samples: Number of samples, shape (trial,), which is also the negative log likelihood of
+            white noise, since the samples have a mean power of 1.
+        independent: Share of the range cells that are independent, shape (trial,).
+    """
+
+    groups: list[tuple[Tensor, Tensor, Tensor]]
+    present: Tensor
+    samples: Tensor
+    independent: Tensor
+
+    @staticmethod
+    def of(rows: Tensor, present: Tensor) -> Speckle:
+        z = rows.mT.to(torch.complex128)
+        samples = present.sum(-1).to(torch.float64) * z.shape[-1]
+        total = (z.real.square() + z.imag.square()).sum((-2, -1))
+        z = z * torch.where(total > 0, samples / or_one(total), 1).sqrt()[:, None, None]
+        power = (z.real.square() + z.imag.square()).sum(-2)
+        groups = []
+        for inside in power_groups(power):
+            if bool(inside.any()):
+                own = z * inside[:, None, :]
+                groups.append((own, own @ own.mH, inside.sum(-1).to(torch.float64)))
+        return Speckle(groups, present, samples, occupied_band(rows))
+
+    def trials(self, at: Tensor) -> Speckle:
+        """The scenes of some of the trials, given by their indices."""
+        groups = [(own[at], products[at], cells[at]) for own, products, cells in self.groups]
+        return Speckle(groups, self.present[at], self.samples[at], self.independent[at])
+
+    def cells(self, kept: Tensor) -> Speckle:
+        """The scenes with some of the range cells, given as bools (trial, range)."""
+        groups = []
+        for own, *_ in self.groups:
+            some = own * kept[:, None, :]
+            groups.append((some, some @ some.mH, (some != 0).any(-2).sum(-1).to(torch.float64)))
+        return Speckle(groups, self.present, self.present.sum(-1) * kept.sum(-1).to(torch.float64), self.independent)
+
+    def blocks(self, size: int) -> Speckle:
+        """Blocks of so many pulses, (trial * block); pulses beyond the last are absent."""
+        n = self.present.shape[-1]
+        count = -(-n // size)
+
+        def cut(x: Tensor, dim: int) -> Tensor:
+            return torch.cat([x, x.new_zeros(*x.shape[:dim], count * size - n, *x.shape[dim + 1 :])], dim)
+
+        present = cut(self.present, 1).reshape(-1, size)
+        groups = []
+        for samples, _, cells in self.groups:
+            own = cut(samples, 1).reshape(-1, size, samples.shape[-1])
+            groups.append((own, own @ own.mH, cells.repeat_interleave(count)))
+        samples = present.sum(-1) * self._cells.repeat_interleave(count)
+        return Speckle(groups, present, samples, self.independent.repeat_interleave(count))
+
+    def start(self, width: float) -> Tensor:
+        """Phases of greatest likelihood for a band (share of the pulse rate), as exp(j phase)."""
+        lag = torch.arange(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
+        every = sum(products for _, products, _ in self.groups) / or_one(self._cells)[:, None, None]
+        flat = torch.ones_like(every[:, 0])
+        band = _IN_BAND * torch.sinc(width * lag) + (1 - _IN_BAND) * (lag == 0)
+        lower, _ = self._factor(self._toeplitz(band.to(flat.dtype).expand_as(flat)))
+        matrix = torch.cholesky_inverse(lower).mT * every
+        return newton(matrix, _smallest(matrix, flat))
+
+    def powers(self, u: Tensor, part: slice = slice(None)) -> list[Tensor]:
+        """Periodograms of each group over a part of the pulses, without the phases of u.
+
+        They are summed over the range cells, shape (trial, bin), at twice as many bins as pulses.
+        """
+        powers = []
+        for own, *_ in self.groups:
+            spectrum = torch.fft.fft((own * u.conj()[..., None])[:, part], 2 * u.shape[-1], dim=-2)
+            powers.append((spectrum.real.square() + spectrum.imag.square()).sum(-1))
+        return powers
+
+    def periodograms(self, u: Tensor, smooth: Smooth) -> list[Tensor]:
+        """Smoothed mean periodograms of each group, without the phases of u."""
+        return self.smoothed(self.powers(u), smooth)
+
+    def smoothed(self, powers: list[Tensor], smooth: Smooth) -> list[Tensor]:
+        """Smoothed mean periodograms of each group, from their sums over the range cells."""
+        pulses = or_one(self.present.sum(-1))[:, None]
+        return [
+            self._smoothed(power / pulses, cells, smooth, SPECTRAL_FLOOR)
+            for power, (*_, cells) in zip(powers, self.groups, strict=True)
+        ]
+
+    def adapted(self, u: Tensor, fit: Fit) -> list[Tensor]:
+        """Smoothed powers of each group behind filters that suppress all other frequencies.
+
+        The filters are R^-1 a / (a^H R^-1 a) with the covariances of a fit, where a is a tone. A
+        periodogram raises weak parts of the spectrum by what leaks from strong ones.
+        """
+        spectra, n = [], u.shape[-1]
+        kept = self.present[:, :, None] & self.present[:, None, :]
+        for (own, _, cells), inverse in zip(self.groups, fit.inverses, strict=True):
+            tones = torch.fft.fft(inverse.mT @ (own * u.conj()[..., None]), 2 * n, dim=-2)
+            sums = torch.roll(torch.nn.functional.pad(lag_sums(inverse.mT * kept), (1, 0)), -n, -1)
+            gain = torch.fft.fft(sums).real
+            power = (tones.real.square() + tones.imag.square()).sum(-1) / gain.square()
+            spectra.append(
+                self._smoothed(power * self.present.sum(-1)[:, None], cells, smoothed_spectrum, _LEAST_FLOOR)
+            )
+        return spectra
+
+    def _smoothed(self, power: Tensor, cells: Tensor, smooth: Smooth, floor: float) -> Tensor:
+        """Smoothed mean of powers that were summed over the cells of a group."""
+        mean = power.mean(-1, keepdim=True)
+        power = torch.where(mean > 0, torch.maximum(power, floor * mean), 1) / or_one(cells)[:, None]
+        return smooth(power, (cells * self.independent).clamp_min(1))
+
+    def round(self, u: Tensor, spectra: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
+        """A Newton step of the phases for given spectra, and the spectra adapted to the result."""
+        fit = self.fit(spectra)
+        u = newton(fit.matrix, u, 1)
+        return u, self.adapted(u, fit)
+
+    def fit(self, spectra: list[Tensor]) -> Fit:
+        """The likelihood with given spectra of the groups."""
+        inverses, constant = [], torch.zeros_like(self.samples)
+        for (_, _, cells), spectrum in zip(self.groups, spectra, strict=True):
+            lower, log_det = self._factor(self._toeplitz(torch.fft.ifft(spectrum)))
+            inverses.append(torch.cholesky_inverse(lower).mT)
+            constant = constant + cells * log_det
+        return Fit(spectra, inverses, self.matrix(inverses), constant)
+
+    def gain(self, u: Tensor, fit: Fit) -> Tensor:
+        """Log likelihood of the phases u minus that of white noise, shape (trial,)."""
+        return self.samples - fit.constant - value_of(fit.matrix, u)
+
+    def information(self, fit: Fit) -> Tensor:
+        """Fisher information of the phases in 1/rad^2, shape (trial, pulse, pulse), if all range
+        cells are independent.
+        """
+        return self.summed(self.information_each(fit))
+
+    def summed(self, each: list[Tensor]) -> Tensor:
+        """Sum over all range cells of what each cell of a group adds."""
+        return sum(
+            (cells[:, None, None] * own for (*_, cells), own in zip(self.groups, each, strict=True)),
+            torch.zeros_like(each[0]),
+        )
+
+    def information_each(self, fit: Fit) -> list[Tensor]:
+        """Fisher information of the phases in a range cell of each group."""
+        eye = torch.eye(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
+        covariances = [self._toeplitz(torch.fft.ifft(spectrum)) for spectrum in fit.spectra]
+        return [2 * ((one * other).real - eye) for one, other in zip(fit.inverses, covariances, strict=True)]
+
+    def independent_share(self, u: Tensor, fit: Fit, each: list[Tensor], of: slice = slice(None)) -> Tensor:
+        """Share of the information that counts, because range cells depend on each other, (trial,).
+
+        Cells that a point fills with its side lobes, or that are sampled finer than the band
+        requires, have the same innovations. What the phases gain from two cells depends as the
+        square of their correlation. Correlations of independent cells of n pulses have a mean
+        square of 1 / n.
+
+        Args:
+            u: Phases as exp(j phase), shape (trial, pulse).
+            fit: The fit to all range cells.
+            each: Information of a range cell of each group, see `information_each`.
+            of: The groups whose share it is.
+        """
+        innovations = torch.zeros_like(self.groups[0][0])
+        of_cell = torch.zeros_like(innovations[:, 0].real)
+        for (own, *_), inverse, information in zip(self.groups[of], fit.inverses[of], each[of], strict=True):
+            lower = cholesky_factor(inverse.mT)
+            innovations = innovations + lower.mH @ (own * u.conj()[..., None])
+            here = (own.real.square() + own.imag.square()).sum(-2) > 0
+            amount = torch.diagonal(information, dim1=-2, dim2=-1).sum(-1).clamp_min(0)
+            of_cell = of_cell + here * amount[:, None]
+        level, count = torch.linalg.vector_norm(innovations, dim=-2), self.present.sum(-1).clamp_min(2)
+        innovations = innovations / or_one(level)[:, None, :]
+        alike = innovations.mH @ innovations
+        excess = (alike.real.square() + alike.imag.square() - 1 / count[:, None, None]) / (1 - 1 / count)[:, None, None]
+        weight = of_cell.sqrt()
+        both = (weight[:, None, :] @ (excess @ weight[..., None]))[:, 0, 0] - (weight.square() * (level > 0)).sum(-1)
+        total = weight.square().sum(-1)
+        return torch.where(total > 0, total / or_one(total + both.clamp_min(0)), 1)
+
+    def crossed(self, u: Tensor, fit: Fit, independent: Tensor) -> Crossed:
+        """Phases by the range cells that share their spectrum with others, and their scatter.
+
+        The Fisher information takes all cells of a group to have the same spectrum, and the fitted
+        one to be true. But cells of few scatterers each have their own, and a spectrum that is
+        fitted to few cells adapts to slow phase errors. Here each cell moves the phases by a Newton
+        step for spectra that other cells fit, with the curvature that these spectra give. The
+        squares of the steps add up to a variance ("sandwich" of curvature and scatter).
+
+        Args:
+            u: Phases as exp(j phase), shape (trial, pulse).
+            fit: The fit to all range cells.
+            independent: Share of the information that counts, see `independent_share`.
+
+        Reference:
+            White, Maximum likelihood estimation of misspecified models, Econometrica 50(1), 1982.
+        """
+        energy = torch.stack([own.abs().square().sum(-2) for own, *_ in self.groups]).sum(0)
+        part = dealt(energy, _PARTS)
+        each = self.information_each(fit)
+        shares = [self.independent_share(u, fit, each, slice(k, k + 1)) for k in range(len(each))]
+        sharing = [share * cells >= LEAST_LOOKS for share, (*_, cells) in zip(shares, self.groups, strict=True)]
+        bend, slopes = torch.zeros_like(self.groups[0][1].real), torch.zeros_like(self.groups[0][0].real)
+        for number in range(_PARTS):
+            judged, others = self.cells(part == number), self.cells(part != number)
+            adapted = zip(others.adapted(u, fit), sharing, strict=True)
+            crossed = others.fit([torch.where(shared[:, None], spectrum, 1) for spectrum, shared in adapted])
+            turned = (u.conj()[:, :, None] * judged.matrix(crossed.inverses) * u[:, None, :]).real
+            bend = bend + 2 * (turned - torch.diag_embed(turned.sum(-1)))
+            for (own, *_), inverse in zip(judged.groups, crossed.inverses, strict=True):
+                straight = own * u.conj()[..., None]
+                slopes = slopes - 2 * (straight.conj() * (inverse.mT @ straight)).imag
+        eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
+        lower, failed = torch.linalg.cholesky_ex(bend + PRIOR * eye)
+        lower = torch.where((failed == 0)[:, None, None], lower, eye)
+        steps = _without_line(u.shape[-1], u.device) @ torch.cholesky_solve(slopes, lower)
+
+        each = [shared[:, None, None] * own for shared, own in zip(sharing, each, strict=True)]
+        std = deviation(independent[:, None, None] * self.summed(each))
+        scatter = (steps.square().sum(-1) / independent[:, None]).sqrt()
+        some = energy * sum(
+            shared[:, None] * (own != 0).any(-2) for (own, *_), shared in zip(self.groups, sharing, strict=True)
+        )
+        known = (failed == 0) & (some.sum(-1) > _LEAST_ENERGY * energy.sum(-1))
+        excess = torch.where(
+            known, rms_of_pulses(scatter, self.present) / or_one(rms_of_pulses(std, self.present)), torch.inf
+        )
+        shift = torch.where(known, rms_of_pulses(steps.sum(-1), self.present), torch.inf)
+        return Crossed(std, excess, shift, some.sum(-1).square() / or_one(some.square().sum(-1)))
+
+    def matrix(self, inverses: list[Tensor]) -> Tensor:
+        """R^-T o C, summed over the range cells, for the R^-T of each group."""
+        return sum(
+            (one * products for one, (_, products, _) in zip(inverses, self.groups, strict=True)),
+            torch.zeros_like(self.groups[0][1]),
+        )
+
+    @property
+    def _cells(self) -> Tensor:
+        return sum((cells for *_, cells in self.groups[1:]), self.groups[0][2])
+
+    def _toeplitz(self, lags: Tensor) -> Tensor:
+        """Covariance of the present pulses, (trial, pulse, pulse); other pulses have variance 1.
+
+        It is Hermitian and Toeplitz with the first column `lags` (trial, at least pulse).
+        """
+        n = self.present.shape[-1]
+        at = torch.arange(n, device=lags.device)
+        both = torch.cat([lags[:, :n], lags[:, 1:n].conj().flip(-1)], -1)[:, (at[:, None] - at) % (2 * n - 1)]
+        kept = self.present[:, :, None] & self.present[:, None, :]
+        return torch.where(kept, both, torch.eye(n, dtype=lags.dtype, device=lags.device))
+
+    def _factor(self, covariance: Tensor) -> tuple[Tensor, Tensor]:
+        """Cholesky factor and log determinant of covariances."""
+        lower = cholesky_factor(covariance)
+        return lower, 2 * torch.diagonal(lower, dim1=-2, dim2=-1).real.log().sum(-1)
+
+
+def lag_sums(matrix: Tensor) -> Tensor:
+    """Sums of the elements (row, column) of equal row - column, from 1 - n to n - 1."""
+    n = matrix.shape[-1]
+    skewed = torch.nn.functional.pad(matrix.flip(-1), (0, n)).flatten(-2)[..., : n * (2 * n - 1)]
+    return skewed.unflatten(-1, (n, 2 * n - 1)).sum(-2)
+
+
+def value_of(matrix: Tensor, u: Tensor) -> Tensor:
+    """u^H M u, shape (trial,)."""
+    return (u.conj() * (matrix @ u[..., None])[..., 0]).sum(-1).real
+
+
+def _smallest(matrix: Tensor, start: Tensor) -> Tensor:
+    """Phases, as exp(j phase), of the eigenvector of the smallest eigenvalue; inverse iteration."""
+    n = start.shape[-1]
+    ridge = 1e-6 * torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1)[:, None, None] + 1e-12
+    lower = cholesky_factor(matrix + ridge * torch.eye(n, dtype=matrix.dtype, device=matrix.device))
+    vector = start
+    for _ in range(4):
+        vector = torch.cholesky_solve(vector[..., None], lower)[..., 0]
+        vector = vector / or_one(vector.abs().amax(-1, keepdim=True))
+    size = vector.abs()
+    return torch.where(size > 0, vector / or_one(size), 1)
+
+
+def newton(matrix: Tensor, u: Tensor, steps: int = _STEPS) -> Tensor:
+    """Lower u^H M u by damped Newton steps of the phases of u."""
+    value, diagonal = value_of(matrix, u), torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1)
+    damping = torch.full_like(value, 1e-3)
+    eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
+    for _ in range(steps):
+        turned = u.conj()[..., :, None] * matrix * u[..., None, :]
+        slope = turned.sum(-1)
+        bend = 2 * turned.real - torch.diag_embed(2 * slope.real - (2 * damping * diagonal + 1e-9)[:, None])
+        lower, failed = torch.linalg.cholesky_ex(bend)
+        lower = torch.where((failed == 0)[:, None, None], lower, eye)
+        step = -torch.cholesky_solve(2 * slope.imag[..., None], lower)[..., 0]
+        trial = u * cis(step.clamp(-1, 1))
+        reached = value_of(matrix, trial)
+        better = (failed == 0) & (reached <= value)
+        u, value = torch.where(better[:, None], trial, u), torch.where(better, reached, value)
+        damping = torch.where(better, damping / 5, damping * 10).clamp(1e-9, 1e3)
+    return u
+
+
+def newton_step(matrix: Tensor, u: Tensor) -> Tensor:
+    """Newton step of the phases of u in rad, (trial, pulse), differentiable in the matrix."""
+    turned = u.conj()[..., :, None] * matrix * u[..., None, :]
+    slope = turned.sum(-1)
+    bend = 2 * (turned.real - torch.diag_embed(slope.real)).detach()
+    # a constant phase has no curvature and no slope
+    ridge = 1e-6 * torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1).detach()
+    eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
+    return -linear_solve(bend + ridge[:, None, None] * eye, 2 * slope.imag)
+
+
+def deviation(information: Tensor) -> Tensor:
+    """Standard deviation of each phase in rad, (trial, pulse), without its straight line."""
+    n = information.shape[-1]
+    eye = torch.eye(n, dtype=torch.float64, device=information.device)
+    flat = _without_line(n, information.device)
+    covariance = flat @ matrix_inverse(information + PRIOR * eye) @ flat
+    return torch.diagonal(covariance, dim1=-2, dim2=-1).clamp_min(0).sqrt()
+
+
+def rms_of_pulses(x: Tensor, present: Tensor) -> Tensor:
+    """Rms over the present pulses, (trial, pulse) -> (trial,)."""
+    return ((x.square() * present).sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
+
+
+def _without_line(n: int, device: torch.device) -> Tensor:
+    """Projection of n phases that removes their constant and linear part, (n, n)."""
+    pulse = torch.linspace(-1, 1, n, dtype=torch.float64, device=device)
+    line = torch.linalg.qr(torch.stack([torch.ones_like(pulse), pulse], -1)).Q
+    return torch.eye(n, dtype=torch.float64, device=device) - line @ line.mT
