@@ -233,6 +233,11 @@ class Speckle:
         covariances = [self._toeplitz(torch.fft.ifft(spectrum)) for spectrum in fit.spectra]
         return [2 * ((one * other).real - eye) for one, other in zip(fit.inverses, covariances, strict=True)]
 
+    def looks(self, u: Tensor, fit: Fit, each: list[Tensor]) -> list[Tensor]:
+        """Number of independent range cells of each group, (trial,) each."""
+        shares = [self.independent_share(u, fit, each, slice(k, k + 1)) for k in range(len(each))]
+        return [share * cells for share, (*_, cells) in zip(shares, self.groups, strict=True)]
+
     def independent_share(self, u: Tensor, fit: Fit, each: list[Tensor], of: slice = slice(None)) -> Tensor:
         """Share of the information that counts, because range cells depend on each other, (trial,).
 
@@ -264,7 +269,7 @@ class Speckle:
         total = weight.square().sum(-1)
         return torch.where(total > 0, total / or_one(total + both.clamp_min(0)), 1)
 
-    def crossed(self, u: Tensor, fit: Fit, independent: Tensor) -> Crossed:
+    def crossed(self, u: Tensor, fit: Fit, each: list[Tensor], looks: list[Tensor], independent: Tensor) -> Crossed:
         """Phases by the range cells that share their spectrum with others, and their scatter.
 
         The Fisher information takes all cells of a group to have the same spectrum, and the fitted
@@ -276,6 +281,8 @@ class Speckle:
         Args:
             u: Phases as exp(j phase), shape (trial, pulse).
             fit: The fit to all range cells.
+            each: Information of a range cell of each group, see `information_each`.
+            looks: Number of independent cells of each group, see `looks`.
             independent: Share of the information that counts, see `independent_share`.
 
         Reference:
@@ -283,9 +290,7 @@ class Speckle:
         """
         energy = torch.stack([own.abs().square().sum(-2) for own, *_ in self.groups]).sum(0)
         part = dealt(energy, _PARTS)
-        each = self.information_each(fit)
-        shares = [self.independent_share(u, fit, each, slice(k, k + 1)) for k in range(len(each))]
-        sharing = [share * cells >= LEAST_LOOKS for share, (*_, cells) in zip(shares, self.groups, strict=True)]
+        sharing = [count >= LEAST_LOOKS for count in looks]
         bend, slopes = torch.zeros_like(self.groups[0][1].real), torch.zeros_like(self.groups[0][0].real)
         for number in range(_PARTS):
             judged, others = self.cells(part == number), self.cells(part != number)

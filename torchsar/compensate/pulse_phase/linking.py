@@ -51,10 +51,10 @@ _NOISE_NATS, _MARGIN = 2.0, 2.0
 # phase error hardly changes it, so that the rms error of a scene may exceed its standard deviation
 # by this factor.
 _SPREAD = 1.9
-# range cells from which on the errors are so predictable; with fewer the factor is larger. Found by
-# trial: in few cells the spectra of points that change adapt to slow phase errors.
+# Range cells from which on the errors are so predictable; with fewer the factor is larger. Found by
+# trial.
 _CELLS = 24
-# Excess of the deviation (see `_Linked`) up to which range cells of similar power have the same
+# Excess of the deviation (see `Crossed`) up to which range cells of similar power have the same
 # spectrum: it was 0.8 to 1.1 in 90 % of the scenes of clutter, 1.2 to 9 where each cell holds few
 # scatterers. In that case only the scatter of many cells predicts the errors: where less than so
 # many hold the energy, up to 6 % of scenes that change were wrong by more than five deviations.
@@ -85,21 +85,26 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
     Returns:
         `phase_rad` of shape (..., pulse), to be removed. The standard deviation of each pulse is
         the Cramer-Rao bound for the estimated spectrum, in which range cells that depend on each
-        other count less, raised by the share of the likelihood that the phases gain on noise. A
-        constant and a linear phase only add a phase to the image and shift it; they are
-        left out of the standard deviation. `quality` is the predicted Strehl ratio times the share
-        of the likelihood that noise does not explain. `ok` is False where the Strehl ratio for 1.9
-        times the standard deviation (more where fewer than 24 range cells hold the energy) is below
-        0.8, the gain in likelihood below twice that of noise, a single range cell holds nearly all
-        of the energy, the range profiles are not aligned (see `Displacement`), the pulses before
-        and after a boundary are less than 0.55 times as coherent as the spectra predict (where the
-        scene changes, or pulses are copies of each other), adjacent pulses are not coherent in any
-        ten range cells of similar power, few range cells hold nearly all of the scene and phases
-        that sharpen it differ by more than three standard deviations, or a sparse description of
-        the scene with these is more likely: in sparse scenes the spectrum adapts to phase errors,
-        which the standard deviation does not contain. `info`
+        other count less, raised by the share of the likelihood that the phases gain on noise. The
+        bound takes range cells of similar power to have one spectrum. Where each holds few
+        scatterers, they have not; the deviation is therefore raised to what the scatter of the
+        range cells shows, each judged by the spectra of others. A constant and a linear phase only
+        add a phase to the image and shift it; they are left out of the standard deviation.
+        `quality` is the predicted Strehl ratio times the share of the likelihood that noise does
+        not explain. `ok` is judged by the range cells that have ten or more independent ones of
+        similar power beside them. It is False where these hold less than a fifth of the energy, as
+        in scenes of few points, for which `autofocus` is made; where the Strehl ratio for 1.9 times
+        the standard deviation by these cells (more where fewer than 24 of them hold the energy) is
+        below 0.8; where they alone would move the phases by 1.5 deviations; and where their scatter
+        exceeds the bound by a factor of 1.2 and less than 30 of them hold the energy. It is also
+        False where the gain in likelihood is below twice that of noise, the range profiles are not
+        aligned (see `Displacement`), the pulses before and after a boundary are less than 0.55
+        times as coherent as the spectra predict (where the scene changes, or pulses are copies of
+        each other), adjacent pulses are not coherent in any ten range cells of similar power, or a
+        sparse description of the scene with the phases that sharpen it is more likely. `info`
         holds, of shape (...,), "gain_nats" (log likelihood minus that of white noise), "fit_nats"
         (the same as if range cells were independent, by which phases of one scene compare),
+        "excess_deviation" (that scatter over the bound, infinite where it is not known),
         "weakest_boundary" (the least coherence across a boundary relative to the prediction),
         "jitter_cells" and "migration_cells".
 
@@ -217,9 +222,12 @@ def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[_Linke
         u, fit = _refined(scene, _grown(scene) if start is None else cis(start.to(torch.float64)))
         each = scene.information_each(fit)
         information, independent = scene.summed(each), scene.independent_share(u, fit, each)
+        looks = scene.looks(u, fit, each)
+        # phases follow the noise of few cells and leave less of it, so that these seem to tell more
+        kept = [own * (1 - 1 / count.clamp_min(1))[:, None, None] for own, count in zip(each, looks, strict=True)]
         gain = scene.gain(u, fit)
-        crossed = scene.crossed(u, fit, independent)
-        std = deviation(independent[:, None, None] * information) * crossed.excess.clamp_min(1)[:, None]
+        crossed = scene.crossed(u, fit, kept, looks, independent)
+        std = deviation(independent[:, None, None] * scene.summed(kept)) * crossed.excess.clamp_min(1)[:, None]
         gains = scene.independent * gain, independent * gain
         judged = std, *gains, _weakest_boundary(fit.matrix, u, information)
     if not rows.requires_grad or not torch.is_grad_enabled():

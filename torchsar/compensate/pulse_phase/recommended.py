@@ -38,10 +38,6 @@ _RELAXATION = 1.8
 # Standard deviation of the sharpest phases below which they are ok where only the dependence of
 # range cells speaks against linked phases: a third of the largest one that is ok elsewhere.
 _SURE_RAD = 0.15
-# Distance of linked phases from sharpest ones of small deviation, in the deviations of both, from
-# which on the sharpest are kept: in 700 trials with up to 20 points it was 2 to 14 where one of
-# them was wrong, and below 1.8 elsewhere. Rows up to which the distance counts fully as deviation.
-_APART, _FEW_ROWS = 1.5, 2.0
 # lines of the image in a strip, by choice: more than the response of a point is wide
 _STRIP = 4
 _SLOPES = 48  # slopes tried over one turn per pulse, found by trial: spacing against time
@@ -106,13 +102,13 @@ def autofocus(
         scene where the images of quarters of them are alike; where these are not alike enough,
         because scatterers change or are not resolved in a quarter, phases found anew from two
         halves of the range cells must agree to 0.25 rad, less where few range cells make the
-        sharpness. The standard deviation then is at least half of their difference. Where
-        scatterers change within an eighth of the record, most trials are not ok, and one of hundred
-        was ok and wrong. Where many that are equally bright all change within a tenth, the scene
-        looks homogeneous: one of five was ok and wrong, by linked phases. Phases of
-        `link_phases` have its standard deviations, `quality` and `ok`; where sharp phases of small
-        deviation contradict them, these stay. `info` holds "homogeneous" of shape (...,), bool,
-        True where the homogeneous description is more likely; `ok` is False if linked phases then
+        sharpness. The standard deviation then is at least half of their difference. Where few
+        scatterers all change within a third of the record, the deviation is up to 1.6 times too
+        small, and up to four of hundred trials were ok and wrong; within an eighth, nearly all
+        trials are not ok. Phases of `link_phases` have its standard deviations, `quality` and
+        `ok`; where they are not ok but the sharpest ones are, these stay. `info` holds
+        "homogeneous" of shape (...,), bool, True where the homogeneous description is more likely
+        and the phases are not the sharpest ones; `ok` is False if linked phases then
         do not confirm that. It also holds "jitter_cells" and "migration_cells", the displacement of
         the range profiles from pulse to pulse and of groups of pulses in cells rms: `ok` is False
         from 0.25 and 0.4 cell on, because the phases may then be wrong. `imaging` corrects
@@ -172,10 +168,8 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
     stay; they are not ok, because the descriptions contradict each other. But where it is less
     likely only because range cells depend on each other, as those that side lobes of few points
     fill, the scene is sparse after all, and phases of small deviation are ok. The sharpest phases
-    also stay in long records, and where they are ok, or of small deviation, and further from the
-    linked ones than both deviations allow: in scenes of one or two points, which sharpness finds,
-    linked phases may be wrong, and their deviations are too small. For the same reason the
-    deviation is at least the distance from such phases, less where more rows make the sharpness.
+    also stay in long records, and where they are ok but the linked ones are not, as in scenes of
+    few points.
     """
     if pulses.n > _MOST_LINKED:
         return sharpest
