@@ -348,14 +348,29 @@ class Speckle:
 
 
 def lag_sums(matrix: Tensor) -> Tensor:
-    """Sums of the elements (row, column) of equal row - column, from 1 - n to n - 1."""
+    """Sum the elements (row, column) of equal row - column.
+
+    Args:
+        matrix: Matrices, shape (trial, n, n).
+
+    Returns:
+        The sums for row - column from 1 - n to n - 1, shape (trial, 2 n - 1).
+    """
     n = matrix.shape[-1]
     skewed = torch.nn.functional.pad(matrix.flip(-1), (0, n)).flatten(-2)[..., : n * (2 * n - 1)]
     return skewed.unflatten(-1, (n, 2 * n - 1)).sum(-2)
 
 
 def value_of(matrix: Tensor, u: Tensor) -> Tensor:
-    """u^H M u, shape (trial,)."""
+    """Compute u^H M u.
+
+    Args:
+        matrix: Hermitian matrices M, shape (trial, pulse, pulse).
+        u: Vectors, shape (trial, pulse).
+
+    Returns:
+        The values, shape (trial,), real.
+    """
     return (u.conj() * (matrix @ u[..., None])[..., 0]).sum(-1).real
 
 
@@ -373,7 +388,16 @@ def _smallest(matrix: Tensor, start: Tensor) -> Tensor:
 
 
 def newton(matrix: Tensor, u: Tensor, steps: int = _STEPS) -> Tensor:
-    """Lower u^H M u by damped Newton steps of the phases of u."""
+    """Lower u^H M u by damped Newton steps of the phases of u.
+
+    Args:
+        matrix: Hermitian matrices M, shape (trial, pulse, pulse).
+        u: Phases to start from as exp(j phase), shape (trial, pulse).
+        steps: Number of steps; one that does not lower the value only changes the damping.
+
+    Returns:
+        The phases reached, as exp(j phase), same shape as `u`.
+    """
     value, diagonal = value_of(matrix, u), torch.diagonal(matrix, dim1=-2, dim2=-1).real.mean(-1)
     damping = torch.full_like(value, 1e-3)
     eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
@@ -393,7 +417,15 @@ def newton(matrix: Tensor, u: Tensor, steps: int = _STEPS) -> Tensor:
 
 
 def newton_step(matrix: Tensor, u: Tensor) -> Tensor:
-    """Newton step of the phases of u in rad, (trial, pulse), differentiable in the matrix."""
+    """Compute a Newton step of the phases that minimise u^H M u, differentiable in M.
+
+    Args:
+        matrix: Hermitian matrices M, shape (trial, pulse, pulse).
+        u: Phases as exp(j phase), shape (trial, pulse).
+
+    Returns:
+        The step in rad, shape (trial, pulse).
+    """
     turned = u.conj()[..., :, None] * matrix * u[..., None, :]
     slope = turned.sum(-1)
     bend = 2 * (turned.real - torch.diag_embed(slope.real)).detach()
@@ -404,7 +436,14 @@ def newton_step(matrix: Tensor, u: Tensor) -> Tensor:
 
 
 def deviation(information: Tensor) -> Tensor:
-    """Standard deviation of each phase in rad, (trial, pulse), without its straight line."""
+    """Predict the standard deviation of phases without their constant and linear part.
+
+    Args:
+        information: Fisher information of the phases in 1/rad^2, shape (trial, pulse, pulse).
+
+    Returns:
+        The standard deviation in rad, shape (trial, pulse).
+    """
     n = information.shape[-1]
     eye = torch.eye(n, dtype=torch.float64, device=information.device)
     flat = _without_line(n, information.device)
@@ -413,7 +452,15 @@ def deviation(information: Tensor) -> Tensor:
 
 
 def rms_of_pulses(x: Tensor, present: Tensor) -> Tensor:
-    """Rms over the present pulses, (trial, pulse) -> (trial,)."""
+    """Compute the rms over the present pulses.
+
+    Args:
+        x: Values, shape (trial, pulse).
+        present: True for present pulses, shape (trial, pulse), bool.
+
+    Returns:
+        The rms, shape (trial,).
+    """
     return ((x.square() * present).sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
 
 
