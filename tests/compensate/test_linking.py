@@ -93,10 +93,10 @@ def test_no_part_of_a_long_record_slips() -> None:
 
 def test_few_points_are_not_linked() -> None:
     """Two of these trials were ok with .78 and .05 rad, and deviations of .06 and .006 rad."""
-    batch = scintillating(10.0, 2, 1e12)(32, 3000)
+    batch = scintillating(10.0, 2, 1e12)(12, 3000)
     assert not bool(link_phases(batch.data.data).ok.any())
     found = autofocus(batch.data.data)
-    assert found.ok.sum() > 28 and float(phase_rmse(found["phase_rad"], batch.truth["phase_rad"])[found.ok].max()) < 0.3
+    assert found.ok.sum() > 10 and float(phase_rmse(found["phase_rad"], batch.truth["phase_rad"])[found.ok].max()) < 0.3
 
 
 def changing(trials: int, points: int, pulses: float, seed: int) -> tuple[Tensor, Tensor]:
@@ -119,7 +119,7 @@ def changing(trials: int, points: int, pulses: float, seed: int) -> tuple[Tensor
 @pytest.mark.parametrize(("points", "pulses", "least_ok"), [(3, 10.0, 0.0), (10, 10.0, 0.0), (100, 10.0, 0.8)])
 def test_points_that_change_are_not_sure_and_wrong(points: int, pulses: float, least_ok: float) -> None:
     """46 % of 3 points were ok and wrong, 29 % of 10; the error of 100 was 2.1 deviations."""
-    data, phase = changing(24, points, pulses, 31)
+    data, phase = changing(12, points, pulses, 31)
     for method in (link_phases, autofocus):
         found = method(data)
         error, std = phase_rmse(found["phase_rad"], phase), found.std["phase_rad"].square().mean(-1).sqrt()
