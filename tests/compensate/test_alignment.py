@@ -94,7 +94,7 @@ def test_displaced_clutter_is_not_believed(share: float) -> None:
         found = link_phases((moved + noise) * torch.exp(1j * phase)[..., None])
         error = phase_rmse(found["phase_rad"], phase)
         if jitter:
-            assert (error > 2 * found.std["phase_rad"].mean(-1)).all() and not found.ok.any()
+            assert (error > 0.5).all() and not found.ok.any()
             truth = float(course.diff(dim=0).square().mean().sqrt()) / math.sqrt(2)
             assert float(found.info["jitter_cells"].median()) == pytest.approx(truth, rel=0.35)
         else:

@@ -32,7 +32,7 @@ from torchsar.compensate.pulse_phase.likelihood import (
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum, windowed_spectrum
-from torchsar.compensate.pulse_phase.verdict import LEAST_STREHL, occupied_band
+from torchsar.compensate.pulse_phase.verdict import LEAST_ROWS, LEAST_STREHL, occupied_band
 from torchsar.core import Estimate, cis, over_blocks
 
 # Longest block whose phases are found by themselves, in pulses; bands of their first guesses as
@@ -127,12 +127,15 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
     return replace(found, ok=found.ok & likelier.reshape(pulses.trials))
 
 
-def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
+def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False) -> Estimate:
     """Estimate the phases of pulses that were checked; see `link_phases`.
 
     Args:
         pulses: The pulses.
         start: Phase to start from in rad, shape (trial, pulse), or None.
+        still: True if scatterers do not change and the caller confirms the phases, as by several
+            starts. The Cramer-Rao bound for one spectrum of similar range cells then is the
+            deviation, also of few cells.
 
     Returns:
         The `Estimate` that `link_phases` returns.
@@ -149,7 +152,7 @@ def linked(pulses: Pulses, start: Tensor | None = None) -> Estimate:
     done: dict[int, tuple[Tensor, ...]] = {}
 
     def work(part: slice) -> None:
-        found, crossed = _linked(rows[part], pulses.present[part], None if start is None else start[part])
+        found, crossed = _linked(rows[part], pulses.present[part], None if start is None else start[part], still)
         moved = displacement(rows[part], pulses.present[part])
         jitter = torch.maximum(moved.jitter, coherent_jitter(rows[part], pulses.present[part]))
         done[part.start] = *found, *crossed, jitter, moved.migration
@@ -195,6 +198,7 @@ def _estimate(pulses: Pulses, found: _Linked, crossed: Crossed, moved: Displacem
     spread = _SPREAD**2 * (_CELLS / crossed.rows.clamp_min(1)).clamp_min(1)
     fitted = (spread * (lost * alone).square() < -math.log(LEAST_STREHL)) & (crossed.shift < _MOVED * alone)
     fitted = fitted & ((crossed.excess < _UNLIKE) | (crossed.rows > _MANY_ROWS)) & (gain > _MARGIN * noise)
+    fitted = fitted & (crossed.rows > LEAST_ROWS)
     return Estimate(
         value={"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
         std={"phase_rad": std.reshape(*trials, pulses.n).to(real)},
@@ -211,7 +215,7 @@ def _estimate(pulses: Pulses, found: _Linked, crossed: Crossed, moved: Displacem
     )
 
 
-def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[_Linked, Crossed]:
+def _linked(rows: Tensor, present: Tensor, start: Tensor | None, still: bool) -> tuple[_Linked, Crossed]:
     """Link the pulses of a block of trials."""
     if rows.shape[-1] < 3:  # nothing to distinguish a phase error from a shift of the image
         zero = torch.zeros(present.shape, dtype=torch.float64, device=rows.device)
@@ -222,12 +226,18 @@ def _linked(rows: Tensor, present: Tensor, start: Tensor | None) -> tuple[_Linke
         u, fit = _refined(scene, _grown(scene) if start is None else cis(start.to(torch.float64)))
         each = scene.information_each(fit)
         information, independent = scene.summed(each), scene.independent_share(u, fit, each)
-        looks = scene.looks(u, fit, each)
-        # phases follow the noise of few cells and leave less of it, so that these seem to tell more
-        kept = [own * (1 - 1 / count.clamp_min(1))[:, None, None] for own, count in zip(each, looks, strict=True)]
         gain = scene.gain(u, fit)
-        crossed = scene.crossed(u, fit, kept, looks, independent)
-        std = deviation(independent[:, None, None] * scene.summed(kept)) * crossed.excess.clamp_min(1)[:, None]
+        if still:
+            energy = (rows.real.square() + rows.imag.square()).sum(-1, dtype=torch.float64)
+            effective = energy.sum(-1).square() / or_one(energy.square().sum(-1))
+            std = deviation(independent[:, None, None] * information)
+            crossed = Crossed(std, torch.ones_like(effective), torch.zeros_like(effective), effective)
+        else:
+            looks = scene.looks(u, fit, each)
+            # phases follow the noise of few cells and leave less of it: these seem to tell more
+            kept = [own * (1 - 1 / count.clamp_min(1))[:, None, None] for own, count in zip(each, looks, strict=True)]
+            crossed = scene.crossed(u, fit, kept, looks, independent)
+            std = deviation(independent[:, None, None] * scene.summed(kept)) * crossed.excess.clamp_min(1)[:, None]
         gains = scene.independent * gain, independent * gain
         judged = std, *gains, _weakest_boundary(fit.matrix, u, information)
     if not rows.requires_grad or not torch.is_grad_enabled():

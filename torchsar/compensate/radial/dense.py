@@ -59,11 +59,11 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
 
     pulses = prepare(averaged(cells), "linked_walk", empty=False)
     start = torch.angle(averaged(cis(polished_rad.detach().to(torch.float64))))
-    results = [linked(pulses, start), linked(pulses, smooth_walk(pulses.rows.detach()))]
+    results = [linked(pulses, start, still=True), linked(pulses, smooth_walk(pulses.rows.detach()), still=True)]
     phase, gain, std, ok = (torch.stack(parts) for parts in zip(*map(_parts, results), strict=True))
     differ = (phase_difference(phase[0], phase[1]) > _SAME_RAD).nonzero()[:, 0]
     if len(differ):
-        third = _parts(linked(Pulses(pulses.rows[differ], pulses.present[differ], differ.shape)))
+        third = _parts(linked(Pulses(pulses.rows[differ], pulses.present[differ], differ.shape), still=True))
         phase, gain, std, ok = (
             torch.cat([of_two, of_two[:1].index_copy(1, differ, of_third[None])])
             for of_two, of_third in zip((phase, gain, std, ok), third, strict=True)
