@@ -104,7 +104,7 @@ def autofocus(
         halves of the range cells must agree to 0.25 rad, less where few range cells make the
         sharpness. The standard deviation then is at least half of their difference. Where few
         scatterers all change within a third of the record, the deviation is up to 1.6 times too
-        small, and up to four of hundred trials were ok and wrong; within an eighth, nearly all
+        small, and up to four of hundred trials were ok and wrong; within an eighth, most
         trials are not ok. Phases of `link_phases` have its standard deviations, `quality` and
         `ok`; where they are not ok but the sharpest ones are, these stay. `info` holds
         "homogeneous" of shape (...,), bool, True where the homogeneous description is more likely
