@@ -26,9 +26,16 @@ def normal(generator: torch.Generator, *shape: int) -> Tensor:
 
 
 def clutter(
-    trials: int, width: float, snr_db: float, seed: int, centre: float = 0.0, points: int = 0, n: int = N
+    trials: int,
+    width: float,
+    snr_db: float,
+    seed: int,
+    centre: float = 0.0,
+    points: int = 0,
+    n: int = N,
+    points_db: float = 15.0,
 ) -> Tensor:
-    """Sum of scatterers at random Doppler frequencies in each range cell, and noise."""
+    """Sum of scatterers at random Doppler frequencies in each range cell, brighter points, and noise."""
     generator = torch.Generator().manual_seed(seed)
     count = 2 * n
     doppler = centre + width * (torch.rand(trials, ROWS, count, generator=generator, dtype=F64) - 0.5)
@@ -36,7 +43,7 @@ def clutter(
     time = torch.arange(n, dtype=F64)
     data = torch.einsum("trc,trcn->tnr", amplitude, torch.exp(2j * math.pi * doppler[..., None] * time))
     for cell in range(points):
-        data[:, :, 7 * cell] += 5.6 * torch.exp(2j * math.pi * width * (cell / points - 0.5) * time)[:, None].mT
+        data[:, :, 7 * cell] += 10 ** (points_db / 20) * torch.exp(2j * math.pi * width * (cell / points - 0.5) * time)[:, None].mT
     return data + 10 ** (-snr_db / 20) * normal(generator, trials, n, ROWS)
 
 
@@ -82,6 +89,15 @@ def test_autofocus_solves_homogeneous_clutter_near_the_bound(
     assert float(error.median()) < 1.4 * bound(width, snr_db) and float(error.max()) < 0.3
     ratio = error.square().mean().sqrt() / found.std["phase_rad"].square().mean().sqrt()
     assert 0.6 < float(ratio) < 1.4
+
+
+def test_one_bright_point_in_clutter_does_not_make_it_surer() -> None:
+    """Autofocus was ok and wrong in 32 of 80 such trials, by seven deviations."""
+    phase = errors("white", 16, 3)[:, : N // 2]
+    found = autofocus(clutter(16, 0.6, 5.0, 4, points=1, n=N // 2, points_db=12.0) * torch.exp(1j * phase)[..., None])
+    error, std = phase_rmse(found["phase_rad"], phase), found.std["phase_rad"].square().mean(-1).sqrt()
+    assert float(found.ok.double().mean()) > 0.8
+    assert float((error / std)[found.ok].max()) < 3
 
 
 def test_no_part_of_a_long_record_slips() -> None:

@@ -289,9 +289,12 @@ class Chip:
         # every pulse lies in two segments, so that the curvature, and the segments, count it twice
         twice = self.segments.length / self.segments.hop
         step = (pull * left).sum(1).real / curvature
-        scatter = step.sum((-2, -1)).square().sum() + twice * step.sum((0, -1)).square().sum()
-        std = torch.maximum(torch.sqrt(twice / curvature) * misfit.clamp_min(1.0), torch.sqrt(scatter))
-        return Fit(step.sum(), std, misfit)
+        by_line, share = step.sum((-2, -1)), (pull * slope).sum((1, 2, 3)).real / curvature
+        scatter = by_line.square().sum() + twice * step.sum((0, -1)).square().sum()
+        apart = (by_line.square() / share.clamp_min(_TINY)).sum() - step.sum().square()
+        apart = apart - twice * (share > 0).sum() / curvature
+        std = torch.sqrt(twice / curvature) * misfit.clamp_min(1.0)
+        return Fit(step.sum(), torch.maximum(std, torch.maximum(scatter, apart).sqrt()), misfit)
 
     def echo(self, cells: Tensor) -> Tensor:
         """Return the most likely deramped echo of scatterers that move as the middle of the body.
@@ -328,7 +331,9 @@ class Fit:
         std_m_s: Predicted standard deviation of u_r in m/s: that of sea and noise times `misfit`,
             since an error of the model is the same in all cells of a scatterer and does not
             average; or the scatter of the steps that single range lines and segments ask for, if
-            that is more.
+            that is more; or the standard deviation between the speeds of range lines, beyond that
+            of sea and noise, if that is still more: lines of one body have one speed, and where
+            they have not, two bodies overlap, and u_r lies between their speeds.
         misfit: Energy that is left of the bright cells for each free dimension, relative to the
             covariance of sea and noise: 1 if scatterers of one velocity explain them.
     """
