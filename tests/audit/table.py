@@ -72,10 +72,6 @@ LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
     "range cells shows: `ok` is False where a sparse description is more likely": [
         *(("compensate.LinkPhases", "own", snr_db) for snr_db in (20.0, 60.0)),
     ],
-    "a body has one velocity: two ships of nearly the same speed in one place count as one, of a speed "
-    "between them, and what it does not explain shows only a part of the difference": [
-        ("multichannel.MoversImage", "two ships in one place", 20.0),
-    ],
 }
 
 

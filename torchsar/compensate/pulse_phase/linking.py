@@ -234,8 +234,9 @@ def _linked(rows: Tensor, present: Tensor, start: Tensor | None, still: bool) ->
             crossed = Crossed(std, torch.ones_like(effective), torch.zeros_like(effective), effective)
         else:
             looks = scene.looks(u, fit, each)
-            # phases follow the noise of few cells and leave less of it: these seem to tell more
-            kept = [own * (1 - 1 / count.clamp_min(1))[:, None, None] for own, count in zip(each, looks, strict=True)]
+            # phases follow the noise of few cells and leave less of it, so that these seem to tell
+            # more; one cell alone tells nothing, and the square was found by trial
+            kept = [own * (1 - count.clamp_min(1) ** -2)[:, None, None] for own, count in zip(each, looks, strict=True)]
             crossed = scene.crossed(u, fit, kept, looks, independent)
             std = deviation(independent[:, None, None] * scene.summed(kept)) * crossed.excess.clamp_min(1)[:, None]
         gains = scene.independent * gain, independent * gain
