@@ -114,6 +114,21 @@ def test_two_ships_of_different_speeds_in_one_place_are_not_mistaken_for_one(spe
     assert not bool(body.ok) or off < 5 * float(body.u_r_std_m_s)
 
 
+@pytest.mark.parametrize("apart", [0.0, 0.8])
+def test_range_lines_of_different_speeds_predict_the_error(apart: float) -> None:
+    """Two ships in neighbouring lines count as one: its speed was ok and off by two deviations."""
+    for seed in range(2):
+        ships = {
+            name: ship(8.0 + side * apart / 2, azimuth_m=-5000 / 300 * (8.0 + side * apart / 2), range_m=6.0 * side)
+            for name, side in (("near", -1), ("far", 1))
+        }
+        data = frame_of(ships, seed)
+        body = find_body(data.data, Frame.of(RADAR, data), 0.0, 5000.0, EXTRACTION, u_a_half_m_s=12.0)
+        off = min(abs(float(body.motion.u_r_m_s) - 8.0 - side * apart / 2) for side in (-1, 1))
+        std = float(body.u_r_std_m_s)
+        assert off < 1.5 * std and (bool(body.ok) and std < 0.05 if apart == 0 else apart / 4 < std < apart / 2 + 0.05)
+
+
 def test_a_ship_in_the_lines_beside_another_is_no_sea() -> None:
     slow = {"slow": ship(2.5, 4.0)}
     fast = {"fast": ship(-5.0, azimuth_m=110.0, range_m=165.0, level_db=30.0)}
