@@ -364,7 +364,7 @@ def test_side_lobes_of_a_few_points_are_no_scene(points, snr_db):
     """Points in the middle of range cells. The third step of `autofocus` took their side lobes in
     azimuth for scene, which added up to .5 rad, and standard deviations of .2 to .5 rad.
     """
-    pulses, cells, trials = 400, 256, 12
+    pulses, cells, trials = 400, 128, 12
     source = torch.Generator().manual_seed(points)
     at, turn, start = torch.rand(3, trials, points, generator=source, dtype=torch.float64)
     in_range = torch.arange(cells) == (cells * (0.3 + 0.4 * at[..., None])).round()

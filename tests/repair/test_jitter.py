@@ -111,20 +111,20 @@ def test_pilot_reaches_the_predicted_error(snr_db, cycles, period):
 @pytest.mark.parametrize("length", [64, 512, 4096, 65536])
 def test_the_period_of_a_pilot_without_noise_is_not_a_multiple(length: int):
     """Rounding errors of strong jitter looked like jitter of two or three times the period."""
-    draws = Draws(1, trials=range(3))
+    draws = Draws(1, trials=range(3 if length <= 4096 else 1))
     time = torch.arange(length, dtype=torch.float64)
     for period in (1, 2, 3, 4, 6, 8):
         offsets = 0.05 * draws.normal(f"{period}", (period,))
         pilot = torch.polar(torch.ones_like(time), 2 * math.pi * 0.1371 * (time + offsets[:, (time % period).long()]))
-        assert estimate_jitter_pilot(pilot)["period"].tolist() == [period] * 3
+        assert estimate_jitter_pilot(pilot)["period"].tolist() == [period] * len(pilot)
 
 
 def test_a_pilot_without_jitter_gives_zero_offsets():
     pilot = PeriodicJitter((0.0,)).pilot(
-        torch.zeros(1, dtype=torch.float64), Draws(0, trials=range(200)), torch.zeros(1, dtype=torch.complex64)
+        torch.zeros(1, dtype=torch.float64), Draws(0, trials=range(100)), torch.zeros(1, dtype=torch.complex64)
     )
     estimate = estimate_jitter_pilot(
-        pilot + 0.03 * Draws(1, trials=range(200)).normal("more", (4096,), torch.complex64)
+        pilot + 0.03 * Draws(1, trials=range(100)).normal("more", (4096,), torch.complex64)
     )
     assert bool(estimate.ok.all()) and float(estimate["offset_samples"].abs().max()) == 0
 
