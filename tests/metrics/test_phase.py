@@ -182,3 +182,6 @@ def test_bound_of_a_known_scene():
     )
     assert known < unknown < 1.5 * known
     assert float(known / pulse_phase_bound_rad(power / 0.01, 16)) == pytest.approx(math.sqrt(38 / 40))
+    snr = torch.tensor([0.0, 1.0])
+    assert pulse_phase_bound_rad(snr, 16, 2).tolist() == [0.0, 0.0]  # nothing is left of two phases
+    assert pulse_phase_bound_rad(snr, 16, 3)[0] == math.inf

@@ -164,10 +164,13 @@ def pulse_phase_bound_rad(snr: Value, n_range: int, n_pulse: int | None = None) 
             they count.
 
     Returns:
-        Standard deviation in rad.
+        Standard deviation in rad: infinite for an SNR of 0, and 0 for two pulses or fewer, whose
+        phases are only a constant and a linear term.
     """
-    free = 1.0 if n_pulse is None else max(0.0, 1 - 2 / n_pulse)
-    return torch.sqrt(free / (2 * n_range * nonnegative(snr)))
+    bound = torch.sqrt(1 / (2 * n_range * nonnegative(snr)))
+    if n_pulse is None:
+        return bound
+    return bound * math.sqrt(1 - 2 / n_pulse) if n_pulse > 2 else torch.zeros_like(bound)
 
 
 def pulse_phase_bound_of_scene_rad(azimuth: Tensor, range_: Tensor, amplitude: Tensor, noise_std: Value) -> Tensor:
