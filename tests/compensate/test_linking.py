@@ -35,7 +35,7 @@ def clutter(
     n: int = N,
     points_db: float = 15.0,
 ) -> Tensor:
-    """Sum of scatterers at random Doppler frequencies in each range cell, brighter points, and noise."""
+    """Scatterers at random Doppler frequencies in each range cell, brighter points, and noise."""
     generator = torch.Generator().manual_seed(seed)
     count = 2 * n
     doppler = centre + width * (torch.rand(trials, ROWS, count, generator=generator, dtype=F64) - 0.5)
@@ -43,7 +43,8 @@ def clutter(
     time = torch.arange(n, dtype=F64)
     data = torch.einsum("trc,trcn->tnr", amplitude, torch.exp(2j * math.pi * doppler[..., None] * time))
     for cell in range(points):
-        data[:, :, 7 * cell] += 10 ** (points_db / 20) * torch.exp(2j * math.pi * width * (cell / points - 0.5) * time)[:, None].mT
+        turn = torch.exp(2j * math.pi * width * (cell / points - 0.5) * time)
+        data[:, :, 7 * cell] += 10 ** (points_db / 20) * turn[:, None].mT
     return data + 10 ** (-snr_db / 20) * normal(generator, trials, n, ROWS)
 
 
@@ -146,22 +147,30 @@ def test_points_that_change_are_not_sure_and_wrong(points: int, pulses: float, l
             assert 0.67 < float(error[ok].square().mean().sqrt() / std[ok].square().mean().sqrt()) < 1.4
 
 
-def test_plates_that_turn_out_of_sight_are_not_sure_and_wrong() -> None:
-    """Two plates, each seen within a lobe of 80 of 128 pulses: 4 of these trials were ok with errors
-    of .2 to 1.2 rad, and deviations of .04 to .07 rad.
+@pytest.mark.parametrize("kind", ["plates", "walks"])
+def test_few_scatterers_that_move_by_themselves_are_not_sure_and_wrong(kind: str) -> None:
+    """Three points whose phases walk within 40 of 128 pulses: 10 of these trials were ok and wrong.
+    Plates are seen within a lobe of 80 pulses: up to 5 % of such trials were.
     """
     trials, source, time = 24, torch.Generator().manual_seed(3), torch.arange(N, dtype=F64)
-    place, doppler, start, seen = torch.rand(4, trials, 2, generator=source, dtype=F64)
+    points = 2 if kind == "plates" else 3
+    place, doppler, start, seen = torch.rand(4, trials, points, generator=source, dtype=F64)
     turn = 0.5 * (doppler[..., None] - 0.5) * time + start[..., None]
-    lobe = torch.sinc((time - N * (1.2 * seen[..., None] - 0.1)) / 80)
-    response = torch.sinc(torch.arange(ROWS, dtype=F64) - 8 - (ROWS - 16) * place[..., None])
-    scene = torch.einsum("tpn,tpr->tnr", lobe * torch.exp(2j * math.pi * turn), response.to(torch.complex128))
+    if kind == "plates":
+        own = torch.sinc((time - N * (1.2 * seen[..., None] - 0.1)) / 80) + 0j
+    else:
+        steps = torch.randn(trials, points, N, generator=source, dtype=F64)
+        own = torch.exp(1j * math.sqrt(2 / 40) * steps.cumsum(-1))
+    away = torch.arange(ROWS, dtype=F64) - 8 - (ROWS - 16) * place[..., None]
+    response = 0.54 * torch.sinc(away) + 0.23 * (torch.sinc(away - 1) + torch.sinc(away + 1))
+    own = own * torch.randn(trials, points, 1, generator=source, dtype=torch.complex128)
+    scene = torch.einsum("tpn,tpr->tnr", own * torch.exp(2j * math.pi * turn), response.to(torch.complex128))
     noise = torch.randn(trials, N, ROWS, generator=source, dtype=torch.complex128)
     scene = scene + 10 ** (-25 / 20) * scene.abs().square().mean((1, 2), keepdim=True).sqrt() * noise
     phase = 2 * math.pi * torch.rand(trials, N, generator=source, dtype=F64)
     found = autofocus(scene * torch.exp(1j * phase)[..., None])
     error, std = phase_rmse(found["phase_rad"], phase), found.std["phase_rad"].square().mean(-1).sqrt()
-    assert int(found.ok.sum()) > 2 and not bool((found.ok & ((error > 5 * std) | (error > 0.47))).any())
+    assert not bool((found.ok & ((error > 5 * std) | (error > 0.47))).any())
 
 
 def test_blocks_without_a_neighbour_are_joined() -> None:

@@ -35,8 +35,8 @@ _LEAST_PULSES = 4
 # Gauss-Newton steps of u_r: a third one changes it by a hundredth of its standard deviation at most
 _FIT_STEPS = 2
 # Largest predicted standard deviation of a reliable body, found by trial: of 200 pairs of ships in
-# one place, 35 were below it, 1.1 deviations off in the rms, one by more than 5. Ships on a sea stay
-# below 0.13. u_r displaces a body by about 20 m per m/s.
+# one place, 35 were below it, 1.1 deviations off in the rms, one by more than 5. Ships on a sea
+# stay below 0.13. u_r displaces a body by about 20 m per m/s.
 _USABLE_M_S = 0.3
 # Least mean of the bright pixels of a reliable body: sea alone stays below 18 in 15 trials, a ship
 # that is weak but visible (4 dB in the frames of the tests) reaches 7000.
