@@ -107,14 +107,14 @@ def autofocus(
         scatterers beyond noise. One point that noise leaves alone tells no change of its own phase
         from a phase error: both are in the phases, which then are ok and wrong. Of scenes of few
         scatterers that all change within a third of the record, up to one of a hundred trials was
-        ok and wrong; within an eighth, most trials are not ok. Phases of `link_phases` have its standard deviations, `quality` and
-        `ok`; where they are not ok but the sharpest ones are, these stay. `info` holds
-        "homogeneous" of shape (...,), bool, True where the homogeneous description is more likely
-        and the phases are not the sharpest ones; `ok` is False if linked phases then
-        do not confirm that. It also holds "jitter_cells" and "migration_cells", the displacement of
-        the range profiles from pulse to pulse and of groups of pulses in cells rms: `ok` is False
-        from 0.25 and 0.4 cell on, because the phases may then be wrong. `imaging` corrects
-        displacements, which are not examined then.
+        ok and wrong; within an eighth, most trials are not ok. Phases of `link_phases` have its
+        standard deviations, `quality` and `ok`; where they are not ok but the sharpest ones are,
+        these stay. `info` holds "homogeneous" of shape (...,), bool, True where the homogeneous
+        description is more likely and the phases are not the sharpest ones; `ok` is False if linked
+        phases then do not confirm that. It also holds "jitter_cells" and "migration_cells", the
+        displacement of the range profiles from pulse to pulse and of groups of pulses in cells rms:
+        `ok` is False from 0.25 and 0.4 cell on, because the phases may then be wrong. `imaging`
+        corrects displacements, which are not examined then.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
