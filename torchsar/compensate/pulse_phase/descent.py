@@ -122,9 +122,10 @@ def sharpest_phase(
         found = descend(_InCoordinates(cost(rows, which), own), own.coordinates(first))
         moved = own.phase(found.x) if basis is not None else torch.where(present, found.x, first)
 
-        def again(some: Tensor, _: Tensor, at: Tensor) -> Tensor:
-            at = moved + own.phase(own.coordinates(at - moved))  # without what the basis does not hold
-            return at + own.phase(own.coordinates(on_the_circle(fixed_point(some, at, continued)[0] - at)))
+        def again(some: Tensor, of: Tensor | slice, at: Tensor) -> Tensor:
+            start, held = moved[of], space.of(which[of])
+            at = start + held.phase(held.coordinates(at - start))  # without what the basis does not hold
+            return at + held.phase(held.coordinates(on_the_circle(fixed_point(some, at, continued)[0] - at)))
 
         return moved, found.steps, again
 

@@ -229,7 +229,7 @@ def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, T
     return phase, total
 
 
-def settled(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
+def settled(rows: Tensor, which: Tensor | slice, phase: Tensor) -> Tensor:
     """Continue the estimation of a phase by four iterations of the entropy fixed point.
 
     Autofocus methods use it to predict their accuracy, from the change of their result when it is
@@ -237,7 +237,7 @@ def settled(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
-        present: False for pulses without samples, shape (trial, pulse), bool; not used.
+        which: Which trials these are; not used, since all are continued in the same way.
         phase: Phase to start from in rad, shape (trial, pulse).
 
     Returns:

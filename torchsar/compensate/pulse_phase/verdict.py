@@ -96,8 +96,11 @@ _BY_CHANCE = 1.15
 # rarely change the result
 _ROUNDS = 6
 _FAR_RAD = 0.1
+_EVERY = slice(None)
 
-Again = Callable[[Tensor, Tensor, Tensor], Tensor]
+# continues a method: (rows, which of the trials that it found these are, phase) -> phase
+Which = Tensor | slice
+Again = Callable[[Tensor, Which, Tensor], Tensor]
 Halves = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Found = tuple[Tensor, Tensor, Again]
 Find = Callable[[Tensor, Tensor, Tensor | None], Found]
@@ -199,8 +202,9 @@ def estimated(
         pulses: The pulses.
         start: Phase to start from in rad, one row per trial, or None.
         find: The autofocus method: a function of (rows, present, start). It returns the phase
-            (trial, pulse), the number of iterations (trial,), and a function of (rows, present,
-            phase) that continues the method from a phase, on all or on half of the rows.
+            (trial, pulse), the number of iterations (trial,), and a function of (rows, which,
+            phase) that continues the method from a phase, on all or on half of the rows, in all or
+            in some of the trials, by their indices `which`.
         at_rest: True if continuing the method does not move its result; the second
             standard deviation is then left out.
         compare: False if the image is not the Fourier transform along pulses. The scene is then
@@ -402,9 +406,9 @@ def _half_difference(
         return torch.full_like(phase[:, 0], _UNKNOWN_RAD, dtype=torch.float64)
     parts = halves(rows, phase)
     if disturbed:
-        ends = _settled_apart(parts, present, phase, again)
+        ends = _settled_apart(parts, present, phase, again, _EVERY)
     else:
-        ends = [again(part, present, phase) for part in parts]
+        ends = [again(part, _EVERY, phase) for part in parts]
     return _half_of(parts, ends, phase, present)
 
 
@@ -421,14 +425,16 @@ def _half_of(parts: Sequence[Tensor], ends: Sequence[Tensor], phase: Tensor, pre
     return torch.where(filled, torch.maximum(apart, moved), _UNKNOWN_RAD)
 
 
-def _settled_apart(parts: Sequence[Tensor], present: Tensor, phase: Tensor, again: Again) -> Sequence[Tensor]:
+def _settled_apart(
+    parts: Sequence[Tensor], present: Tensor, phase: Tensor, again: Again, which: Which
+) -> Sequence[Tensor]:
     """Phases of two halves, (trial, pulse) each, that started on either side of the phase."""
     walk = _disturbance(phase)
     ends: Sequence[Tensor] = (phase + walk, phase - walk)
     active = torch.ones_like(phase[:, 0], dtype=torch.bool)
     every = 1 if phase.device.type == "cpu" else _RETURNS // 2  # waiting costs as much as a round
     for number in range(1, _RETURNS + 1):
-        reached = [again(part, present, at) for part, at in zip(parts, ends, strict=True)]
+        reached = [again(part, which, at) for part, at in zip(parts, ends, strict=True)]
         far = torch.stack([_moved(*pair, present) for pair in zip(reached, ends, strict=True)]) >= _RETURNED_RAD
         ends = [torch.where(active[:, None], new, old) for new, old in zip(reached, ends, strict=True)]
         active = active & far.any(0)
@@ -525,13 +531,14 @@ def _between_scatterers(
         seen = torch.where(inside, energy, 0).sum(-1) / or_one(noise) - 1.1 * samples - 4 * samples.sqrt()
         variance = variance + torch.where(seen > 0, present.sum(-1) / (2 * or_one(seen)), torch.inf)
     expected = variance.sqrt() / 2
-    apart = _half_of(parts, [again(part, present, phase) for part in parts], phase, present)
+    apart = _half_of(parts, [again(part, at, phase) for part in parts], phase, present)
     unlike = apart > _BEYOND_NOISE * expected  # the first step does not go all the way
     count = host_value(unlike.sum(), len(unlike))
     if count:
         far = true_positions(unlike, count)
         parts, present, phase = [part[far] for part in parts], present[far], phase[far]
-        apart = apart.index_copy(0, far, _half_of(parts, _settled_apart(parts, present, phase, again), phase, present))
+        ends = _settled_apart(parts, present, phase, again, at[far])
+        apart = apart.index_copy(0, far, _half_of(parts, ends, phase, present))
     found = torch.where(apart > _BEYOND_NOISE * expected, (apart.square() - expected.square()).clamp_min(0).sqrt(), 0)
     return torch.where(few, std.index_copy(0, at, found), 0)
 
@@ -593,7 +600,7 @@ def _drift(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor
     current, total = phase, torch.zeros(len(phase), dtype=torch.float64, device=phase.device)
     active = torch.ones_like(total, dtype=torch.bool)
     for _ in range(_ROUNDS):
-        reached = again(rows, present, current)
+        reached = again(rows, _EVERY, current)
         step = phase_rmse(reached, current, present)
         total = torch.where(active, phase_rmse(reached, phase, present), total)
         active = active & (step > _FAR_RAD) & (torch.exp(-total.square()) > LEAST_STREHL)
