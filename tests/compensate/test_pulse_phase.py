@@ -29,6 +29,7 @@ from torchsar.compensate import (
     pga,
     pga_sca,
     sca,
+    sharpest_phase,
 )
 from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.compensate.pulse_phase.gradient import _centred, _Rows, _solver, _view, _windowed
@@ -379,6 +380,23 @@ def test_side_lobes_of_a_few_points_are_no_scene(points, snr_db):
     # of the phase of a pulse, to which the energy of all points contributes
     bound = 10 ** (-snr_db / 20) / math.sqrt(2 * cells)
     assert found.ok.all() and error < 3 * bound and error < 1.1 * std < 0.15
+
+
+@pytest.mark.parametrize("method", [sharpest_phase, autofocus, pga])
+def test_few_and_many_scatterers_in_one_batch(method):
+    """The scatterers of few are compared in these trials alone."""
+    source = torch.Generator().manual_seed(8)
+    pulses, cells, time = 48, 32, torch.arange(48, dtype=torch.float64)
+    data = 0.02 * torch.randn(3, pulses, cells, generator=source, dtype=torch.complex128)
+    for trial, points in enumerate((2, 60, 3)):
+        for at, turn in torch.rand(points, 2, generator=source, dtype=torch.float64):
+            response = torch.sinc(torch.arange(cells) - (4 + 24 * at))
+            data[trial] += torch.exp(1j * math.pi * (turn - 0.5) * time)[:, None] * response
+    together = method(data)
+    for trial in range(3):
+        alone = method(data[trial])
+        torch.testing.assert_close(together.std["phase_rad"][trial], alone.std["phase_rad"], rtol=1e-6, atol=1e-9)
+        assert together.ok[trial] == alone.ok
 
 
 def judged(found: Estimate, phase: Tensor) -> tuple[Tensor, Tensor]:

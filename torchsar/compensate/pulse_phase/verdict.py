@@ -523,12 +523,13 @@ def _between_scatterers(
     energy = (rows.real.square() + rows.imag.square()).sum(-1)
     half, parts, variance = dealt(energy, 2), [], torch.zeros_like(noise)
     for k in (0, 1):
-        inside = half == k
-        most = max(1, host_value(inside.sum(-1).amax(), half.shape[-1]))  # one row of zeros at least
-        own = inside.to(torch.int8).argsort(-1, descending=True)[:, :most]
-        parts.append((rows * inside[..., None]).gather(1, own[..., None].expand(-1, -1, rows.shape[-1])))
+        power = torch.where(half == k, energy, -1)
+        power, strongest = power.sort(-1, descending=True)
+        power, strongest = (x[:, : -(-x.shape[-1] // 2)] for x in (power, strongest))
+        inside = power >= 0
+        parts.append(rows.gather(1, strongest[..., None].expand(-1, -1, rows.shape[-1])) * inside[..., None])
         samples = inside.sum(-1) * present.sum(-1)
-        seen = torch.where(inside, energy, 0).sum(-1) / or_one(noise) - 1.1 * samples - 4 * samples.sqrt()
+        seen = power.clamp_min(0).sum(-1) / or_one(noise) - 1.1 * samples - 4 * samples.sqrt()
         variance = variance + torch.where(seen > 0, present.sum(-1) / (2 * or_one(seen)), torch.inf)
     expected = variance.sqrt() / 2
     apart = _half_of(parts, [again(part, at, phase) for part in parts], phase, present)
