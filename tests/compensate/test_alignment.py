@@ -70,10 +70,10 @@ def test_scatterers_in_one_range_cell_are_no_displacement(apart: int) -> None:
 
 
 def test_a_displacement_would_go_unnoticed_otherwise() -> None:
-    """The standard deviation does not show it: both halves of the range cells agree."""
+    """The standard deviation shows a third of it: both halves of the range cells agree."""
     data, phase = displaced(COURSES["jitter"], 6, 15.0, trials=1, seed=8)
     found = autofocus(data)
-    assert float(phase_rmse(found["phase_rad"], phase)) > max(0.3, 3 * float(found.std["phase_rad"][0, 0]))
+    assert float(phase_rmse(found["phase_rad"], phase)) > max(0.3, 2.5 * float(found.std["phase_rad"][0, 0]))
     assert not found.ok.any()
     assert not entropy_fixed_point(data).ok.any()
 

@@ -71,10 +71,10 @@ _TELLING_ROWS, _MANY_ROWS, _STILL = 6, 30, 0.92
 # where two scatterers turn out of sight, whose correlations were 0.80 to 0.98; those of points that
 # stay were 0.995 to 1.01.
 _CLEAR, _SAME = 0.6, 0.015
-# Rows that make the sharpness up to which single scatterers are compared; multiple of the
-# difference that noise explains from which on they differ. Where three scatterers walk in phase
-# within 40 of 128 pulses, 15 to 45 % were wrong and ok without this.
-_FEW_ROWS, _BEYOND_NOISE = 12, 3.0
+# Multiple of the difference that noise explains from which on few scatterers differ. Where three of
+# them walk in phase within 40 of 128 pulses, 15 to 45 % were wrong and ok without this. With 12
+# telling rows instead of 6, points that migrate in a small scene were doubted.
+_BEYOND_NOISE = 3.0
 # Factor of the deviation of few scatterers whose quarters are not the same. Their errors are slow,
 # and the difference of two halves has as few degrees of freedom as the record has times of
 # coherence: with 4 of them, an error is sqrt(4 / (4 - 2)) as large as such a difference says.
@@ -194,7 +194,7 @@ def estimated(
       their band requires are not independent. Where a single point makes the image sharp, it is the
       relative scatter of the modulus of its echo instead: noise and weaker scatterers change the
       modulus as much as the phase, and the phase error does not change it. The scatter of the phase
-      that remains is added. Where less than 12 rows make the sharpness, the halves may hold the
+      that remains is added. Where less than 6 rows make the sharpness, the halves may hold the
       same scatterers; the difference between scatterers beyond noise then counts too.
     - The distance by which the phases move when the method is continued on all rows.
 
@@ -295,7 +295,7 @@ def _assessed(
         if compare:
             few = (sharpness_rows / _TELLING_ROWS).clamp_max(1)
             largest = math.sqrt(-math.log(LEAST_STREHL)) * few
-            alone = ~lone & (sharpness_rows < _FEW_ROWS)
+            alone = ~lone & (sharpness_rows < _TELLING_ROWS)
             std = torch.maximum(std, _between_scatterers(rows, present, phase, again, image, alone) / occupied.sqrt())
             one, sure, differ = _one_scene(rows, phase, std, largest, sharpness_rows)
             least = _UNSURE_RAD * few
@@ -303,7 +303,7 @@ def _assessed(
             std = torch.maximum(std, _found_anew(rows, present, start, phase, find, unsure) / occupied.sqrt())
             stays = one & (sure | (unsure & (std < least)))
             std = torch.where(unsure, _BY_CHANCE * std, std)
-            std = torch.where(differ & ~lone & (sharpness_rows < _TELLING_ROWS), _FEW_TELL * std, std)
+            std = torch.where(differ & alone, _FEW_TELL * std, std)
         else:
             stays = torch.ones_like(lone)
     homogeneous = scene.homogeneous & compare & ~lone
