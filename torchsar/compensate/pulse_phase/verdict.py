@@ -510,7 +510,8 @@ def _between_scatterers(
 
     Zero for trials with more than few scatterers, and where noise hides all but one. Each scatterer
     of a few has a phase of its own if it moves within the target, and halves of the rows that hold
-    the same one do not show it.
+    the same one do not show it. The halves here have none in common, and a noise that explains their
+    difference follows from the energy of each half over the median power of the image.
     """
     std = torch.zeros_like(phase[:, 0], dtype=torch.float64)
     count = host_value(few.sum(), len(few))
@@ -528,6 +529,8 @@ def _between_scatterers(
         power, strongest = (x[:, : -(-x.shape[-1] // 2)] for x in (power, strongest))
         inside = power >= 0
         parts.append(rows.gather(1, strongest[..., None].expand(-1, -1, rows.shape[-1])) * inside[..., None])
+        # energy of scatterers in noise variances: beyond a noise that is a tenth stronger than the
+        # median says, and four deviations of its sum
         samples = inside.sum(-1) * present.sum(-1)
         seen = power.clamp_min(0).sum(-1) / or_one(noise) - 1.1 * samples - 4 * samples.sqrt()
         variance = variance + torch.where(seen > 0, present.sum(-1) / (2 * or_one(seen)), torch.inf)
