@@ -510,8 +510,8 @@ def _between_scatterers(
 
     Zero for trials with more than few scatterers, and where noise hides all but one. Each scatterer
     of a few has a phase of its own if it moves within the target, and halves of the rows that hold
-    the same one do not show it. The halves here have none in common, and a noise that explains their
-    difference follows from the energy of each half over the median power of the image.
+    the same one do not show it. The halves here have none in common. The difference that noise
+    explains follows from the energy of each half over the median power of the image.
     """
     std = torch.zeros_like(phase[:, 0], dtype=torch.float64)
     count = host_value(few.sum(), len(few))
