@@ -181,6 +181,19 @@ def scintillating(snr_db: float, points: int, pulses: float) -> Callable[[int, i
     return draw
 
 
+def walking(snr_db: float, points: int, pulses: float) -> Callable[[int, int], Batch]:
+    """Draw points that stay visible while their phases walk at random within so many pulses."""
+
+    def draw(trials: int, seed: int) -> Batch:
+        draws = Draws(seed + 9, trials=range(trials))
+        walk = math.sqrt(2 / pulses) * draws.normal("walk", (points, PULSES)).cumsum(-1)
+        phase = white(trials, PULSES, seed + 1)
+        scene = _points(draws, points, history=torch.exp(1j * walk))
+        return Batch(signal(turned(noisy(scene, snr_db, seed + 2), phase)), {"phase_rad": phase})
+
+    return draw
+
+
 def displaced(snr_db: float, points: int, jitter: float) -> Callable[[int, int], Batch]:
     """Draw points whose pulses are displaced in range by `jitter` cells rms, with white phases."""
 
@@ -243,6 +256,7 @@ WORLDS = (
         for points in (8, 40)
         for snr in (0.0, 20.0)
     ),
+    *(World("walking 3 points", walking(snr, 3, 40.0), snr) for snr in (5.0, 20.0)),
 )
 ALIGN_WORLDS = (
     *unlit(nothing((PULSES, 128))),

@@ -104,10 +104,9 @@ def autofocus(
         halves of the range cells must agree to 0.25 rad, less where few range cells make the
         sharpness. The standard deviation then is at least half of their difference. Where few
         range cells make the sharpness, it is also at least half of the difference between
-        scatterers beyond noise. One point that noise leaves alone tells no change of its own phase
-        from a phase error: both are in the phases, which then are ok and wrong. Of scenes of few
-        scatterers that all change within a third of the record, up to six of a hundred trials were
-        ok and wrong; within an eighth, most trials are not ok. Phases of `link_phases` have its
+        scatterers beyond noise, and `ok` is False if that is 0.25 rad or more. One point that
+        noise leaves alone tells no change of its own phase from a phase error: both are in the
+        phases, which then are those of this point, and ok. Phases of `link_phases` have its
         standard deviations, `quality` and `ok`; where they are not ok but the sharpest ones are,
         these stay. `info` holds "homogeneous" of shape (...,), bool, True where the homogeneous
         description is more likely and the phases are not the sharpest ones; `ok` is False if linked
