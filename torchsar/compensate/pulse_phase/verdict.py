@@ -261,6 +261,7 @@ def _assessed(
         lone = lone & (imaging is None) & (rows.shape[-2] > 1)
         disturbed = halves is None and imaging is None
         apart = half_difference(rows, present, phase, again, halves or halves_of_rows, disturbed)
+        mixed = torch.where(lone, 0, apart)
         if halves is None:
             apart = apart / torch.maximum(occupied, _band_of_noise(image)).sqrt()
         std = torch.where(lone, torch.hypot(scatter, rest), apart)
@@ -274,7 +275,7 @@ def _assessed(
             alone = ~lone & (sharpness_rows < _TELLING_ROWS)
             compared = sharpness_rows * occupied < _TELLING_ROWS
             of_point = torch.hypot(scatter, rest)
-            between, unlike, untold = between_scatterers(rows, present, phase, again, image, of_point, compared)
+            between, unlike, untold = between_scatterers(rows, present, phase, again, image, mixed, of_point, compared)
             std = torch.maximum(std, between / occupied.sqrt())
             one, sure, differ = one_scene(rows, phase, std, largest, sharpness_rows)
             least = _UNSURE_RAD * few
