@@ -382,6 +382,43 @@ def test_side_lobes_of_a_few_points_are_no_scene(points, snr_db):
     assert found.ok.all() and error < 3 * bound and error < 1.1 * std < 0.15
 
 
+@pytest.mark.parametrize("windowed", [False, True])
+def test_two_points_of_one_range_are_as_wrong_as_promised(windowed: bool) -> None:
+    """Their phases make one point of both, in all range cells alike: in half of these trials and
+    more the error was over five deviations and ok.
+    """
+    trials, pulses, cells, source = 24, 128, 64, torch.Generator().manual_seed(1)
+    turn, start = torch.rand(2, trials, 2, generator=source, dtype=torch.float64)
+    slow = torch.exp(2j * math.pi * (0.3 * (turn[..., None] - 0.5) * torch.arange(pulses) + start[..., None]))
+    away = torch.arange(cells, dtype=torch.float64) - cells / 2 + 0.5
+    response = torch.sinc(away)
+    if windowed:
+        response = 0.54 * response + 0.23 * (torch.sinc(away - 1) + torch.sinc(away + 1))
+    data = (slow[:, 0] + 10 ** (-15 / 20) * slow[:, 1])[..., None] * response
+    level = 10 ** (-15 / 20) * data.abs().square().mean((1, 2), keepdim=True).sqrt()
+    data = data + level * torch.randn(data.shape, generator=source, dtype=torch.complex128)
+    phase = 2 * math.pi * torch.rand(trials, pulses, generator=source, dtype=torch.float64)
+    found = autofocus(data * torch.exp(1j * phase)[..., None])
+    error, std = phase_rmse(found["phase_rad"], phase)[found.ok], found.std["phase_rad"][found.ok, 0]
+    assert len(error) >= 12 and 0.67 < float(error.square().mean().sqrt() / std.square().mean().sqrt()) < 1.4
+
+
+def test_white_noise_of_windowed_data_is_independent_between_rows() -> None:
+    """The rows were taken to be as dependent as the data: deviations were a third too large."""
+    trials, pulses, cells, source = 24, 128, 64, torch.Generator().manual_seed(2)
+    place, turn = torch.rand(2, trials, 10, generator=source, dtype=torch.float64)
+    slow = torch.exp(2j * math.pi * (turn[..., None] - 0.5) * torch.arange(pulses) * 0.5)
+    away = torch.arange(cells, dtype=torch.float64) - 4 - 56 * place[..., None]
+    response = 0.54 * torch.sinc(away) + 0.23 * (torch.sinc(away - 1) + torch.sinc(away + 1))
+    data = torch.einsum("tkp,tkr->tpr", slow, response.to(slow.dtype))
+    level = 10 ** (-10 / 20) * data.abs().square().mean((1, 2), keepdim=True).sqrt()
+    data = data + level * torch.randn(data.shape, generator=source, dtype=torch.complex128)
+    phase = 2 * math.pi * torch.rand(trials, pulses, generator=source, dtype=torch.float64)
+    found = autofocus(data * torch.exp(1j * phase)[..., None])
+    error, std = (x.square().mean().sqrt() for x in (phase_rmse(found["phase_rad"], phase), found.std["phase_rad"]))
+    assert found.ok.all() and 0.85 < float(error / std) < 1.2
+
+
 @pytest.mark.parametrize("method", [sharpest_phase, autofocus, pga])
 def test_few_and_many_scatterers_in_one_batch(method):
     """The scatterers of few are compared in these trials alone."""

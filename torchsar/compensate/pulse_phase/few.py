@@ -19,8 +19,8 @@ from torchsar.metrics.phase import phase_rmse
 # A single point: largest relative scatter of its modulus, far below the 0.52 of noise.
 STEADY = 0.25
 # Few scatterers differ where their phases do by more than this multiple of what noise explains, and
-# by more rad, because a step does not go all the way. Of 2 to 6 points that stay, 5 % or less do so
-# up to 15 dB; of those that walk in phase within 40 of 128 pulses, nearly all at 0 dB.
+# by more rad, because a step does not go all the way. Up to 10 dB a tenth of the scenes of 2
+# to 6 points that stay do so, and at 0 dB nine of ten of those that walk within 40 of 128 pulses.
 _BEYOND_NOISE, _BEYOND_RAD = 1.5, 0.02
 # Several scatterers in a range cell are less certain than the noise bound, as halves that hold the
 # same scatterers show; but not by more than this: four rows of four points at -8 dB differed by 1.7
@@ -95,8 +95,8 @@ def between_scatterers(
         points = excess.sum(-1).square() < _MOST_ROWS * excess.square().sum(-1)
         of_noise = torch.where((seen > 0) & points, pulses / (2 * or_one(seen)), torch.inf)
         scatter, _ = scatter_of_point(rotate(part, phase), present)
-        mixed = scatter.square() > STEADY**2 + 2 * of_noise
-        blind = blind | (mixed & _of_one_place(part, noise, pulses))
+        unsteady = scatter.square() > STEADY**2 + 2 * of_noise
+        blind = blind | (unsteady & _of_one_place(part, noise, pulses))
         variance = variance + of_noise
         parts.append(part)
     single = _of_one_place(torch.cat(parts, 1), noise, pulses)

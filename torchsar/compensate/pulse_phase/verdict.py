@@ -55,9 +55,10 @@ _UNSURE_RAD = 0.25
 # factor of the deviation of these: halves agree by chance in some of those that are ok, which were
 # 0.9 times (dense scenes) to 1.4 times (40 points that change) as wrong as the deviation said
 _BY_CHANCE = 1.15
-# limits of `_drift`, found by trial: more rounds, or rounds after smaller steps, cost time and
-# rarely change the result
+# limit of `_drift`, found by trial: more rounds cost time and rarely change the result
 _ROUNDS = 6
+# Smaller steps of `_drift` rarely change its result, and smaller differences between few scatterers
+# that of phases found anew: both only cost time.
 _FAR_RAD = 0.1
 
 Found = tuple[Tensor, Tensor, Again]
@@ -123,7 +124,12 @@ def occupied_band(rows: Tensor) -> Tensor:
     """
     spectrum = torch.fft.fft(rows, dim=-2)
     density = (spectrum.real.square() + spectrum.imag.square()).mean(-1, dtype=torch.float64)
-    return torch.where(density.sum(-1) > 0, density.mean(-1).square() / or_one(density.square().mean(-1)), 1)
+    return torch.where(density.sum(-1) > 0, _filled(density), 1)
+
+
+def _filled(density: Tensor) -> Tensor:
+    """Share of the last dimension over which a density is spread, 0 where there is none."""
+    return density.mean(-1).square() / or_one(density.square().mean(-1))
 
 
 def _band_of_noise(image: Tensor) -> Tensor:
@@ -138,7 +144,7 @@ def _band_of_noise(image: Tensor) -> Tensor:
     cells = image.shape[-1]
     density = rising(spectrum.real.square() + spectrum.imag.square())[..., (cells - 1) // 2].to(torch.float64)
     scatter = 1 + 1 / (math.log(2) ** 2 * cells)
-    return (scatter * density.mean(-1).square() / or_one(density.square().mean(-1))).clamp_max(1)
+    return (scatter * _filled(density)).clamp_max(1)
 
 
 def estimated(
@@ -207,9 +213,9 @@ def estimated(
         common scatterer, and the standard deviation is at least half of their difference; it must
         be below 0.25 rad, as where few scatterers differ beyond noise. The last four conditions
         need not hold for a single point whose modulus scatters by less than 0.25, with 32 pulses or
-        more. `info` holds "present", shape (...,
-        pulse), False for pulses that hold only zeros; and, of shape (...,), "homogeneous" (True
-        where that description is more likely), "ok_if_sparse" (what `ok` is if it is not),
+        more. `info` holds "present", shape (..., pulse), False for pulses that hold only zeros;
+        and, of shape (...,), "homogeneous" (True where that description is more likely),
+        "ok_if_sparse" (what `ok` is if it is not),
         "sparse_gain_nats" (gain of the log likelihood of the sparse description over white noise),
         "jitter_cells" and "migration_cells" (see `Displacement`),
         "iterations", "sharpness_nats", "noise_sharpness_nats" (the largest sharpness that noise can
@@ -264,7 +270,8 @@ def _assessed(
         mixed = torch.where(lone, 0, apart)
         if halves is None:
             apart = apart / torch.maximum(occupied, _band_of_noise(image)).sqrt()
-        std = torch.where(lone, torch.hypot(scatter, rest), apart)
+        of_point = torch.hypot(scatter, rest)
+        std = torch.where(lone, of_point, apart)
         if not at_rest:
             std = torch.maximum(std, _drift(rows, present, phase, again))
         scene = describe(rows, phase, occupied)
@@ -274,7 +281,6 @@ def _assessed(
             largest = math.sqrt(-math.log(LEAST_STREHL)) * few
             alone = ~lone & (sharpness_rows < _TELLING_ROWS)
             compared = sharpness_rows * occupied < _TELLING_ROWS
-            of_point = torch.hypot(scatter, rest)
             between, unlike, untold = between_scatterers(rows, present, phase, again, image, mixed, of_point, compared)
             std = torch.maximum(std, between / occupied.sqrt())
             one, sure, differ = one_scene(rows, phase, std, largest, sharpness_rows)
