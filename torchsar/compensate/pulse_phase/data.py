@@ -242,6 +242,35 @@ def rising(x: Tensor) -> Tensor:
     return x.detach().sort(-1).values
 
 
+def without_lobes(image: Tensor) -> Tensor:
+    """Weight the pulses of an image with a Hann window, so that side lobes do not count as noise.
+
+    Args:
+        image: Image or its transform over range, shape (..., Doppler), complex, by a Fourier
+            transform of pulses.
+
+    Returns:
+        The image with the same mean power of noise, same shape.
+    """
+    return (image - (image.roll(1, -1) + image.roll(-1, -1)) / 2) / math.sqrt(1.5)
+
+
+def noise_power(rows: Tensor, phase_rad: Tensor) -> Tensor:
+    """Estimate the variance of the noise of pulses whose scatterers fill less than half the image.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        phase_rad: Phases that focus them in rad, shape (trial, pulse).
+
+    Returns:
+        The median power of the cells of the image over ln 2, which is that of the median of noise,
+        shape (trial,), float64, without derivatives.
+    """
+    image = without_lobes(torch.fft.fft(rotate(rows.detach(), phase_rad.detach()), norm="ortho"))
+    power = rising((image.real.square() + image.imag.square()).flatten(1))
+    return power[:, (power.shape[-1] - 1) // 2].to(torch.float64) / math.log(2)
+
+
 def dealt(energy: Tensor, parts: int) -> Tensor:
     """Deal range cells into parts of similar energy that have no scatterer in common.
 

@@ -6,12 +6,10 @@ scatterer moves within the target or several of them lie at one range.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import dealt, or_one, rising, rotate, safe_angle
+from torchsar.compensate.pulse_phase.data import dealt, or_one, rotate, safe_angle
 from torchsar.compensate.pulse_phase.halves import Again, half_of, settled_apart
 from torchsar.core import host_value, true_positions
 from torchsar.metrics.phase import phase_rmse
@@ -31,7 +29,7 @@ _FEW_CELLS = 16
 # effective number of rows up to which a half holds few scatterers, not clutter beside a point
 _MOST_ROWS = 6
 # effective number of ranges below which all scatterers have one range
-_ONE_PLACE = 1.2
+_ONE_RANGE = 1.2
 
 
 def between_scatterers(
@@ -39,7 +37,7 @@ def between_scatterers(
     present: Tensor,
     phase: Tensor,
     again: Again,
-    image: Tensor,
+    noise: Tensor,
     mixed_rad: Tensor,
     of_point: Tensor,
     few: Tensor,
@@ -48,7 +46,7 @@ def between_scatterers(
 
     Each scatterer has a phase of its own if it moves within the target, and halves of the rows that
     hold the same one do not show it. The halves here have none in common. The difference that noise
-    explains follows from the energy of each half over the median power of the image; it is more
+    explains follows from the energy of each half over the power of the noise; it is more
     where halves with the same scatterers differ by more, because several scatterers share a range
     cell. A half whose scatterers have one range tells nothing unless it is a single point, because
     phases can be found that make it one.
@@ -58,7 +56,7 @@ def between_scatterers(
         present: False where a pulse holds only zeros, shape (trial, pulse).
         phase: Phase that focuses them in rad, shape (trial, pulse).
         again: Continues the method that found it.
-        image: Image, shape (trial, range, Doppler), complex.
+        noise: Variance of the noise of a sample, shape (trial,).
         mixed_rad: Half of the difference between halves that hold the same scatterers in rad, 0
             where a single point makes the image sharp, shape (trial,), float64.
         of_point: Scatter of the echo of the strongest point in rad, shape (trial,).
@@ -77,8 +75,7 @@ def between_scatterers(
         return zero, no, no
     at = true_positions(few, count)
     rows, present, phase = rows[at], present[at], phase[at]
-    noise = rising((image[at].real.square() + image[at].imag.square()).flatten(1))
-    noise = noise[:, (noise.shape[-1] - 1) // 2].to(torch.float64) / math.log(2)
+    noise = noise[at]
     energy, pulses = (rows.real.square() + rows.imag.square()).sum(-1), present.sum(-1)
     half, parts, variance, blind = dealt(energy, 2), [], torch.zeros_like(noise), no[at]
     for k in (0, 1):
@@ -96,10 +93,10 @@ def between_scatterers(
         of_noise = torch.where((seen > 0) & points, pulses / (2 * or_one(seen)), torch.inf)
         scatter, _ = scatter_of_point(rotate(part, phase), present)
         unsteady = scatter.square() > STEADY**2 + 2 * of_noise
-        blind = blind | (unsteady & _of_one_place(part, noise, pulses))
+        blind = blind | (unsteady & _of_one_range(part, noise, pulses))
         variance = variance + of_noise
         parts.append(part)
-    single = _of_one_place(torch.cat(parts, 1), noise, pulses)
+    single = _of_one_range(torch.cat(parts, 1), noise, pulses)
     expected = variance.sqrt() / 2
     largest = torch.minimum(_BEYOND_NOISE * mixed_rad[at], _MOST_NOISE * expected)
     largest = torch.maximum(_BEYOND_NOISE * expected + _BEYOND_RAD, largest)
@@ -119,7 +116,7 @@ def between_scatterers(
     return std, unlike, blind
 
 
-def _of_one_place(rows: Tensor, noise: Tensor, pulses: Tensor) -> Tensor:
+def _of_one_range(rows: Tensor, noise: Tensor, pulses: Tensor) -> Tensor:
     """Whether all scatterers in rows (trial, range, pulse) have one range, a bool per trial.
 
     The effective number of ranges is that of the eigenvalues of the covariance of the rows, without
@@ -131,7 +128,7 @@ def _of_one_place(rows: Tensor, noise: Tensor, pulses: Tensor) -> Tensor:
     squares = (covariance.real.square() + covariance.imag.square()).sum((-2, -1)).to(torch.float64)
     scene = (total - pulses * cells * noise).clamp_min(0)
     squares = squares - 2 * pulses * noise * scene - cells * pulses * (cells + pulses) * noise.square()
-    return (scene > 0) & (scene.square() < _ONE_PLACE * squares)
+    return (scene > 0) & (scene.square() < _ONE_RANGE * squares)
 
 
 def scatter_of_point(focused: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:

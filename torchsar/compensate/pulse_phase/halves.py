@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import on_the_circle, without_line
+from torchsar.core import host_value, true_positions
 from torchsar.metrics.phase import phase_rmse, residual_phase
 
 UNKNOWN_RAD = math.pi / math.sqrt(3)  # standard deviation of a random phase
@@ -46,7 +47,7 @@ def halves_of_rows(rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def half_difference(
-    rows: Tensor, present: Tensor, phase: Tensor, again: Again, halves: Halves, disturbed: bool
+    rows: Tensor, present: Tensor, phase: Tensor, again: Again, halves: Halves, disturbed: bool, which: Tensor | None
 ) -> Tensor:
     """Predict the error of phases from the difference between two halves of the pulses.
 
@@ -60,18 +61,27 @@ def half_difference(
         again: Continues the method.
         halves: Divides the pulses.
         disturbed: True if the halves start on either side of the phase (see `settled_apart`).
+        which: True for the trials to examine, shape (trial,); None for all.
 
     Returns:
-        The standard deviation in rad, shape (trial,), float64.
+        The standard deviation in rad, shape (trial,), float64; 0 for trials not examined.
     """
     if rows.shape[-2] < 2:
         return torch.full_like(phase[:, 0], UNKNOWN_RAD, dtype=torch.float64)
-    parts = halves(rows, phase)
+    std = torch.zeros_like(phase[:, 0], dtype=torch.float64)
+    count = len(std) if which is None else host_value(which.sum(), len(std))
+    if not count:
+        return std
+    at = EVERY if which is None or count == len(std) else true_positions(which, count)
+    present, phase = present[at], phase[at]
+    parts = halves(rows[at], phase)
     if disturbed:
-        ends = settled_apart(parts, present, phase, again, EVERY)
+        ends = settled_apart(parts, present, phase, again, at)
     else:
-        ends = [again(part, EVERY, phase) for part in parts]
-    return half_of(parts, ends, phase, present)
+        ends = [again(part, at, phase) for part in parts]
+    apart = half_of(parts, ends, phase, present)
+    apart = apart if isinstance(at, slice) else std.index_copy(0, at, apart)
+    return apart if which is None else torch.where(which, apart, 0)
 
 
 def half_of(parts: Sequence[Tensor], ends: Sequence[Tensor], phase: Tensor, present: Tensor) -> Tensor:

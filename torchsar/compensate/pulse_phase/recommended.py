@@ -13,6 +13,7 @@ from torchsar.compensate.pulse_phase.data import Pulses, prepare, refuse_odd_cou
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.linking import linked
 from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.points import FEW_ROWS, phases_of_points
 from torchsar.compensate.pulse_phase.sharpen import (
     LEAST_PULSES_OF_FACTORS,
     WIENER_FACTORS,
@@ -131,11 +132,11 @@ def autofocus(
     else:
         again = Run(LogAbove(_FLOOR), coarse, 4, _RELAXATION, 0.0)
 
-    def runs(coarse: Imaging, fine: Imaging) -> list[Run]:
-        return [
-            Run(LogAbove(_FLOOR), coarse, search, _RELAXATION, search_tolerance_rad),
-            Run(Wiener(), fine, polish, factors, tolerance_rad),
-        ]
+    def iterations(imaging: Imaging) -> Run:
+        return Run(LogAbove(_FLOOR), imaging, search, _RELAXATION, search_tolerance_rad)
+
+    def polishing(imaging: Imaging) -> Run:
+        return Run(Wiener(), imaging, polish, factors, tolerance_rad)
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:
         first = Run(
@@ -145,11 +146,12 @@ def autofocus(
             _RELAXATION,
             search_tolerance_rad,
         )
-        phase, taken = in_turn(
-            rows, pair_phase(rows, present) if begin is None else begin, [first, *runs(AlongPulses(), AlongPulses(2))]
-        )
+        begin = pair_phase(rows, present) if begin is None else begin
+        phase, taken = in_turn(rows, begin, [first, iterations(AlongPulses())])
+        phase, more = _polished(rows, present, phase, polishing(AlongPulses(2)), through is None)
+        taken = taken + more
         if through is not None:
-            phase, more = _WithSlope(through, runs(through, through))(rows, phase)
+            phase, more = _WithSlope(through, [iterations(through), polishing(through)])(rows, phase)
             taken = taken + more
         return phase, taken, lambda some, _, at: fixed_point(some, at, again)[0]
 
@@ -160,6 +162,29 @@ def autofocus(
         halves = partial(halves_of_image, through)
         sharpest = estimated(pulses, begin, find, at_rest=True, compare=False, halves=halves)
     return _with_linked(pulses, sharpest)
+
+
+def _polished(rows: Tensor, present: Tensor, phase: Tensor, run: Run, by_points: bool) -> tuple[Tensor, Tensor]:
+    """Phases (trial, pulse) and number of iterations (trial,) of the third step.
+
+    Where few points explain the pulses, the phases are those, if `by_points` permits it.
+    """
+    few = torch.zeros_like(phase[:, 0], dtype=torch.bool)
+    if by_points and run.iterations:
+        energy = (rows.detach().real.square() + rows.detach().imag.square()).sum(-1)
+        few = energy.sum(-1).square() < FEW_ROWS * energy.square().sum(-1)
+    points = phases_of_points(rows, present, phase, few)
+    phase, taken = points.phase_rad, torch.zeros_like(few, dtype=torch.int64)
+    count = host_value((~points.explained).sum(), len(few)) if points.examined else len(few)
+    if not count:
+        return phase, taken
+    if count == len(few):
+        other, more = fixed_point(rows, phase, run)
+    else:
+        at = true_positions(~points.explained, count)
+        other, more = fixed_point(rows[at], phase[at], run.of(at))
+        other, more = phase.index_copy(0, at, other), taken.index_copy(0, at, more)
+    return torch.where(points.explained[:, None], phase, other), torch.where(points.explained, taken, more)
 
 
 def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.alignment import Displacement, displacement
-from torchsar.compensate.pulse_phase.data import Pulses, dealt, or_one, rising, rotate
+from torchsar.compensate.pulse_phase.data import Pulses, dealt, or_one, rising, rotate, without_lobes
 from torchsar.compensate.pulse_phase.few import STEADY, between_scatterers, scatter_of_point
 from torchsar.compensate.pulse_phase.halves import (
     EVERY,
@@ -26,6 +26,7 @@ from torchsar.compensate.pulse_phase.halves import (
 )
 from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.compensate.pulse_phase.imaging import Imaging
+from torchsar.compensate.pulse_phase.points import FEW_ROWS, phases_of_points
 from torchsar.compensate.pulse_phase.quarters import one_scene
 from torchsar.core import Estimate, block_bytes_of, host_value, over_blocks, true_positions
 from torchsar.metrics.phase import phase_rmse
@@ -136,15 +137,14 @@ def _band_of_noise(image: Tensor) -> Tensor:
     """Share of the range band that noise occupies, (trial,), from a focused image.
 
     The density of a range frequency is the median over Doppler, in which a sparse scene has no
-    part. It scatters by 1 / ln 2 / sqrt(Doppler cells).
+    part. Its relative variance is 3.2 / Doppler cells, measured.
 
     image: (trial, range, Doppler).
     """
-    spectrum = torch.fft.fft(image, dim=-2)
+    spectrum = without_lobes(torch.fft.fft(image, dim=-2))
     cells = image.shape[-1]
     density = rising(spectrum.real.square() + spectrum.imag.square())[..., (cells - 1) // 2].to(torch.float64)
-    scatter = 1 + 1 / (math.log(2) ** 2 * cells)
-    return (scatter * _filled(density)).clamp_max(1)
+    return ((1 + 3.2 / cells) * _filled(density)).clamp_max(1)
 
 
 def estimated(
@@ -265,11 +265,16 @@ def _assessed(
         scatter, rest = scatter_of_point(focused, present)
         lone = (sharpness_rows <= LEAST_ROWS) & (scatter < STEADY) & (present.sum(-1) >= _LEAST_PULSES)
         lone = lone & (imaging is None) & (rows.shape[-2] > 1)
+        compared = (sharpness_rows * occupied < _TELLING_ROWS) & compare
+        few_points = (compared | (effective < FEW_ROWS)) & compare
+        points = phases_of_points(rows, present, phase, few_points)
+        stay, compared = points.explained, compared & ~points.explained
         disturbed = halves is None and imaging is None
-        apart = half_difference(rows, present, phase, again, halves or halves_of_rows, disturbed)
+        which = ~stay if points.examined else None
+        apart = half_difference(rows, present, phase, again, halves or halves_of_rows, disturbed, which)
         mixed = torch.where(lone, 0, apart)
-        if halves is None:
-            apart = apart / torch.maximum(occupied, _band_of_noise(image)).sqrt()
+        band = torch.maximum(occupied, _band_of_noise(image)) if halves is None else torch.ones_like(apart)
+        apart = apart / band.sqrt()
         of_point = torch.hypot(scatter, rest)
         std = torch.where(lone, of_point, apart)
         if not at_rest:
@@ -280,9 +285,13 @@ def _assessed(
             few = (sharpness_rows / _TELLING_ROWS).clamp_max(1)
             largest = math.sqrt(-math.log(LEAST_STREHL)) * few
             alone = ~lone & (sharpness_rows < _TELLING_ROWS)
-            compared = sharpness_rows * occupied < _TELLING_ROWS
-            between, unlike, untold = between_scatterers(rows, present, phase, again, image, mixed, of_point, compared)
-            std = torch.maximum(std, between / occupied.sqrt())
+            between, unlike, untold = torch.zeros_like(std), torch.zeros_like(stay), torch.zeros_like(stay)
+            if points.examined:
+                between, unlike, untold = between_scatterers(
+                    rows, present, phase, again, points.noise, mixed, of_point, compared
+                )
+            exact = torch.hypot(points.std_rad / band.sqrt(), phase_rmse(points.phase_rad, phase, present))
+            std = torch.where(stay, exact, torch.maximum(std, between / occupied.sqrt()))
             one, sure, differ = one_scene(rows, phase, std, largest, sharpness_rows)
             least = _UNSURE_RAD * few
             unsure = one & ~sure & ~lone & (std < least)
@@ -291,12 +300,12 @@ def _assessed(
             std = torch.maximum(std, anew / occupied.sqrt())
             stays = one & (sure | (unsure & (std < least)))
             std = torch.where(unsure, _BY_CHANCE * std, std)
-            std = torch.where(differ & alone, _FEW_TELL * std, std)
+            std = torch.where(differ & alone & ~stay, _FEW_TELL * std, std)
             unlike = unlike & (std >= _UNSURE_RAD)
             stays, lone = stays & ~unlike & ~(untold & differ), lone & ~unlike
         else:
             stays = torch.ones_like(lone)
-    homogeneous = scene.homogeneous & compare & ~lone
+    homogeneous = scene.homogeneous & compare & ~lone & ~stay
     scene_rows = effective * occupied, sharpness_rows
     return phase, taken, sharp, *scene_rows, std, scene.sparse, homogeneous, lone, stays, moved.jitter, moved.migration
 
