@@ -40,8 +40,9 @@ _CLOSE, _ONE_RANGE = 3.0, 0.5
 _TOLD_RAD = 0.25
 # Rounds of phases, amplitudes and Dopplers for each number of lines. They end early where both move
 # the phases by less than this share of what noise does. One line alone need not be exact.
-_ROUNDS, _FIRST_ROUNDS, _SETTLED = 12, 3, 0.1
+_ROUNDS, _FIRST_ROUNDS, _SETTLED = 16, 3, 0.1
 _FINER = 4  # samples of the spectrum per Doppler cell, in which the strongest line is found
+_LARGEST_TURN = 0.25  # change of a Doppler in one round in cells
 _RIDGE = 1e-6  # of the energy of a line, so that equal lines have an inverse
 
 
@@ -163,7 +164,7 @@ class _Fit:
     def with_another_line(self) -> _Fit:
         """Add a line where the spectrum of the rest is largest, and fit all lines and phases."""
         n = self.rows.shape[-1]
-        rest = torch.fft.fft((rotate(self.rows, self.change) - self.model).detach(), _FINER * n)
+        rest = torch.fft.fft(rotate(self.rows, self.change) - self.model, _FINER * n)
         power = (rest.real.square() + rest.imag.square()).sum(-2)
         top = power.argmax(-1, keepdim=True)
         below, peak, above = (power.gather(-1, (top + k) % (_FINER * n))[:, 0] for k in (-1, 0, 1))
@@ -176,7 +177,7 @@ class _Fit:
         pulse = (pulse - (pulse * self.present).sum(-1, keepdim=True) / pulses[:, None]) * self.present
         ridge = _RIDGE * pulses[:, None, None] * torch.eye(lines.shape[-1], dtype=change.dtype, device=change.device)
         every = 1 if change.device.type == "cpu" else _ROUNDS
-        amplitudes, model = self.amplitudes, self.model
+        amplitudes, model = self.rows.new_zeros(*lines.shape, self.rows.shape[-2]), self.model
         active = torch.ones_like(lines[:, :1], dtype=torch.bool)
         rounds = _ROUNDS if lines.shape[-1] > 1 else _FIRST_ROUNDS
         for number in range(1, rounds + 1):
@@ -184,12 +185,11 @@ class _Fit:
             waves = cis(lines[..., None] * pulse[:, None]) * self.present[:, None]
             matrix = waves.conj() @ waves.mT + ridge
             # the ridge makes the matrix regular, so that no check must wait for the device
-            amplitudes = torch.linalg.solve_ex(matrix, waves.conj() @ rows.mT)[0]
-            model = (waves.mT @ amplitudes).mT
+            solved = torch.linalg.solve_ex(matrix, waves.conj() @ rows.mT)[0]
+            amplitudes = torch.where(active[..., None], solved, amplitudes)
+            model = torch.where(active[..., None], (waves.mT @ amplitudes).mT, model)
             step = safe_angle((model.conj() * rows).sum(-2))
-            slopes = (1j * pulse[:, None] * waves).conj() @ (rotate(rows, step) - model).mT
-            size = (amplitudes.real.square() + amplitudes.imag.square()).sum(-1)
-            turn = (amplitudes.conj() * slopes).real.sum(-1) / or_one(size * pulse.square().sum(-1)[:, None])
+            turn = _turns(waves, 1j * pulse[:, None] * waves, matrix, amplitudes, rotate(rows, step) - model)
             change, lines = change + active * step, lines + active * turn
             moved = (step.detach().square().sum(-1, keepdim=True) / or_one(pulses)[:, None]).sqrt()
             active = active & (moved > settled[:, None])
@@ -223,3 +223,20 @@ class _Fit:
         energy = (self.rows.real.square() + self.rows.imag.square()).sum((-2, -1))
         scene = (energy - self.cells * pulses * self.noise).detach()
         return torch.where(scene > 0, (pulses * self.noise / or_one(2 * scene)).sqrt(), torch.inf)
+
+
+def _turns(waves: Tensor, slopes: Tensor, matrix: Tensor, amplitudes: Tensor, rest: Tensor) -> Tensor:
+    """Changes of the Dopplers in rad per pulse, (trial, line), that explain most of the rest.
+
+    A Gauss-Newton step: the slopes of the waves by their Dopplers, (trial, line, pulse) as these,
+    count without what the amplitudes can explain. matrix: products of the waves.
+    """
+    mixed = waves.conj() @ slopes.mT
+    free = slopes.conj() @ slopes.mT - mixed.mH @ torch.linalg.solve_ex(matrix, mixed)[0]
+    curvature = (free * (amplitudes @ amplitudes.mH).conj()).real
+    size = or_one(curvature.diagonal(dim1=-2, dim2=-1).sum(-1))[:, None, None]
+    ridge = _RIDGE * size * torch.eye(curvature.shape[-1], dtype=size.dtype, device=size.device)
+    right = (amplitudes.conj() * (slopes.conj() @ rest.mT)).real.sum(-1, keepdim=True)
+    turns = torch.linalg.solve_ex(curvature + ridge, right)[0][..., 0]
+    largest = _LARGEST_TURN * 2 * math.pi / waves.shape[-1]
+    return turns.clamp(-largest, largest)

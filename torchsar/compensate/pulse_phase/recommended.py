@@ -68,8 +68,10 @@ def autofocus(
     `entropy_fixed_point` until the phases no longer change; cells below 2.5 times the mean power of
     the image get no weight (5 times in the first six iterations if noise is weak). In the third
     step the phase of each pulse is measured against a Wiener estimate of the scene, on an image of
-    twice as many Doppler cells. The third step reduces the remaining error by half or more.
-    Differentiable without `imaging`.
+    twice as many Doppler cells. The third step reduces the remaining error by half or more. Where
+    two to six points explain the pulses down to the noise, their phases by maximum likelihood take
+    its place (see `phases_of_points`): the sharpest phases of few points are up to eight times as
+    wrong where noise is weak. Differentiable without `imaging`.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
@@ -78,7 +80,7 @@ def autofocus(
             has no effect on the result.
         search: Largest number of iterations of the second step, approximately; only hard cases of
             low SNR need them all.
-        polish: Largest number of iterations of the third step.
+        polish: Largest number of iterations of the third step; with 0 it is left out.
         search_tolerance_rad: Phase change in rad, rms over the pulses, below which the iterations
             of the second step end.
         tolerance_rad: Phase step in rad, rms over the pulses, below which the iterations of the
@@ -95,8 +97,9 @@ def autofocus(
 
     Returns:
         `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
-        halves of the range cells, or of the image by `imaging`; for point targets it is close to
-        the true error. `ok` is False unless the image is 1.5 times as sharp as autofocus can make
+        halves of the range cells, or of the image by `imaging`, or from the noise where points
+        explain the pulses; for point targets it is close to the true error.
+        `ok` is False unless the image is 1.5 times as sharp as autofocus can make
         pure noise, more than one range cell or a single point makes the sharpness, the pulses show
         one scene, and the Strehl ratio predicted from the standard deviation exceeds 0.8. Sharpness
         is the amount by which the image entropy lies below that of speckle. The pulses show one

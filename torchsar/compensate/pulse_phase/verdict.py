@@ -176,7 +176,10 @@ def estimated(
       error does not change it. The scatter of the phase that remains is added. Where less than 6
       independent rows make the sharpness, the halves may hold the same scatterers; the difference
       between scatterers beyond noise then counts too, and the scatter of the point if one makes the
-      scene (see `between_scatterers`).
+      scene (see `between_scatterers`). All this holds where few points do not explain the pulses
+      down to the noise. Where they do, the scene is known to stay, and the deviation is the
+      distance from the phases of these points and their deviation due to noise (see
+      `phases_of_points`).
     - The distance by which the phases move when the method is continued on all rows.
 
     Args:
