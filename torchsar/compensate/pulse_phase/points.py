@@ -40,7 +40,7 @@ _CLOSE, _ONE_RANGE = 3.0, 0.5
 _TOLD_RAD = 0.25
 # Rounds of phases, amplitudes and Dopplers for each number of lines. They end early where both move
 # the phases by less than this share of what noise does. One line alone need not be exact.
-_ROUNDS, _FIRST_ROUNDS, _SETTLED = 16, 3, 0.1
+_ROUNDS, _FIRST_ROUNDS, _SETTLED = 10, 3, 0.1
 _FINER = 4  # samples of the spectrum per Doppler cell, in which the strongest line is found
 _LARGEST_TURN = 0.25  # change of a Doppler in one round in cells
 _RIDGE = 1e-6  # of the energy of a line, so that equal lines have an inverse
