@@ -255,20 +255,23 @@ def without_lobes(image: Tensor) -> Tensor:
     return (image - (image.roll(1, -1) + image.roll(-1, -1)) / 2) / math.sqrt(1.5)
 
 
-def noise_power(rows: Tensor, phase_rad: Tensor) -> Tensor:
+def noise_power(rows: Tensor, present: Tensor, phase_rad: Tensor) -> Tensor:
     """Estimate the variance of the noise of pulses whose scatterers fill less than half the image.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
+        present: False where a pulse holds only zeros, shape (trial, pulse).
         phase_rad: Phases that focus them in rad, shape (trial, pulse).
 
     Returns:
-        The median power of the cells of the image over ln 2, which is that of the median of noise,
-        shape (trial,), float64, without derivatives.
+        The variance of a sample, shape (trial,), float64, without derivatives: the median power of
+        the cells of the image over ln 2, which is that of the median of noise, and over the share
+        of pulses that hold samples.
     """
     image = without_lobes(torch.fft.fft(rotate(rows.detach(), phase_rad.detach()), norm="ortho"))
     power = rising((image.real.square() + image.imag.square()).flatten(1))
-    return power[:, (power.shape[-1] - 1) // 2].to(torch.float64) / math.log(2)
+    median = power[:, (power.shape[-1] - 1) // 2].to(torch.float64)
+    return median / (math.log(2) * or_one(present.mean(-1, dtype=torch.float64)))
 
 
 def dealt(energy: Tensor, parts: int) -> Tensor:

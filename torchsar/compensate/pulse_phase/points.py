@@ -67,7 +67,9 @@ class Points:
     examined: bool
 
 
-def phases_of_points(rows: Tensor, present: Tensor, phase_rad: Tensor, which: Tensor) -> Points:
+def phases_of_points(
+    rows: Tensor, present: Tensor, phase_rad: Tensor, which: Tensor, count: int | None = None
+) -> Points:
     """Explain pulses by one phase per pulse and few lines in Doppler.
 
     Lines are added one by one, each at the maximum of the spectrum of what is not explained, until
@@ -83,6 +85,7 @@ def phases_of_points(rows: Tensor, present: Tensor, phase_rad: Tensor, which: Te
         present: False where a pulse holds only zeros, shape (trial, pulse).
         phase_rad: Phase to start from in rad, shape (trial, pulse).
         which: True for the trials that are examined, shape (trial,).
+        count: Their number, if it is known; otherwise the device is waited for.
 
     Returns:
         The phases, which are those to start from where points do not explain the pulses.
@@ -90,15 +93,13 @@ def phases_of_points(rows: Tensor, present: Tensor, phase_rad: Tensor, which: Te
     phase, explained = phase_rad, torch.zeros_like(which)
     noise = torch.zeros_like(which, dtype=torch.float64)
     std = torch.full_like(noise, torch.inf)
-    count = host_value(which.sum(), len(which))
+    count = host_value(which.sum(), len(which)) if count is None else count
     if not count:
         return Points(phase, std, noise, explained, False)
     at = true_positions(which, count)
-    noise = noise.index_copy(0, at, noise_power(rows[at], phase[at]))
-    if rows.shape[-1] < _LEAST_PULSES:
-        return Points(phase, std, noise, explained, True)
+    noise = noise.index_copy(0, at, noise_power(rows[at], present[at], phase[at]))
     fit = _Fit.begin(rows[at], present[at], phase[at], noise[at])
-    unexplained, before = which & (noise > 0), fit.rest()
+    unexplained, before = which & (noise > 0) & (present.sum(-1) >= _LEAST_PULSES), fit.rest()
     for lines in range(1, _MOST_LINES + 1):
         fit = fit.with_another_line()
         rest = fit.rest()

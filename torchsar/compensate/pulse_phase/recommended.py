@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import Pulses, prepare, refuse_odd_counts, rotate, starting_phase
+from torchsar.compensate.pulse_phase.gaps import across_gaps, have_gaps
+from torchsar.compensate.pulse_phase.halves import Which
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.linking import linked
 from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.points import FEW_ROWS, phases_of_points
+from torchsar.compensate.pulse_phase.points import FEW_ROWS, Points, phases_of_points
 from torchsar.compensate.pulse_phase.sharpen import (
     LEAST_PULSES_OF_FACTORS,
     WIENER_FACTORS,
@@ -24,7 +26,7 @@ from torchsar.compensate.pulse_phase.sharpen import (
     in_turn,
 )
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
-from torchsar.core import Estimate, host_value, true_positions
+from torchsar.core import Estimate, host_value, host_values, true_positions
 from torchsar.metrics import entropy
 
 # floor of the entropy fixed point in mean powers, found by trial: a lower floor includes noise, a
@@ -39,6 +41,9 @@ _RELAXATION = 1.8
 # Standard deviation of the sharpest phases below which they are ok where only the dependence of
 # range cells speaks against linked phases: a third of the largest one that is ok elsewhere.
 _SURE_RAD = 0.15
+# Iterations across gaps for each of the third step: filled pulses grow slowly. A quarter of a
+# record of 40 points takes 60 to 100.
+_FILLING = 5
 # lines of the image in a strip, by choice: more than the response of a point is wide
 _STRIP = 4
 _SLOPES = 48  # slopes tried over one turn per pulse, found by trial: spacing against time
@@ -71,7 +76,8 @@ def autofocus(
     twice as many Doppler cells. The third step reduces the remaining error by half or more. Where
     two to six points explain the pulses down to the noise, their phases by maximum likelihood take
     its place (see `phases_of_points`): the sharpest phases of few points are up to eight times as
-    wrong where noise is weak. Differentiable without `imaging`.
+    wrong where noise is weak. Missing pulses, which are all zeros, are filled in from the estimate of
+    the scene (see `across_gaps`). Differentiable without `imaging`.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
@@ -129,9 +135,10 @@ def autofocus(
     through = None if imaging is None else Through(imaging)
     coarse, fine = (AlongPulses(), AlongPulses(2)) if through is None else (through, through)
     quick = through is None and pulses.n >= LEAST_PULSES_OF_FACTORS
-    factors, few = (WIENER_FACTORS, len(WIENER_FACTORS)) if quick else (1.0, 6)
+    factors, few_iterations = (WIENER_FACTORS, len(WIENER_FACTORS)) if quick else (1.0, 6)
+    special = through is None and polish > 0  # points and gaps
     if polish:
-        again = Run(Wiener(), fine, few, factors, tolerance_rad)
+        again = Run(Wiener(), fine, few_iterations, factors, tolerance_rad)
     else:
         again = Run(LogAbove(_FLOOR), coarse, 4, _RELAXATION, 0.0)
 
@@ -151,8 +158,19 @@ def autofocus(
         )
         begin = pair_phase(rows, present) if begin is None else begin
         phase, taken = in_turn(rows, begin, [first, iterations(AlongPulses())])
-        phase, more = _polished(rows, present, phase, polishing(AlongPulses(2)), through is None)
+        few, gaps = _few_rows(rows) & special, have_gaps(present) & special
+        counts = host_values(torch.stack([few.sum(), gaps.sum()]), len(rows))
+        points = phases_of_points(rows, present, phase, few, counts[0])
+        phase, more = _polished(rows, points, polishing(AlongPulses(2)))
         taken = taken + more
+        if counts[1]:
+            phase = _filled(rows, phase, phase, gaps & ~points.explained, _FILLING * polish, tolerance_rad / 10)
+
+            def further(some: Tensor, which: Which, at: Tensor) -> Tensor:
+                reached = fixed_point(some, at, again)[0]
+                return _filled(some, reached, at, gaps[which], _FILLING * few_iterations, tolerance_rad / 10)
+
+            return phase, taken, further
         if through is not None:
             phase, more = _WithSlope(through, [iterations(through), polishing(through)])(rows, phase)
             taken = taken + more
@@ -167,27 +185,38 @@ def autofocus(
     return _with_linked(pulses, sharpest)
 
 
-def _polished(rows: Tensor, present: Tensor, phase: Tensor, run: Run, by_points: bool) -> tuple[Tensor, Tensor]:
+def _few_rows(rows: Tensor) -> Tensor:
+    """Whether the energy lies in so few range cells that few points may explain it, (trial,)."""
+    energy = (rows.detach().real.square() + rows.detach().imag.square()).sum(-1)
+    return energy.sum(-1).square() < FEW_ROWS * energy.square().sum(-1)
+
+
+def _polished(rows: Tensor, points: Points, run: Run) -> tuple[Tensor, Tensor]:
     """Phases (trial, pulse) and number of iterations (trial,) of the third step.
 
-    Where few points explain the pulses, the phases are those, if `by_points` permits it.
+    The phases of points stay where these explain the pulses.
     """
-    few = torch.zeros_like(phase[:, 0], dtype=torch.bool)
-    if by_points and run.iterations:
-        energy = (rows.detach().real.square() + rows.detach().imag.square()).sum(-1)
-        few = energy.sum(-1).square() < FEW_ROWS * energy.square().sum(-1)
-    points = phases_of_points(rows, present, phase, few)
-    phase, taken = points.phase_rad, torch.zeros_like(few, dtype=torch.int64)
-    count = host_value((~points.explained).sum(), len(few)) if points.examined else len(few)
+    phase, taken = points.phase_rad, torch.zeros_like(points.explained, dtype=torch.int64)
+    count = host_value((~points.explained).sum(), len(rows)) if points.examined else len(rows)
     if not count:
         return phase, taken
-    if count == len(few):
+    if count == len(rows):
         other, more = fixed_point(rows, phase, run)
     else:
         at = true_positions(~points.explained, count)
         other, more = fixed_point(rows[at], phase[at], run.of(at))
         other, more = phase.index_copy(0, at, other), taken.index_copy(0, at, more)
     return torch.where(points.explained[:, None], phase, other), torch.where(points.explained, taken, more)
+
+
+def _filled(rows: Tensor, phase: Tensor, start: Tensor, gaps: Tensor, iterations: int, tolerance_rad: float) -> Tensor:
+    """Phases (trial, pulse): those across gaps, found from a start, where there are gaps."""
+    count = host_value(gaps.sum(), len(gaps))
+    if not count:
+        return phase
+    at = true_positions(gaps, count)
+    found = across_gaps(rows[at], start[at], iterations, tolerance_rad)
+    return torch.where(gaps[:, None], phase.index_copy(0, at, found), phase)
 
 
 def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
