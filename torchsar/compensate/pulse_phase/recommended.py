@@ -76,8 +76,8 @@ def autofocus(
     twice as many Doppler cells. The third step reduces the remaining error by half or more. Where
     two to six points explain the pulses down to the noise, their phases by maximum likelihood take
     its place (see `phases_of_points`): the sharpest phases of few points are up to eight times as
-    wrong where noise is weak. Missing pulses, which are all zeros, are filled in from the estimate of
-    the scene (see `across_gaps`). Differentiable without `imaging`.
+    wrong where noise is weak. Missing pulses, which are all zeros, are filled in from the estimate
+    of the scene (see `across_gaps`). Differentiable without `imaging`.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
