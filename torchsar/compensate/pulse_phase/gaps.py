@@ -15,9 +15,10 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import or_one, rotate, safe_angle
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import LEAST_PULSES_OF_FACTORS, WIENER_FACTORS, Wiener, bright
+from torchsar.core import host_value
 
 # Largest side lobe of missing pulses, relative to the main lobe, from which on they are filled in.
-# With 0.07 (a gap of a sixteenth of the record) errors are hardly larger than without a gap.
+# With 0.07, a gap of a sixteenth of the record, errors of 40 points were a sixth larger.
 _LOBE = 0.06
 # Lobes as high as the main lobe are images of the whole scene, as of every other pulse: they do not
 # change the sharpness.
@@ -88,6 +89,7 @@ def across_gaps(rows: Tensor, phase_rad: Tensor, iterations: int, tolerance_rad:
         phase = phase + factors[number % len(factors)] * step
         size = (min(factors) * step.detach()).square().sum(-1) / or_one(present.sum(-1))
         active = active & (size > tolerance_rad**2)
-        if phase.device.type == "cpu" and not bool(active.any()):
+        # on an accelerator waiting for the decision costs as much as iterations that change nothing
+        if phase.device.type == "cpu" and not host_value(active.sum(), 1):
             break
     return phase

@@ -194,7 +194,7 @@ class _Fit:
             change, lines = change + active * step, lines + active * turn
             moved = (step.detach().square().sum(-1, keepdim=True) / or_one(pulses)[:, None]).sqrt()
             active = active & (moved > settled[:, None])
-            if number % every == 0 and number < rounds and not bool(active.any()):
+            if number % every == 0 and number < rounds and not host_value(active.sum(), 1):
                 break
         return _Fit(self.rows, self.cells, self.present, self.noise, change, lines, amplitudes, model)
 
