@@ -126,5 +126,5 @@ def test_cells_that_were_wrong(name: str, world: str, snr_db: float | None, leas
 def test_wrong_phases_in_noise_are_not_ok(name: str, world: str, snr_db: float) -> None:
     entry = next(entry for entry in ENTRIES if entry.name == name)
     cell = replace(entry, worlds=[w for w in entry.worlds if (w.name, w.snr_db) == (world, snr_db)])
-    (row,) = audit([cell], lambda entry, world: 40)
+    (row,) = audit([cell], lambda entry, world: 24)
     assert row["false_ok"] == 0, row

@@ -387,7 +387,7 @@ def test_two_points_of_one_range_are_as_wrong_as_promised(windowed: bool) -> Non
     """Their phases make one point of both, in all range cells alike: in half of these trials and
     more the error was over five deviations and ok.
     """
-    trials, pulses, cells, source = 24, 128, 64, torch.Generator().manual_seed(1)
+    trials, pulses, cells, source = 12, 128, 64, torch.Generator().manual_seed(1)
     turn, start = torch.rand(2, trials, 2, generator=source, dtype=torch.float64)
     slow = torch.exp(2j * math.pi * (0.3 * (turn[..., None] - 0.5) * torch.arange(pulses) + start[..., None]))
     away = torch.arange(cells, dtype=torch.float64) - cells / 2 + 0.5
@@ -400,7 +400,7 @@ def test_two_points_of_one_range_are_as_wrong_as_promised(windowed: bool) -> Non
     phase = 2 * math.pi * torch.rand(trials, pulses, generator=source, dtype=torch.float64)
     found = autofocus(data * torch.exp(1j * phase)[..., None])
     error, std = phase_rmse(found["phase_rad"], phase)[found.ok], found.std["phase_rad"][found.ok, 0]
-    assert len(error) >= 12 and 0.67 < float(error.square().mean().sqrt() / std.square().mean().sqrt()) < 1.4
+    assert len(error) >= 6 and 0.67 < float(error.square().mean().sqrt() / std.square().mean().sqrt()) < 1.4
 
 
 def test_white_noise_of_windowed_data_is_independent_between_rows() -> None:
