@@ -8,11 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.compensate.scenes import spread_points
 from torchsar.compensate import autofocus
 from torchsar.compensate.pulse_phase.gaps import have_gaps, side_lobes
 from torchsar.metrics import phase_rmse
 
-PULSES, CELLS = 128, 64
+PULSES = 128
 TIME = torch.arange(PULSES)
 PRESENT = {
     "a quarter at once": (TIME < 42) | (TIME >= 74),
@@ -21,25 +22,10 @@ PRESENT = {
 }
 
 
-def scene(trials: int, points: int, snr_db: float, seed: int) -> tuple[Tensor, Tensor]:
-    """Pulses (trial, pulse, range) of points in half of the Doppler band, and their phases."""
-    source = torch.Generator().manual_seed(seed)
-    place, turn, start, size = torch.rand(4, trials, points, generator=source, dtype=torch.float64)
-    slow = torch.exp(2j * math.pi * (0.5 * (turn[..., None] - 0.5) * TIME + start[..., None]))
-    slow = slow * (-size.clamp_min(1e-3).log()).sqrt()[..., None]
-    away = torch.arange(CELLS, dtype=torch.float64) - 4 - (CELLS - 8) * place[..., None]
-    response = 0.54 * torch.sinc(away) + 0.23 * (torch.sinc(away - 1) + torch.sinc(away + 1))
-    data = torch.einsum("tkp,tkr->tpr", slow, response.to(slow.dtype))
-    level = 10 ** (-snr_db / 20) * data.abs().square().mean((1, 2), keepdim=True).sqrt()
-    data = data + level * torch.randn(data.shape, generator=source, dtype=torch.complex128)
-    phase = 2 * math.pi * torch.rand(trials, PULSES, generator=source, dtype=torch.float64)
-    return data * torch.exp(1j * phase)[..., None], phase
-
-
 @pytest.fixture(scope="module")
 def pulses() -> tuple[Tensor, Tensor, float]:
     """Whole records, their phases and the median error of the phases found."""
-    data, phase = scene(8, 40, 15.0, seed=1)
+    data, phase = spread_points(8, 40, 15.0, seed=1)
     return data, phase, float(phase_rmse(autofocus(data)["phase_rad"], phase).median())
 
 
@@ -58,7 +44,7 @@ def test_missing_pulses_do_not_make_phases_wrong(missing: str, pulses: tuple[Ten
 
 
 def test_trials_without_gaps_are_as_without_the_others() -> None:
-    data, _ = scene(3, 20, 10.0, seed=2)
+    data, _ = spread_points(3, 20, 10.0, seed=2)
     data[1] = torch.where(PRESENT["three gaps"][:, None], data[1], 0)
     together = autofocus(data)
     for trial in range(3):

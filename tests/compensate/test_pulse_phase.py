@@ -12,7 +12,18 @@ import torch
 from torch import Tensor
 
 from tests.audit.pulses import scintillating
-from tests.compensate.scenes import DOUBLE, EQUIVARIANT, METHODS, doppler_image, noisy, still, turned, white
+from tests.compensate.scenes import (
+    DOUBLE,
+    EQUIVARIANT,
+    METHODS,
+    doppler_image,
+    hamming_response,
+    noisy,
+    spread_points,
+    still,
+    turned,
+    white,
+)
 from torchsar.compensate import (
     Autofocus,
     CorrectPulsePhase,
@@ -391,9 +402,7 @@ def test_two_points_of_one_range_are_as_wrong_as_promised(windowed: bool) -> Non
     turn, start = torch.rand(2, trials, 2, generator=source, dtype=torch.float64)
     slow = torch.exp(2j * math.pi * (0.3 * (turn[..., None] - 0.5) * torch.arange(pulses) + start[..., None]))
     away = torch.arange(cells, dtype=torch.float64) - cells / 2 + 0.5
-    response = torch.sinc(away)
-    if windowed:
-        response = 0.54 * response + 0.23 * (torch.sinc(away - 1) + torch.sinc(away + 1))
+    response = hamming_response(away) if windowed else torch.sinc(away)
     data = (slow[:, 0] + 10 ** (-15 / 20) * slow[:, 1])[..., None] * response
     level = 10 ** (-15 / 20) * data.abs().square().mean((1, 2), keepdim=True).sqrt()
     data = data + level * torch.randn(data.shape, generator=source, dtype=torch.complex128)
@@ -405,16 +414,8 @@ def test_two_points_of_one_range_are_as_wrong_as_promised(windowed: bool) -> Non
 
 def test_white_noise_of_windowed_data_is_independent_between_rows() -> None:
     """The rows were taken to be as dependent as the data: deviations were a third too large."""
-    trials, pulses, cells, source = 24, 128, 64, torch.Generator().manual_seed(2)
-    place, turn = torch.rand(2, trials, 10, generator=source, dtype=torch.float64)
-    slow = torch.exp(2j * math.pi * (turn[..., None] - 0.5) * torch.arange(pulses) * 0.5)
-    away = torch.arange(cells, dtype=torch.float64) - 4 - 56 * place[..., None]
-    response = 0.54 * torch.sinc(away) + 0.23 * (torch.sinc(away - 1) + torch.sinc(away + 1))
-    data = torch.einsum("tkp,tkr->tpr", slow, response.to(slow.dtype))
-    level = 10 ** (-10 / 20) * data.abs().square().mean((1, 2), keepdim=True).sqrt()
-    data = data + level * torch.randn(data.shape, generator=source, dtype=torch.complex128)
-    phase = 2 * math.pi * torch.rand(trials, pulses, generator=source, dtype=torch.float64)
-    found = autofocus(data * torch.exp(1j * phase)[..., None])
+    data, phase = spread_points(24, 10, 10.0, seed=2)
+    found = autofocus(data)
     error, std = (x.square().mean().sqrt() for x in (phase_rmse(found["phase_rad"], phase), found.std["phase_rad"]))
     assert found.ok.all() and 0.85 < float(error / std) < 1.2
 

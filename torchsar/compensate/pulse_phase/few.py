@@ -46,10 +46,10 @@ def between_scatterers(
 
     Each scatterer has a phase of its own if it moves within the target, and halves of the rows that
     hold the same one do not show it. The halves here have none in common. The difference that noise
-    explains follows from the energy of each half over the power of the noise; it is more
-    where halves with the same scatterers differ by more, because several scatterers share a range
-    cell. A half whose scatterers have one range tells nothing unless it is a single point, because
-    phases can be found that make it one.
+    explains follows from the energy of each half over the power of the noise; it is more where
+    halves with the same scatterers differ by more, because several scatterers share a range cell. A
+    half whose scatterers have one range tells nothing unless it is a single point, because phases
+    can be found that make it one.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one, rotate, safe_angle
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
-from torchsar.compensate.pulse_phase.sharpen import LEAST_PULSES_OF_FACTORS, WIENER_FACTORS, Wiener, bright
+from torchsar.compensate.pulse_phase.sharpen import LEAST_PULSES_OF_FACTORS, WIENER_FACTORS, Wiener
 from torchsar.core import host_value
 
 # Largest side lobe of missing pulses, relative to the main lobe, from which on they are filled in.
@@ -70,7 +70,7 @@ def across_gaps(rows: Tensor, phase_rad: Tensor, iterations: int, tolerance_rad:
     Returns:
         The phase in rad, shape (trial, pulse).
     """
-    present, along, settings = (rows != 0).any(-2), AlongPulses(2), Wiener()
+    present, along, scene = (rows != 0).any(-2), AlongPulses(2), Wiener()
     factors = WIENER_FACTORS if rows.shape[-1] >= LEAST_PULSES_OF_FACTORS else (1.0,)
     filled, phase = torch.zeros_like(rows), phase_rad
     active = torch.ones_like(phase[:, 0], dtype=torch.bool)
@@ -79,8 +79,7 @@ def across_gaps(rows: Tensor, phase_rad: Tensor, iterations: int, tolerance_rad:
         image = along.image(pulses)
         power = image.real.square() + image.imag.square()
         mean = or_one(power.mean((-2, -1), keepdim=True))
-        noise = torch.maximum(settings.level * mean, settings.share * bright(power))
-        weight = settings.filter(power, noise, -2)
+        weight = scene.of_scene(power, mean)
         filled = along.adjoint(image * weight)
         if number < 0:
             continue

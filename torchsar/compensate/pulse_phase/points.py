@@ -37,7 +37,7 @@ _EXPLAINED = 1.15
 _CLOSE, _ONE_RANGE = 3.0, 0.5
 # Largest deviation in rad, due to noise, of the phases that the points tell beside those of one
 # range: energy of a second range, from the eigenvalues of the covariance over range.
-_TOLD_RAD = 0.25
+_SECOND_RANGE_RAD = 0.25
 # Rounds of phases, amplitudes and Dopplers for each number of lines. They end early where both move
 # the phases by less than this share of what noise does. One line alone need not be exact.
 _ROUNDS, _FIRST_ROUNDS, _SETTLED = 10, 3, 0.1
@@ -216,7 +216,7 @@ class _Fit:
         # elementary symmetric polynomials of the eigenvalues: their sum, and that of their products
         total = power.sum(-1)
         pairs = (total.square() - (products.real.square() + products.imag.square()).sum((-2, -1))) / 2
-        return ~close & (2 * _TOLD_RAD**2 * pairs > total * self.noise)
+        return ~close & (2 * _SECOND_RANGE_RAD**2 * pairs > total * self.noise)
 
     def std_rad(self) -> Tensor:
         """Standard deviation of the phases due to noise in rad, (trial,)."""

@@ -76,8 +76,8 @@ def autofocus(
     twice as many Doppler cells. The third step reduces the remaining error by half or more. Where
     two to six points explain the pulses down to the noise, their phases by maximum likelihood take
     its place (see `phases_of_points`): the sharpest phases of few points are up to eight times as
-    wrong where noise is weak. Missing pulses, which are all zeros, are filled in from the estimate
-    of the scene (see `across_gaps`). Differentiable without `imaging`.
+    wrong at 25 dB. Without `imaging`, missing pulses, which are all zeros, are filled in from the
+    estimate of the scene (see `across_gaps`). Differentiable without `imaging`.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
@@ -136,7 +136,7 @@ def autofocus(
     coarse, fine = (AlongPulses(), AlongPulses(2)) if through is None else (through, through)
     quick = through is None and pulses.n >= LEAST_PULSES_OF_FACTORS
     factors, few_iterations = (WIENER_FACTORS, len(WIENER_FACTORS)) if quick else (1.0, 6)
-    special = through is None and polish > 0  # points and gaps
+    of_lines = through is None and polish > 0  # points, and pulses that are filled in
     if polish:
         again = Run(Wiener(), fine, few_iterations, factors, tolerance_rad)
     else:
@@ -158,7 +158,7 @@ def autofocus(
         )
         begin = pair_phase(rows, present) if begin is None else begin
         phase, taken = in_turn(rows, begin, [first, iterations(AlongPulses())])
-        few, gaps = _few_rows(rows) & special, have_gaps(present) & special
+        few, gaps = _few_rows(rows) & of_lines, have_gaps(present) & of_lines
         counts = host_values(torch.stack([few.sum(), gaps.sum()]), len(rows))
         points = phases_of_points(rows, present, phase, few, counts[0])
         phase, more = _polished(rows, points, polishing(AlongPulses(2)))

@@ -181,8 +181,17 @@ class Wiener:
     share: float = 0.01
 
     def __call__(self, power: Tensor, mean: Tensor) -> Tensor:
-        weight = self.filter(power, torch.maximum(self.level * mean, self.share * bright(power)), -2)
+        weight = self.of_scene(power, mean)
         return weight - weight.mean(-1, keepdim=True)
+
+    def of_scene(self, power: Tensor, mean: Tensor) -> Tensor:
+        """Return the first term, 0 to 1.
+
+        Args:
+            power: Power of the cells of images, shape (trial, range, Doppler).
+            mean: Its mean, shape (trial, 1, 1).
+        """
+        return self.filter(power, torch.maximum(self.level * mean, self.share * bright(power)), -2)
 
     @staticmethod
     def filter(power: Tensor, noise: Tensor, range_dim: int) -> Tensor:
