@@ -35,7 +35,7 @@ PRIOR = 3 / math.pi**2  # information in 1/rad^2 of a phase that is uniform over
 _PARTS = 4
 # Share of the energy that the cells must hold which share their spectrum with others: cells with
 # the side lobes of few points do so too. It is a quarter in clutter with five points of +15 dB.
-_LEAST_ENERGY = 0.2
+LEAST_ENERGY = 0.2
 
 Smooth = Callable[[Tensor, Tensor], Tensor]
 
@@ -312,7 +312,7 @@ class Speckle:
         some = energy * sum(
             shared[:, None] * (own != 0).any(-2) for (own, *_), shared in zip(self.groups, sharing, strict=True)
         )
-        known = (failed == 0) & (some.sum(-1) > _LEAST_ENERGY * energy.sum(-1))
+        known = (failed == 0) & (some.sum(-1) > LEAST_ENERGY * energy.sum(-1))
         excess = torch.where(
             known, rms_of_pulses(scatter, self.present) / or_one(rms_of_pulses(std, self.present)), torch.inf
         )

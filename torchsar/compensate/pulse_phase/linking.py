@@ -16,9 +16,10 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.alignment import Displacement, coherent_jitter, displacement
 from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare, starting_phase
-from torchsar.compensate.pulse_phase.homogeneous import describe
+from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, describe, power_groups
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.likelihood import (
+    LEAST_ENERGY,
     PRIOR,
     Crossed,
     Fit,
@@ -125,6 +126,22 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         scene = describe(pulses.rows, sharp, occupied_band(pulses.rows))
         likelier = (found.info["gain_nats"].flatten() > scene.sparse) & (scene.ratio > 0)
     return replace(found, ok=found.ok & likelier.reshape(pulses.trials))
+
+
+def may_be_ok(rows: Tensor) -> Tensor:
+    """Tell where linked phases may be ok: range cells of similar power are not too few.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+
+    Returns:
+        False where the range cells that have nine or more of similar power beside them hold less
+        than a fifth of the energy, shape (trial,), bool.
+    """
+    energy = (rows.detach().real.square() + rows.detach().imag.square()).sum(-1, dtype=torch.float64)
+    groups = power_groups(energy)
+    many = groups.sum(-1, keepdim=True) >= LEAST_LOOKS
+    return (groups * many * energy).sum((0, -1)) > LEAST_ENERGY * energy.sum(-1)
 
 
 def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False) -> Estimate:

@@ -9,7 +9,7 @@ points that sharpen the image were up to eight times as wrong.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,8 +22,8 @@ from torchsar.core import cis, host_value, true_positions
 FEW_ROWS = 16
 # fewest pulses: with fewer, lines explain what is no point
 _LEAST_PULSES = 32
-# largest number of lines, and of the strongest range cells that count
-_MOST_LINES, _CELLS = 6, 32
+# Largest number of lines, of lines per pulse, and of the strongest range cells that count.
+_MOST_LINES, _OF_PULSES, _CELLS = 16, 1 / 8, 32
 # No more lines are tried if those that are left would have to explain more than so many times what
 # the last one did.
 _SLACK = 1.5
@@ -38,12 +38,20 @@ _CLOSE, _ONE_RANGE = 3.0, 0.5
 # Largest deviation in rad, due to noise, of the phases that the points tell beside those of one
 # range: energy of a second range, from the eigenvalues of the covariance over range.
 _SECOND_RANGE_RAD = 0.25
-# Rounds of phases, amplitudes and Dopplers for each number of lines. They end early where both move
-# the phases by less than this share of what noise does. One line alone need not be exact.
-_ROUNDS, _FIRST_ROUNDS, _SETTLED = 10, 3, 0.1
+# The phases stay where they start until lines explain all but this share of the energy: phases that
+# make a line of one point out of ten hide the others.
+_HELD = 0.25
+# Rounds of amplitudes and Dopplers for each number of lines with held phases, and rounds after
+# which they end with free ones, or earlier where both move the phases by less than this share of
+# what noise does. The bend is adapted every third round.
+_HELD_ROUNDS, _ROUNDS, _SETTLED, _BEND_EVERY = 3, 10, 0.1, 3
+# Largest bend in rad per range cell. It is pi / 8 of a wavelength over a cell (if cells are squares),
+# and with a ratio of 1 / 100 a target of 80 cells migrates by .2 cell already, which lines are not.
+_LARGEST_BEND = 0.004
 _FINER = 4  # samples of the spectrum per Doppler cell, in which the strongest line is found
 _LARGEST_TURN = 0.25  # change of a Doppler in one round in cells
 _RIDGE = 1e-6  # of the energy of a line, so that equal lines have an inverse
+_READ_EVERY = 4  # lines after which trials that are explained are left out on a device
 
 
 @dataclass(frozen=True)
@@ -73,12 +81,17 @@ def phases_of_points(
     """Explain pulses by one phase per pulse and few lines in Doppler.
 
     Lines are added one by one, each at the maximum of the spectrum of what is not explained, until
-    the rest is noise. With each number of lines, the amplitudes, the Dopplers and the phases are
-    fitted in turn, by least squares. Trials are not explained if they need more than six lines; if
-    nearly all energy has one range, because phases can be found that make one point of it, and a
-    single point tells no change of its own phase from a phase error; or if two lines of the same
-    range are closer than three Doppler cells, because they may be a scatterer that changes.
-    Differentiable.
+    the rest is noise. With each number of lines, the amplitudes and the Dopplers are fitted in
+    turn, by least squares; and also the phases, as soon as lines explain most of the energy. A
+    target that turns bends the phases of its ranges against each other, by a square over the pulses
+    that grows with range; this bend is fitted too. The phases are those at the range where the
+    energy has its centre.
+
+    Trials are not explained if they need more than sixteen lines or one per eight pulses, or if the lines do not tell
+    phases: those of nearly all energy have one range, because phases can be found that make one
+    point of it, and a single point tells no change of its own phase from a phase error. Lines of
+    one range that are closer than three Doppler cells do not tell anything, because they may be a
+    scatterer that changes. Differentiable.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
@@ -100,16 +113,23 @@ def phases_of_points(
     noise = noise.index_copy(0, at, noise_power(rows[at], present[at], phase[at]))
     fit = _Fit.begin(rows[at], present[at], phase[at], noise[at])
     unexplained, before = which & (noise > 0) & (present.sum(-1) >= _LEAST_PULSES), fit.rest()
+    every = 1 if rows.device.type == "cpu" else _READ_EVERY
     for lines in range(1, _MOST_LINES + 1):
         fit = fit.with_another_line()
         rest = fit.rest()
         found = (rest < _EXPLAINED) & unexplained[at]
-        good = found & fit.tells()
-        phase = phase.index_copy(0, at, torch.where(good[:, None], phase[at] + fit.change, phase[at]))
-        std = std.index_copy(0, at, torch.where(good, fit.std_rad(), std[at]))
+        second, doubt = fit.of_second_range()
+        good = found & (second < _SECOND_RANGE_RAD)
+        deviation = torch.where(doubt, torch.maximum(fit.std_rad(), second), fit.std_rad())
+        phase = phase.index_copy(0, at, torch.where(good[:, None], phase_rad[at] + fit.change, phase[at]))
+        std = std.index_copy(0, at, torch.where(good, deviation, std[at]))
         explained = explained.index_copy(0, at, explained[at] | good)
-        hopeful = rest - _SLACK * (_MOST_LINES - lines) * (before - rest) < _EXPLAINED
+        more = ((_OF_PULSES * present[at].sum(-1)).floor() - lines).clamp_max(_MOST_LINES - lines)
+        hopeful = (more > 0) & (rest - _SLACK * more * (before - rest) < fit.rest_of_held())
         unexplained = unexplained.index_copy(0, at, unexplained[at] & ~found & hopeful)
+        before = rest
+        if lines % every:
+            continue
         left = host_value(unexplained[at].sum(), len(at))
         if not left:
             break
@@ -128,35 +148,51 @@ class _Fit:
         cells: Number of those that count, shape (trial,).
         present: False where a pulse holds only zeros, shape (trial, pulse).
         noise: Variance of the noise of a sample, shape (trial,).
+        curve: Phase in rad of each sample for a bend of 1, shape (trial, cell, pulse).
+        bend: Phase in rad by which a range cell, from the middle of the pulses to their ends,
+            differs from a cell that is nearer by one, shape (trial,).
+        free: True where the phases are fitted, shape (trial,), bool.
         change: Change of the phases in rad, shape (trial, pulse).
         lines: Dopplers in rad per pulse, shape (trial, line).
         amplitudes: Complex amplitudes, shape (trial, line, cell).
-        model: What lines explain of the rows without the change of the phases, their shape.
+        model: What lines explain of the rows without the change of the phases and the bend, the
+            shape of the rows.
+        left: What they do not explain.
     """
 
     rows: Tensor
     cells: Tensor
     present: Tensor
     noise: Tensor
+    curve: Tensor
+    bend: Tensor
+    free: Tensor
     change: Tensor
     lines: Tensor
     amplitudes: Tensor
     model: Tensor
+    left: Tensor
 
     @staticmethod
     def begin(rows: Tensor, present: Tensor, phase: Tensor, noise: Tensor) -> _Fit:
         """Return the fit without a line."""
         pulses = present.sum(-1)
-        energy = rows.real.square() + rows.imag.square()
-        power, strongest = energy.sum(-1).sort(-1, descending=True)
+        power, strongest = _power(rows).sum(-1).detach().sort(-1, descending=True)
         power, strongest = power[:, :_CELLS], strongest[:, :_CELLS]
         seen = power > (noise * (pulses + _SEEN * pulses.sqrt()))[:, None]
         cells = seen.sum(-1)
         most = max(1, host_value(cells.max(), strongest.shape[-1]))
-        inside, strongest = seen[:, :most, None], strongest[:, :most]
-        some = rotate(rows.gather(1, strongest[..., None].expand(-1, -1, rows.shape[-1])), phase) * inside
-        none = rows.new_zeros(len(rows), 0, most)
-        return _Fit(some, cells, present, noise, 0 * phase, 0 * phase[:, :0], none, torch.zeros_like(some))
+        inside, strongest, power = seen[:, :most], strongest[:, :most], (power * seen)[:, :most]
+        some = rotate(rows.gather(1, strongest[..., None].expand(-1, -1, rows.shape[-1])), phase) * inside[..., None]
+        centre = (power * strongest).sum(-1, keepdim=True) / or_one(power.sum(-1, keepdim=True))
+        square = (2 / rows.shape[-1] * _numbers(present, phase.dtype)).square()
+        square = square - (square * present).sum(-1, keepdim=True) / or_one(pulses)[:, None]
+        curve = ((strongest - centre) * inside).to(phase.dtype)[..., None] * square[:, None]
+        lines, amplitudes = 0 * phase[:, :0], rows.new_zeros(len(rows), 0, most)
+        none, zero = torch.zeros_like(some), 0 * phase
+        return _Fit(
+            some, cells, present, noise, curve, zero[:, 0], cells < 0, zero, lines, amplitudes, model=none, left=some
+        )
 
     def of(self, trials: Tensor) -> _Fit:
         """Return the fit of some of the trials, given by their positions."""
@@ -164,66 +200,115 @@ class _Fit:
 
     def with_another_line(self) -> _Fit:
         """Add a line where the spectrum of the rest is largest, and fit all lines and phases."""
-        n = self.rows.shape[-1]
-        rest = torch.fft.fft(rotate(self.rows, self.change) - self.model, _FINER * n)
-        power = (rest.real.square() + rest.imag.square()).sum(-2)
-        top = power.argmax(-1, keepdim=True)
-        below, peak, above = (power.gather(-1, (top + k) % (_FINER * n))[:, 0] for k in (-1, 0, 1))
-        bend = below + above - 2 * peak
-        place = top[:, 0] + torch.where(bend < 0, (below - above) / (2 * torch.where(bend < 0, bend, -1)), 0)
-        line = 2 * math.pi / (_FINER * n) * place.to(self.change.dtype)
-        change, lines = self.change, torch.cat([self.lines, line[:, None]], -1)
+        change, bend, free, model = self.change, self.bend, self.free, self.model
+        lines = torch.cat([self.lines, self._strongest()[:, None]], -1)
         pulses, settled = self.present.sum(-1), _SETTLED * self.std_rad()
-        pulse = torch.arange(n, dtype=change.dtype, device=change.device)
-        pulse = (pulse - (pulse * self.present).sum(-1, keepdim=True) / pulses[:, None]) * self.present
+        pulse = _numbers(self.present, change.dtype)
         ridge = _RIDGE * pulses[:, None, None] * torch.eye(lines.shape[-1], dtype=change.dtype, device=change.device)
         every = 1 if change.device.type == "cpu" else _ROUNDS
-        amplitudes, model = self.rows.new_zeros(*lines.shape, self.rows.shape[-2]), self.model
-        active = torch.ones_like(lines[:, :1], dtype=torch.bool)
-        rounds = _ROUNDS if lines.shape[-1] > 1 else _FIRST_ROUNDS
-        for number in range(1, rounds + 1):
-            rows = rotate(self.rows, change)
+        amplitudes = self.rows.new_zeros(*lines.shape, self.rows.shape[-2])
+        active = torch.ones_like(free)
+        straight = rows = self.rows
+        for number in range(1, _ROUNDS + 1):
+            if number % _BEND_EVERY == 1:
+                straight = self._straight(bend)
+            rows = rotate(straight, change)
             waves = cis(lines[..., None] * pulse[:, None]) * self.present[:, None]
             matrix = waves.conj() @ waves.mT + ridge
             # the ridge makes the matrix regular, so that no check must wait for the device
             solved = torch.linalg.solve_ex(matrix, waves.conj() @ rows.mT)[0]
-            amplitudes = torch.where(active[..., None], solved, amplitudes)
-            model = torch.where(active[..., None], (waves.mT @ amplitudes).mT, model)
-            step = safe_angle((model.conj() * rows).sum(-2))
-            turn = _turns(waves, 1j * pulse[:, None] * waves, matrix, amplitudes, rotate(rows, step) - model)
-            change, lines = change + active * step, lines + active * turn
-            moved = (step.detach().square().sum(-1, keepdim=True) / or_one(pulses)[:, None]).sqrt()
-            active = active & (moved > settled[:, None])
-            if number % every == 0 and number < rounds and not host_value(active.sum(), 1):
+            amplitudes = torch.where(active[:, None, None], solved, amplitudes)
+            model = torch.where(active[:, None, None], (waves.mT @ amplitudes).mT, model)
+            if number == _HELD_ROUNDS:
+                unknown = _power(rows - model).sum((-2, -1)) - self.noise * self._degrees(lines.shape[-1])
+                free = free | (unknown < _HELD * self._energy())
+                active = active & free
+            step = safe_angle((model.conj() * rows).sum(-2)) * (active & free)[:, None]
+            left = rotate(rows, step) - model
+            turn = _turns(waves, 1j * pulse[:, None] * waves, matrix, amplitudes, left)
+            change, lines = change + step, lines + active[:, None] * turn
+            if number % _BEND_EVERY == 0:
+                bent = self.curve * model
+                more = (bent.conj() * left).imag.sum((-2, -1)) / or_one(_power(bent).sum((-2, -1)))
+                bend = (bend + active * more).clamp(-_LARGEST_BEND, _LARGEST_BEND)
+            if number > _HELD_ROUNDS:
+                active = active & (step.detach().square().sum(-1) > settled.square() * pulses)
+            if number >= _HELD_ROUNDS and number % every == 0 and not host_value(active.sum(), 1):
                 break
-        return _Fit(self.rows, self.cells, self.present, self.noise, change, lines, amplitudes, model)
+        left = rotate(self._straight(bend), change) - model
+        return replace(
+            self, bend=bend, free=free, change=change, lines=lines, amplitudes=amplitudes, model=model, left=left
+        )
+
+    def _straight(self, bend: Tensor) -> Tensor:
+        """Return the rows without a bend."""
+        return self.rows * cis(-bend[:, None, None] * self.curve)
+
+    def _strongest(self) -> Tensor:
+        """Doppler of the strongest line of what is not explained in rad per pulse, (trial,)."""
+        n = _FINER * self.rows.shape[-1]
+        power = _power(torch.fft.fft(self.left, n)).sum(-2)
+        top = power.argmax(-1, keepdim=True)
+        below, peak, above = (power.gather(-1, (top + k) % n)[:, 0] for k in (-1, 0, 1))
+        fall = 2 * peak - below - above
+        place = top[:, 0] + torch.where(fall > 0, (above - below) / (2 * torch.where(fall > 0, fall, 1)), 0)
+        return 2 * math.pi / n * place.to(self.change.dtype)
+
+    def _energy(self) -> Tensor:
+        """Energy of the scatterers without that of the noise, (trial,)."""
+        return (_power(self.rows).sum((-2, -1)) - self.cells * self.present.sum(-1) * self.noise).detach()
+
+    def _degrees(self, lines: int) -> Tensor:
+        """Complex degrees of freedom that lines leave to the noise, (trial,)."""
+        return self.cells * (self.present.sum(-1) - lines)
 
     def rest(self) -> Tensor:
         """Power of what is not explained in powers of the noise, (trial,): 1 if it is all noise."""
-        rest = rotate(self.rows, self.change) - self.model
-        pulses, lines = self.present.sum(-1), self.lines.shape[-1]
-        free = self.cells * (pulses - lines) - pulses / 2
-        return (rest.real.square() + rest.imag.square()).sum((-2, -1)) / or_one(self.noise * free)
+        degrees = self._degrees(self.lines.shape[-1]) - (self.present.sum(-1) + self.lines.shape[-1]) / 2
+        return _power(self.left).sum((-2, -1)) / or_one(self.noise * degrees)
 
-    def tells(self) -> Tensor:
-        """Whether the lines are points that tell the phases, a bool per trial."""
+    def rest_of_held(self) -> Tensor:
+        """Rest below which the phases become free, or the pulses are explained, (trial,)."""
+        known = self.noise * self._degrees(self.lines.shape[-1])
+        return (1 + torch.where(self.free, 0, _HELD * self._energy() / or_one(known))).clamp_min(_EXPLAINED)
+
+    def of_second_range(self) -> tuple[Tensor, Tensor]:
+        """Deviation in rad of the phases that the points tell beside those of one range, (trial,).
+
+        Also a bool per trial, True if lines of one range are close and do not count, because they
+        may be a scatterer that changes.
+        """
         products = self.amplitudes @ self.amplitudes.mH
-        power = products.diagonal(dim1=-2, dim2=-1).real
-        alike = (products.real.square() + products.imag.square()) / or_one(power[:, None] * power[..., None])
+        power, squares = products.diagonal(dim1=-2, dim2=-1).real, _power(products)
         turns = (self.lines[:, None] - self.lines[..., None]) / (2 * math.pi)
-        apart = (turns - turns.round()).abs() * self.rows.shape[-1]
-        close = ((apart < _CLOSE) & (alike > _ONE_RANGE)).sum((-2, -1)) > self.lines.shape[-1]
+        near = (turns - turns.round()).abs() * self.rows.shape[-1] < _CLOSE
+        near = near & (squares > _ONE_RANGE * power[:, None] * power[..., None])
+        clear = near.sum(-1) <= 1
         # elementary symmetric polynomials of the eigenvalues: their sum, and that of their products
-        total = power.sum(-1)
-        pairs = (total.square() - (products.real.square() + products.imag.square()).sum((-2, -1))) / 2
-        return ~close & (2 * _SECOND_RANGE_RAD**2 * pairs > total * self.noise)
+        total = (power * clear).sum(-1)
+        pairs = total.square() - (squares * (clear[:, None] & clear[..., None])).sum((-2, -1))
+        std = torch.where(pairs > 0, (total * self.noise / or_one(pairs.clamp_min(0))).sqrt(), torch.inf)
+        return std.detach(), ~clear.all(-1)
 
     def std_rad(self) -> Tensor:
-        """Standard deviation of the phases due to noise in rad, (trial,)."""
-        pulses = self.present.sum(-1)
-        energy = (self.rows.real.square() + self.rows.imag.square()).sum((-2, -1))
-        scene = (energy - self.cells * pulses * self.noise).detach()
-        return torch.where(scene > 0, (pulses * self.noise / or_one(2 * scene)).sqrt(), torch.inf)
+        """Standard deviation of the phases due to noise in rad, rms over the pulses, (trial,).
+
+        That of a pulse in which the points cancel each other is at most that of any phase.
+        """
+        scene = _power(self.model if self.lines.shape[-1] else self.rows).detach().sum(-2)
+        variance = 1 / (2 * scene / or_one(self.noise)[:, None] + 3 / math.pi**2)
+        return ((variance * self.present).sum(-1) / or_one(self.present.sum(-1))).sqrt()
+
+
+def _power(z: Tensor) -> Tensor:
+    return z.real.square() + z.imag.square()
+
+
+def _numbers(present: Tensor, dtype: torch.dtype) -> Tensor:
+    """Number of each pulse less their mean, 0 where there is none, (trial, pulse)."""
+    pulse = torch.arange(present.shape[-1], dtype=dtype, device=present.device)
+    mean = (pulse * present).sum(-1, keepdim=True) / or_one(present.sum(-1, keepdim=True))
+    return (pulse - mean) * present
 
 
 def _turns(waves: Tensor, slopes: Tensor, matrix: Tensor, amplitudes: Tensor, rest: Tensor) -> Tensor:

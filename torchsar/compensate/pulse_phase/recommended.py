@@ -13,7 +13,7 @@ from torchsar.compensate.pulse_phase.data import Pulses, prepare, refuse_odd_cou
 from torchsar.compensate.pulse_phase.gaps import across_gaps, have_gaps
 from torchsar.compensate.pulse_phase.halves import Which
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
-from torchsar.compensate.pulse_phase.linking import linked
+from torchsar.compensate.pulse_phase.linking import linked, may_be_ok
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.points import FEW_ROWS, Points, phases_of_points
 from torchsar.compensate.pulse_phase.sharpen import (
@@ -74,9 +74,9 @@ def autofocus(
     the image get no weight (5 times in the first six iterations if noise is weak). In the third
     step the phase of each pulse is measured against a Wiener estimate of the scene, on an image of
     twice as many Doppler cells. The third step reduces the remaining error by half or more. Where
-    two to six points explain the pulses down to the noise, their phases by maximum likelihood take
-    its place (see `phases_of_points`): the sharpest phases of few points are up to eight times as
-    wrong at 25 dB. Without `imaging`, missing pulses, which are all zeros, are filled in from the
+    two to sixteen points explain the pulses down to the noise, their phases by maximum likelihood
+    take its place (see `phases_of_points`): the sharpest phases of few points are up to eight times
+    as wrong at 25 dB. Without `imaging`, missing pulses, which are all zeros, are filled in from the
     estimate of the scene (see `across_gaps`). Differentiable without `imaging`.
 
     Args:
@@ -119,8 +119,8 @@ def autofocus(
         phases, which then are those of this point, and ok. Phases of `link_phases` have its
         standard deviations, `quality` and `ok`; where they are not ok but the sharpest ones are,
         these stay. `info` holds "homogeneous" of shape (...,), bool, True where the homogeneous
-        description is more likely and the phases are not the sharpest ones; `ok` is False if linked
-        phases then do not confirm that. It also holds "jitter_cells" and "migration_cells", the
+        description is more likely and linked phases do not contradict it; `ok` is False if they do
+        not confirm it, and where too few range cells have similar power for that. It also holds "jitter_cells" and "migration_cells", the
         displacement of the range profiles from pulse to pulse and of groups of pulses in cells rms:
         `ok` is False from 0.25 and 0.4 cell on, because the phases may then be wrong. `imaging`
         corrects displacements, which are not examined then.
@@ -227,15 +227,16 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
     likely only because range cells depend on each other, as those that side lobes of few points
     fill, the scene is sparse after all, and phases of small deviation are ok. The sharpest phases
     also stay in long records, and where they are ok but the linked ones are not, as in scenes of
-    few points.
+    few points. Nothing is linked where neither can be ok.
     """
     if pulses.n > _MOST_LINKED:
         return sharpest
     homogeneous = sharpest.info["homogeneous"].flatten()
-    count = host_value(homogeneous.sum(), 0)
+    matter = homogeneous & (sharpest.info["ok_if_sparse"].flatten() | may_be_ok(pulses.rows))
+    count = host_value(matter.sum(), 0)
     if not count:
         return sharpest
-    at = true_positions(homogeneous, count)
+    at = true_positions(matter, count)
     some = linked(Pulses(pulses.rows[at], pulses.present[at], at.shape))
     info, ok = dict(sharpest.info), sharpest.ok.flatten()
     std = sharpest.std["phase_rad"].reshape(pulses.rows.shape[0], -1)[at]
