@@ -87,11 +87,12 @@ def phases_of_points(
     that grows with range; this bend is fitted too. The phases are those at the range where the
     energy has its centre.
 
-    Trials are not explained if they need more than sixteen lines or one per eight pulses, or if the lines do not tell
-    phases: those of nearly all energy have one range, because phases can be found that make one
-    point of it, and a single point tells no change of its own phase from a phase error. Lines of
-    one range that are closer than three Doppler cells do not tell anything, because they may be a
-    scatterer that changes. Differentiable.
+    Trials are not explained if they need more than sixteen lines or one per eight pulses, or if the
+    lines do not tell the phases because nearly all energy has one range: phases can be found that
+    make one point of it, and a single point tells no change of its own phase from a phase error.
+    Lines of one range that are closer than three Doppler cells do not count there, because they may
+    be a scatterer that changes; then the others must tell the phases as exactly as promised.
+    Differentiable.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.

@@ -120,10 +120,10 @@ def autofocus(
         standard deviations, `quality` and `ok`; where they are not ok but the sharpest ones are,
         these stay. `info` holds "homogeneous" of shape (...,), bool, True where the homogeneous
         description is more likely and linked phases do not contradict it; `ok` is False if they do
-        not confirm it, and where too few range cells have similar power for that. It also holds "jitter_cells" and "migration_cells", the
-        displacement of the range profiles from pulse to pulse and of groups of pulses in cells rms:
-        `ok` is False from 0.25 and 0.4 cell on, because the phases may then be wrong. `imaging`
-        corrects displacements, which are not examined then.
+        not confirm it, and where too few range cells have similar power for that. It also holds
+        "jitter_cells" and "migration_cells", the displacement of the range profiles from pulse to
+        pulse and of groups of pulses in cells rms: `ok` is False from 0.25 and 0.4 cell on, because
+        the phases may then be wrong. `imaging` corrects displacements, which are not examined then.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
