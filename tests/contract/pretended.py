@@ -1,8 +1,8 @@
 """A pretended accelerator: tensors that claim another device and hold their values on the CPU.
 
 Like CUDA, it refuses operands on several devices. It counts, by line of the library, what costs
-time on an accelerator: synchronisations (the host waits for a value), copies from the host, and
-kernels. It runs on every machine.
+time on an accelerator: synchronisations (the host waits for a value) and copies from the host. It
+runs on every machine.
 
 The claimed device is `meta`: torch has no lazy start, no device threads and no kernels of its own
 for it, so that every operation comes here and gradients run in the thread of the caller. Other
@@ -49,6 +49,7 @@ _WAITS = {
     _aten._linalg_svd,
     _aten.linalg_eig,
 }
+_COPIES = {_aten.copy_, _aten._to_copy}
 _INDEXED = {_aten.index, _aten._unsafe_index, _aten.index_put, _aten.index_put_, _aten._index_put_impl_}
 _PUTS = _INDEXED - {_aten.index, _aten._unsafe_index}
 # these take a value in a CPU tensor of no dimensions, like elementwise operations
@@ -64,14 +65,12 @@ class Counts:
     Args:
         waits: Synchronisations.
         uploads: Copies from the host.
-        kernels: Operations other than views.
         faults: Operations with an index out of range. CUDA reports them later, and then computes
             nothing more in this process.
     """
 
     waits: Counter[str] = field(default_factory=Counter)
     uploads: Counter[str] = field(default_factory=Counter)
-    kernels: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
 
 
@@ -179,23 +178,34 @@ class _Operation:
     Args:
         packet: Its name without overload.
         waits: Whether the host waits for it.
-        computes: Whether it is more than a view.
+        counted: Whether the host may wait for it or copy to it, which its arguments decide.
         scalars: Whether it takes a value in a CPU tensor of no dimensions.
         writes: Whether it changes an argument.
     """
 
     packet: Any
     waits: bool
-    computes: bool
+    counted: bool
     scalars: bool
     writes: bool
 
 
-@cache
+_OPERATIONS: dict[int, _Operation] = {}
+
+
 def _known(func: Any) -> _Operation:
+    """By identity: operations live as long as torch, and their hash costs more than the rest."""
+    known = _OPERATIONS.get(id(func))
+    if known is None:
+        known = _OPERATIONS[id(func)] = _looked_up(func)
+    return known
+
+
+def _looked_up(func: Any) -> _Operation:
     packet = func.overloadpacket
+    counted = packet in _WAITS | _COPIES | _INDEXED | {_aten.repeat_interleave}
     scalars = packet in _TAKES_SCALAR or (torch.Tag.pointwise in func.tags and packet not in _TAKES_NO_SCALAR)
-    return _Operation(packet, packet in _WAITS, not func.is_view, scalars, func._schema.is_mutable)
+    return _Operation(packet, packet in _WAITS, counted, scalars, func._schema.is_mutable)
 
 
 def _carried_out(func: Any, args: Any, kwargs: Mapping[str, Any]) -> Any:
@@ -213,7 +223,7 @@ def _carried_out(func: Any, args: Any, kwargs: Mapping[str, Any]) -> Any:
         on_device = type(args[0]) is Pretended
     elif len(here) < len(operands) and known.packet is not _aten._to_copy:
         _refuse_mixed(func, known, operands, args)
-    if _Counting.now is not None:
+    if known.counted and _Counting.now is not None:
         _count(_Counting.now, known, operands, on_device, args, kwargs)
     if wanted is not None:
         named["device"] = _CPU
@@ -271,7 +281,7 @@ def _count(
     counts: Counts, known: _Operation, operands: list[Tensor], on_device: bool, args: Any, kwargs: Mapping[str, Any]
 ) -> None:
     waits, uploads = known.waits, 0
-    if known.packet in (_aten.copy_, _aten._to_copy):
+    if known.packet in _COPIES:
         waits, uploads = not on_device, int(on_device and not isinstance(operands[-1], Pretended))
     elif known.packet in _INDEXED:
         indices = [x for x in args[1] if x is not None]
@@ -280,11 +290,10 @@ def _count(
         uploads = sum(not isinstance(x, Pretended) for x in indices)
     elif known.packet is _aten.repeat_interleave:
         waits = kwargs.get("output_size") is None
-    if waits or uploads or known.computes:
+    if waits or uploads:
         line = _line()
         counts.waits[line] += int(waits)
         counts.uploads[line] += uploads
-        counts.kernels[line] += int(known.computes and not waits)
 
 
 def _is_number(x: Tensor) -> bool:
