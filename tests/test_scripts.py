@@ -62,7 +62,7 @@ def test_the_sweep_of_the_documentation_is_right(printed: Printed, tmp_path: Pat
 
 def test_the_benchmark_of_sweeps_runs(printed: Printed) -> None:
     fork_workers()
-    overrides = ["processor.recommended.stages.velocity.lines=16", "world.lines=384"]
+    overrides = ["processor.recommended.stages.velocity.lines=16", "world.lines=384", "world.samples=128"]
     arguments = ["stripmap_doppler", "--trials", "2", "--rounds", "1", *overrides]
     text = printed(ROOT / "scripts" / "sweep_speed.py", arguments)
     for name in ("one by one", "one batch", "automatic ", "automatic, 2 workers"):

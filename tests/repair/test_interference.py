@@ -59,6 +59,7 @@ def scene(kind: str, n_pulse: int, n_range: int):
     }[kind]
 
 
+@cache
 def acquire(kind: str, snr_db: float | None, seed: int, n_pulse: int = 192, n_range: int = 2048) -> Recording:
     world = StripmapWorld(scene(kind, n_pulse, n_range), Dwell(0.03), snr_db=snr_db)
     return simulate(RADAR, world, n_pulse, n_range, Draws(seed))[0]

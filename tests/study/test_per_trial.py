@@ -352,7 +352,7 @@ def test_a_gate_that_gives_a_sea_its_cells_makes_cases(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("system", CONFIGS)
 def test_a_sweep_over_velocities_costs_what_trials_of_one_velocity_cost(system: str, tmp_path: Path) -> None:
-    count = 6 if system == "geo_ocean" else 64
+    count = 6 if system == "geo_ocean" else 32
     key, values = VELOCITIES[system][0], spread(system, count)
     many = loaded(system, tmp_path, cheap=True, sweep={key: values})
     one = loaded(system, tmp_path, cheap=True, sweep={key: values[:1]})

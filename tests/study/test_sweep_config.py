@@ -192,6 +192,7 @@ def test_a_sweep_does_not_go_on_with_other_code_of_own_stages(
 ) -> None:
     """It would mix the results of two stages. A sweep without own stages has no such entry."""
     config = load_tree({**TINY, "sweep": {**SWEEP, "trials": 1}})
+    one_picture(monkeypatch)
     assert identity(config, SweepTrial(config).bench({}).chains.values()) == identity(config)
     for code in ("one", "another"):
         monkeypatch.setattr(sweep_module, "own_code", lambda chains, code=code: {"mine": code} if list(chains) else {})

@@ -70,14 +70,17 @@ def image_entropy(data: Tensor, phase_rad: Tensor | None = None) -> Tensor:
 
 @pytest.fixture(scope="module")
 def table_1() -> dict[str, dict[str, Tensor]]:
-    """Entropy above that of the error-free image, (trial,), by row and method."""
+    """Entropy above that of the error-free image, (trial,), by row and method; in double precision,
+    so that only the scene matters for methods started from SCA.
+    """
     rows = {}
     for row, (motion, start) in TABLE_1.items():
-        recording, truth = simulated(Aircraft(), motion, start, trials=2)
+        recording, truth = simulated(Aircraft(), motion, start, trials=1, dtype=torch.complex128)
         assert truth.clean is not None
         ideal, data = image_entropy(truth.clean.signal.data), recording.signal.data
         rows[row] = {name: image_entropy(data, METHODS[name](data)["phase_rad"]) - ideal for name in METHODS} | {
-            "polluted": image_entropy(data) - ideal
+            "polluted": image_entropy(data) - ideal,
+            "ideal": ideal,
         }
     return rows
 
@@ -102,13 +105,9 @@ def test_table_1(table_1, row):
 
 
 @pytest.mark.parametrize("name", ["sca", "pga_sca", "entropy_fixed_point", "autofocus"])
-def test_rows_of_table_1_are_the_same_for_methods_started_from_sca(name):
+def test_rows_of_table_1_are_the_same_for_methods_started_from_sca(table_1, name):
     """Noise-free, in complex128: only the scene matters, the kind and size of the error do not."""
-    ends = []
-    for motion, start in TABLE_1.values():
-        data = simulated(Aircraft(), motion, start, trials=1, dtype=torch.complex128)[0].signal.data
-        ends.append(image_entropy(data, METHODS[name](data)["phase_rad"]))
-    assert float(torch.stack(ends).std(0)) < 1e-9
+    assert float(torch.stack([row[name] + row["ideal"] for row in table_1.values()]).std(0)) < 1e-9
 
 
 # section 7: noise
@@ -159,8 +158,8 @@ def judged(method, scene, snr_db: float, trials: int = 4, pulses: int = 400) -> 
 def test_dense_rows_defeat_pga_sca_and_not_autofocus():
     """128 equal scatterers a row."""
     scene = SpreadRows(64, 128, 0.5, EXTENT_M, RADAR.range_step_m)
-    assert float(judged(pga_sca, scene, 10.0)[0].median()) > 0.4
-    error, ok = judged(autofocus, scene, 10.0, 2)
+    assert float(judged(pga_sca, scene, 10.0, 3)[0].median()) > 0.4
+    error, ok = judged(autofocus, scene, 10.0, 1)
     assert float(error.max()) < 0.1 and ok.all()
 
 
