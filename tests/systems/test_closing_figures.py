@@ -41,7 +41,8 @@ def test_rotations_are_found_to_their_bound_at_0_db(metric: str) -> None:
     ("overrides", "names"),
     [
         (["world.samples=null"], ["P1", "P2", "P3", "P4"]),
-        (["world.targets={P4: {u_r_m_s: 5.0, u_a_m_s: 10.0}}"], ["P4"]),
+        # 10 s hold the replicas of one PRF, the strongest; those farther off need no range samples
+        (["world.targets={P4: {u_r_m_s: 5.0, u_a_m_s: 10.0}}", "world.pulses=1800"], ["P4"]),
     ],
     ids=["azimuth only", "with range samples"],
 )
