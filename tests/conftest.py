@@ -38,8 +38,13 @@ def _process() -> None:
 
 @pytest.fixture(autouse=True)
 def _same_numbers() -> None:
-    """Numbers that a test draws without a generator do not depend on the tests before it."""
-    torch.manual_seed(1)
+    """Numbers that a test draws without a generator do not depend on the tests before it.
+
+    `torch.manual_seed` would note a stack of calls for every kind of device that is not in use.
+    """
+    torch.default_generator.manual_seed(1)
+    if torch.cuda.is_initialized():
+        torch.cuda.manual_seed_all(1)
 
 
 @pytest.fixture(scope="session")
