@@ -138,13 +138,17 @@ class Speckle:
         samples = present.sum(-1) * self._cells.repeat_interleave(count)
         return Speckle(groups, present, samples, self.independent.repeat_interleave(count))
 
-    def start(self, width: float) -> Tensor:
-        """Phases of greatest likelihood for a band (share of the pulse rate), as exp(j phase)."""
+    def start(self, width: Tensor) -> Tensor:
+        """Phases of greatest likelihood for bands (shares of the pulse rate), as exp(j phase).
+
+        Args:
+            width: Band of each trial, shape (trial,).
+        """
         lag = torch.arange(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
         every = sum(products for _, products, _ in self.groups) / or_one(self._cells)[:, None, None]
         flat = torch.ones_like(every[:, 0])
-        band = _IN_BAND * torch.sinc(width * lag) + (1 - _IN_BAND) * (lag == 0)
-        lower, _ = self._factor(self._toeplitz(band.to(flat.dtype).expand_as(flat)))
+        band = _IN_BAND * torch.sinc(width[:, None] * lag) + (1 - _IN_BAND) * (lag == 0)
+        lower, _ = self._factor(self._toeplitz(band.to(flat.dtype)))
         matrix = torch.cholesky_inverse(lower).mT * every
         return newton(matrix, _smallest(matrix, flat))
 

@@ -304,17 +304,16 @@ def _grown(scene: Speckle) -> Tensor:
 
 def _solved(blocks: Speckle) -> Tensor:
     """Phases of short blocks: those of greatest likelihood that are found from several bands."""
-    best, most = torch.ones_like(blocks.groups[0][0][..., 0]), torch.full_like(blocks.samples, -torch.inf)
-    for width in _WIDTHS:
-        u = blocks.start(width)
-        for count in range(_ROUNDS):
-            smooth = windowed_spectrum if count < _COARSE_ROUNDS else smoothed_spectrum
-            u = newton(blocks.fit(blocks.periodograms(u, smooth)).matrix, u)
-        fit = blocks.fit(blocks.periodograms(u, smoothed_spectrum))
-        gain = blocks.gain(u, fit)
-        best = torch.where((gain > most)[:, None], u, best)
-        most = torch.maximum(gain, most)
-    return best
+    count = len(blocks.samples)
+    which = torch.arange(count, device=blocks.samples.device)
+    widths = torch.tensor(_WIDTHS, dtype=torch.float64, device=which.device)
+    every = blocks.trials(which.repeat(len(_WIDTHS)))
+    u = every.start(widths.repeat_interleave(count))
+    for number in range(_ROUNDS):
+        smooth = windowed_spectrum if number < _COARSE_ROUNDS else smoothed_spectrum
+        u = newton(every.fit(every.periodograms(u, smooth)).matrix, u)
+    gain = every.gain(u, every.fit(every.periodograms(u, smoothed_spectrum)))
+    return u.unflatten(0, (-1, count))[gain.unflatten(0, (-1, count)).nan_to_num(-torch.inf).argmax(0), which]
 
 
 def _joined(pairs: Speckle, u: Tensor) -> Tensor:
