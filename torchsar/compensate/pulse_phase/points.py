@@ -36,8 +36,9 @@ _EXPLAINED = 1.15
 # well as two that stay. Two lines have one range if their amplitudes over range correlate by this.
 _CLOSE, _ONE_RANGE = 3.0, 0.5
 # Largest deviation in rad, due to noise, of the phases that the points tell beside those of one
-# range: energy of a second range, from the eigenvalues of the covariance over range.
-_SECOND_RANGE_RAD = 0.25
+# range: energy of a second range, from the eigenvalues of the covariance over range. It is smaller
+# where some lines may be a scatterer that changes.
+_SECOND_RANGE_RAD, _IN_DOUBT_RAD = 0.25, 0.1
 # The phases stay where they start until lines explain all but this share of the energy: phases that
 # make a line of one point out of ten hide the others.
 _HELD = 0.25
@@ -65,6 +66,7 @@ class Points:
         noise: Variance of the noise of a sample, shape (trial,), float64; 0 where not examined.
         explained: True where points at two ranges or more explain the pulses down to the noise,
             shape (trial,), bool.
+        enough: True where points do so that may have one range, shape (trial,), bool.
         examined: False if no trial was examined.
     """
 
@@ -72,6 +74,7 @@ class Points:
     std_rad: Tensor
     noise: Tensor
     explained: Tensor
+    enough: Tensor
     examined: bool
 
 
@@ -104,12 +107,12 @@ def phases_of_points(
     Returns:
         The phases, which are those to start from where points do not explain the pulses.
     """
-    phase, explained = phase_rad, torch.zeros_like(which)
+    phase, explained, enough = phase_rad, torch.zeros_like(which), torch.zeros_like(which)
     noise = torch.zeros_like(which, dtype=torch.float64)
     std = torch.full_like(noise, torch.inf)
     count = host_value(which.sum(), len(which)) if count is None else count
     if not count:
-        return Points(phase, std, noise, explained, False)
+        return Points(phase, std, noise, explained, enough, False)
     at = true_positions(which, count)
     noise = noise.index_copy(0, at, noise_power(rows[at], present[at], phase[at]))
     fit = _Fit.begin(rows[at], present[at], phase[at], noise[at])
@@ -120,11 +123,12 @@ def phases_of_points(
         rest = fit.rest()
         found = (rest < _EXPLAINED) & unexplained[at]
         second, doubt = fit.of_second_range()
-        good = found & (second < _SECOND_RANGE_RAD)
+        good = found & (second < torch.where(doubt, _IN_DOUBT_RAD, _SECOND_RANGE_RAD))
         deviation = torch.where(doubt, torch.maximum(fit.std_rad(), second), fit.std_rad())
         phase = phase.index_copy(0, at, torch.where(good[:, None], phase_rad[at] + fit.change, phase[at]))
         std = std.index_copy(0, at, torch.where(good, deviation, std[at]))
         explained = explained.index_copy(0, at, explained[at] | good)
+        enough = enough.index_copy(0, at, enough[at] | found)
         more = ((_OF_PULSES * present[at].sum(-1)).floor() - lines).clamp_max(_MOST_LINES - lines)
         hopeful = (more > 0) & (rest - _SLACK * more * (before - rest) < fit.rest_of_held())
         unexplained = unexplained.index_copy(0, at, unexplained[at] & ~found & hopeful)
@@ -136,7 +140,7 @@ def phases_of_points(
             break
         some = true_positions(unexplained[at], left)
         at, fit, before = at[some], fit.of(some), rest[some]
-    return Points(phase, std, noise, explained, True)
+    return Points(phase, std, noise, explained, enough, True)
 
 
 @dataclass(frozen=True)

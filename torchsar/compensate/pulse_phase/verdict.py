@@ -45,6 +45,9 @@ _LEAST_PULSES = 32
 # Changes of few scatterers do not average out. Where fewer rows than this make the sharpness, the
 # largest deviation that is ok is smaller, and the scatterers are compared with each other.
 _TELLING_ROWS = 6
+# Where fewer rows than this make the sharpness, points must explain the pulses down to the noise:
+# more than noise beside a bright point tells that they change.
+_ROWS_THAT_TELL = 2.5
 # Factor of the deviation of few scatterers whose quarters are not the same. Their errors are slow,
 # and the difference of two halves has as few degrees of freedom as the record has times of
 # coherence: with 4 of them, an error is sqrt(4 / (4 - 2)) as large as such a difference says.
@@ -305,7 +308,8 @@ def _assessed(
             std = torch.where(unsure, _BY_CHANCE * std, std)
             std = torch.where(differ & alone & ~stay, _FEW_TELL * std, std)
             unlike = unlike & (std >= _UNSURE_RAD)
-            stays, lone = stays & ~unlike & ~(untold & differ), lone & ~unlike
+            hidden = alone & ~points.enough & (sharpness_rows < _ROWS_THAT_TELL)
+            stays, lone = stays & ~unlike & ~(untold & differ) & ~hidden, lone & ~unlike
         else:
             stays = torch.ones_like(lone)
     homogeneous = scene.homogeneous & compare & ~lone & ~stay
