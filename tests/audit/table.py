@@ -72,10 +72,6 @@ LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
     "range cells shows: `ok` is False where a sparse description is more likely": [
         *(("compensate.LinkPhases", "own", snr_db) for snr_db in (20.0, 60.0)),
     ],
-    "the phase of a point that walks is that of the pulses, where noise or its side lobes hide all others: "
-    "3 of 200 trials": [
-        *((f"compensate.{name}", "walking 3 points", 5.0) for name in ("Autofocus", "TargetAutofocus")),
-    ],
 }
 
 

@@ -32,6 +32,9 @@ _SEEN = 5.0
 # Largest power of what lines do not explain in powers of the noise, whose level errs by a few
 # percent.
 _EXPLAINED = 1.15
+# Least variance of the noise in mean powers: that of data without noise, which the rounds do not
+# explain any better.
+_LEAST_NOISE = 1e-8
 # Lines of one range that are closer than this in Doppler cells describe a scatterer that changes as
 # well as two that stay. Two lines have one range if their amplitudes over range correlate by this.
 _CLOSE, _ONE_RANGE = 3.0, 0.5
@@ -45,7 +48,7 @@ _HELD = 0.25
 # Rounds of amplitudes and Dopplers for each number of lines with held phases, and rounds after
 # which they end with free ones, or earlier where both move the phases by less than this share of
 # what noise does. The bend is adapted every third round.
-_HELD_ROUNDS, _ROUNDS, _SETTLED, _BEND_EVERY = 3, 10, 0.1, 3
+_HELD_ROUNDS, _ROUNDS, _SETTLED, _BEND_EVERY = 3, 20, 0.1, 3
 # Largest bend in rad per range cell. It is pi / 8 of a wavelength over a cell (if cells are squares),
 # and with a ratio of 1 / 100 a target of 80 cells migrates by .2 cell already, which lines are not.
 _LARGEST_BEND = 0.004
@@ -63,7 +66,8 @@ class Points:
         phase_rad: Phase of each pulse in rad, shape (trial, pulse).
         std_rad: Its standard deviation due to noise in rad, shape (trial,), infinite where points
             do not explain the pulses.
-        noise: Variance of the noise of a sample, shape (trial,), float64; 0 where not examined.
+        noise: Variance of the noise of a sample, shape (trial,), float64, at least 1e-8 of the mean
+            power; 0 where not examined.
         explained: True where points at two ranges or more explain the pulses down to the noise,
             shape (trial,), bool.
         enough: True where points do so that may have one range, shape (trial,), bool.
@@ -114,7 +118,8 @@ def phases_of_points(
     if not count:
         return Points(phase, std, noise, explained, enough, False)
     at = true_positions(which, count)
-    noise = noise.index_copy(0, at, noise_power(rows[at], present[at], phase[at]))
+    least = _LEAST_NOISE * _power(rows[at].detach()).mean((-2, -1), dtype=torch.float64)
+    noise = noise.index_copy(0, at, torch.maximum(noise_power(rows[at], present[at], phase[at]), least))
     fit = _Fit.begin(rows[at], present[at], phase[at], noise[at])
     unexplained, before = which & (noise > 0) & (present.sum(-1) >= _LEAST_PULSES), fit.rest()
     every = 1 if rows.device.type == "cpu" else _READ_EVERY
