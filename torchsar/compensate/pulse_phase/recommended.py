@@ -76,8 +76,8 @@ def autofocus(
     twice as many Doppler cells. The third step reduces the remaining error by half or more. Where
     two to sixteen points explain the pulses down to the noise, their phases by maximum likelihood
     take its place (see `phases_of_points`): the sharpest phases of few points are up to eight times
-    as wrong at 25 dB. Without `imaging`, missing pulses, which are all zeros, are filled in from the
-    estimate of the scene (see `across_gaps`). Differentiable without `imaging`.
+    as wrong at 25 dB. Without `imaging`, missing pulses, which are all zeros, are filled in from
+    the estimate of the scene (see `across_gaps`). Differentiable without `imaging`.
 
     Args:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
@@ -114,8 +114,9 @@ def autofocus(
         halves of the range cells must agree to 0.25 rad, less where few range cells make the
         sharpness. The standard deviation then is at least half of their difference. Where few
         range cells make the sharpness, it is also at least half of the difference between
-        scatterers beyond noise, and `ok` is False if that is 0.25 rad or more. One point that
-        noise leaves alone tells no change of its own phase from a phase error: both are in the
+        scatterers beyond noise, and `ok` is False if that is 0.25 rad or more; with less than 2.5
+        such cells, `ok` is also False unless points explain the pulses down to the noise. One point
+        that noise leaves alone tells no change of its own phase from a phase error: both are in the
         phases, which then are those of this point, and ok. Phases of `link_phases` have its
         standard deviations, `quality` and `ok`; where they are not ok but the sharpest ones are,
         these stay. `info` holds "homogeneous" of shape (...,), bool, True where the homogeneous

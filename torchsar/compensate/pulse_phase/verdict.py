@@ -217,11 +217,12 @@ def estimated(
         the pulses are alike. Otherwise the quarters may show scatterers that change, or stay and
         are not resolved. The phases are then found anew from two halves of the rows without a
         common scatterer, and the standard deviation is at least half of their difference; it must
-        be below 0.25 rad, as where few scatterers differ beyond noise. The last four conditions
-        need not hold for a single point whose modulus scatters by less than 0.25, with 32 pulses or
-        more. `info` holds "present", shape (..., pulse), False for pulses that hold only zeros;
-        and, of shape (...,), "homogeneous" (True where that description is more likely),
-        "ok_if_sparse" (what `ok` is if it is not),
+        be below 0.25 rad, as where few scatterers differ beyond noise. Where less than 2.5 rows
+        make the sharpness, points must explain the pulses down to the noise, be it points of one
+        range. The last five conditions need not hold for a single point whose modulus scatters by
+        less than 0.25, with 32 pulses or more. `info` holds "present", shape (..., pulse), False
+        for pulses that hold only zeros; and, of shape (...,), "homogeneous" (True where that
+        description is more likely), "ok_if_sparse" (what `ok` is if it is not),
         "sparse_gain_nats" (gain of the log likelihood of the sparse description over white noise),
         "jitter_cells" and "migration_cells" (see `Displacement`),
         "iterations", "sharpness_nats", "noise_sharpness_nats" (the largest sharpness that noise can
