@@ -50,7 +50,7 @@ _HELD = 0.25
 # what noise does. The bend is adapted every third round.
 _HELD_ROUNDS, _ROUNDS, _SETTLED, _BEND_EVERY = 3, 20, 0.1, 3
 # Largest bend in rad per range cell. The bend is pi / 8 times a wavelength over a cell, if cells
-# are squares. With cells of 100 wavelengths, the points of a target of 80 cells already migrate by a
+# are squares. With cells of 100 wavelengths, the points of a target of 80 cells migrate by a
 # fifth of a cell, and are no lines any more.
 _LARGEST_BEND = 0.004
 _FINER = 4  # samples of the spectrum per Doppler cell, in which the strongest line is found
