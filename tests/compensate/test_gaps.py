@@ -10,7 +10,8 @@ from torch import Tensor
 
 from tests.compensate.scenes import spread_points
 from torchsar.compensate import autofocus
-from torchsar.compensate.pulse_phase.gaps import have_gaps, side_lobes
+from torchsar.compensate.pulse_phase.data import noise_power
+from torchsar.compensate.pulse_phase.gaps import have_gaps, longest_gap, side_lobes
 from torchsar.metrics import phase_rmse
 
 PULSES = 128
@@ -41,6 +42,37 @@ def test_missing_pulses_do_not_make_phases_wrong(missing: str, pulses: tuple[Ten
     assert error.median() < 1.3 * whole
     assert found.ok.double().mean() >= 0.5
     assert not (found.ok & ((error > 5 * std) | (error > 0.5))).any()
+
+
+@pytest.mark.parametrize(("points", "least"), [(3, 0.8), (10, 0.0)])
+def test_a_gap_of_two_fifths_is_not_sure_and_wrong(points: int, least: float) -> None:
+    """10 of 24 trials of three points were, and 19 of ten: the noise was taken to be a third of
+    what it is. Three points explain the pulses and are right; more of them do not.
+    """
+    data, phase = spread_points(24, points, 15.0, seed=4)
+    present = ((TIME < 38) | (TIME >= 90)).expand(len(data), -1)
+    found = autofocus(torch.where(present[..., None], data, 0))
+    error, std = phase_rmse(found["phase_rad"], phase, present), found.std["phase_rad"][:, 0]
+    assert found.ok.double().mean() >= least
+    assert not (found.ok & ((error > 3 * std) & (error > 0.1))).any()
+
+
+@pytest.mark.parametrize("missing", ["none", "middle", "end", "rows"])
+def test_noise_is_measured_where_pulses_or_ranges_are_missing(missing: str) -> None:
+    source = torch.Generator().manual_seed(5)
+    rows = torch.randn(4, 32, PULSES, generator=source, dtype=torch.complex128)
+    present = {"middle": (TIME < 40) | (TIME >= 90), "end": TIME < 88}.get(missing, TIME >= 0)
+    rows = torch.where(present, rows, 0)
+    if missing == "rows":
+        rows[:, ::3] = 0
+    power = noise_power(rows, present.expand(4, -1), torch.zeros(4, PULSES, dtype=torch.float64))
+    torch.testing.assert_close(power, torch.ones_like(power), rtol=0.1, atol=0)
+
+
+def test_the_longest_gap_lies_between_the_first_and_the_last_pulse() -> None:
+    texts = ["1111", "0111", "1011", "1001", "0010", "0000"]
+    present = torch.tensor([[mark == "1" for mark in text] for text in texts])
+    assert longest_gap(present).tolist() == [0, 0, 0.25, 0.5, 0, 0]
 
 
 def test_trials_without_gaps_are_as_without_the_others() -> None:

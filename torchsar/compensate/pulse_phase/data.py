@@ -265,13 +265,19 @@ def noise_power(rows: Tensor, present: Tensor, phase_rad: Tensor) -> Tensor:
 
     Returns:
         The variance of a sample, shape (trial,), float64, without derivatives: the median power of
-        the cells of the image over ln 2, which is that of the median of noise, and over the share
-        of pulses that hold samples.
+        the cells of the image over ln 2, which is that of the median of noise. Range cells that
+        hold only zeros do not count, and the power of absent pulses is made up for.
     """
-    image = without_lobes(torch.fft.fft(rotate(rows.detach(), phase_rad.detach()), norm="ortho"))
-    power = rising((image.real.square() + image.imag.square()).flatten(1))
-    median = power[:, (power.shape[-1] - 1) // 2].to(torch.float64)
-    return median / (math.log(2) * or_one(present.mean(-1, dtype=torch.float64)))
+    rows = rows.detach()
+    image = without_lobes(torch.fft.fft(rotate(rows, phase_rad.detach()), norm="ortho"))
+    power = image.real.square() + image.imag.square()
+    filled = (rows != 0).any(-1)
+    power = rising(torch.where(filled[..., None], power, torch.inf).flatten(1))
+    middle = (filled.sum(-1, keepdim=True) * rows.shape[-1] - 1).clamp_min(0) // 2
+    median = torch.where(filled.any(-1), power.gather(-1, middle)[:, 0].to(torch.float64), 0)
+    turn = 2 * math.pi / rows.shape[-1] * torch.arange(rows.shape[-1], dtype=torch.float64, device=rows.device)
+    window = (1 - torch.cos(turn)).square() / 1.5
+    return median / (math.log(2) * or_one((present * window).mean(-1)))
 
 
 def dealt(energy: Tensor, parts: int) -> Tensor:

@@ -54,6 +54,24 @@ def have_gaps(present: Tensor) -> Tensor:
     return side_lobes(present) > _LOBE
 
 
+def longest_gap(present: Tensor) -> Tensor:
+    """Compute the length of the longest gap between the first and the last pulse.
+
+    Args:
+        present: False where a pulse is missing, shape (trial, pulse).
+
+    Returns:
+        The share of the pulses from the first to the last that the gap takes, shape (trial,),
+        float64; 0 without pulses.
+    """
+    number = torch.arange(1, present.shape[-1] + 1, device=present.device)
+    last = torch.where(present, number, 0).cummax(-1).values
+    first = torch.where(present, number, number[-1] + 1).amin(-1, keepdim=True)
+    steps = torch.where(present[:, 1:] & (number[1:] > first), number[1:] - last[:, :-1], 1).amax(-1)
+    span = (last[:, -1:] - first + 1)[:, 0]
+    return torch.where(present.any(-1), (steps - 1).double() / or_one(span.double()), 0)
+
+
 def across_gaps(rows: Tensor, phase_rad: Tensor, iterations: int, tolerance_rad: float) -> Tensor:
     """Compare pulses with a Wiener estimate of the scene from all pulses and fill missing ones in.
 

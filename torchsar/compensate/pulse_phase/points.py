@@ -42,11 +42,11 @@ _CLOSE, _ONE_RANGE = 3.0, 0.5
 # range: energy of a second range, from the eigenvalues of the covariance over range. It is smaller
 # where some lines may be a scatterer that changes.
 _SECOND_RANGE_RAD, _IN_DOUBT_RAD = 0.25, 0.1
-# The phases stay where they start until lines explain all but this share of the energy: phases that
-# make a line of one point out of ten hide the others.
+# The phases stay where they start until lines explain all but this share of the energy without
+# noise: phases that make a line of one point out of ten hide the others.
 _HELD = 0.25
-# Rounds of amplitudes and Dopplers for each number of lines with held phases, and rounds after
-# which they end with free ones, or earlier where both move the phases by less than this share of
+# Rounds of amplitudes and Dopplers for each number of lines: those with held phases, and all if the
+# phases become free. They end earlier where a round moves the phases by less than `_SETTLED` of
 # what noise does. The bend is adapted every third round.
 _HELD_ROUNDS, _ROUNDS, _SETTLED, _BEND_EVERY = 3, 20, 0.1, 3
 # Largest bend in rad per range cell. The bend is pi / 8 times a wavelength over a cell, if cells
@@ -56,7 +56,9 @@ _LARGEST_BEND = 0.004
 _FINER = 4  # samples of the spectrum per Doppler cell, in which the strongest line is found
 _LARGEST_TURN = 0.25  # change of a Doppler in one round in cells
 _RIDGE = 1e-6  # of the energy of a line, so that equal lines have an inverse
-_READ_EVERY = 4  # lines after which trials that are explained are left out on a device
+# Lines after which trials that are explained are left out on a device. Before, they are fitted on,
+# but their phases are not changed any more.
+_READ_EVERY = 4
 
 
 @dataclass(frozen=True)
@@ -122,12 +124,13 @@ def phases_of_points(
     least = _LEAST_NOISE * _power(rows[at].detach()).mean((-2, -1), dtype=torch.float64)
     noise = noise.index_copy(0, at, torch.maximum(noise_power(rows[at], present[at], phase[at]), least))
     fit = _Fit.begin(rows[at], present[at], phase[at], noise[at])
-    unexplained, before = which & (noise > 0) & (present.sum(-1) >= _LEAST_PULSES), fit.rest()
+    unexplained = which & (noise > 0) & (present.sum(-1) >= _LEAST_PULSES)
+    unexplained, before = unexplained.index_copy(0, at, unexplained[at] & (fit.cells > 0)), fit.rest()
     every = 1 if rows.device.type == "cpu" else _READ_EVERY
     for lines in range(1, _MOST_LINES + 1):
         fit = fit.with_another_line()
         rest = fit.rest()
-        found = (rest < _EXPLAINED) & unexplained[at]
+        found = (rest < _EXPLAINED) & fit.free & unexplained[at]
         second, doubt = fit.of_second_range()
         good = found & (second < torch.where(doubt, _IN_DOUBT_RAD, _SECOND_RANGE_RAD))
         deviation = torch.where(doubt, torch.maximum(fit.std_rad(), second), fit.std_rad())
@@ -160,8 +163,8 @@ class _Fit:
         present: False where a pulse holds only zeros, shape (trial, pulse).
         noise: Variance of the noise of a sample, shape (trial,).
         curve: Phase in rad of each sample for a bend of 1, shape (trial, cell, pulse).
-        bend: Phase in rad by which a range cell, from the middle of the pulses to their ends,
-            differs from a cell that is nearer by one, shape (trial,).
+        bend: Phase in rad that a range cell has beyond its nearer neighbour at the first and the
+            last pulse, less that in the middle, shape (trial,).
         free: True where the phases are fitted, shape (trial,), bool.
         change: Change of the phases in rad, shape (trial, pulse).
         lines: Dopplers in rad per pulse, shape (trial, line).
@@ -275,6 +278,7 @@ class _Fit:
 
     def rest(self) -> Tensor:
         """Power of what is not explained in powers of the noise, (trial,): 1 if it is all noise."""
+        # a phase or a Doppler is half a complex parameter
         degrees = self._degrees(self.lines.shape[-1]) - (self.present.sum(-1) + self.lines.shape[-1]) / 2
         return _power(self.left).sum((-2, -1)) / or_one(self.noise * degrees)
 
@@ -289,7 +293,8 @@ class _Fit:
         Also a bool per trial, True if lines of one range are close and do not count, because they
         may be a scatterer that changes.
         """
-        products = self.amplitudes @ self.amplitudes.mH
+        amplitudes = self.amplitudes.to(torch.complex128)
+        products = amplitudes @ amplitudes.mH
         power, squares = products.diagonal(dim1=-2, dim2=-1).real, _power(products)
         turns = (self.lines[:, None] - self.lines[..., None]) / (2 * math.pi)
         near = (turns - turns.round()).abs() * self.rows.shape[-1] < _CLOSE
@@ -298,13 +303,14 @@ class _Fit:
         # elementary symmetric polynomials of the eigenvalues: their sum, and that of their products
         total = (power * clear).sum(-1)
         pairs = total.square() - (squares * (clear[:, None] & clear[..., None])).sum((-2, -1))
-        std = torch.where(pairs > 0, (total * self.noise / or_one(pairs.clamp_min(0))).sqrt(), torch.inf)
+        known = pairs > 10 * torch.finfo(self.rows.dtype).eps * total.square()
+        std = torch.where(known, (total * self.noise / or_one(pairs.clamp_min(0))).sqrt(), torch.inf)
         return std.detach(), ~clear.all(-1)
 
     def std_rad(self) -> Tensor:
         """Standard deviation of the phases due to noise in rad, rms over the pulses, (trial,).
 
-        That of a pulse in which the points cancel each other is at most that of any phase.
+        Pulses in which the points cancel each other make it large; theirs is that of any phase.
         """
         scene = _power(self.model if self.lines.shape[-1] else self.rows).detach().sum(-2)
         variance = 1 / (2 * scene / or_one(self.noise)[:, None] + 3 / math.pi**2)
@@ -322,8 +328,8 @@ def _numbers(present: Tensor, dtype: torch.dtype) -> Tensor:
     return (pulse - mean) * present
 
 
-def _turns(waves: Tensor, slopes: Tensor, matrix: Tensor, amplitudes: Tensor, rest: Tensor) -> Tensor:
-    """Changes of the Dopplers in rad per pulse, (trial, line), that explain most of the rest.
+def _turns(waves: Tensor, slopes: Tensor, matrix: Tensor, amplitudes: Tensor, left: Tensor) -> Tensor:
+    """Changes of the Dopplers in rad per pulse, (trial, line), that explain most of what is left.
 
     A Gauss-Newton step: the slopes of the waves by their Dopplers, (trial, line, pulse) as these,
     count without what the amplitudes can explain. matrix: products of the waves.
@@ -333,7 +339,7 @@ def _turns(waves: Tensor, slopes: Tensor, matrix: Tensor, amplitudes: Tensor, re
     curvature = (free * (amplitudes @ amplitudes.mH).conj()).real
     size = or_one(curvature.diagonal(dim1=-2, dim2=-1).sum(-1))[:, None, None]
     ridge = _RIDGE * size * torch.eye(curvature.shape[-1], dtype=size.dtype, device=size.device)
-    right = (amplitudes.conj() * (slopes.conj() @ rest.mT)).real.sum(-1, keepdim=True)
+    right = (amplitudes.conj() * (slopes.conj() @ left.mT)).real.sum(-1, keepdim=True)
     turns = torch.linalg.solve_ex(curvature + ridge, right)[0][..., 0]
     largest = _LARGEST_TURN * 2 * math.pi / waves.shape[-1]
     return turns.clamp(-largest, largest)

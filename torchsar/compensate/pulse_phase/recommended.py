@@ -115,9 +115,10 @@ def autofocus(
         sharpness. The standard deviation then is at least half of their difference. Where few
         range cells make the sharpness, it is also at least half of the difference between
         scatterers beyond noise, and `ok` is False if that is 0.25 rad or more; with less than 2.5
-        such cells, `ok` is also False unless points explain the pulses down to the noise. One point
-        that noise leaves alone tells no change of its own phase from a phase error: both are in the
-        phases, which then are those of this point, and ok. Phases of `link_phases` have its
+        such cells, or a gap of more than 0.36 of the pulses, `ok` is also False unless points
+        explain the pulses down to the noise. One point that noise leaves alone tells no change of
+        its own phase from a phase error: both are in the phases, which then are those of this
+        point, and ok. Phases of `link_phases` have its
         standard deviations, `quality` and `ok`; where they are not ok but the sharpest ones are,
         these stay. `info` holds "homogeneous" of shape (...,), bool, True where the homogeneous
         description is more likely and linked phases do not contradict it; `ok` is False if they do

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.alignment import Displacement, displacement
 from torchsar.compensate.pulse_phase.data import Pulses, dealt, or_one, rising, rotate, without_lobes
 from torchsar.compensate.pulse_phase.few import STEADY, between_scatterers, scatter_of_point
+from torchsar.compensate.pulse_phase.gaps import longest_gap
 from torchsar.compensate.pulse_phase.halves import (
     EVERY,
     UNKNOWN_RAD,
@@ -48,6 +49,9 @@ _TELLING_ROWS = 6
 # Where fewer rows than this make the sharpness, points must explain the pulses down to the noise:
 # more than noise beside a bright point tells that they change.
 _ROWS_THAT_TELL = 2.5
+# Longest gap as a share of the pulses from the first to the last, up to which scenes of many points
+# tell how the phases before and after it go together: with 0.39, 1 trial of 32 was wrong.
+_LONGEST_GAP = 0.36
 # Factor of the deviation of few scatterers whose quarters are not the same. Their errors are slow,
 # and the difference of two halves has as few degrees of freedom as the record has times of
 # coherence: with 4 of them, an error is sqrt(4 / (4 - 2)) as large as such a difference says.
@@ -214,15 +218,16 @@ def estimated(
         description of the scene is not more likely (see `describe`), because sharpness does not
         find the phases of homogeneous clutter, and the pulses show one scene: where its scatterers
         change, the standard deviation is too small. That is sure where the images of quarters of
-        the pulses are alike. Otherwise the quarters may show scatterers that change, or stay and
-        are not resolved. The phases are then found anew from two halves of the rows without a
-        common scatterer, and the standard deviation is at least half of their difference; it must
-        be below 0.25 rad, as where few scatterers differ beyond noise. Where less than 2.5 rows
-        make the sharpness, points must explain the pulses down to the noise, be it points of one
-        range. The last five conditions need not hold for a single point whose modulus scatters by
-        less than 0.25, with 32 pulses or more. `info` holds "present", shape (..., pulse), False
-        for pulses that hold only zeros; and, of shape (...,), "homogeneous" (True where that
-        description is more likely), "ok_if_sparse" (what `ok` is if it is not),
+        the pulses are alike, or points explain the pulses. Otherwise the quarters may show
+        scatterers that change, or stay and are not resolved. The phases are then found anew from
+        two halves of the rows without a common scatterer, and the standard deviation is at least
+        half of their difference; it must be below 0.25 rad, as where few scatterers differ beyond
+        noise. Where less than 2.5 rows make the sharpness, points must explain the pulses down to
+        the noise, be it points of one range; and points of several ranges where one gap takes more
+        than 0.36 of the pulses. The last six conditions need not hold for a single point whose
+        modulus scatters by less than 0.25, with 32 pulses or more. `info` holds "present", shape
+        (..., pulse), False for pulses that hold only zeros; and, of shape (...,), "homogeneous"
+        (True where that description is more likely), "ok_if_sparse" (what `ok` is if it is not),
         "sparse_gain_nats" (gain of the log likelihood of the sparse description over white noise),
         "jitter_cells" and "migration_cells" (see `Displacement`),
         "iterations", "sharpness_nats", "noise_sharpness_nats" (the largest sharpness that noise can
@@ -300,7 +305,7 @@ def _assessed(
             exact = torch.hypot(points.std_rad / band.sqrt(), phase_rmse(points.phase_rad, phase, present))
             std = torch.where(stay, exact, torch.maximum(std, between / occupied.sqrt()))
             one, sure, differ = one_scene(rows, phase, std, largest, sharpness_rows)
-            least = _UNSURE_RAD * few
+            least, sure = _UNSURE_RAD * few, sure | stay
             unsure = one & ~sure & ~lone & (std < least)
             far = unlike & (between > _FAR_RAD) & (std < _UNSURE_RAD)
             anew = _found_anew(rows, present, start, phase, find, unsure | far)
@@ -310,6 +315,7 @@ def _assessed(
             std = torch.where(differ & alone & ~stay, _FEW_TELL * std, std)
             unlike = unlike & (std >= _UNSURE_RAD)
             hidden = alone & ~points.enough & (sharpness_rows < _ROWS_THAT_TELL)
+            hidden = hidden | (~stay & (longest_gap(present) > _LONGEST_GAP))
             stays, lone = stays & ~unlike & ~(untold & differ) & ~hidden, lone & ~unlike
         else:
             stays = torch.ones_like(lone)
