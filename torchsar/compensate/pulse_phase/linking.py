@@ -303,17 +303,25 @@ def _grown(scene: Speckle) -> Tensor:
 
 
 def _solved(blocks: Speckle) -> Tensor:
-    """Phases of short blocks: those of greatest likelihood that are found from several bands."""
+    """Phases of short blocks: those of greatest likelihood that are found from several bands.
+
+    As many bands go together as fit into the memory of a block of trials.
+    """
     count = len(blocks.samples)
     which = torch.arange(count, device=blocks.samples.device)
-    widths = torch.tensor(_WIDTHS, dtype=torch.float64, device=which.device)
-    every = blocks.trials(which.repeat(len(_WIDTHS)))
-    u = every.start(widths.repeat_interleave(count))
-    for number in range(_ROUNDS):
-        smooth = windowed_spectrum if number < _COARSE_ROUNDS else smoothed_spectrum
-        u = newton(every.fit(every.periodograms(u, smooth)).matrix, u)
-    gain = every.gain(u, every.fit(every.periodograms(u, smoothed_spectrum)))
-    return u.unflatten(0, (-1, count))[gain.unflatten(0, (-1, count)).nan_to_num(-torch.inf).argmax(0), which]
+    together = max(1, _BLOCK_BYTES // max(1, sum(16 * own.numel() for own, *_ in blocks.groups)))
+    found, gains = [], []
+    for widths in torch.tensor(_WIDTHS, dtype=torch.float64, device=which.device).split(together):
+        every = blocks.trials(which.repeat(len(widths)))
+        u = every.start(widths.repeat_interleave(count))
+        for number in range(_ROUNDS):
+            smooth = windowed_spectrum if number < _COARSE_ROUNDS else smoothed_spectrum
+            u = newton(every.fit(every.periodograms(u, smooth)).matrix, u)
+        gain = every.gain(u, every.fit(every.periodograms(u, smoothed_spectrum)))
+        found.append(u.unflatten(0, (-1, count)))
+        gains.append(gain.unflatten(0, (-1, count)))
+    best = torch.cat(gains).nan_to_num(-torch.inf).argmax(0)
+    return torch.cat(found)[best, which]
 
 
 def _joined(pairs: Speckle, u: Tensor) -> Tensor:
