@@ -384,7 +384,12 @@ CASES = [
     # of a target that turns: what is fitted to an echo that shows no rotation is chance
     # iterations end at 1e-9 of the position, by how the memory of the data is aligned
     Case(
-        "rotation", lambda: UnevenRotation(turning.RADAR), differentiable=False, vmap=False, turning=True, tolerance=1e-8
+        "rotation",
+        lambda: UnevenRotation(turning.RADAR),
+        differentiable=False,
+        vmap=False,
+        turning=True,
+        tolerance=1e-8,
     ),
     Case(
         "rotation_autofocus",
