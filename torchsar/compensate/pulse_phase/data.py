@@ -275,9 +275,9 @@ def noise_power(rows: Tensor, present: Tensor, phase_rad: Tensor) -> Tensor:
     power = rising(torch.where(filled[..., None], power, torch.inf).flatten(1))
     middle = (filled.sum(-1, keepdim=True) * rows.shape[-1] - 1).clamp_min(0) // 2
     median = torch.where(filled.any(-1), power.gather(-1, middle)[:, 0].to(torch.float64), 0)
-    turn = 2 * math.pi / rows.shape[-1] * torch.arange(rows.shape[-1], dtype=torch.float64, device=rows.device)
-    window = (1 - torch.cos(turn)).square() / 1.5
-    return median / (math.log(2) * or_one((present * window).mean(-1)))
+    # the window that the pulses had in the image
+    window = torch.fft.ifft(without_lobes(torch.fft.fft(present.to(torch.complex128))))
+    return median / (math.log(2) * or_one(window.real.square().mean(-1)))
 
 
 def dealt(energy: Tensor, parts: int) -> Tensor:

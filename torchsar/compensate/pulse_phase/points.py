@@ -222,7 +222,7 @@ class _Fit:
         every = 1 if change.device.type == "cpu" else _ROUNDS
         amplitudes = self.rows.new_zeros(*lines.shape, self.rows.shape[-2])
         active = torch.ones_like(free)
-        straight = rows = self.rows
+        straight = self.rows
         for number in range(1, _ROUNDS + 1):
             if number % _BEND_EVERY == 1:
                 straight = self._straight(bend)
