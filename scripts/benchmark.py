@@ -1,14 +1,16 @@
 """Time of every stage, echo simulation, metric and draw of the packaged configs over a floor.
 
     python scripts/benchmark.py --out benchmark.json [--small] [--only NAME] [--threads 1 2]
-                                [--device cpu cuda] [--budget SECONDS]
+                                [--device cpu cuda] [--budget SECONDS] [--random SOURCE SOURCE]
 
 Every config runs in a process of its own, so that its peak memory is its own, and once per number
 of threads and device. A row holds
 
 - `config` (its first case), `part` and `name`: what was measured. The parts are `echo` (the
   simulation of the data, draws included), `draws` (random numbers alone), `stage` (METHOD.STAGE),
-  `metrics` (METHOD), `batch` (echo, recommended method and metrics) and `memory`;
+  `metrics` (METHOD), `batch` (echo, recommended method and metrics) and `memory`. With `--random`
+  there are further rows of `batch`, and of the `draws` in it, whose name is the source of random
+  numbers;
 - `seconds`: median time of one call on all trials of the batch, and `trials`: how many these are;
 - `over_floor`: median of the ratio of this time to that of the floor, which is measured in turn
   with it: bare transforms of the same data, one two-dimensional FFT and its inverse. A machine that
@@ -33,14 +35,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Trace, keep_freed_memory
+from torchsar.core.draws import Source
 from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.text import find_config
 from torchsar.study.table import load
@@ -152,7 +155,9 @@ def drawing(device: torch.device) -> Iterator[list[float]]:
             setattr(Draws, name, method)
 
 
-def measured(config: str, count: int, budget_s: float, threads: int, device: str) -> list[Row]:
+def measured(
+    config: str, count: int, budget_s: float, sources: Sequence[Source], threads: int, device: str
+) -> list[Row]:
     """Rows of one config with so many trials, for one number of threads on one device."""
     torch.set_num_threads(threads)
     keep_freed_memory()  # as the commands do
@@ -176,6 +181,12 @@ def measured(config: str, count: int, budget_s: float, threads: int, device: str
         found.time("metrics", method, judge, trace.signal.data)
     found.time("batch", "", lambda: bench.batch(draws, methods=["recommended"]), raw)
     found.add("memory", "", peak_bytes=peak_bytes(bench.device))
+    for source in sources:
+        others = replace(draws, source=source)
+        bench.trials(others)  # the first draws of a process compile
+        with drawing(raw.device) as spent:
+            found.time("batch", source, lambda d=others: bench.batch(d, methods=["recommended"]), raw)
+        found.add("draws", source, seconds=sum(spent) / found.calls, over_floor=None)
     return found.rows
 
 
@@ -228,6 +239,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
     parser.add_argument("--budget", type=float, default=BUDGET_S, help="seconds for the repetitions of a call")
     parser.add_argument("--device", nargs="+", default=devices, help="devices, by default all that there are")
+    parser.add_argument(
+        "--random", nargs="+", choices=get_args(Source), default=[], help="sources of random numbers to compare"
+    )
     options = parser.parse_args(arguments)
     counts, budget_s = (SMALL, 0.0) if options.small else (CONFIGS, options.budget)
     chosen = [name for name in counts if options.only in name]
@@ -241,7 +255,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for threads in options.threads[: 1 if options.small or device != "cpu" else None]:
                 received, sent = spawn.Pipe(duplex=False)
                 count = counts[config] * (MORE if device != "cpu" and counts[config] > 1 else 1)
-                process = spawn.Process(target=worker, args=(sent, config, count, budget_s, threads, device))
+                about = (config, count, budget_s, options.random, threads, device)
+                process = spawn.Process(target=worker, args=(sent, *about))
                 process.start()
                 sent.close()
                 try:

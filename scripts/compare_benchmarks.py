@@ -57,7 +57,7 @@ def compared(
     old: dict[tuple[Any, ...], Row], new: dict[tuple[Any, ...], Row]
 ) -> Iterator[tuple[float, tuple[Any, ...]]]:
     """Ratio of new to old of every part that counts."""
-    whole = {key[:3]: row["seconds"] for key, row in old.items() if row["part"] == "batch"}
+    whole = {key[:3]: row["seconds"] for key, row in old.items() if row["part"] == "batch" and not row["name"]}
     for key, before in old.items():
         measure = next(name for name in ("over_floor", "seconds", "peak_bytes") if before.get(name) is not None)
         if before.get("seconds", 1.0) >= LEAST_SHARE * whole.get(key[:3], 0.0) and before[measure] > 0:

@@ -220,6 +220,25 @@ class BenchmarkTable(RecordTable):
         return self.shown(columns, lines, f"{where}; torch {machine['torch']}")
 
 
+class DrawsTable(RecordTable):
+    """Time of the draws from every source, and their share of the batch, of a record of
+    `scripts/benchmark.py` for one config.
+    """
+
+    def run(self) -> list[nodes.Node]:
+        record, lines = self.record(), []
+        named = [row for row in record["rows"] if row["name"] and row["part"] in ("batch", "draws")]
+        for draws in (row for row in named if row["part"] == "draws"):
+            same = {key: draws[key] for key in ("name", "threads")}
+            batch = next(row for row in named if row["part"] == "batch" and same.items() <= row.items())
+            share = f"{draws['seconds'] / batch['seconds']:.1%}"
+            lines.append((f"`{draws['name']}`", draws["threads"], cell(1e3 * draws["seconds"]), share))
+        machine, one = record["machine"], record["rows"][0]
+        config = one["config"].removeprefix("sweeps/")
+        note = f"`{config}`, batches of {one['trials']} trials; {machine['processor']}; torch {machine['torch']}"
+        return self.shown(("source", ">threads", ">ms", ">of the batch"), lines, note)
+
+
 class BusyTable(RecordTable):
     """Speed of every sweep of a record of `scripts/sweep_busy.py`, and how busy the GPU was."""
 
@@ -347,6 +366,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
         "sweep-figure": SweepFigure,
         "sweep-table": SweepTable,
         "benchmark-table": BenchmarkTable,
+        "draws-table": DrawsTable,
         "busy-table": BusyTable,
         "compiled-table": CompiledTable,
         "trade-table": TradeTable,

@@ -190,7 +190,9 @@ class TestDraws:
             Draws(7, trials=4, source=source)  # type: ignore[arg-type]
 
     def test_an_unknown_source_is_refused(self, source):
-        with pytest.raises(ValueError, match=f"source of Draws must be 'numpy' or 'philox', got '{source}s'"):
+        with pytest.raises(
+            ValueError, match=f"source of Draws must be one of 'numpy', 'philox', 'philox_compiled', got '{source}s'"
+        ):
             Draws(7, source=f"{source}s")  # type: ignore[arg-type]
 
     def test_earlier_draws_do_not_change_a_draw(self, source):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from tests.contract.pretended import DEVICE, Pretended, pretended_device, to_host
-from torchsar.core import Draws, philox
+from torchsar.core import Draws, philox, philox_compiled
 
 CPU = torch.device("cpu")
 
@@ -152,3 +153,66 @@ def test_neighbours_are_not_correlated() -> None:
         else:
             assert abs(float((a * b).mean())) < limit / 2
         assert abs(float((a.abs().square() - a.abs().square().mean()).mul(b.abs().square()).mean())) < limit
+
+
+@pytest.fixture
+def traced(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The loop of "philox_compiled" is traced but not compiled, which takes half a minute; its rows
+    are short, and few make a call.
+    """
+    compiler = partial(torch.compile, backend="eager")
+    monkeypatch.setattr(torch, "compile", lambda function, options, **how: compiler(function, **how))
+    monkeypatch.setattr(philox_compiled, "_WIDTH", 64)
+    monkeypatch.setattr(philox_compiled, "_ROWS", 4)
+    philox_compiled._compiled.cache_clear()
+    yield
+    philox_compiled._compiled.cache_clear()
+
+
+@pytest.mark.parametrize("dtype", [torch.complex128, torch.float64, torch.complex64, torch.float32])
+@pytest.mark.usefixtures("traced")
+def test_the_compiled_loop_gives_the_same_normal_numbers(dtype: torch.dtype) -> None:
+    """Within rounding, also for one row, for a last row that is not full, and for many parts."""
+    for trials, shape in ((1, (64,)), (1, (128,)), (3, (7, 43)), (5, (1000,))):
+        one, loop = (Draws(3, trials=range(trials), source=s) for s in ("philox", "philox_compiled"))
+        expected, found = one.normal("n", shape, dtype), loop.normal("n", shape, dtype)
+        single = dtype.to_real() == torch.float32
+        torch.testing.assert_close(found, expected, rtol=2e-7 if single else 0, atol=1e-12 if single else 4e-15)
+        assert torch.equal(loop.for_trials([trials - 1]).normal("n", shape, dtype)[0], found[-1])
+
+
+@pytest.mark.usefixtures("traced")
+def test_the_compiled_loop_stands_where_it_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draws shorter than a row are those of "philox"; others do not call it."""
+    monkeypatch.delattr(philox, "normal")
+    draws = Draws(3, trials=range(2), source="philox_compiled")
+    assert draws.normal("n", (64,), torch.complex64).shape == (2, 64)
+    with pytest.raises(AttributeError, match="normal"):
+        draws.normal("n", (63,), torch.complex64)
+
+
+def test_sines_of_fractions_of_a_turn() -> None:
+    """Against cosines and sines of the reduced angle, at all quarters and at random fractions."""
+    some = torch.from_numpy(np.random.default_rng(5).integers(0, 1 << 32, 20_000))
+    edges = torch.arange(0, 1 << 32, 1 << 29)
+    angle = torch.cat((some, edges, edges + 1, (edges - 1) % (1 << 32)))
+    turns = angle.to(torch.float64) * 2.0**-32
+    cosine, sine = philox_compiled._cosine_and_sine(angle)
+    for found, shift in ((sine, 0.0), (cosine, 0.25)):
+        # near its zeros a sine has the relative accuracy of the distance from them, which is exact
+        halves = (2 * (turns + shift)).round()
+        near = (turns + shift - halves / 2) * (2 * math.pi)
+        expected = near.sin() * (1 - 2 * (halves % 2))
+        torch.testing.assert_close(found, expected, rtol=5e-16, atol=1e-18)
+
+
+def test_a_loop_that_cannot_be_compiled_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> object:
+        raise OSError("no compiler")
+
+    compiler = partial(torch.compile, backend=fail)
+    monkeypatch.setattr(torch, "compile", lambda function, options, **how: compiler(function, **how))
+    philox_compiled._compiled.cache_clear()
+    with pytest.raises(RuntimeError, match="(?s)^torch.compile could not.*no compiler.*take source 'philox'"):
+        Draws(3, source="philox_compiled").normal("n", (1 << 13,), torch.complex64)
+    philox_compiled._compiled.cache_clear()

@@ -200,8 +200,9 @@ def sweep(
             it is resumed only if the code of `trial`, what it closes over and the global names that
             it uses are unchanged; see `torchsar.core.fingerprint`. Give a version if these change
             without an effect on the results, or if results depend on more than these.
-        random: Source of the random numbers: "numpy" draws them on the CPU, "philox" computes other
-            numbers on the device where they are used; see `torchsar.Draws`.
+        random: Source of the random numbers: "numpy" draws them on the CPU, "philox" and
+            "philox_compiled" compute other numbers on the device where they are used; see
+            `torchsar.Draws`.
 
     Returns:
         The results, with the dims (algorithm, *parameters, trial).
@@ -217,7 +218,7 @@ def sweep(
         ("stop", stop is None or isinstance(stop, Stop), "be a Stop, such as Stop('error_m', 0.05)", stop),
         ("save", isinstance(save, Iterable), "list the numbers of trials", save),
         ("config", isinstance(config or {}, Mapping), "be a mapping of what else results depend on", config),
-        ("random", random in get_args(Source), f"be {' or '.join(get_args(Source))}", random),
+        ("random", random in get_args(Source), f"be one of {', '.join(get_args(Source))}", random),
         ("version", version is None or isinstance(version, (str, int)), "be a word or a whole number", version),
     ):
         if not good:
