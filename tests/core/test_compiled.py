@@ -131,25 +131,32 @@ def test_what_one_graph_cannot_hold_runs_between_graphs(stage: Stage, values: di
     torch.testing.assert_close(x.data.grad, y.data.grad)
 
 
-def test_derivatives_pass_through_a_compiled_chain() -> None:
-    chain, x, y = (
+class Table(Stage):
+    """Multiplies by a table that it keeps, in place or not, or writes into it."""
+
+    def __init__(self, writes: bool = False, inplace: bool = False) -> None:
+        super().__init__()
+        self.table, self.writes, self.inplace = torch.arange(1.0, 5.0), writes, inplace
+
+    def forward(self, signal: Signal) -> Signal:
+        table = self.table.add_(1) if self.writes else self.table
+        return signal.with_data(signal.data.clone().mul_(table) if self.inplace else signal.data * table)
+
+
+@pytest.mark.parametrize(
+    "chain",
+    [
         Chain(level=Level(), divide=use(Divide(), level="level")),
-        *(signal_of(requires_grad=True) for _ in "xy"),
-    )
+        Chain(table=Table(), again=Table()),
+        Chain(table=Table(inplace=True)),
+    ],
+    ids=["estimate", "table", "table in place"],
+)
+def test_derivatives_pass_through_a_compiled_chain(chain: Chain) -> None:
+    x, y = (signal_of(requires_grad=True) for _ in "xy")
     for signal, form in ((x, compiled(chain)), (y, chain)):
         form(signal).data.abs().pow(3).sum().backward()
     torch.testing.assert_close(x.data.grad, y.data.grad)
-
-
-class Table(Stage):
-    """Multiplies by a table that it keeps, or writes into it."""
-
-    def __init__(self, writes: bool = False) -> None:
-        super().__init__()
-        self.table, self.writes = torch.arange(1.0, 5.0), writes
-
-    def forward(self, signal: Signal) -> Signal:
-        return signal.with_data(signal.data * (self.table.add_(1) if self.writes else self.table))
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ import.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 from operator import index
 from typing import Any
 
@@ -16,8 +16,9 @@ import torch._dynamo
 from torch import Tensor
 from torch._guards import active_fake_mode
 from torch._subclasses.fake_tensor import is_fake
+from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree as pytree
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._python_dispatch import TorchDispatchMode, _get_current_dispatch_mode_stack
 
 from torchsar.core.host import untraced
 
@@ -54,7 +55,10 @@ def call_as_one(stage: Any, args: Sequence[Any], values: Mapping[str, Any]) -> A
 @torch.compiler.disable
 def _call(stage: Any, args: Sequence[Any], values: Mapping[str, Any], fixed: Sequence[str]) -> Any:
     """Call a stage with the constants that `fixed` holds in place of the values given."""
-    with nullcontext() if active_fake_mode() is None else _Constants():
+    with ExitStack() as modes:
+        if active_fake_mode() is not None:
+            modes.enter_context(_Constants())
+            modes.enter_context(_Operands())
         known = {}
         for name, digits in map(str.split, fixed):
             x = values[name]
@@ -66,6 +70,29 @@ def _call(stage: Any, args: Sequence[Any], values: Mapping[str, Any], fixed: Seq
                 "constant; compile a new one",
             )
         return stage(*args, **{**values, **known})
+
+
+class _Operands(TorchFunctionMode):
+    """Makes tensors of the host values of a traced program before a derivative refers to them.
+
+    A tensor into which a function writes is left to `_Constants`, which refuses it.
+    """
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs, name = kwargs or {}, getattr(func, "__name__", "")
+        if not any(isinstance(mode, _Constants) for mode in _get_current_dispatch_mode_stack()):
+            return func(*args, **kwargs)  # within `untraced`
+        inplace = name.endswith("_") and not name.endswith("__")
+        written = int(inplace or name.startswith("__i") or name in ("__setitem__", "__set__"))
+        lifted = pytree.tree_map(_lifted, (args[written:], {k: x for k, x in kwargs.items() if k != "out"}))
+        return func(*args[:written], *lifted[0], **{**kwargs, **lifted[1]})
+
+
+def _lifted(x: Any) -> Any:
+    """A tensor of the host as a value of the program, and anything else as it is."""
+    return torch.ops.aten.lift_fresh_copy(x) if _of_host(x) else x
 
 
 class _Constants(TorchDispatchMode):
@@ -86,7 +113,7 @@ class _Constants(TorchDispatchMode):
                 raise RuntimeError(
                     f"a compiled program cannot write into a tensor that it holds as a constant ({func})"
                 )
-        lifted = pytree.tree_map(lambda x: torch.ops.aten.lift_fresh_copy(x) if _of_host(x) else x, (args, kwargs))
+        lifted = pytree.tree_map(_lifted, (args, kwargs))
         return func(*lifted[0], **lifted[1])
 
 
