@@ -912,6 +912,7 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
     "core.reduced_turns": (core.reduced_turns, {"turns": ONES}),
     "core.unit_phasor": (lambda turns: core.unit_phasor(turns, torch.complex64), {"turns": ONES}),
     "core.settle": (core.settle, {"value": ONES, "fallback": 0.0}),
+    "core.power_of": (core.power_of, {"x": torch.ones(4, 4, dtype=torch.complex64)}),
     "core.level_of": (core.level_of, {"x": torch.ones(4, 4)}),
     "core.unit_level": (core.unit_level, {"x": torch.ones(4, 4)}),
     "radar.geocentric": (

@@ -39,7 +39,7 @@ from torchsar.compensate.group import (
     pick_group,
     student_log_likelihood,
 )
-from torchsar.core import Estimate, Signal, Stage, checked_samples, fft_lines, settle, take, unit_level
+from torchsar.core import Estimate, Signal, Stage, checked_samples, fft_lines, power_of, settle, take, unit_level
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -108,7 +108,7 @@ def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turn
     rows = beam_spectrum(group, doppler_hz).rows(doppler_hz, velocity_m_s)
     height = rows.shape[-2] // looks
     image = fft_lines(rows[..., : height * looks, :].unflatten(-2, (looks, height)), inverse=True)
-    intensity = image.real.square() + image.imag.square()
+    intensity = power_of(image)
     mean = intensity.mean((-3, -2, -1), keepdim=True)
     intensity = (intensity / torch.where(mean > 0, mean, 1)).clamp_max(20)
     intensity = intensity - intensity.mean(-1, keepdim=True)

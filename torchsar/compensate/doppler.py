@@ -29,6 +29,7 @@ from torchsar.core import (
     legendre,
     linear_solve,
     matrix_inverse,
+    power_of,
     settle,
     unit_level,
 )
@@ -105,7 +106,7 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
     products, powers = [], []
     for first, last in _bounds(x.shape[-2] - 1, blocks[0], "pairs of lines"):
         part = x[..., first : last + 1, :]
-        square = part.real.square() + part.imag.square()
+        square = power_of(part)
         present = (square.detach().amax(-1) > 0).to(square.dtype)
         both = (present[..., :-1] * present[..., 1:])[..., None]
         product = (part[..., :-1, :].conj() * part[..., 1:, :]).sum(-2)
@@ -151,7 +152,7 @@ def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
     spectra = []
     for first, last in segments:
         part = fft_lines(x[..., first : last + 1, :], n=n)
-        power = (part.real.square() + part.imag.square()).to(torch.float64)
+        power = power_of(part).to(torch.float64)
         spectra.append(_sums(power, columns).mT)
     return torch.stack(spectra, -3)
 

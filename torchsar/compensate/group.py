@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import fft_lines, per_trial
+from torchsar.core import fft_lines, per_trial, power_of
 from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, refocus, refocus_turns_per_sample
 from torchsar.focus.reference import range_compress
 from torchsar.radar import StripmapRadar
@@ -234,7 +234,7 @@ def column_signal(lines: Tensor) -> Tensor:
     Returns:
         The energy above the background, in units of the background, shape (..., range), float64.
     """
-    energy = (lines.detach().real.square() + lines.detach().imag.square()).sum(-2).to(torch.float64)
+    energy = power_of(lines.detach()).sum(-2).to(torch.float64)
     floor = energy.kthvalue(max(1, energy.shape[-1] // 10), dim=-1, keepdim=True).values
     floor = torch.maximum(floor, 1e-3 * energy.amax(-1, keepdim=True))
     excess = energy / torch.where(floor > 0, floor, 1) - 1 - 4 / math.sqrt(lines.shape[-2])
@@ -340,7 +340,7 @@ def entropy_parts(image: Tensor, parts: int) -> tuple[Tensor, Tensor]:
         The summands in nats and the shares of the energy of the block, shape (..., block, parts)
         each, float64. The sum of the summands over the last dimension is `block_entropy`.
     """
-    power = image.real.square() + image.imag.square()
+    power = power_of(image)
     tiny = torch.finfo(power.dtype).tiny
     blocks, shares = [], []
     for block in power.tensor_split(_block_count(image.shape[-1]), -1):

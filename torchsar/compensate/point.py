@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.doppler import nominal_doppler, point_doppler, wrap_hz
-from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, settle, unit_level
+from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, power_of, settle, unit_level
 from torchsar.metrics.bounds import tone_frequency_bound_hz
 from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import StripmapRadar
@@ -227,7 +227,7 @@ class PointDoppler(Stage):
                 "PointDoppler: frame_hz, the Doppler (Hz) that the image was focused with, is not known; "
                 "connect it with torchsar.use, or set radar.pointing_doppler_hz"
             )
-        power = image.real.square() + image.imag.square()
+        power = power_of(image)
         peak, width = power.flatten(-2).argmax(-1), power.shape[-1]
         line, sample = peak // width, peak % width
         found = impulse_response(

@@ -4,7 +4,14 @@ from torchsar.core import trees as trees  # registers signals and estimates with
 from torchsar.core.alternate import Alternate, Turn
 from torchsar.core.axis import Axis
 from torchsar.core.chain import Chain, Trace, Use, use
-from torchsar.core.check import checked_samples, level_of, refuse_non_finite, refuse_non_finite_values, unit_level
+from torchsar.core.check import (
+    checked_samples,
+    level_of,
+    power_of,
+    refuse_non_finite,
+    refuse_non_finite_values,
+    unit_level,
+)
 from torchsar.core.draws import Draws, Source
 from torchsar.core.estimate import Estimate, settle
 from torchsar.core.fft import (
@@ -119,6 +126,7 @@ __all__ = [
     "own_code",
     "per_trial",
     "phasor_tables",
+    "power_of",
     "real_dtype",
     "reduced_turns",
     "refuse_non_finite",

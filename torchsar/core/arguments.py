@@ -5,8 +5,9 @@ from __future__ import annotations
 import functools
 import inspect
 import numbers
+import re
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,23 +23,26 @@ _WORDS = {
     "Tensor": "a tensor",
     "None": "None",
 }
+# annotations of several values, and what these are called
+_SEVERAL = {"Sequence": "a sequence", "list": "a sequence", "tuple": "a sequence", "Mapping": "a mapping"}
 # errors of Python and torch about values of other types than expected
-_RAW = (TypeError, AttributeError, IndexError, RuntimeError)
+_RAW = (TypeError, AttributeError, IndexError, RuntimeError, ValueError)
 
 
 def names_arguments(cls: type[_Class]) -> type[_Class]:
     """Let the constructor of a class that fails name the argument whose type does not fit.
 
     Arguments are looked at only after an error that the code does not raise itself, so that
-    whatever a constructor accepts stays accepted, and its own sentences stay. Only annotations of
-    numbers, words and tensors are judged, as texts; tensors fit where numbers do.
+    whatever a constructor accepts stays accepted, and its own sentences stay. Annotations of
+    numbers, words, tensors, sequences, mappings and classes are judged; tensors fit where numbers
+    and sequences do.
 
     Args:
         cls: Class with an `__init__` of its own, such as a dataclass.
 
     Returns:
-        The class. Its constructor raises TypeError with one sentence in place of a TypeError,
-        AttributeError, IndexError or RuntimeError if an argument does not fit its annotation.
+        The class. Its constructor raises TypeError with one sentence in place of an error of Python
+        or torch if an argument does not fit its annotation.
     """
     init = cls.__init__
 
@@ -73,18 +77,37 @@ def _fault(init: Callable[..., None], *args: Any, **kwargs: Any) -> str:
         parameter = signature.parameters[name]
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             continue
-        kinds = [kind.strip() for kind in str(parameter.annotation).split("|")]
-        if set(kinds) <= _WORDS.keys() and not _fits(value, kinds):
-            expected = " or ".join(_WORDS[kind] for kind in kinds)
+        # alternatives, without what stands in brackets
+        kinds = [kind.strip() for kind in re.sub(r"\[.*?\]+", "", str(parameter.annotation)).split("|")]
+        named = [kind for kind in kinds if kind not in _WORDS and kind not in _SEVERAL]
+        classes = tuple(found for kind in named if (found := _class_of(kind, init.__globals__)))
+        if len(classes) == len(named) and not _fits(value, kinds) and not isinstance(value, classes):
+            words = {**{kind: _with_article(kind.rpartition(".")[2]) for kind in named}, **_WORDS, **_SEVERAL}
+            expected = " or ".join(dict.fromkeys(words[kind] for kind in kinds))
             return f"{name} must be {expected}, got {' '.join(repr(value).split())[:60]}"
     return ""
 
 
+def _class_of(kind: str, known: Mapping[str, Any]) -> type | None:
+    """The class that an annotation names, if instances can be told from others."""
+    first, *rest = kind.split(".")
+    found = functools.reduce(lambda x, name: getattr(x, name, None), rest, known.get(first))
+    return found if inspect.isclass(found) and not getattr(found, "_is_protocol", False) else None
+
+
+def _with_article(name: str) -> str:
+    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
+
+
 def _fits(value: Any, kinds: list[str]) -> bool:
-    """Whether a value may be of one of the kinds."""
+    """Whether a value may be of one of the kinds that have words."""
     if value is None or isinstance(value, str):
         return ("None" if value is None else "str") in kinds
-    if isinstance(value, (list, tuple, complex)):
-        return "Tensor" in kinds
-    number = isinstance(value, (numbers.Number, np.generic, np.ndarray, Tensor))
-    return number and bool({"int", "float", "bool", "Tensor"} & set(kinds))
+    if isinstance(value, Mapping):
+        return "Mapping" in kinds
+    several, number = {"Sequence", "list", "tuple"}, {"int", "float", "bool"}
+    if isinstance(value, (list, tuple)):
+        return bool(several & set(kinds))
+    if isinstance(value, (np.generic, np.ndarray, Tensor)):
+        return bool({"Tensor", *several, *number} & set(kinds))
+    return isinstance(value, numbers.Real) and bool(number & set(kinds))

@@ -124,6 +124,18 @@ def checked_samples(
     return x
 
 
+def power_of(x: Tensor) -> Tensor:
+    """Compute |x|^2 from real and imaginary part, without a root. Differentiable.
+
+    Args:
+        x: Samples, any shape, real or complex.
+
+    Returns:
+        Powers, same shape, real.
+    """
+    return x.real.square().add_(x.imag.square()) if x.is_complex() else x.square()
+
+
 def level_of(x: Tensor, trailing: int = 2) -> Tensor:
     """Return a power of two next to the largest magnitude of each trial.
 

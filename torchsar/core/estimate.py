@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from torchsar.core.arguments import names_arguments
 from torchsar.core.show import Shown, Summary, content, one_number
 
 
+@names_arguments
 @dataclass(frozen=True, repr=False)
 class Estimate(Shown):
     """Estimated values with their predicted accuracy and their reliability in each trial.

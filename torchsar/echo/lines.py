@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording
+from torchsar.core.arguments import names_arguments
 from torchsar.scene.trials import refuse_other_trials, refuse_unless
 
 # line number of padding at the end of a trial, by convention: no line has a negative number
@@ -153,6 +154,7 @@ class LostLines:
         return _drop(recording, lost.scatter(-1, 1 + order, chosen.expand(order.shape)))
 
 
+@names_arguments
 @dataclass(frozen=True)
 class LostGaps:
     """Impairment: gaps of consecutive lost lines, with at least one received line between gaps.
@@ -194,6 +196,7 @@ class LostGaps:
         return _drop(recording, _at(index, number.shape[-1]))
 
 
+@names_arguments
 @dataclass(frozen=True)
 class RepeatedLines:
     """Impairment: lines that appear twice in succession, with the same number and samples.
@@ -234,6 +237,7 @@ class RepeatedLines:
         return take_lines(recording, source), {"repeated": starts == 0}
 
 
+@names_arguments
 @dataclass(frozen=True)
 class CorruptedNumbers:
     """Impairment: line numbers that are overwritten, while the samples are unchanged.

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Signal, Truth, gathered_checks, per_trial
+from torchsar.core import Draws, Recording, Signal, Truth, gathered_checks, per_trial, power_of
 from torchsar.echo.pulsed import echo_spectrum
 from torchsar.radar import StripmapRadar
 from torchsar.scene import Scatterers, StripmapWorld
@@ -286,7 +286,7 @@ def lit_power(echo: Tensor) -> Tensor:
         Mean power of the samples whose power exceeds 1e-4 of the largest power in their trial,
         shape (...,).
     """
-    power = echo.real.square() + echo.imag.square()
+    power = power_of(echo)
     lit = power > 1e-4 * power.amax((-2, -1), keepdim=True)
     return (power * lit).sum((-2, -1)) / lit.sum((-2, -1)).clamp_min(1)
 

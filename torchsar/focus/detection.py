@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torchsar.core import Axis, Signal, Stage, checked_samples, host_value, level_of
+from torchsar.core import Axis, Signal, Stage, checked_samples, host_value, level_of, power_of
 
 
 def power(image: Tensor) -> Tensor:
@@ -20,7 +20,7 @@ def power(image: Tensor) -> Tensor:
     Returns:
         Power, same shape, real.
     """
-    return image.real.square() + image.imag.square() if image.is_complex() else image
+    return power_of(image) if image.is_complex() else image
 
 
 def multilook(image: Tensor, looks: tuple[int, int]) -> Tensor:

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, host_value, level_of, unit_level
+from torchsar.core import Signal, host_value, level_of, power_of, unit_level
 
 # quantities that sharpness is defined for, with their power of the modulus |I|
 _OF = {"intensity": 2, "amplitude": 1}
@@ -205,7 +205,7 @@ def _norm(x: Tensor) -> Tensor:
     """
     level = level_of(x)
     unit = x / level
-    return (unit.real.square() + unit.imag.square()).sum((-2, -1), dtype=torch.float64).sqrt() * level[..., 0, 0]
+    return power_of(unit).sum((-2, -1), dtype=torch.float64).sqrt() * level[..., 0, 0]
 
 
 def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
@@ -272,7 +272,7 @@ def error_after_gain_db(images: Tensor, references: Tensor) -> Tensor:
     a, b = pair_of(images, references)
     # one level for all images, so that the gain is common
     a, b = (x / level_of(x, x.ndim) for x in (a, b))
-    energy = (a.real.square() + a.imag.square()).sum(dtype=torch.float64)
+    energy = power_of(a).sum(dtype=torch.float64)
     gain = (a.conj() * b).sum(dtype=torch.complex128) / torch.where(energy == 0, 1, energy)
     return error_db(a * gain.to(a.dtype), b)
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, checked_samples, cis
+from torchsar.core import Signal, checked_samples, cis, power_of
 
 # chosen: samples per axis of the neighbourhood in which the maximum is interpolated
 _PATCH = 64
@@ -377,7 +377,7 @@ def _lobes(fine: Tensor, nulls: int) -> tuple[dict[str, Tensor], Tensor, Tensor]
     """Figures of interpolated cuts (..., 2 m - 1) about their peaks, the peaks, and whether the
     cuts contain all that the figures depend on, (...,) each.
     """
-    power = fine.real.square() + fine.imag.square()
+    power = power_of(fine)
     middle = fine.shape[-1] // 2
     right, left = power[..., middle:], power[..., : middle + 1].flip(-1)
     irw = _crossing(right) + _crossing(left)

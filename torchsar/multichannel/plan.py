@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchsar.core import Signal, Stage, block_bytes_of, unit_phasor
+from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.azimuth import azimuth_filter, image_axis
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import check_condition, doppler_axis, refuse_shifted
@@ -21,6 +22,7 @@ from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_centre
 from torchsar.radar import BistaticRadar
 
 
+@names_arguments
 class AzimuthPlan:
     """Plan that turns channels into focused images of points with one motion.
 

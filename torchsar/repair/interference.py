@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples, host_largest, level_of, unit_level
+from torchsar.core import Estimate, Signal, Stage, checked_samples, host_largest, level_of, power_of, unit_level
 from torchsar.repair.interference_band import find_band, subtract_band
 from torchsar.repair.interference_detect import THRESHOLD, Level, clean_level, line_spectra, stands_out
 from torchsar.repair.interference_tone import Tone, anything, find_tones, subtract_tones
@@ -121,7 +121,7 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     raw, level, found, touched = _searched(raw, "notch_interference", threshold)
     spectrum = torch.fft.fft(raw)
     with torch.no_grad():
-        power = (spectrum.real.square() + spectrum.imag.square()) / raw.shape[-1]
+        power = power_of(spectrum) / raw.shape[-1]
         hit = (found.level.excess(power) > threshold) & touched[..., None]
         left = power.masked_fill(hit, 0).sum(-1)
         lost = touched & (left > _MOST_LEFT * found.level.density.sum(-1))

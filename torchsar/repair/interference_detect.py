@@ -20,6 +20,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsar.core import power_of
+
 # In units of the mean level. Speckle is exponential: exp(-30) leaves one false cell in 1e13. The
 # clean RADARSAT-1 blocks stay below 24.
 THRESHOLD = 30.0
@@ -101,7 +103,7 @@ def line_spectra(raw: Tensor, oversampling: int = 1) -> Tensor:
     """
     n = raw.shape[-1]
     spectrum = torch.fft.fft(raw * blackman_harris(n, raw), oversampling * n)
-    return (spectrum.real.square() + spectrum.imag.square()) / n
+    return power_of(spectrum) / n
 
 
 def running_median(x: Tensor, width: int) -> Tensor:

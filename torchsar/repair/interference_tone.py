@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import host_value, unit_phasor
+from torchsar.core import host_value, power_of, unit_phasor
 from torchsar.repair.interference_detect import THRESHOLD, Level, line_spectra, stands_out
 
 # Largest drift within a line and largest error of the initial frequency that are searched, in
@@ -159,7 +159,7 @@ def phase_step(blocks: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     """
     a = blocks @ basis.to(blocks.dtype)
     carrier = a[..., 0]
-    power = (carrier.real.square() + carrier.imag.square()).clamp_min(torch.finfo(carrier.real.dtype).tiny)
+    power = power_of(carrier).clamp_min(torch.finfo(carrier.real.dtype).tiny)
     steps = (a[..., 1:] * carrier.conj()[..., None]).imag / power[..., None]
     steps = steps.clamp(-0.7, 0.7).to(torch.float64)
     return steps[..., 0], steps[..., 1]

@@ -21,7 +21,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, linear_phasor, unit_level
+from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, linear_phasor, power_of, unit_level
 from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.repair.response import (
     GRID,
@@ -210,7 +210,7 @@ def _entropy_slope(turned: Tensor) -> tuple[Tensor, Tensor]:
     y = torch.fft.ifft(
         torch.cat([turned[:, : n // 2], torch.zeros_like(turned), turned[:, n // 2 :]], -1), norm="ortho"
     )
-    p = y.real.square() + y.imag.square()
+    p = power_of(y)
     log = torch.log(p.clamp_min(1e-30))
     slope = torch.fft.fft(-log * y, norm="ortho")
     slope = torch.cat([slope[:, : n // 2], slope[:, -(n - n // 2) :]], -1)
@@ -485,7 +485,7 @@ def _align(spectra: Tensor, reference: Tensor) -> Tensor:
     """Spectra (window, n), with linear and constant phase aligned with the references."""
     n = 8 * spectra.shape[-1]
     correlation = torch.fft.fft(spectra * reference.conj(), n)
-    index = (correlation.real.square() + correlation.imag.square()).argmax(-1, keepdim=True)
+    index = power_of(correlation).argmax(-1, keepdim=True)
     slope = (index - n * (2 * index >= n)).to(torch.float64) / n
     turned = torch.gather(correlation, -1, index)
     return spectra * linear_phasor(-slope[..., 0], 0, spectra.shape[-1], spectra.dtype) * cis(-torch.angle(turned))

@@ -22,7 +22,16 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchsar.core import block_bytes_of, checked_samples, host_largest, host_value, is_plain, level_of, over_blocks
+from torchsar.core import (
+    block_bytes_of,
+    checked_samples,
+    host_largest,
+    host_value,
+    is_plain,
+    level_of,
+    over_blocks,
+    power_of,
+)
 from torchsar.focus.defocus import InvertibleOmegaK, all_pass
 from torchsar.radar import StripmapRadar
 
@@ -34,18 +43,6 @@ _SETTLED = 1e-5
 _ARRAYS = 4
 # measured: least width of a block of columns, below which reading and writing them takes longer
 _LEAST_COLUMNS = 32
-
-
-def power_of(x: Tensor) -> Tensor:
-    """Return |x|^2 of complex samples of any shape.
-
-    Args:
-        x: Samples, any shape, complex.
-
-    Returns:
-        Powers, same shape, real.
-    """
-    return x.real.square() + x.imag.square()
 
 
 def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, residual: Tensor, steps: int) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.imaging import Imaging
-from torchsar.core import unit_phasor
+from torchsar.core import power_of, unit_phasor
 from torchsar.core.polynomials import legendre
 from torchsar.metrics import entropy
 from torchsar.optim import lbfgs
@@ -115,7 +115,7 @@ def drift_m(profiles: Tensor, frequency_hz: Tensor, imaging: Imaging, slopes: bo
 def _cost_and_slope(samples: Tensor, rate: Tensor, basis: Tensor, imaging: Imaging) -> tuple[Tensor, Tensor]:
     """Entropy of the image of samples (1, pulse, frequency), and its gradient in a drift."""
     image = imaging.image(range_profiles(samples))
-    power = image.real.square() + image.imag.square()
+    power = power_of(image)
     total = power.sum()
     log = torch.log((power / total).clamp_min(torch.finfo(power.dtype).tiny))
     value = -(power * log).sum() / total

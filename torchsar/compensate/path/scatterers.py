@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from torchsar.core import unit_phasor
+from torchsar.core import power_of, unit_phasor
 from torchsar.focus import ImageGrid
 from torchsar.radar import LIGHT_M_S, AntennaPath
 
@@ -40,7 +40,7 @@ def prominent_places(image: Tensor, grid: ImageGrid, cells: tuple[float, float],
     Returns:
         Positions in metres, float64 (scatterer, 3), the strongest one first.
     """
-    power = image.real.square() + image.imag.square()
+    power = power_of(image)
     # the median of an exponential distribution is ln 2 of its mean; that of the image where a range
     # has few pixels with samples
     clutter = power.median(0).values.clamp_min(power.median()) / math.log(2)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
+from torchsar.core import power_of
 
 # Displacements in cells rms from which on profiles are not aligned, from pulse to pulse and slow
 # ones. Found by trial on 2 to 300 scatterers: the phases may be wrong from 0.2 and 0.45 on, and
@@ -71,7 +72,7 @@ def displacement(rows: Tensor, present: Tensor) -> Displacement:
     cells, n = rows.shape[-2:]
     if cells < _LEAST_CELLS or n < _LEAST_PULSES:
         return Displacement(*torch.zeros(2, len(rows), dtype=torch.float64, device=rows.device))
-    powers = [_power(half).to(torch.float64) for half in _halves(rows)]
+    powers = [power_of(half).to(torch.float64) for half in _halves(rows)]
     length = -(-n // _GROUPS)
 
     def grouped(x: Tensor) -> Tensor:
@@ -129,7 +130,7 @@ def coherent_jitter(rows: Tensor, present: Tensor) -> Tensor:
     slopes = []
     for half in (offset > 0, offset <= 0):
         turns = torch.exp(2j * torch.pi * steps[:, None] * offset[:, None]) * half[:, None]
-        slope = steps[_power(turns.to(products.dtype) @ products).argmax(-2)] * both
+        slope = steps[power_of(turns.to(products.dtype) @ products).argmax(-2)] * both
         slopes.append(torch.where(both, slope - _mean(slope, both)[:, None], 0))
     return _common(slopes, both.sum(-1)) / 2**0.5
 
@@ -147,7 +148,7 @@ def _about_centroid(rows: Tensor) -> tuple[Tensor, Tensor]:
     """
     spectrum = torch.fft.fft(rows, dim=-2)
     frequency = torch.fft.fftfreq(rows.shape[-2], dtype=torch.float64, device=rows.device)
-    density = _power(spectrum).sum(-1, dtype=torch.float64)
+    density = power_of(spectrum).sum(-1, dtype=torch.float64)
     turn = torch.exp(2j * torch.pi * frequency)
     centre = (density.to(turn.dtype) @ turn)[:, None]
     return spectrum, (turn * centre.conj()).angle() / (2 * torch.pi)
@@ -196,7 +197,3 @@ def _displacements(power: Tensor, present: Tensor, cells: Tensor | None = None) 
 def _mean(values: Tensor, present: Tensor) -> Tensor:
     """Mean of the values that are present, along the last dim."""
     return (values * present).sum(-1) / present.sum(-1).clamp_min(1)
-
-
-def _power(samples: Tensor) -> Tensor:
-    return samples.real.square() + samples.imag.square()

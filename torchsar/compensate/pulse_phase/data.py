@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import checked_samples, cis, is_plain, unit_level
+from torchsar.core import checked_samples, cis, is_plain, power_of, unit_level
 
 # largest rounding error of a start, far below the accuracy of any estimate
 _PHASE_ERROR_RAD = 1e-3
@@ -270,7 +270,7 @@ def noise_power(rows: Tensor, present: Tensor, phase_rad: Tensor) -> Tensor:
     """
     rows = rows.detach()
     image = without_lobes(torch.fft.fft(rotate(rows, phase_rad.detach()), norm="ortho"))
-    power = image.real.square() + image.imag.square()
+    power = power_of(image)
     filled = (rows != 0).any(-1)
     power = rising(torch.where(filled[..., None], power, torch.inf).flatten(1))
     middle = (filled.sum(-1, keepdim=True) * rows.shape[-1] - 1).clamp_min(0) // 2

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import dealt, or_one, rotate, safe_angle
 from torchsar.compensate.pulse_phase.halves import Again, half_of, settled_apart
-from torchsar.core import host_value, true_positions
+from torchsar.core import host_value, power_of, true_positions
 from torchsar.metrics.phase import phase_rmse
 
 # A single point: largest relative scatter of its modulus, far below the 0.52 of noise.
@@ -76,7 +76,7 @@ def between_scatterers(
     at = true_positions(few, count)
     rows, present, phase = rows[at], present[at], phase[at]
     noise = noise[at]
-    energy, pulses = (rows.real.square() + rows.imag.square()).sum(-1), present.sum(-1)
+    energy, pulses = power_of(rows).sum(-1), present.sum(-1)
     half, parts, variance, blind = dealt(energy, 2), [], torch.zeros_like(noise), no[at]
     for k in (0, 1):
         power, strongest = torch.where(half == k, energy, -1).sort(-1, descending=True)
@@ -125,7 +125,7 @@ def _of_one_range(rows: Tensor, noise: Tensor, pulses: Tensor) -> Tensor:
     cells = (rows != 0).any(-1).sum(-1)
     covariance = rows @ rows.mH
     total = covariance.diagonal(dim1=-2, dim2=-1).real.sum(-1).to(torch.float64)
-    squares = (covariance.real.square() + covariance.imag.square()).sum((-2, -1)).to(torch.float64)
+    squares = power_of(covariance).sum((-2, -1)).to(torch.float64)
     scene = (total - pulses * cells * noise).clamp_min(0)
     squares = squares - 2 * pulses * noise * scene - cells * pulses * (cells + pulses) * noise.square()
     return (scene > 0) & (scene.square() < _ONE_RANGE * squares)
@@ -145,7 +145,7 @@ def scatter_of_point(focused: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
         The standard deviation of the modulus over its mean, and that of the phase in rad about a
         straight line, shape (trial,) each.
     """
-    bright = (focused.real.square() + focused.imag.square()).sum(-1).argmax(-1)
+    bright = power_of(focused).sum(-1).argmax(-1)
     row = focused.gather(1, bright[:, None, None].expand(-1, 1, focused.shape[-1]))
     at = torch.fft.fft(row).abs().argmax(-1)[..., None].expand(-1, focused.shape[-2], 1)
     echo = (focused * torch.fft.fft(focused).gather(-1, at).conj()).sum(-2)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import or_one, rotate, safe_angle
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import LEAST_PULSES_OF_FACTORS, WIENER_FACTORS, Wiener
-from torchsar.core import host_value
+from torchsar.core import host_value, power_of
 
 # Largest side lobe of missing pulses, relative to the main lobe, from which on they are filled in.
 # With 0.07, a gap of a sixteenth of the record, errors of 40 points were a sixth larger.
@@ -95,7 +95,7 @@ def across_gaps(rows: Tensor, phase_rad: Tensor, iterations: int, tolerance_rad:
     for number in range(-_FIRST, iterations):
         pulses = torch.where(present[:, None], rotate(rows, phase), filled)
         image = along.image(pulses)
-        power = image.real.square() + image.imag.square()
+        power = power_of(image)
         mean = or_one(power.mean((-2, -1), keepdim=True))
         weight = scene.of_scene(power, mean)
         filled = along.adjoint(image * weight)

@@ -29,7 +29,7 @@ from torchsar.compensate.pulse_phase.data import (
 from torchsar.compensate.pulse_phase.pairs import pair_phase, pair_products, running_sum
 from torchsar.compensate.pulse_phase.sharpen import settled
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
-from torchsar.core import Estimate, unit_phasor
+from torchsar.core import Estimate, power_of, unit_phasor
 from torchsar.core.arguments import names_arguments
 
 Kernel = Literal["lumv", "ml", "synchronised", "eigenvector"]
@@ -333,13 +333,8 @@ class _View:
 def _view(rows: Tensor, phase: Tensor) -> _View:
     """Padded image of the pulses with a phase removed."""
     image = torch.fft.fft(rotate(rows, phase), _PADDING * rows.shape[-1], norm="ortho")
-    power = _power(image.detach())
+    power = power_of(image.detach())
     return _View(image, power, power.max(-1).indices)
-
-
-def _power(x: Tensor) -> Tensor:
-    """Squared moduli of complex values."""
-    return x.real.square().add_(x.imag.square())
 
 
 def _step(view: _View, width: Tensor, present: Tensor, solve: Solver) -> Tensor:
@@ -378,11 +373,11 @@ class _Rows:
         length = 1 << (4 * reach).bit_length()
         if 2 * length > self.padded or not bool(self.present.all()):
             g = self.pulses()
-            return pair_products(g, self.present), _power(g[..., :-1]).sum(-2)
+            return pair_products(g, self.present), power_of(g[..., :-1]).sum(-2)
         offsets = torch.arange(-reach, reach + 1, dtype=torch.float64, device=self.cells.device)
         earlier = self.cells * unit_phasor(-offsets / self.padded, self.cells.dtype)
         now, before = (torch.fft.ifft(_spread(x, length), norm="forward") for x in (self.cells, earlier))
-        sums = torch.stack([(now * before.conj()).sum(-2), _power(before).sum(-2).to(now.dtype)])
+        sums = torch.stack([(now * before.conj()).sum(-2), power_of(before).sum(-2).to(now.dtype)])
         harmonics = torch.fft.fftshift(torch.fft.fft(sums, norm="forward"), dim=-1)[..., 1:]
         products, powers = torch.fft.ifft(_spread(harmonics, self.padded))[..., 1 : self.present.shape[-1]]
         return products, powers.real

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import on_the_circle, without_line
-from torchsar.core import host_value, true_positions
+from torchsar.core import host_value, power_of, true_positions
 from torchsar.metrics.phase import phase_rmse, residual_phase
 
 UNKNOWN_RAD = math.pi / math.sqrt(3)  # standard deviation of a random phase
@@ -39,7 +39,7 @@ def halves_of_rows(rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Both halves, shape (trial, range of the half, pulse).
     """
-    order = (rows.real.square() + rows.imag.square()).sum(-1).argsort(-1, descending=True)
+    order = power_of(rows).sum(-1).argsort(-1, descending=True)
     one, other = (
         rows.gather(1, order[:, part::2].sort(-1).values[..., None].expand(-1, -1, rows.shape[-1])) for part in (0, 1)
     )

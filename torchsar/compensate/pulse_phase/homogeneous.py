@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one, rising, rotate
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
+from torchsar.core import power_of
 
 # Range cells are grouped by power, because each group has its own spectrum: largest ratio of the
 # powers in a group, and number of groups; the last one also takes all weaker cells.
@@ -81,7 +82,7 @@ def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> Descriptio
         The gains and the decision.
     """
     n = rows.shape[-1]
-    energy = rows.real.square() + rows.imag.square()
+    energy = power_of(rows)
     mean = energy.mean((-2, -1), dtype=torch.float64)
     power = energy.mean(-1, dtype=torch.float64) / or_one(mean)[:, None]
     groups = power_groups(power).to(torch.float64)
@@ -90,7 +91,7 @@ def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> Descriptio
     by_power = -(n * cells * or_one(of_group).log()).sum(0)
 
     image = torch.fft.fft(rotate(rows, phase_rad), 2 * n)
-    power = (image.real.square() + image.imag.square()) / or_one(n * mean).to(energy.dtype)[:, None, None]
+    power = power_of(image) / or_one(n * mean).to(energy.dtype)[:, None, None]
     sparse = sparse_gain_nats(power[..., ::2])
     spectra = torch.einsum("gtr,trk->gtk", groups.to(power.dtype), power).to(torch.float64)
     by_spectra = -(cells * n * (_whittle(spectra / or_one(cells)[..., None], cells * independent))).sum(0)
@@ -137,7 +138,7 @@ def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor)
     Groups of fewer than ten independent range cells are left out. To second order in the coherence
     the gain of a sample is the sum of its squares over the lags.
     """
-    n, energy = rows.shape[-1], rows.real.square() + rows.imag.square()
+    n, energy = rows.shape[-1], power_of(rows)
     kinds = groups.to(energy.dtype)
     pulse = torch.einsum("gtr,trp->gtp", kinds, energy)
     row = kinds * energy.sum(-1)
@@ -146,7 +147,7 @@ def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor)
     lags = min(_LAGS, n - 1)
     for lag in range(1, lags + 1):
         product = torch.einsum("gtr,trp->gtp", kinds.to(rows.dtype), rows[..., lag:] * rows[..., :-lag].conj())
-        square = (product.real.square() + product.imag.square()).sum(-1)
+        square = power_of(product).sum(-1)
         excess = excess + square / or_one((pulse[..., lag:] * pulse[..., :-lag]).sum(-1)) - 1 / looks.clamp_min(1)
     weight = torch.where(looks >= LEAST_LOOKS, n * cells, 0)
     deviation = weight * math.sqrt(lags / n) / looks.clamp_min(1)

@@ -23,7 +23,7 @@ from torchsar.compensate.pulse_phase.data import dealt, or_one
 from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, SPECTRAL_FLOOR, power_groups
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 from torchsar.compensate.pulse_phase.verdict import occupied_band
-from torchsar.core import cholesky_factor, cis, linear_solve, matrix_inverse
+from torchsar.core import cholesky_factor, cis, linear_solve, matrix_inverse, power_of
 
 _IN_BAND = 0.85  # share of the power in the band of a first guess
 _STEPS = 4  # Newton steps of the phases after each estimate of the spectrum
@@ -99,9 +99,9 @@ class Speckle:
     def of(rows: Tensor, present: Tensor) -> Speckle:
         z = rows.mT.to(torch.complex128)
         samples = present.sum(-1).to(torch.float64) * z.shape[-1]
-        total = (z.real.square() + z.imag.square()).sum((-2, -1))
+        total = power_of(z).sum((-2, -1))
         z = z * torch.where(total > 0, samples / or_one(total), 1).sqrt()[:, None, None]
-        power = (z.real.square() + z.imag.square()).sum(-2)
+        power = power_of(z).sum(-2)
         groups = []
         for inside in power_groups(power):
             if bool(inside.any()):
@@ -160,7 +160,7 @@ class Speckle:
         powers = []
         for own, *_ in self.groups:
             spectrum = torch.fft.fft((own * u.conj()[..., None])[:, part], 2 * u.shape[-1], dim=-2)
-            powers.append((spectrum.real.square() + spectrum.imag.square()).sum(-1))
+            powers.append(power_of(spectrum).sum(-1))
         return powers
 
     def periodograms(self, u: Tensor, smooth: Smooth) -> list[Tensor]:
@@ -187,7 +187,7 @@ class Speckle:
             tones = torch.fft.fft(inverse.mT @ (own * u.conj()[..., None]), 2 * n, dim=-2)
             sums = torch.roll(torch.nn.functional.pad(lag_sums(inverse.mT * kept), (1, 0)), -n, -1)
             gain = torch.fft.fft(sums).real
-            power = (tones.real.square() + tones.imag.square()).sum(-1) / gain.square()
+            power = power_of(tones).sum(-1) / gain.square()
             spectra.append(
                 self._smoothed(power * self.present.sum(-1)[:, None], cells, smoothed_spectrum, _LEAST_FLOOR)
             )
@@ -261,13 +261,13 @@ class Speckle:
         for (own, *_), inverse, information in zip(self.groups[of], fit.inverses[of], each[of], strict=True):
             lower = cholesky_factor(inverse.mT)
             innovations = innovations + lower.mH @ (own * u.conj()[..., None])
-            here = (own.real.square() + own.imag.square()).sum(-2) > 0
+            here = power_of(own).sum(-2) > 0
             amount = torch.diagonal(information, dim1=-2, dim2=-1).sum(-1).clamp_min(0)
             of_cell = of_cell + here * amount[:, None]
         level, count = torch.linalg.vector_norm(innovations, dim=-2), self.present.sum(-1).clamp_min(2)
         innovations = innovations / or_one(level)[:, None, :]
         alike = innovations.mH @ innovations
-        excess = (alike.real.square() + alike.imag.square() - 1 / count[:, None, None]) / (1 - 1 / count)[:, None, None]
+        excess = (power_of(alike) - 1 / count[:, None, None]) / (1 - 1 / count)[:, None, None]
         weight = of_cell.sqrt()
         both = (weight[:, None, :] @ (excess @ weight[..., None]))[:, 0, 0] - (weight.square() * (level > 0)).sum(-1)
         total = weight.square().sum(-1)

@@ -34,7 +34,7 @@ from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum, windowed_spectrum
 from torchsar.compensate.pulse_phase.verdict import LEAST_ROWS, LEAST_STREHL, occupied_band
-from torchsar.core import Estimate, cis, over_blocks
+from torchsar.core import Estimate, cis, over_blocks, power_of
 
 # Longest block whose phases are found by themselves, in pulses; bands of their first guesses as
 # shares of the pulse rate.
@@ -138,7 +138,7 @@ def may_be_ok(rows: Tensor) -> Tensor:
         False where the range cells that have nine or more of similar power beside them hold less
         than a fifth of the energy, shape (trial,), bool.
     """
-    energy = (rows.detach().real.square() + rows.detach().imag.square()).sum(-1, dtype=torch.float64)
+    energy = power_of(rows.detach()).sum(-1, dtype=torch.float64)
     groups = power_groups(energy)
     many = groups.sum(-1, keepdim=True) >= LEAST_LOOKS
     return (groups * many * energy).sum((0, -1)) > LEAST_ENERGY * energy.sum(-1)
@@ -245,7 +245,7 @@ def _linked(rows: Tensor, present: Tensor, start: Tensor | None, still: bool) ->
         information, independent = scene.summed(each), scene.independent_share(u, fit, each)
         gain = scene.gain(u, fit)
         if still:
-            energy = (rows.real.square() + rows.imag.square()).sum(-1, dtype=torch.float64)
+            energy = power_of(rows).sum(-1, dtype=torch.float64)
             effective = energy.sum(-1).square() / or_one(energy.square().sum(-1))
             std = deviation(independent[:, None, None] * information)
             crossed = Crossed(std, torch.ones_like(effective), torch.zeros_like(effective), effective)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import noise_power, or_one, rotate, safe_angle
-from torchsar.core import cis, host_value, true_positions
+from torchsar.core import cis, host_value, power_of, true_positions
 
 # Effective number of range cells over which the energy is spread, below which few points may
 # explain the pulses. With more, noise is as strong as they are, or they are many.
@@ -121,7 +121,7 @@ def phases_of_points(
     if not count:
         return Points(phase, std, noise, explained, enough, False)
     at = true_positions(which, count)
-    least = _LEAST_NOISE * _power(rows[at].detach()).mean((-2, -1), dtype=torch.float64)
+    least = _LEAST_NOISE * power_of(rows[at].detach()).mean((-2, -1), dtype=torch.float64)
     noise = noise.index_copy(0, at, torch.maximum(noise_power(rows[at], present[at], phase[at]), least))
     fit = _Fit.begin(rows[at], present[at], phase[at], noise[at])
     unexplained = which & (noise > 0) & (present.sum(-1) >= _LEAST_PULSES)
@@ -191,7 +191,7 @@ class _Fit:
     def begin(rows: Tensor, present: Tensor, phase: Tensor, noise: Tensor) -> _Fit:
         """Return the fit without a line."""
         pulses = present.sum(-1)
-        power, strongest = _power(rows).sum(-1).detach().sort(-1, descending=True)
+        power, strongest = power_of(rows).sum(-1).detach().sort(-1, descending=True)
         power, strongest = power[:, :_CELLS], strongest[:, :_CELLS]
         seen = power > (noise * (pulses + _SEEN * pulses.sqrt()))[:, None]
         cells = seen.sum(-1)
@@ -234,7 +234,7 @@ class _Fit:
             amplitudes = torch.where(active[:, None, None], solved, amplitudes)
             model = torch.where(active[:, None, None], (waves.mT @ amplitudes).mT, model)
             if number == _HELD_ROUNDS:
-                unknown = _power(rows - model).sum((-2, -1)) - self.noise * self._degrees(lines.shape[-1])
+                unknown = power_of(rows - model).sum((-2, -1)) - self.noise * self._degrees(lines.shape[-1])
                 free = free | (unknown < _HELD * self._energy())
                 active = active & free
             step = safe_angle((model.conj() * rows).sum(-2)) * (active & free)[:, None]
@@ -243,7 +243,7 @@ class _Fit:
             change, lines = change + step, lines + active[:, None] * turn
             if number % _BEND_EVERY == 0:
                 bent = self.curve * model
-                more = (bent.conj() * left).imag.sum((-2, -1)) / or_one(_power(bent).sum((-2, -1)))
+                more = (bent.conj() * left).imag.sum((-2, -1)) / or_one(power_of(bent).sum((-2, -1)))
                 bend = (bend + active * more).clamp(-_LARGEST_BEND, _LARGEST_BEND)
             if number > _HELD_ROUNDS:
                 active = active & (step.detach().square().sum(-1) > settled.square() * pulses)
@@ -261,7 +261,7 @@ class _Fit:
     def _strongest(self) -> Tensor:
         """Doppler of the strongest line of what is not explained in rad per pulse, (trial,)."""
         n = _FINER * self.rows.shape[-1]
-        power = _power(torch.fft.fft(self.left, n)).sum(-2)
+        power = power_of(torch.fft.fft(self.left, n)).sum(-2)
         top = power.argmax(-1, keepdim=True)
         below, peak, above = (power.gather(-1, (top + k) % n)[:, 0] for k in (-1, 0, 1))
         fall = 2 * peak - below - above
@@ -270,7 +270,7 @@ class _Fit:
 
     def _energy(self) -> Tensor:
         """Energy of the scatterers without that of the noise, (trial,)."""
-        return (_power(self.rows).sum((-2, -1)) - self.cells * self.present.sum(-1) * self.noise).detach()
+        return (power_of(self.rows).sum((-2, -1)) - self.cells * self.present.sum(-1) * self.noise).detach()
 
     def _degrees(self, lines: int) -> Tensor:
         """Complex degrees of freedom that lines leave to the noise, (trial,)."""
@@ -280,7 +280,7 @@ class _Fit:
         """Power of what is not explained in powers of the noise, (trial,): 1 if it is all noise."""
         # a phase or a Doppler is half a complex parameter
         degrees = self._degrees(self.lines.shape[-1]) - (self.present.sum(-1) + self.lines.shape[-1]) / 2
-        return _power(self.left).sum((-2, -1)) / or_one(self.noise * degrees)
+        return power_of(self.left).sum((-2, -1)) / or_one(self.noise * degrees)
 
     def rest_of_held(self) -> Tensor:
         """Rest below which the phases become free, or the pulses are explained, (trial,)."""
@@ -295,7 +295,7 @@ class _Fit:
         """
         amplitudes = self.amplitudes.to(torch.complex128)
         products = amplitudes @ amplitudes.mH
-        power, squares = products.diagonal(dim1=-2, dim2=-1).real, _power(products)
+        power, squares = products.diagonal(dim1=-2, dim2=-1).real, power_of(products)
         turns = (self.lines[:, None] - self.lines[..., None]) / (2 * math.pi)
         near = (turns - turns.round()).abs() * self.rows.shape[-1] < _CLOSE
         near = near & (squares > _ONE_RANGE * power[:, None] * power[..., None])
@@ -312,13 +312,9 @@ class _Fit:
 
         Pulses in which the points cancel each other make it large; theirs is that of any phase.
         """
-        scene = _power(self.model if self.lines.shape[-1] else self.rows).detach().sum(-2)
+        scene = power_of(self.model if self.lines.shape[-1] else self.rows).detach().sum(-2)
         variance = 1 / (2 * scene / or_one(self.noise)[:, None] + 3 / math.pi**2)
         return ((variance * self.present).sum(-1) / or_one(self.present.sum(-1))).sqrt()
-
-
-def _power(z: Tensor) -> Tensor:
-    return z.real.square() + z.imag.square()
 
 
 def _numbers(present: Tensor, dtype: torch.dtype) -> Tensor:

@@ -26,7 +26,7 @@ from torchsar.compensate.pulse_phase.sharpen import (
     in_turn,
 )
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
-from torchsar.core import Estimate, host_value, host_values, true_positions
+from torchsar.core import Estimate, host_value, host_values, power_of, true_positions
 from torchsar.metrics import entropy
 
 # floor of the entropy fixed point in mean powers, found by trial: a lower floor includes noise, a
@@ -189,7 +189,7 @@ def autofocus(
 
 def _few_rows(rows: Tensor) -> Tensor:
     """Whether the energy lies in so few range cells that few points may explain it, (trial,)."""
-    energy = (rows.detach().real.square() + rows.detach().imag.square()).sum(-1)
+    energy = power_of(rows.detach()).sum(-1)
     return energy.sum(-1).square() < FEW_ROWS * energy.square().sum(-1)
 
 
@@ -284,7 +284,7 @@ def halves_of_image(imaging: Imaging, rows: Tensor, phase: Tensor) -> tuple[Tens
     image = imaging.image(rotate(rows, phase))
     lines = image.shape[-1]
     strip = torch.arange(lines, device=image.device) // max(1, min(_STRIP, lines // 2))
-    energy = (image.real.square() + image.imag.square()).sum(-2)
+    energy = power_of(image).sum(-2)
     strips = energy.new_zeros(len(energy), int(strip[-1]) + 1).index_add_(1, strip, energy)
     place = strips.argsort(-1, descending=True).argsort(-1)[:, strip]
     one, other = (rotate(imaging.adjoint(torch.where(place[:, None] % 2 == half, image, 0)), -phase) for half in (0, 1))
@@ -298,7 +298,7 @@ def _first_floor(rows: Tensor) -> Tensor:
     weak. A low floor then ends in a wrong minimum in one scene of two hundred; in strong noise, a
     high floor hides the target.
     """
-    energy = (rows.detach().real.square() + rows.detach().imag.square()).sum(-1)
+    energy = power_of(rows.detach()).sum(-1)
     share = energy / energy.sum(-1, keepdim=True).clamp_min(torch.finfo(energy.dtype).tiny)
     filled = 1 / share.square().sum(-1).clamp_min(torch.finfo(energy.dtype).tiny) / rows.shape[-2]
     return torch.where(filled < 0.5, _FIRST_FLOOR, _FLOOR)[:, None, None].to(energy.dtype)

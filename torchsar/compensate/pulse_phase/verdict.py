@@ -29,7 +29,7 @@ from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.compensate.pulse_phase.points import FEW_ROWS, phases_of_points
 from torchsar.compensate.pulse_phase.quarters import one_scene
-from torchsar.core import Estimate, block_bytes_of, host_value, over_blocks, true_positions
+from torchsar.core import Estimate, block_bytes_of, host_value, over_blocks, power_of, true_positions
 from torchsar.metrics.phase import phase_rmse
 
 # difference of the entropies of a uniform row and of speckle, whose power has an exponential
@@ -131,7 +131,7 @@ def occupied_band(rows: Tensor) -> Tensor:
         The share 0..1, shape (trial,), float64.
     """
     spectrum = torch.fft.fft(rows, dim=-2)
-    density = (spectrum.real.square() + spectrum.imag.square()).mean(-1, dtype=torch.float64)
+    density = power_of(spectrum).mean(-1, dtype=torch.float64)
     return torch.where(density.sum(-1) > 0, _filled(density), 1)
 
 
@@ -150,7 +150,7 @@ def _band_of_noise(image: Tensor) -> Tensor:
     """
     spectrum = without_lobes(torch.fft.fft(image, dim=-2))
     cells = image.shape[-1]
-    density = rising(spectrum.real.square() + spectrum.imag.square())[..., (cells - 1) // 2].to(torch.float64)
+    density = rising(power_of(spectrum))[..., (cells - 1) // 2].to(torch.float64)
     return ((1 + 3.2 / cells) * _filled(density)).clamp_max(1)
 
 
@@ -385,7 +385,7 @@ def _found_anew(
         return std
     at = true_positions(unsure, count)
     rows, present, phase, start = rows[at], present[at], phase[at], None if start is None else start[at]
-    energy = (rows.real.square() + rows.imag.square()).sum(-1)
+    energy = power_of(rows).sum(-1)
     half = dealt(energy, 2)
     parts = [torch.where((half == k)[..., None], rows, 0) for k in (0, 1)]
     ends = [find(part, present, start)[0] for part in parts]

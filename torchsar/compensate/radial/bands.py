@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, checked_samples, cis, level_of, real_dtype
+from torchsar.core import Axis, checked_samples, cis, level_of, power_of, real_dtype
 from torchsar.radar import TriangularLadar
 
 # periods over which envelopes are averaged, found by trial: more raise the SNR, fewer follow
@@ -368,7 +368,7 @@ def bands_of(
 
 def _without_echo(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
     """Whether a sweep has much less energy in the window than usual, (..., pulse) bool: no echo."""
-    both = torch.stack([(x.detach().real.square() + x.detach().imag.square()).sum(-1) for x in (up, down)])
+    both = torch.stack([power_of(x.detach()).sum(-1) for x in (up, down)])
     usual = torch.where(alike, both.mean(0), torch.nan).nanmedian(-1, keepdim=True).values
     return both.amin(0) < _FAINT * usual
 
@@ -418,7 +418,7 @@ def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int,
     line = torch.arange(first - 1, first + lines + 1, device=spectrum.device)
     kept = spectrum.gather(-1, mirror * (line + sides[..., None]) % n) * scale
     smooth = kept[..., 1:-1] - (kept[..., :-2] + kept[..., 2:]) / 2
-    power = smooth.real.square() + smooth.imag.square()
+    power = power_of(smooth)
     power = power - power.mean(-1, keepdim=True)
     power = power / power.square().sum(-1, keepdim=True).sqrt().clamp_min(torch.finfo(power.dtype).tiny)
     length = 2 ** math.ceil(math.log2(2 * lines))

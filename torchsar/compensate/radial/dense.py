@@ -16,7 +16,7 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare
 from torchsar.compensate.pulse_phase.homogeneous import power_groups
 from torchsar.compensate.pulse_phase.linking import linked
-from torchsar.core import Estimate, cis
+from torchsar.core import Estimate, cis, power_of
 from torchsar.core.spline import UniformSpline
 
 # Pulses are averaged to about so many blocks, over which the residual phase is smooth; it makes the
@@ -115,7 +115,7 @@ def smooth_walk(rows: Tensor) -> Tensor:
     order = torch.arange(2, min(n // 2, _COSINES) + 2, dtype=real, device=rows.device)
     pulse = (torch.arange(n, dtype=real, device=rows.device) + 0.5) / n
     walks = torch.cos(math.pi * order[:, None] * pulse) * (_WALK_RAD * math.sqrt(30) / math.pi / order[:, None])
-    power = (rows.real.square() + rows.imag.square()).mean(-1)
+    power = power_of(rows).mean(-1)
     member = power_groups(power).to(real)
     cells = member.sum(-1)
     window = torch.hann_window(n + 2, periodic=False, dtype=real, device=rows.device)[1:-1]
@@ -124,7 +124,7 @@ def smooth_walk(rows: Tensor) -> Tensor:
 
     def cost(amplitude: Tensor, floor: float) -> Tensor:
         image = torch.fft.fft(z * cis(-amplitude @ walks)[:, None])
-        spectra = torch.einsum("gtr,trk->gtk", member, image.real.square() + image.imag.square())
+        spectra = torch.einsum("gtr,trk->gtk", member, power_of(image))
         spectra = spectra / or_one(cells)[..., None]
         raised = spectra + floor * spectra.mean(-1, keepdim=True) + torch.finfo(real).tiny
         return (cells * raised.log().sum(-1)).sum() + amplitude.square().sum() / 2

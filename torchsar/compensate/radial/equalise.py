@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import prepare
-from torchsar.core import Estimate, checked_samples, cis, refuse_non_finite_values
+from torchsar.core import Estimate, checked_samples, cis, power_of, refuse_non_finite_values
 
 LEAST_GAIN = 0.05  # least gain of a pulse: a lost pulse is not amplified more than 20 times
 _PAD = 4  # zero-padding of the transform: a peak is then found to an eighth of a cell
@@ -45,8 +45,8 @@ def pulse_gain(data: Tensor) -> Estimate:
     turns = best.to(torch.float64)[..., None] * index / (_PAD * n)
     demodulated = rows * cis((-2 * math.pi * (turns - torch.round(turns))).to(rows.real.dtype))
     level = demodulated.mean(-1)
-    energy = (rows.real.square() + rows.imag.square()).sum(-1)
-    power = level.real.square() + level.imag.square()
+    energy = power_of(rows).sum(-1)
+    power = power_of(level)
     tiny = torch.finfo(power.dtype).tiny
     share = n * power / energy.clamp_min(tiny)
     explained = ((n * power).sum(-1) / energy.sum(-1).clamp_min(tiny)).detach()

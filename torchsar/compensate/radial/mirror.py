@@ -12,7 +12,7 @@ from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweep
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.newton import climbed, step_uphill
 from torchsar.compensate.radial.verdict import Intercept, velocity_estimate
-from torchsar.core import Axis, Estimate, cis, take
+from torchsar.core import Axis, Estimate, cis, power_of, take
 from torchsar.radar import TriangularLadar
 
 _PAD = 2  # zero-padding of the transform, enough for the Newton steps to converge
@@ -169,7 +169,7 @@ def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
     """
     n, per = z.shape[-1], 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s
     spectrum = torch.fft.fft(z.detach(), _PAD * n)
-    power = spectrum.real.square() + spectrum.imag.square()
+    power = power_of(spectrum)
     reach = min(round(_REACH * _PAD * n / bands.time_s.shape[-1]), n // 2)
     best = torch.cat([power[..., -reach:], power[..., : reach + 1]], -1).argmax(-1) - reach
     best = best + _parabola(power, best)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import cis
+from torchsar.core import cis, power_of
 
 
 def climbed(x: Tensor, weights: Tensor, value: Tensor, steps: int) -> Tensor:
@@ -30,7 +30,7 @@ def climbed(x: Tensor, weights: Tensor, value: Tensor, steps: int) -> Tensor:
         turned = x * cis((-value[..., None] * weights).to(w.dtype))
         s0, s1, s2 = turned.sum(-1), (turned * w).sum(-1), (turned * w * w).sum(-1)
         gradient = 2 * (s0.conj() * s1).imag
-        bend = 2 * (s1.real.square() + s1.imag.square() - (s0.conj() * s2).real)
+        bend = 2 * (power_of(s1) - (s0.conj() * s2).real)
         value = value + step_uphill(gradient, bend)
     return value
 

@@ -11,7 +11,7 @@ from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_oth
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.newton import climbed
 from torchsar.compensate.radial.verdict import velocity_estimate
-from torchsar.core import Axis, Estimate, cis
+from torchsar.core import Axis, Estimate, cis, power_of
 from torchsar.radar import TriangularLadar
 
 _PAD = 2  # zero-padding of the transform, enough for the Newton steps to converge
@@ -104,7 +104,7 @@ def _amplitude_slope(x: Tensor, beat_hz: Tensor, bands: Bands) -> Tensor:
     tone = x * cis((-2 * math.pi * beat_hz[..., None] * u).to(x.real.dtype))
     level = tone.mean(-1)
     slope = (level.conj() * (tone * u.to(x.real.dtype)).mean(-1)).real
-    power = (level.real.square() + level.imag.square()).clamp_min(torch.finfo(x.real.dtype).tiny)
+    power = power_of(level).clamp_min(torch.finfo(x.real.dtype).tiny)
     return (slope / power).to(torch.float64) / float(2 * math.pi * u.square().mean())
 
 
@@ -139,7 +139,7 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
     both = torch.stack([bands.up, bands.down], -3)
     m = both.shape[-1]
     spectrum = torch.fft.fft(both.detach(), _PAD * m)
-    power = spectrum.real.square() + spectrum.imag.square()
+    power = power_of(spectrum)
     searched = inside(bands.radar, window_m, _PAD * m, _PAD, both.device)
     centre = torch.where(searched, power.mean((-3, -2), keepdim=True), -1).argmax(-1, keepdim=True)
     distance = (torch.arange(_PAD * m, device=both.device) - centre + _PAD * m // 2) % (_PAD * m) - _PAD * m // 2

@@ -16,7 +16,7 @@ from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, sta
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import Run, Wiener, bright, in_turn
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
-from torchsar.core import Estimate
+from torchsar.core import Estimate, power_of
 
 # standard deviation of the phase from which on it is not ok: a Strehl ratio of exp(-0.25) = 0.78
 ENOUGH_STD_RAD = 0.5
@@ -123,7 +123,7 @@ def scene_cells(rows: Tensor) -> tuple[Tensor, Tensor]:
         The number of image cells and that of range cells, float64 (trial,) each.
     """
     image = torch.fft.fft(rows, norm="ortho")
-    power = (image.real.square() + image.imag.square()).to(torch.float64)
+    power = power_of(image).to(torch.float64)
     noise = power.flatten(-2).median(-1).values[:, None, None] / math.log(2)
     scene = torch.where(power > 12 * noise, power - noise, 0)
     row, tiny = scene.sum(-1), torch.finfo(torch.float64).tiny

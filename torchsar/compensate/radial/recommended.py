@@ -26,7 +26,7 @@ from torchsar.compensate.radial.dense import linked_walk, phase_difference
 from torchsar.compensate.radial.mirror import Intercept, mirror_estimate, refuse_other_intercept
 from torchsar.compensate.radial.polish import ENOUGH_STD_RAD, scene_cells, sharpened
 from torchsar.compensate.radial.trajectory import integrated_range, sweep_motion
-from torchsar.core import Axis, Estimate, host_values, true_positions
+from torchsar.core import Axis, Estimate, host_values, power_of, true_positions
 from torchsar.core.spline import UniformSpline
 from torchsar.focus.triangular import deramp_azimuth, profile_axes
 from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
@@ -226,7 +226,7 @@ def _modulation(lines: Tensor, lit: Tensor) -> Tensor:
 
     lines: (trial, pulse, range); lit: (trial, pulse), bool.
     """
-    power = (lines.real.square() + lines.imag.square()).sum(-1, dtype=torch.float64)
+    power = power_of(lines).sum(-1, dtype=torch.float64)
     count, tiny = lit.sum(-1, keepdim=True).clamp_min(1), torch.finfo(torch.float64).tiny
     mean = (power * lit).sum(-1, keepdim=True) / count
     square = ((power / mean.clamp_min(tiny) - 1).square() * lit).sum(-1) / count[:, 0]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchsar.compensate.radial.bands import Bands, filled
 from torchsar.compensate.radial.newton import climbed
 from torchsar.compensate.radial.trajectory import geometric_velocity_m_s
-from torchsar.core import Axis, Estimate, cis, settle
+from torchsar.core import Axis, Estimate, cis, power_of, settle
 
 Intercept = Literal["known", "record", "free"]
 # SNR of a sweep after compression below which noise may exceed the peak in single periods and the
@@ -65,16 +65,11 @@ def signal_and_noise(bands: Bands, residual_m_s: Tensor) -> tuple[Tensor, Tensor
     weight = weight / weight.sum(-1, keepdim=True).clamp_min(1)
     common = (up * down.conj() * static).mean(-1).abs().to(torch.float64)
     shared = (common * weight).sum(-1)
-    total = (sum(_power(x).mean(-1).to(torch.float64) for x in (up, down)) * weight).sum(-1) / 2
+    total = (sum(power_of(x).mean(-1).to(torch.float64) for x in (up, down)) * weight).sum(-1) / 2
     # the magnitude of a mean of noise is not zero: what noise alone would give counts as no signal
     chance = total / math.sqrt(min(up.shape[-1], 2 * bands.noise_lines))
     signal = torch.where(shared > 1.5 * chance, shared, 0).clamp_max(total)
     return signal, total - signal, common
-
-
-def _power(x: Tensor) -> Tensor:
-    """Squared magnitude."""
-    return x.real.square() + x.imag.square()
 
 
 @torch.no_grad()
@@ -103,7 +98,7 @@ def product_spread(bands: Bands, residual_m_s: Tensor, intercept: Intercept) -> 
     w = -4 * math.pi * radar.carrier_hz / radar.wave_speed_m_s * between_s
     static = cis((-residual_m_s[..., None] * w).to(up.real.dtype))
     power = (up * down.conj() * static).real.to(torch.float64)
-    excess = (_power(up) - _power(down)).to(torch.float64) / 2
+    excess = (power_of(up) - power_of(down)).to(torch.float64) / 2
     # the mean velocity over a time s about the turning point exceeds v there by s^2 / 24 d2v/dt2
     jerk = power * w * (between_s / radar.period_s).square() / 24
     return _fitted(power, excess, w, intercept), _fitted(power, jerk, w, intercept)
@@ -144,7 +139,7 @@ def _product_peaks(bands: Bands) -> tuple[Tensor, Tensor, Tensor]:
     z = z / level.clamp_min(torch.finfo(z.real.dtype).tiny)
     spectrum = torch.fft.fft(z, _PAD * z.shape[-1])
     n = spectrum.shape[-1]
-    bins = _power(spectrum).argmax(-1)
+    bins = power_of(spectrum).argmax(-1)
     bins = torch.where(bins >= n // 2, bins - n, bins)
     per = 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s
     peak = climbed(z, 2 * math.pi * per * u, bins.to(torch.float64) / (n * (u[1] - u[0]) * per), 3)

@@ -19,6 +19,7 @@ from torchsar.core import (
     checked_samples,
     level_of,
     linear_phasor,
+    power_of,
     real_dtype,
     take,
     unit_phasor,
@@ -198,7 +199,7 @@ class _Search:
         for value in self.rates:
             parts = self._segmented(rows * self.chirp(torch.zeros_like(value), value, rows.dtype).conj(), self.segments)
             spectrum = torch.fft.ifft(parts, bins, norm="forward")
-            power, index = (spectrum.real.square() + spectrum.imag.square()).sum(-2).max(-1)
+            power, index = power_of(spectrum).sum(-2).max(-1)
             better = power > best
             best = torch.where(better, power, best)
             frequency = torch.where(better, _signed(index.to(torch.float64), bins) / bins, frequency)
@@ -220,7 +221,7 @@ class _Search:
         spectrum = torch.fft.ifft(
             thin[..., None, :] * unit_phasor(rates[:, None] * (0.5 * t.square()), rows.dtype), bins, norm="forward"
         )
-        power = spectrum.real.square() + spectrum.imag.square()
+        power = power_of(spectrum)
         flat = power.flatten(-2).argmax(-1)
         row, column = flat // bins, flat % bins
         along_f, along_r = take(power, row, -2), take(power.mT, column, -2)
@@ -250,7 +251,7 @@ def _vertex(values: Tensor, index: Tensor, circular: bool) -> Tensor:
 
 def _energy(rows: Tensor) -> Tensor:
     """Energy of the rows of each trial."""
-    return (rows.real.square() + rows.imag.square()).sum((-2, -1))
+    return power_of(rows).sum((-2, -1))
 
 
 def _check(data: Tensor, prf_hz: float, atoms: int, sweep: float, floor_db: float) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchsar.compensate.rotation.motion import Motion, Sampling
 from torchsar.compensate.rotation.unknowns import RotationParameters, Unknowns, Variables
 from torchsar.compensate.rotation.verdicts import warp_phase_error
-from torchsar.core import Signal, block_bytes_of, checked_samples, unit_level
+from torchsar.core import Signal, block_bytes_of, checked_samples, power_of, unit_level
 from torchsar.core.arguments import names_arguments
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier, range_phase
@@ -326,7 +326,7 @@ def _value_and_gradient(cost: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Te
 def _normalised(data: Tensor) -> Tensor:
     """Each trial over its root mean square, so that squares neither underflow nor overflow."""
     unit = unit_level(data)
-    rms = (unit.real.square() + unit.imag.square()).mean((-2, -1), keepdim=True).sqrt()
+    rms = power_of(unit).mean((-2, -1), keepdim=True).sqrt()
     return unit / torch.where(rms > 0, rms, 1)
 
 

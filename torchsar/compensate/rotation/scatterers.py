@@ -30,7 +30,7 @@ from torchsar.compensate.rotation.histories import inverted
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.compensate.rotation.range_response import Envelopes, RangeResponse
-from torchsar.core import real_dtype, reduced_turns
+from torchsar.core import power_of, real_dtype, reduced_turns
 from torchsar.core.warp import least_rate
 
 _OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
@@ -268,7 +268,7 @@ def fit_scatterers(
         elif iteration > max(_SEARCHES):
             # the residual of the last search was larger: the fit had not converged
             image = image_of(residual, sampling, fit.motion, oversampling=1)
-            _, noise = _noise(image.real.square() + image.imag.square(), sampling, fit, present)
+            _, noise = _noise(power_of(image), sampling, fit, present)
         if step is not None:
             fit = _after_step(
                 fit,
@@ -314,7 +314,7 @@ def _new_scatterers(
     At most `bound` per trial, including those already fitted.
     """
     image = image_of(residual, sampling, fit.motion, oversampling=_OVERSAMPLING)
-    power = image.real.square() + image.imag.square()
+    power = power_of(image)
     floor, noise = _noise(power, sampling, fit, present)
     known = (fit.scatterers.amplitude != 0).sum(-1)
     peaks = find_peaks(
