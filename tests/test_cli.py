@@ -46,6 +46,32 @@ def test_list_explains_experiments_systems_stages_keys_and_data(capsys: pytest.C
     assert "rad, rad/s, ...\n" in text and not re.search(r"[^.]\.\.\n", text)
 
 
+@pytest.mark.parametrize(
+    "words, lines",
+    [
+        (["pga_sca"], ["STAGES, compensate", "  pga_sca ", "      kernel", "      windows", "      iter", "      pat"]),
+        (["isal_SNR"], ["EXPERIMENTS", "  isal_snr "]),
+        (["velocity", "stripmap_doppler"], ["EXPERIMENTS", "  stripmap_doppler "]),
+        (
+            ["sampling_hz", "pulse"],
+            ["SYSTEMS", "  stripmap ", "    radar", "      sampling_hz"],
+        ),
+    ],
+)
+def test_list_with_words_shows_the_entries_that_contain_them(
+    words: list[str], lines: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["list", *words]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert len(shown) == len(lines), shown
+    assert all(line.startswith(begin) for line, begin in zip(shown, lines, strict=True)), shown
+
+
+def test_list_with_a_word_that_no_entry_contains_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", "omega_k", "xyzzy"]) == 2
+    assert spoken(capsys) == ["torchsar: no entry of `torchsar list` contains 'omega_k' and 'xyzzy'"]
+
+
 def test_a_method_that_uses_true_values_says_that_a_recording_has_none(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

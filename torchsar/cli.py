@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from torchsar.spelling import entries_with
 from torchsar.study.settings.errors import ConfigError
 
 _MOST = 10_000  # threads or processes, far more than machines have
@@ -99,6 +100,8 @@ def parser() -> argparse.ArgumentParser:
     )
     for name, text in _PRINTED.items():
         commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    words = "only entries that contain all these words, such as `torchsar list omega_k`"
+    commands.choices["list"].add_argument("words", nargs="*", metavar="WORD", help=words)
     one = commands.choices["config"]
     one.add_argument("what", choices=("show", "schema"), help="a packaged config, or the schema of all configs")
     one.add_argument("config", nargs="?", help="name of the packaged config (see `torchsar list`)")
@@ -267,13 +270,17 @@ def _print(options: argparse.Namespace) -> int:
         print(find_config(options.config).read_text(encoding="utf-8").replace("=../schema", "=schema"), end="")
         return 0
     if options.command == "list":
-        print(experiments(), flush=True)  # before the import of torch
+        names = entries_with(options.words, experiments())
+        print(names, end="\n" if names else "", flush=True)  # before the import of torch
     from torchsar.study.table import systems
 
     if options.command == "list":
         from torchsar.study.commands.listing import listing
 
-        print(listing(systems))
+        others = entries_with(options.words, listing(systems))
+        if not names and not others:
+            raise ConfigError(f"no entry of `torchsar list` contains {' and '.join(map(repr, options.words))}")
+        print(others, end="\n" if others else "")
     else:
         from torchsar.schema import config_schema, schema_text
 
