@@ -100,7 +100,7 @@ def parser() -> argparse.ArgumentParser:
     )
     for name, text in _PRINTED.items():
         commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-    words = "only entries that contain all these words, such as `torchsar list omega_k`"
+    words = "only entries that contain all these words, such as `torchsar list stripmap prf_hz`"
     commands.choices["list"].add_argument("words", nargs="*", metavar="WORD", help=words)
     one = commands.choices["config"]
     one.add_argument("what", choices=("show", "schema"), help="a packaged config, or the schema of all configs")

@@ -10,28 +10,28 @@ def entries_with(words: Iterable[str], text: str) -> str:
     """Select the entries of an indented text that contain all words.
 
     Args:
-        words: Words, in any case of letters.
+        words: Parts of words, in any case of letters. One of them stands in the line of the entry,
+            the others there or in the lines to which it belongs.
         text: Lines; those that are indented deeper belong to the one above.
 
     Returns:
-        The lines that contain all words, with the lines that belong to them and those to which they
-        belong; the text itself without words.
+        The entries, with the lines that belong to them and those to which they belong; the text
+        itself without words.
     """
     wanted, found = [word.lower() for word in words], []
-    above: list[tuple[int, str]] = []  # lines to which the next one may belong, not yet in `found`
-    within = None  # indent of the entry whose lines are taken
+    above: list[tuple[int, str]] = []  # indent and text of the lines to which the next one may belong
+    shown = taken = -1  # indent of the last of them in `found`, and of the entry whose lines are taken
     for line in text.splitlines():
         depth = len(line) - len(line.lstrip())
-        if not line or (within is not None and depth <= within):
-            within = None
-        above = [(deep, one) for deep, one in above if deep < depth]
-        if line and within is None and all(word in line.lower() for word in wanted):
-            within = depth
-        if within is None and line:
-            above.append((depth, line))
-        elif line:
-            found += [*(one for _, one in above), line]
-            above = []
+        above = [(deep, one) for deep, one in above if deep < depth and line]
+        shown, taken = min(shown, above[-1][0] if above else -1), taken if depth > taken >= 0 and line else -1
+        here, whole = line.lower(), "\n".join([*(one for _, one in above), line]).lower()
+        if taken < 0 and any(word in here for word in wanted) and all(word in whole for word in wanted):
+            taken = depth
+        if taken >= 0 and line:
+            found += [*(one for deep, one in above if deep > shown), line]
+            shown = depth
+        above.append((depth, line))
     return "\n".join(found) if wanted else text
 
 

@@ -222,21 +222,21 @@ class BenchmarkTable(RecordTable):
 
 class DrawsTable(RecordTable):
     """Time of the draws from every source, and their share of the batch, of a record of
-    `scripts/benchmark.py` for one config.
+    `scripts/benchmark.py`.
     """
 
     def run(self) -> list[nodes.Node]:
         record, lines = self.record(), []
         named = [row for row in record["rows"] if row["name"] and row["part"] in ("batch", "draws")]
         for draws in (row for row in named if row["part"] == "draws"):
-            same = {key: draws[key] for key in ("name", "threads")}
+            same = {key: draws[key] for key in ("config", "device", "name", "threads", "trials")}
             batch = next(row for row in named if row["part"] == "batch" and same.items() <= row.items())
             share = f"{draws['seconds'] / batch['seconds']:.1%}"
-            lines.append((f"`{draws['name']}`", draws["threads"], cell(1e3 * draws["seconds"]), share))
-        machine, one = record["machine"], record["rows"][0]
-        config = one["config"].removeprefix("sweeps/")
-        note = f"`{config}`, batches of {one['trials']} trials; {machine['processor']}; torch {machine['torch']}"
-        return self.shown(("source", ">threads", ">ms", ">of the batch"), lines, note)
+            about = f"`{draws['config'].removeprefix('sweeps/')}`", draws["trials"], f"`{draws['name']}`"
+            lines.append((*about, draws["device"], draws["threads"], cell(1e3 * draws["seconds"]), share))
+        machine = record["machine"]
+        columns = ("config", ">batch", "source", "device", ">threads", ">ms", ">of the batch")
+        return self.shown(columns, lines, f"{machine['processor']}; torch {machine['torch']}")
 
 
 class BusyTable(RecordTable):

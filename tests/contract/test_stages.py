@@ -402,7 +402,9 @@ CASES = [
     Case("chirplet_clean", lambda: ChirpletClean(TURNTABLE, atoms=3), differentiable=False, vmap=False, tolerance=1e-6),
     Case(
         "alternate",
-        lambda: Alternate(2, phase=Turn(Autofocus(), CorrectPulsePhase()), rotation=Turn(CoarseRotation(TURNTABLE))),
+        lambda: Alternate(
+            2, phase=Turn(EntropyFixedPoint(), CorrectPulsePhase()), rotation=Turn(CoarseRotation(TURNTABLE))
+        ),
         differentiable=False,
         vmap=False,
         tolerance=1e-6,

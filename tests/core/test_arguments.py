@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from torchsar import compensate, core, echo, focus, metrics, multichannel, optim, radar, repair, scene
 from torchsar.core.arguments import names_arguments
@@ -103,6 +104,8 @@ def test_the_argument_is_named_only_if_it_is_the_cause() -> None:
         Limits(1.0, words=3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match=r"^Limits: scale must be a Limits or None, got \[2\]$"):
         Limits(1.0, scale=[2])  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"expected str instance"):
+        Limits(1.0, words=range(3))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="low must be below high"):
         Limits(2.0, 1.0)
     with pytest.raises(TypeError, match="missing 1 required"):
@@ -110,6 +113,29 @@ def test_the_argument_is_named_only_if_it_is_the_cause() -> None:
     with pytest.raises(TypeError, match="expected str instance"):
         Limits(1.0, 2.0, (3,))  # pyright: ignore[reportArgumentType]
     assert Limits(None).low is None  # pyright: ignore[reportArgumentType]
+
+
+@names_arguments
+@dataclass
+class Tables:
+    """Tables, the first of which may be a list."""
+
+    first: Tensor
+    second: Tensor
+    limits: Limits | None = None
+
+    def __post_init__(self) -> None:
+        self.first = torch.as_tensor(self.first)
+        assert self.second.ndim and (self.limits is None or self.limits.low)
+
+
+def test_arguments_that_may_be_converted_are_named_only_without_others() -> None:
+    said = r"^Tables: first must be a tensor, got \[1\]; second must be a tensor, got 3$"
+    with pytest.raises(TypeError, match=said):
+        Tables([1], 3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"^Tables: limits must be a Limits or None, got 'x'$"):
+        Tables([1], torch.ones(1), "x")  # pyright: ignore[reportArgumentType]
+    assert Tables([1], torch.ones(1)).first.tolist() == [1]  # pyright: ignore[reportArgumentType]
 
 
 def test_own_sentences_and_what_numbers_may_be_stay() -> None:

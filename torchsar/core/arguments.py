@@ -7,11 +7,13 @@ import inspect
 import numbers
 import re
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sized
 from typing import Any, TypeVar
 
 import numpy as np
 from torch import Tensor
+
+from torchsar.core.memory import is_out_of_memory
 
 _Class = TypeVar("_Class")
 # types that annotations name, and what they are called
@@ -51,7 +53,7 @@ def names_arguments(cls: type[_Class]) -> type[_Class]:
         try:
             init(self, *args, **kwargs)
         except _RAW as error:
-            sentence = "" if _is_own(error) else _fault(init, self, *args, **kwargs)
+            sentence = "" if _is_own(error) or is_out_of_memory(error) else _fault(init, self, *args, **kwargs)
             if sentence:
                 raise TypeError(f"{type(self).__name__}: {sentence}") from error
             raise
@@ -67,12 +69,16 @@ def _is_own(error: Exception) -> bool:
 
 
 def _fault(init: Callable[..., None], *args: Any, **kwargs: Any) -> str:
-    """What is wrong with the first argument that does not fit; empty if all do."""
+    """What is wrong with the first argument that does not fit; empty if all may fit.
+
+    Those that some constructors convert are named, all of them, only if there is no other one.
+    """
     signature = inspect.signature(init)
     try:
         given = signature.bind(*args, **kwargs).arguments
     except TypeError:  # one is missing or unknown, as the error of the call says
         return ""
+    wrong, doubtful = [], []
     for name, value in given.items():
         parameter = signature.parameters[name]
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
@@ -81,11 +87,13 @@ def _fault(init: Callable[..., None], *args: Any, **kwargs: Any) -> str:
         kinds = [kind.strip() for kind in re.sub(r"\[.*?\]+", "", str(parameter.annotation)).split("|")]
         named = [kind for kind in kinds if kind not in _WORDS and kind not in _SEVERAL]
         classes = tuple(found for kind in named if (found := _class_of(kind, init.__globals__)))
-        if len(classes) == len(named) and not _fits(value, kinds) and not isinstance(value, classes):
-            words = {**{kind: _with_article(kind.rpartition(".")[2]) for kind in named}, **_WORDS, **_SEVERAL}
-            expected = " or ".join(dict.fromkeys(words[kind] for kind in kinds))
-            return f"{name} must be {expected}, got {' '.join(repr(value).split())[:60]}"
-    return ""
+        if len(classes) < len(named) or isinstance(value, classes) or _fits(value, kinds):
+            continue
+        words = {**{kind: _with_article(kind) for kind in named}, **_WORDS, **_SEVERAL}
+        expected = " or ".join(dict.fromkeys(words[kind] for kind in kinds))
+        sentence = f"{name} must be {expected}, got {' '.join(repr(value).split())[:60]}"
+        (doubtful if _converts(value, kinds) else wrong).append(sentence)
+    return wrong[0] if wrong else "; ".join(doubtful)
 
 
 def _class_of(kind: str, known: Mapping[str, Any]) -> type | None:
@@ -96,7 +104,7 @@ def _class_of(kind: str, known: Mapping[str, Any]) -> type | None:
 
 
 def _with_article(name: str) -> str:
-    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
+    return f"{'an' if name[0] in 'AEIO' or name.startswith('nn.') else 'a'} {name}"
 
 
 def _fits(value: Any, kinds: list[str]) -> bool:
@@ -106,8 +114,15 @@ def _fits(value: Any, kinds: list[str]) -> bool:
     if isinstance(value, Mapping):
         return "Mapping" in kinds
     several, number = {"Sequence", "list", "tuple"}, {"int", "float", "bool"}
-    if isinstance(value, (list, tuple)):
-        return bool(several & set(kinds))
     if isinstance(value, (np.generic, np.ndarray, Tensor)):
         return bool({"Tensor", *several, *number} & set(kinds))
-    return isinstance(value, numbers.Real) and bool(number & set(kinds))
+    if isinstance(value, (Sized, Iterable)):
+        return bool(several & set(kinds))
+    return isinstance(value, numbers.Real) and bool({"torch.device", *number} & set(kinds))
+
+
+def _converts(value: Any, kinds: list[str]) -> bool:
+    """Whether some code takes a value that is not of these kinds for one that is."""
+    if isinstance(value, (numbers.Number, list, tuple)):
+        return "Tensor" in kinds
+    return callable(value) and "nn.Module" in kinds

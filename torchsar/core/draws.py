@@ -58,11 +58,13 @@ class Draws:
             device. "philox" computes them on their device from the words of the same generator, so
             that only keys are copied: uniform numbers are those of "numpy", normal numbers and
             orders are others. Its normal numbers are equal to rounding on all devices; none lies
-            beyond 6.8 standard deviations. On a CPU long draws take 0.4 to 0.6 times as long, a few
+            beyond 6.8 standard deviations. On a CPU long draws take 0.5 to 0.7 times as long, a few
             numbers of many trials a fraction of the time, and orders several times as long.
             "philox_compiled" computes the normal numbers of "philox", equal to rounding, in a loop
-            made by `torch.compile`, in a third of their time; it takes up to 25 s to make the loop
-            for the first time, and 8 s in later processes. On a CPU it needs a C++ compiler.
+            made by `torch.compile`, in less than half of their time. It takes up to half a minute
+            to make the loop for the first time, and ten seconds in later processes; the loop is
+            used only if it gives the numbers of "philox" in a test. On a CPU it needs a C++
+            compiler.
 
     Raises:
         TypeError: If `trials` is a number instead of indices.

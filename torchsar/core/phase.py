@@ -13,6 +13,8 @@ from torchsar.core.memory import is_out_of_memory
 
 # the distance of float64 numbers of this size is 6e-5 turn
 MAX_TURNS = 4e11
+# measured: number of phasors from which on copies of their parts cost more than strided writing
+_FEW = 1 << 15
 # real dtype of each complex dtype
 _REAL = {torch.complex64: torch.float32, torch.complex128: torch.float64}
 
@@ -46,8 +48,9 @@ def cis(angle_rad: Tensor) -> Tensor:
     Returns:
         Unit phasors of the same shape, complex64 or complex128.
     """
-    if angle_rad.requires_grad or is_traced(angle_rad):
+    if angle_rad.requires_grad or angle_rad.numel() < _FEW or is_traced(angle_rad):
         return torch.complex(torch.cos(angle_rad), torch.sin(angle_rad))
+    # without copies of the parts, whose fresh memory takes as long as the functions
     try:
         parts = angle_rad.new_empty((*angle_rad.shape, 2))
         torch.cos(angle_rad, out=parts[..., 0])

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 # constants of Salmon et al.: multipliers, and what is added to the halves of the key in each round
-_MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
+MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
 _KEY_STEPS = (0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B)
 _ROUNDS = 10
 LOW = (1 << 32) - 1
@@ -45,28 +45,27 @@ def words(keys: Tensor, first: int, count: int) -> Tensor:
     """
     block, skipped = divmod(first, 4)
     blocks = -(-(skipped + count) // 4)
-    counter = torch.arange(block + 1, block + blocks + 1, dtype=torch.int64, device=keys.device)[None]
-    return words_of_blocks(keys, counter)[:, skipped : skipped + count]
-
-
-def words_of_blocks(keys: Tensor, counter: Tensor) -> Tensor:
-    """Compute blocks of four words of Philox4x64-10.
-
-    Args:
-        keys: Halves of keys, (row, 2), as in `words`.
-        counter: Number of each block, (row or 1, block), int64.
-
-    Returns:
-        The words of each row in order, (row, 4 block), int64.
-    """
     # dims of size one are expanded by the operations, which saves most of the first two rounds
+    counter = torch.arange(block + 1, block + blocks + 1, dtype=torch.int64, device=keys.device)[None]
     zero = torch.zeros_like(keys[:, :1])
     a, b, c, d = counter, zero, zero, zero
-    for i in range(_ROUNDS):
-        low_key, high_key = (keys[:, n, None] + _signed(i * step) for n, step in enumerate(_KEY_STEPS))
-        (high_a, low_a), (high_c, low_c) = _product(_MULTIPLIERS[0], a), _product(_MULTIPLIERS[1], c)
+    for low_key, high_key in round_keys(keys[..., None]):
+        (high_a, low_a), (high_c, low_c) = _product(MULTIPLIERS[0], a), _product(MULTIPLIERS[1], c)
         a, b, c, d = high_c ^ b ^ low_key, low_c, high_a ^ d ^ high_key, low_a
-    return torch.stack((a, b, c, d), -1).flatten(-2)
+    return torch.stack((a, b, c, d), -1).flatten(-2)[:, skipped : skipped + count]
+
+
+def round_keys(keys: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Compute the keys of the rounds of Philox4x64-10.
+
+    Args:
+        keys: Low and high halves of keys, (key, 2, ...), int64.
+
+    Yields:
+        The halves of the keys of each round, (key, ...).
+    """
+    for i in range(_ROUNDS):
+        yield keys[:, 0] + _signed(i * _KEY_STEPS[0]), keys[:, 1] + _signed(i * _KEY_STEPS[1])
 
 
 def radius_of(found: Tensor, scale: int) -> Tensor:
