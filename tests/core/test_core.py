@@ -195,6 +195,23 @@ class TestDraws:
         ):
             Draws(7, source=f"{source}s")  # type: ignore[arg-type]
 
+    @pytest.mark.parametrize("dtype", [torch.complex64, torch.float64, torch.bfloat16])
+    def test_threads_do_not_matter(self, source, dtype):
+        draws, threads = Draws(7, trials=range(3), source=source), torch.get_num_threads()
+        try:
+            torch.set_num_threads(2)
+            many = draws.normal("noise", (50_000,), dtype)
+        finally:
+            torch.set_num_threads(threads)
+        assert torch.equal(many, draws.normal("noise", (50_000,), dtype))
+        assert torch.equal(draws.for_trials([2]).normal("noise", (50_000,), dtype), many[2:])
+
+    @pytest.mark.parametrize("dtype", [torch.complex64, torch.float32])
+    def test_no_trials_and_no_numbers(self, source, dtype):
+        draws = Draws(7, trials=range(3), source=source)
+        assert draws.for_trials([]).normal("noise", (4,), dtype).shape == (0, 4)
+        assert draws.normal("noise", (0, 4), dtype).shape == (3, 0, 4)
+
     def test_earlier_draws_do_not_change_a_draw(self, source):
         a, b = Draws(7, source=source), Draws(7, source=source)
         b.uniform("something else", (1000,))

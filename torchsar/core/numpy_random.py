@@ -6,10 +6,14 @@ The functions are those of `torchsar.core.philox`, with normal numbers by numpy'
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
 from torch import Tensor
+
+# numbers from which on trials are drawn by several threads
+_MANY = 1 << 17
 
 
 def normal(keys: Sequence[int], shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -26,8 +30,22 @@ def normal(keys: Sequence[int], shape: Sequence[int], dtype: torch.dtype, device
         ones are circular.
     """
     inner = (*shape, 2) if dtype.is_complex else tuple(shape)
-    x = _stacked([np.asarray(g.standard_normal(inner)) for g in _generators(keys)])
-    return (torch.view_as_complex(x) / 2**0.5 if dtype.is_complex else x).to(device=device, dtype=dtype)
+    out = np.empty((len(keys), *inner), np.float32 if dtype.to_real() == torch.float32 else np.float64)
+
+    def draw(i: int, generator: np.random.Generator) -> None:
+        x = generator.standard_normal(inner)
+        out[i] = x * (1 / 2**0.5) if dtype.is_complex else x
+
+    # numpy draws without the lock of the interpreter
+    threads = min(torch.get_num_threads(), len(keys)) if out.size > _MANY else 1
+    if threads > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(draw, range(len(keys)), _generators(keys)))
+    else:
+        for i, generator in enumerate(_generators(keys)):
+            draw(i, generator)
+    made = torch.from_numpy(out.view(np.result_type(out, np.complex64)) if dtype.is_complex else out)
+    return (made[..., 0] if dtype.is_complex else made).to(device=device, dtype=dtype)
 
 
 def uniform(

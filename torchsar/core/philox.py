@@ -20,7 +20,7 @@ MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
 _KEY_STEPS = (0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B)
 _ROUNDS = 10
 LOW = (1 << 32) - 1
-# words that are processed at a time: in the cache of a CPU, elsewhere in about 300 MiB
+# words that are processed at a time: by a thread of a CPU in its cache, elsewhere in about 300 MiB
 _CPU_BLOCK, _BLOCK = 1 << 15, 1 << 22
 # on a CPU, tensor operations are faster for short rows of many trials, and numpy for all others, as
 # measured
@@ -109,7 +109,7 @@ def _signed(x: int) -> int:
 def _blocks(keys: Sequence[int], count: int, device: torch.device) -> Iterator[tuple[slice, int, Tensor]]:
     """Yield (trials, number of the first word, words), together `count` words per trial."""
     cpu = device.type == "cpu"
-    size = _CPU_BLOCK if cpu else _BLOCK
+    size = _CPU_BLOCK * torch.get_num_threads() if cpu else _BLOCK
     width = max(1, min(count, size))
     height = size // width
     for row in range(0, len(keys), height):
