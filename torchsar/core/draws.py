@@ -58,7 +58,7 @@ class Draws:
             device. "philox" computes them on their device from the words of the same generator, so
             that only keys are copied: uniform numbers are those of "numpy", normal numbers and
             orders are others. Its normal numbers are equal to rounding on all devices; none lies
-            beyond 6.8 standard deviations. On a CPU long draws take 0.5 to 0.7 times as long, a few
+            beyond 6.8 standard deviations. On a CPU long draws take 0.5 to 1.3 times as long, a few
             numbers of many trials a fraction of the time, and orders several times as long.
             "philox_compiled" computes the normal numbers of "philox", equal to rounding, in a loop
             made by `torch.compile`, in less than half of their time. It takes up to half a minute
