@@ -109,9 +109,9 @@ def reason_of(error: Exception, radar: Any) -> str:
     Returns:
         The text of the error in one line, with its kind where the text alone may say too little.
     """
-    if isinstance(error, AttributeError) and radar is not None and error.obj is radar:
+    if isinstance(missing := error.__cause__ or error, AttributeError) and radar is not None and missing.obj is radar:
         return (
-            f"this stage needs radar.{error.name}, which a radar of this system does not have; use a stage of this "
+            f"this stage needs radar.{missing.name}, which a radar of this system does not have; use a stage of this "
             "system"
         )
     text = one_line(error)
