@@ -17,8 +17,7 @@ class ConfigError(ValueError):
 
 def one_line(error: BaseException) -> str:
     """Return the text of an error as one line; that of a KeyError has no quotes around it."""
-    text = error.args[0] if isinstance(error, KeyError) and error.args else error
-    return " ".join(str(text).split())
+    return " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())
 
 
 @contextmanager

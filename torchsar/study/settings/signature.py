@@ -135,6 +135,8 @@ class Section:
         try:
             return self.target(**{**made, **{name: value for name, value in given.items() if "." not in name}})
         except (ValueError, TypeError) as error:
+            if isinstance(lacked := error.__cause__, AttributeError) and any(lacked.obj is x for x in context.values()):
+                raise  # no key is wrong: what the context holds, such as a radar, has no such attribute
             text = one_line(error)
             raise ConfigError(f"{file}: {text if text.startswith(f'{where}.') else f'{where}: {text}'}") from None
 

@@ -114,5 +114,6 @@ def reason_of(error: Exception, radar: Any) -> str:
             f"this stage needs radar.{missing.name}, which a radar of this system does not have; use a stage of this "
             "system"
         )
-    text = one_line(error)
-    return text if text and isinstance(error, _PLAIN) else f"{type(error).__name__}: {text or 'no message'}"
+    return ("" if isinstance(error, _PLAIN) and one_line(error) else f"{type(error).__name__}: ") + (
+        one_line(error) or "no message"
+    )
