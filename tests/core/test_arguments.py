@@ -7,6 +7,7 @@ import pickle
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -123,6 +124,7 @@ class Tables:
     first: Tensor
     second: Tensor
     limits: Limits | None = None
+    content: Any = None
 
     def __post_init__(self) -> None:
         self.first = torch.as_tensor(self.first)
@@ -134,7 +136,7 @@ def test_arguments_that_may_be_converted_are_named_only_without_others() -> None
     with pytest.raises(TypeError, match=said):
         Tables([1], 3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match=r"^Tables: limits must be a Limits or None, got 'x'$"):
-        Tables([1], torch.ones(1), "x")  # pyright: ignore[reportArgumentType]
+        Tables([1], torch.ones(1), "x", content=3)  # pyright: ignore[reportArgumentType]
     assert Tables([1], torch.ones(1)).first.tolist() == [1]  # pyright: ignore[reportArgumentType]
 
 

@@ -209,7 +209,9 @@ class TestDraws:
     @pytest.mark.parametrize("dtype", [torch.complex64, torch.float32])
     def test_no_trials_and_no_numbers(self, source, dtype):
         draws = Draws(7, trials=range(3), source=source)
-        assert draws.for_trials([]).normal("noise", (4,), dtype).shape == (0, 4)
+        none = draws.for_trials([])
+        assert none.normal("noise", (4,), dtype).shape == (0, 4) == none.uniform("u", (4,)).shape
+        assert none.permutation("order", []).shape == (0, 0)
         assert draws.normal("noise", (0, 4), dtype).shape == (3, 0, 4)
 
     def test_earlier_draws_do_not_change_a_draw(self, source):

@@ -197,6 +197,23 @@ def test_one_program_serves_every_state_of_torch(traced: CompileCounter) -> None
     assert 0 < before == traced.frame_count
 
 
+def test_every_number_of_threads_has_a_tested_program(traced: CompileCounter) -> None:
+    """torch.compile makes a limited number of programs of one function, here two."""
+    draws, threads = Draws(3, trials=range(2), source="philox_compiled"), torch.get_num_threads()
+    dtypes = (torch.complex64, torch.float64)
+    expected = [draws.normal("n", (128,), dtype) for dtype in dtypes]
+    tested = philox_compiled._tested.cache_info().currsize
+    try:
+        with torch._dynamo.config.patch(recompile_limit=2):
+            for count in (threads + 1, threads):
+                torch.set_num_threads(count)
+                for dtype, numbers in zip(dtypes, expected, strict=True):
+                    assert torch.equal(draws.normal("n", (128,), dtype), numbers)
+    finally:
+        torch.set_num_threads(threads)
+    assert philox_compiled._tested.cache_info().currsize == tested + 2
+
+
 @pytest.mark.usefixtures("traced")
 def test_the_compiled_loop_stands_where_it_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draws shorter than a row are those of "philox"; others do not call it after the first one."""

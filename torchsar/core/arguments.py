@@ -100,7 +100,9 @@ def _class_of(kind: str, known: Mapping[str, Any]) -> type | None:
     """The class that an annotation names, if instances can be told from others."""
     first, *rest = kind.split(".")
     found = functools.reduce(lambda x, name: getattr(x, name, None), rest, known.get(first))
-    return found if inspect.isclass(found) and not getattr(found, "_is_protocol", False) else None
+    if found is Any or getattr(found, "_is_protocol", False):
+        return None
+    return found if inspect.isclass(found) else None
 
 
 def _with_article(name: str) -> str:

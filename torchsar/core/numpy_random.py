@@ -5,6 +5,7 @@ The functions are those of `torchsar.core.philox`, with normal numbers by numpy'
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# numbers from which on trials are drawn by several threads
-_MANY = 1 << 17
+# numbers of a trial from which on trials are drawn by several threads
+_MANY = 1 << 15
 
 
 def normal(keys: Sequence[int], shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -37,7 +38,7 @@ def normal(keys: Sequence[int], shape: Sequence[int], dtype: torch.dtype, device
         out[i] = x * (1 / 2**0.5) if dtype.is_complex else x
 
     # numpy draws without the lock of the interpreter
-    threads = min(torch.get_num_threads(), len(keys)) if out.size > _MANY else 1
+    threads = min(torch.get_num_threads(), len(keys)) if math.prod(inner) > _MANY else 1
     if threads > 1:
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(draw, range(len(keys)), _generators(keys)))
@@ -64,8 +65,10 @@ def uniform(
     Returns:
         Numbers of shape (trial, *shape).
     """
-    drawn = [np.asarray(g.uniform(low, high, tuple(shape))) for g in _generators(keys)]
-    return _stacked(drawn).to(device=device, dtype=dtype)
+    out = np.empty((len(keys), *shape))
+    for i, generator in enumerate(_generators(keys)):
+        out[i] = generator.uniform(low, high, tuple(shape))
+    return torch.from_numpy(out).to(device=device, dtype=dtype)
 
 
 def permutation(keys: Sequence[int], counts: Sequence[int], device: torch.device) -> Tensor:
@@ -80,16 +83,12 @@ def permutation(keys: Sequence[int], counts: Sequence[int], device: torch.device
         Numbers 0 to count - 1 of each trial in random order, and then those from its count on in
         rising order, (trial, largest count), int64.
     """
-    rows = [
-        np.concatenate([g.permutation(count), np.arange(count, max(counts))])
-        for g, count in zip(_generators(keys), counts, strict=True)
-    ]
-    return _stacked(rows).to(device=device, dtype=torch.int64)
+    longest = max(counts, default=0)
+    out = np.empty((len(keys), longest), np.int64)
+    for row, generator, count in zip(out, _generators(keys), counts, strict=True):
+        row[:] = np.concatenate([generator.permutation(count), np.arange(count, longest)])
+    return torch.from_numpy(out).to(device)
 
 
 def _generators(keys: Sequence[int]) -> list[np.random.Generator]:
     return [np.random.Generator(np.random.Philox(key=key)) for key in keys]
-
-
-def _stacked(arrays: Sequence[np.ndarray]) -> Tensor:
-    return torch.from_numpy(np.stack(arrays))

@@ -65,7 +65,8 @@ def normal(keys: Sequence[int], shape: Sequence[int], dtype: torch.dtype, device
     if not keys or count < per_word * _WIDTH or dtype not in _REAL:
         return philox.normal(keys, shape, dtype, device)
     with torch.inference_mode(False), torch.no_grad():  # one program serves for all
-        loop = _tested(per_word, _REAL[dtype], device)
+        # torch.compile makes another program for each of the other states
+        loop = _tested(per_word, _REAL[dtype], device, torch.get_num_threads(), torch.get_default_dtype())
         return _drawn(loop, keys, count, dtype, device).reshape(len(keys), *shape)
 
 
@@ -87,8 +88,8 @@ def _drawn(loop: Loop, keys: Sequence[int], count: int, dtype: torch.dtype, devi
 
 
 @cache
-def _tested(scale: int, dtype: torch.dtype, device: torch.device) -> Loop:
-    """The loop, once it gives the numbers of `philox`."""
+def _tested(scale: int, dtype: torch.dtype, device: torch.device, *_: object) -> Loop:
+    """The loop for this state of torch, once it gives the numbers of `philox`."""
     loop, drawn = _compiled(scale, dtype), dtype.to_complex() if scale == 1 else dtype
     count = _TEST_ROWS * _WIDTH * scale
     found = _drawn(loop, _TEST_KEYS, count, drawn, device)
@@ -111,6 +112,8 @@ def _compiled(scale: int, dtype: torch.dtype) -> Loop:
         cosine, sine = _cosine_and_sine(words & LOW)
         return (cosine * radius).to(dtype), (sine * radius).to(dtype)
 
+    # programs of one code object are limited in number
+    parts.__code__ = parts.__code__.replace()
     program = torch.compile(parts, fullgraph=True, dynamic=True, options={"cpp.dynamic_threads": True})
 
     def loop(rounds: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
