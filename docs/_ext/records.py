@@ -200,10 +200,12 @@ class BenchmarkTable(RecordTable):
 
     def run(self) -> list[nodes.Node]:
         record, lines = self.record(), []
-        whole = [row for row in record["rows"] if row["part"] == "batch" and row["threads"] == 1]
+        # those of `--random` are in a table of their own
+        usual = [row for row in record["rows"] if row["part"] not in ("batch", "draws") or not row["name"]]
+        whole = [row for row in usual if row["part"] == "batch" and row["threads"] == 1]
         for batch in whole:
             same = {key: batch[key] for key in ("config", "threads", "device")}
-            rows = [row for row in record["rows"] if same.items() <= row.items()]
+            rows = [row for row in usual if same.items() <= row.items()]
             part = {row["part"]: row for row in rows}
             stages = [row for row in rows if row["part"] == "stage" and row["name"].startswith("recommended.")]
             slowest = max(stages, key=lambda row: row["seconds"])

@@ -97,7 +97,7 @@ def _fault(init: Callable[..., None], *args: Any, **kwargs: Any) -> str:
 
 
 def _class_of(kind: str, known: Mapping[str, Any]) -> type | None:
-    """The class that an annotation names, if instances can be told from others."""
+    """The class that an annotation names, if `isinstance` can judge by it."""
     first, *rest = kind.split(".")
     found = functools.reduce(lambda x, name: getattr(x, name, None), rest, known.get(first))
     if found is Any or getattr(found, "_is_protocol", False):
