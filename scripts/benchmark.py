@@ -222,6 +222,7 @@ def machine() -> Row:
     """What the figures depend on."""
     about: Row = {"python": platform.python_version(), "torch": torch.__version__, "system": platform.platform()}
     about |= {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+    about["vectors"] = torch.backends.cpu.get_cpu_capability()
     if torch.cuda.is_available():
         about["cuda"] = torch.cuda.get_device_name()
     return about

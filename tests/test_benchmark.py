@@ -25,7 +25,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_part_of_a_config_is_measured(result: Path) -> None:
     found = json.loads(result.read_text(encoding="utf-8"))
-    assert not found["failed"] and {"torch", "processor", "cores"} <= found["machine"].keys()
+    assert not found["failed"] and {"torch", "processor", "vectors", "cores"} <= found["machine"].keys()
     rows = found["rows"]
     assert {row["part"] for row in rows} == {"echo", "draws", "stage", "metrics", "batch", "memory"}
     stages = [row for row in rows if row["part"] == "stage"]

@@ -238,7 +238,8 @@ class DrawsTable(RecordTable):
             lines.append((*about, draws["device"], draws["threads"], cell(1e3 * draws["seconds"]), share))
         machine = record["machine"]
         columns = ("config", ">batch", "source", "device", ">threads", ">ms", ">of the batch")
-        return self.shown(columns, lines, f"{machine['processor']}; torch {machine['torch']}")
+        about = f"{machine['processor']} with {machine['vectors']}; torch {machine['torch']}"
+        return self.shown(columns, lines, about)
 
 
 class BusyTable(RecordTable):

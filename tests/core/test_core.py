@@ -191,7 +191,7 @@ class TestDraws:
 
     def test_an_unknown_source_is_refused(self, source):
         with pytest.raises(
-            ValueError, match=f"source of Draws must be one of 'numpy', 'philox', 'philox_compiled', got '{source}s'"
+            ValueError, match=f"source of Draws must be one of 'numpy', 'philox', 'threefry', got '{source}s'"
         ):
             Draws(7, source=f"{source}s")  # type: ignore[arg-type]
 

@@ -331,7 +331,7 @@ def test_a_sweep_draws_from_its_source_and_goes_on_with_no_other(tmp_path: Path)
     assert longer.about["random"] == "philox" and longer.metrics["x"][0, :3].tolist() == expected.tolist()
     with pytest.raises(ConfigError, match="random was philox and is absent"):
         sweep(drawn, {}, trials=3, out=tmp_path / "philox", resume=True)
-    with pytest.raises(ConfigError, match="random must be one of numpy, philox, philox_compiled, got 'mersenne'"):
+    with pytest.raises(ConfigError, match="random must be one of numpy, philox, threefry, got 'mersenne'"):
         sweep(drawn, {}, random="mersenne")  # type: ignore[arg-type]
 
 

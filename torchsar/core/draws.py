@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import numpy_random, philox, philox_compiled
+from torchsar.core import numpy_random, philox, threefry
 
-Source = Literal["numpy", "philox", "philox_compiled"]
-_SOURCES = {"numpy": numpy_random, "philox": philox, "philox_compiled": philox_compiled}
+Source = Literal["numpy", "philox", "threefry"]
+_SOURCES = {"numpy": numpy_random, "philox": philox, "threefry": threefry}
 
 
 def generator_at(*address: str | int) -> np.random.Generator:
@@ -44,8 +44,7 @@ class Draws:
     The address of a draw is (seed, purpose, case, trial), where the purpose is the name of the
     quantity that is drawn. A draw therefore does not depend on draws made before it, on the
     division of trials into chunks, or on the device; a repeated draw gives the same numbers.
-    Numbers are drawn in float64 and then converted, so that all precisions and devices see the same
-    noise.
+    All precisions and devices see the same noise, up to rounding.
 
     Args:
         seed: Seed of the whole study.
@@ -58,13 +57,16 @@ class Draws:
             device. "philox" computes them on their device from the words of the same generator, so
             that only keys are copied: uniform numbers are those of "numpy", normal numbers and
             orders are others. Its normal numbers are equal to rounding on all devices; none lies
-            beyond 6.8 standard deviations. On a CPU long draws take 0.5 to 1.3 times as long, a few
+            beyond 6.8 standard deviations. On a CPU long draws take 0.5 to 2.3 times as long, a few
             numbers of many trials a fraction of the time, and orders several times as long.
-            "philox_compiled" computes the normal numbers of "philox", equal to rounding, in a loop
-            made by `torch.compile`, in less than half of their time. It takes up to half a minute
-            to make the loop for the first time, and ten seconds in later processes; the loop is
-            used only if it gives the numbers of "philox" in a test. On a CPU it needs a C++
-            compiler.
+            "threefry" draws the normal numbers of a trial, if they are at least 16,384 complex or
+            32,768 real ones, in a loop made by `torch.compile`; all others are those of "philox".
+            On a CPU with AVX2 long draws took a sixth of the time of "numpy" in single precision,
+            and as much in double precision. Numbers of single precision are computed in it. It
+            takes half a minute to make the loop of a precision for the first time, and five seconds
+            in later processes; the loop is used only if it gives the expected numbers in a test. On
+            a CPU it needs a C++ compiler. The numbers depend on how many there are: the halves of a
+            draw are made together.
 
     Raises:
         TypeError: If `trials` is a number instead of indices.

@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 # constants of Salmon et al.: multipliers, and what is added to the halves of the key in each round
-MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
+_MULTIPLIERS = (0xD2E7470EE14C6C93, 0xCA5A826395121157)
 _KEY_STEPS = (0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B)
 _ROUNDS = 10
-LOW = (1 << 32) - 1
+_LOW = (1 << 32) - 1
 # words that are processed at a time: by a thread of a CPU in its cache, elsewhere in about 300 MiB
 _CPU_BLOCK, _BLOCK = 1 << 15, 1 << 22
 # on a CPU, tensor operations are faster for short rows of many trials, and numpy for all others, as
@@ -49,56 +49,24 @@ def words(keys: Tensor, first: int, count: int) -> Tensor:
     counter = torch.arange(block + 1, block + blocks + 1, dtype=torch.int64, device=keys.device)[None]
     zero = torch.zeros_like(keys[:, :1])
     a, b, c, d = counter, zero, zero, zero
-    for low_key, high_key in round_keys(keys[..., None]):
-        (high_a, low_a), (high_c, low_c) = _product(MULTIPLIERS[0], a), _product(MULTIPLIERS[1], c)
+    for i in range(_ROUNDS):
+        low_key, high_key = (keys[:, n, None] + _signed(i * step) for n, step in enumerate(_KEY_STEPS))
+        (high_a, low_a), (high_c, low_c) = _product(_MULTIPLIERS[0], a), _product(_MULTIPLIERS[1], c)
         a, b, c, d = high_c ^ b ^ low_key, low_c, high_a ^ d ^ high_key, low_a
     return torch.stack((a, b, c, d), -1).flatten(-2)[:, skipped : skipped + count]
 
 
-def round_keys(keys: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Compute the keys of the rounds of Philox4x64-10.
-
-    Args:
-        keys: Low and high halves of keys, (key, 2, ...), int64.
-
-    Yields:
-        The halves of the keys of each round, (key, ...).
-    """
-    for i in range(_ROUNDS):
-        yield keys[:, 0] + _signed(i * _KEY_STEPS[0]), keys[:, 1] + _signed(i * _KEY_STEPS[1])
-
-
-def radius_of(found: Tensor, scale: int) -> Tensor:
-    """Compute the square root of -`scale` log(u), with u from the high 32 bits of each word.
-
-    Args:
-        found: Words, int64.
-        scale: 1 for complex numbers, 2 for real ones.
-
-    Returns:
-        Radii of Box and Muller in float64, in the shape of the words.
-    """
-    return upper(found).to(torch.float64).add_(0.5).mul_(2.0**-32).log_().mul_(-scale).sqrt_()
-
-
 def _product(a: int, b: Tensor) -> tuple[Tensor, Tensor]:
     """High and low 64 bits of the product of an unsigned number and unsigned numbers in int64."""
-    high_a, low_a, high_b, low_b = a >> 32, a & LOW, upper(b), b & LOW
-    middle = high_a * low_b + upper(low_a * low_b)
-    other = low_a * high_b + (middle & LOW)
-    return high_a * high_b + upper(middle) + upper(other), b * _signed(a)
+    high_a, low_a, high_b, low_b = a >> 32, a & _LOW, _upper(b), b & _LOW
+    middle = high_a * low_b + _upper(low_a * low_b)
+    other = low_a * high_b + (middle & _LOW)
+    return high_a * high_b + _upper(middle) + _upper(other), b * _signed(a)
 
 
-def upper(x: Tensor) -> Tensor:
-    """Take the high 32 bits, as a logical shift does.
-
-    Args:
-        x: Bits of unsigned numbers, int64.
-
-    Returns:
-        Numbers from 0 to 2**32 - 1.
-    """
-    return (x >> 32) & LOW
+def _upper(x: Tensor) -> Tensor:
+    """The high 32 bits, as a logical shift gives them."""
+    return (x >> 32) & _LOW
 
 
 def _signed(x: int) -> int:
@@ -161,8 +129,9 @@ def normal(keys: Sequence[int], shape: Sequence[int], dtype: torch.dtype, device
     count, per_word = math.prod(shape), 1 if dtype.is_complex else 2
     out = torch.empty(len(keys), count, dtype=dtype, device=device)
     for rows, first, found in _blocks(keys, -(-count // per_word), device):
-        radius = radius_of(found, per_word)
-        angle = (found & LOW).to(torch.float64).mul_(2 * math.pi * 2.0**-32)
+        unit = _upper(found).to(torch.float64).add_(0.5).mul_(2.0**-32)
+        radius = unit.log_().mul_(-per_word).sqrt_()
+        angle = (found & _LOW).to(torch.float64).mul_(2 * math.pi * 2.0**-32)
         both = torch.complex(angle.cos().mul_(radius), angle.sin_().mul_(radius))
         made = both if dtype.is_complex else torch.view_as_real(both).flatten(-2)
         place = out[rows, first * per_word : (first + found.shape[1]) * per_word]

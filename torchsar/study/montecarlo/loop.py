@@ -201,7 +201,7 @@ def sweep(
             it uses are unchanged; see `torchsar.core.fingerprint`. Give a version if these change
             without an effect on the results, or if results depend on more than these.
         random: Source of the random numbers: "numpy" draws them on the CPU, "philox" and
-            "philox_compiled" compute other numbers on the device where they are used; see
+            "threefry" compute other numbers on the device where they are used; see
             `torchsar.Draws`.
 
     Returns:

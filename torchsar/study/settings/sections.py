@@ -149,7 +149,7 @@ class Config(Strict):
     Fields:
         seed: Seed of all random numbers of the world.
         random: Source of these numbers: `numpy` draws them on the CPU, `philox` and
-            `philox_compiled` compute other numbers on the device of the trials; see
+            `threefry` compute other numbers on the device of the trials; see
             `torchsar.Draws`.
         cases: Values by dotted key that each case changes, by name of the case.
         beyond_limits: Methods that are deliberately used beyond their limits.
