@@ -62,11 +62,11 @@ class Draws:
             "threefry" draws the normal numbers of a trial, if they are at least 16,384 complex or
             32,768 real ones, in a loop made by `torch.compile`; all others are those of "philox".
             On a CPU with AVX2 long draws took a sixth of the time of "numpy" in single precision,
-            and as much in double precision. Numbers of single precision are computed in it. It
-            takes half a minute to make the loop of a precision for the first time, and five seconds
-            in later processes; the loop is used only if it gives the expected numbers in a test. On
-            a CPU it needs a C++ compiler. The numbers depend on how many there are: the halves of a
-            draw are made together.
+            and about the same time in double precision. Numbers of single precision are computed in
+            it. It takes half a minute to make the loop of a precision for the first time, and five
+            seconds in later processes; the loop is used only if it gives the expected numbers in a
+            test. On a CPU it needs a C++ compiler. The numbers depend on how many there are: the
+            halves of a draw are made together.
 
     Raises:
         TypeError: If `trials` is a number instead of indices.
