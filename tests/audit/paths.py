@@ -107,7 +107,7 @@ def strip_autofocus(data: Signal, **known: Tensor) -> Estimate:
     found = StripAutofocus(**of_strips.STRIP)(data, **known)
     seen = of_strips.judged()
     value, std = ({key: x[..., seen] for key, x in of.items() if x.ndim == 2} for of in (found.value, found.std))
-    return Estimate(value, found.quality, found.ok, std)
+    return Estimate(value, std, found.quality, found.outcome)
 
 
 def abeam(found: Tensor, truth: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from tests.echo.ladars import COMMON, direct_sweeps, table1
 from torchsar.compensate import compensate_motion, integrated_range, radial_motion, range_error, turning_points
 from torchsar.compensate.radial.compensate import polynomial_phasor
 from torchsar.compensate.radial.trajectory import sweep_motion
-from torchsar.core import Axis, Estimate
+from torchsar.core import Axis, Estimate, Outcome
 from torchsar.focus import compress_sweeps
 from torchsar.radar import sweep_middles
 from torchsar.scene import Polynomial, Scatterers, displacement_m
@@ -147,7 +147,12 @@ def test_range_error_adds_velocities_and_phases() -> None:
     bump = 3e-8 * torch.sin(2 * math.pi * 5 * torch.arange(64, dtype=torch.float64) / 64)
     phase = 4 * math.pi / RADAR.wavelength_m * bump
     one = torch.ones((), dtype=torch.bool)
-    both = range_error(Estimate({"velocity_m_s": v, "phase_rad": phase}, one.double(), one), RADAR, pulse, at)
+    both = range_error(
+        Estimate({"velocity_m_s": v, "phase_rad": phase}, quality=one.double(), outcome=Outcome.of(one, Outcome.NOISE)),
+        RADAR,
+        pulse,
+        at,
+    )
     torch.testing.assert_close(
         both, position(at) - position(turning_points(RADAR, pulse).values()[:1]) + bump, atol=1e-12, rtol=0
     )
@@ -158,8 +163,12 @@ def test_phase_has_the_sign_of_the_range() -> None:
     sweeps, pulse, truth = seen(n=128, trials=2, snr_db=0.0)
     found = radial_motion(sweeps, RADAR, pulse, window_m=GATE)
     middle = sweep_middles(RADAR, pulse)[0]
-    alone = Estimate({"velocity_m_s": found["velocity_m_s"]}, found.quality, found.ok)
-    wrong = Estimate({"velocity_m_s": found["velocity_m_s"], "phase_rad": -found["phase_rad"]}, found.quality, found.ok)
+    alone = Estimate({"velocity_m_s": found["velocity_m_s"]}, quality=found.quality, outcome=found.outcome)
+    wrong = Estimate(
+        {"velocity_m_s": found["velocity_m_s"], "phase_rad": -found["phase_rad"]},
+        quality=found.quality,
+        outcome=found.outcome,
+    )
     error = [
         float(rms(without_line(range_error(e, RADAR, pulse, middle) - truth.values["range_error_up_m"])).mean())
         for e in (found, alone, wrong)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from torchsar.core import Alternate, Axis, Chain, Estimate, Signal, Stage, Turn, use
+from torchsar.core import Alternate, Axis, Chain, Estimate, Outcome, Signal, Stage, Turn, use
 
 F64 = torch.float64
 
@@ -27,10 +27,10 @@ class Mean(Stage):
         found = signal.data.real.mean((-2, -1)).to(F64)
         return Estimate(
             {"mean": found},
-            torch.full_like(found, self.quality),
-            torch.full(found.shape, self.ok),
             {"mean": 0 * found + 0.1},
-            {"steps": 0 * found + 3},
+            torch.full_like(found, self.quality),
+            Outcome.of(torch.full(found.shape, self.ok), Outcome.NOISE),
+            info={"steps": 0 * found + 3},
         )
 
 
@@ -42,7 +42,11 @@ class Slope(Stage):
     def forward(self, signal: Signal) -> Estimate:
         pulse = torch.arange(signal.data.shape[-2], dtype=F64)
         found = (signal.data.real.mean(-1) * pulse).sum(-1) / pulse.square().sum()
-        return Estimate({"slope": found}, torch.full_like(found, 0.9), torch.ones(found.shape, dtype=torch.bool))
+        return Estimate(
+            {"slope": found},
+            quality=torch.full_like(found, 0.9),
+            outcome=Outcome.of(torch.ones(found.shape, dtype=torch.bool), Outcome.NOISE),
+        )
 
 
 class WithoutMean(Stage):
@@ -67,7 +71,7 @@ class Dependent(Stage):
     provides = ("copy",)
 
     def forward(self, signal: Signal, slope: Tensor) -> Estimate:
-        return Estimate({"copy": slope}, slope, slope > 0)
+        return Estimate({"copy": slope}, quality=slope, outcome=Outcome.of(slope > 0, Outcome.NOISE))
 
 
 def lines(mean: Tensor, slope: Tensor) -> Signal:

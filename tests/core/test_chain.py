@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from tests.helpers import small_radar, small_recording
-from torchsar.core import Axis, Chain, Draws, Estimate, Signal, Stage, use
+from torchsar.core import Axis, Chain, Draws, Estimate, Outcome, Signal, Stage, use
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK
 from torchsar.metrics import entropy
@@ -24,7 +24,11 @@ class LagOneDoppler(Stage):
         x = signal.data
         lag = (x[..., 1:, :] * x[..., :-1, :].conj()).sum((-2, -1))
         value = torch.angle(lag).double() / (2 * torch.pi * signal.axis("pulse").step)
-        return Estimate({"doppler_hz": value}, torch.ones_like(value), torch.ones_like(value, dtype=torch.bool))
+        return Estimate(
+            {"doppler_hz": value},
+            quality=torch.ones_like(value),
+            outcome=Outcome.of(torch.ones_like(value, dtype=torch.bool), Outcome.NOISE),
+        )
 
 
 class GivenVelocity(Stage):
@@ -34,7 +38,11 @@ class GivenVelocity(Stage):
 
     def forward(self, signal: Signal) -> Estimate:
         value = torch.full(signal.trials, 118.0, dtype=torch.float64)
-        return Estimate({"velocity_m_s": value}, torch.ones_like(value), torch.ones_like(value, dtype=torch.bool))
+        return Estimate(
+            {"velocity_m_s": value},
+            quality=torch.ones_like(value),
+            outcome=Outcome.of(torch.ones_like(value, dtype=torch.bool), Outcome.NOISE),
+        )
 
 
 def squinted_chain(radar):

@@ -13,7 +13,7 @@ from torch._functorch.aot_autograd import make_boxed_func
 from torch._inductor import compile_fx
 
 from tests.helpers import compiles_stages
-from torchsar.core import Axis, Chain, Estimate, Signal, Stage, host_value, untraced, use
+from torchsar.core import Axis, Chain, Estimate, Outcome, Signal, Stage, host_value, untraced, use
 
 pytestmark = compiles_stages
 
@@ -41,7 +41,7 @@ class Level(Stage):
 
     def forward(self, signal: Signal) -> Estimate:
         level = signal.data.abs().mean((-2, -1))
-        return Estimate({"level": level}, torch.ones_like(level), level > 0)
+        return Estimate({"level": level}, quality=torch.ones_like(level), outcome=Outcome.of(level > 0, Outcome.NOISE))
 
 
 class Divide(Stage):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.core import Alternate, Axis, Chain, Estimate, Signal, Stage, Turn, use
+from torchsar.core import Alternate, Axis, Chain, Estimate, Outcome, Signal, Stage, Turn, use
 
 F64 = torch.float64
 OK = torch.tensor([True, False, True])
@@ -26,7 +26,7 @@ class Level(Stage):
 
     def forward(self, signal: Signal, level: Tensor | None = None) -> Estimate:
         value = {"level": signal.data.real.mean(-1), "count": torch.full(signal.trials, 7)}
-        return Estimate(value, self.ok.double(), self.ok)
+        return Estimate(value, quality=self.ok.double(), outcome=self.outcome)
 
 
 class Free(Level):
@@ -49,7 +49,9 @@ class Double(Stage):
     neutral = {"factor": 1.0}
 
     def forward(self, signal: Signal) -> tuple[Signal, Estimate]:
-        return signal.with_data(2 * signal.data), Estimate({"factor": 2.0 * OK.double() + 1}, OK.double(), OK)
+        return signal.with_data(2 * signal.data), Estimate(
+            {"factor": 2.0 * OK.double() + 1}, quality=OK.double(), outcome=Outcome.of(OK, Outcome.NOISE)
+        )
 
 
 def pulses(**kwargs: bool) -> Signal:
@@ -130,10 +132,15 @@ def test_a_given_estimate_of_a_function_has_the_neutral_values_of_the_stage() ->
     """A function returns its Estimate without neutral values."""
     x, chain = pulses(), Chain(level=Level(), correct=use(Subtract(), level="level"))
     bare = Level()(x)
-    bare = Estimate(bare.value, bare.quality, bare.ok)
+    bare = Estimate(bare.value, quality=bare.quality, outcome=bare.outcome)
     assert torch.equal(chain(x, given={"level": bare}).data, chain(x).data)
     with pytest.raises(ValueError, match=r"'level' of the estimate 'level' must begin with the trial dimensions"):
-        chain(x, given={"level": Estimate(bare.value, bare.quality[:2], bare.ok[:2])})
+        chain(
+            x,
+            given={
+                "level": Estimate(bare.value, quality=bare.quality[:2], outcome=Outcome.of(bare.ok[:2], Outcome.NOISE))
+            },
+        )
     with pytest.raises(TypeError, match="`given` must map names"):
         chain(x, given=[bare])  # pyright: ignore[reportArgumentType]
 

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 import torchsar
-from torchsar.core import Axis, Estimate, Recording, Signal, Stage, Truth, use
+from torchsar.core import Axis, Estimate, Outcome, Recording, Signal, Stage, Truth, use
 from torchsar.core.show import in_bytes, some_of
 
 AXES = (Axis("pulse", 4, 0.0, 0.5, "s"), Axis("range", 1000, 700e3, 0.6, "m"))
@@ -25,7 +25,7 @@ class Gain(Stage):
     def forward(self, x: Signal) -> Estimate:
         trials = x.data.new_zeros(x.trials).real
         ok = torch.arange(trials.numel()).reshape(trials.shape) > 0
-        return Estimate({"gain_db": trials + 3}, trials, ok, {"gain_db": trials + 0.25})
+        return Estimate({"gain_db": trials + 3}, {"gain_db": trials + 0.25}, trials, Outcome.of(ok, Outcome.NOISE))
 
 
 class Amplify(nn.Module):
@@ -94,7 +94,11 @@ def test_a_text_that_is_too_long_has_a_line_for_each_part() -> None:
 
 
 def test_one_number_of_an_estimate_is_shown_and_several_are_not() -> None:
-    one = Estimate({"doppler_hz": torch.tensor(24.9)}, torch.ones(()), torch.tensor(True))
+    one = Estimate(
+        {"doppler_hz": torch.tensor(24.9)},
+        quality=torch.ones(()),
+        outcome=Outcome.of(torch.tensor(True), Outcome.NOISE),
+    )
     assert repr(one) == "Estimate(ok in 1 of 1, cpu; doppler_hz: 24.9)"
     shown = repr(objects()["estimate"])
     assert shown == "Estimate(ok in 2 of 3, cpu; gain_db: float32 (3,), standard deviation float32 (3,))"
@@ -140,7 +144,15 @@ def test_objects_are_shown_within_vmap() -> None:
     seen = []
 
     def look(x: Signal) -> Signal:
-        seen.append(repr(Estimate({"a_m": x.data.real[0, 0]}, x.data.real[0, 0], x.data.real[0, 0] > 0)))
+        seen.append(
+            repr(
+                Estimate(
+                    {"a_m": x.data.real[0, 0]},
+                    quality=x.data.real[0, 0],
+                    outcome=Outcome.of(x.data.real[0, 0] > 0, Outcome.NOISE),
+                )
+            )
+        )
         return x
 
     torch.func.vmap(look)(signal(3))

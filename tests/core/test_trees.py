@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, default_collate
 
 from tests.helpers import small_radar, small_recording
 from torchsar.compensate import CorrectPulsePhase, Sca
-from torchsar.core import Axis, Estimate, Recording, Signal, Truth
+from torchsar.core import Axis, Estimate, Outcome, Recording, Signal, Truth
 from torchsar.focus import OmegaK
 from torchsar.metrics import entropy
 
@@ -62,7 +62,12 @@ def test_vmap_maps_recordings_and_returns_estimates() -> None:
     def found(signal: Signal) -> Estimate:
         power = signal.data.abs().square().sum((-2, -1))
         ok, name = power > 0, "power"
-        return Estimate({name: power}, power / (1 + power), ok, neutral={name: 0.5, "other": torch.zeros(())})
+        return Estimate(
+            {name: power},
+            quality=power / (1 + power),
+            outcome=Outcome.of(ok, Outcome.NOISE),
+            neutral={name: 0.5, "other": torch.zeros(())},
+        )
 
     one, whole = vmap(found)(made.signal), found(made.signal)
     same(replace(one, neutral={}), replace(whole, neutral={}))

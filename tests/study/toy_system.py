@@ -15,7 +15,7 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Draws, Estimate, Recording, Signal, Stage, Trace, unit_phasor
+from torchsar.core import Axis, Draws, Estimate, Outcome, Recording, Signal, Stage, Trace, unit_phasor
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics.bounds import tone_frequency_bound_hz
@@ -81,7 +81,12 @@ def strongest_line(x: Tensor, sample_rate_hz: float, padding: int) -> Estimate:
     rest = (x.abs().double().square().sum(-1) - power / n).clamp_min(1e-12 * power) / n
     q = power / (n * rest)
     std = torch.hypot(tone_frequency_bound_hz(q, n / sample_rate_hz), _step_hz(sample_rate_hz, n, padding) / 12**0.5)
-    return Estimate({"frequency_hz": frequency}, q / (1 + q), q > 10 ** (DETECTION_DB / 10), {"frequency_hz": std})
+    return Estimate(
+        {"frequency_hz": frequency},
+        {"frequency_hz": std},
+        q / (1 + q),
+        Outcome.of(q > 10 ** (DETECTION_DB / 10), Outcome.NOISE),
+    )
 
 
 def _step_hz(sample_rate_hz: float, samples: int, padding: int) -> Tensor:

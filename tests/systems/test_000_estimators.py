@@ -186,7 +186,10 @@ def test_experiment_a_stripmap_at_20_db(seed) -> None:
     assert bool(found.ok)
     polished, plain = (
         middle_point(radar, sweeps, pulse, e)["pslr_azimuth_db"]
-        for e in (found, Estimate({"velocity_m_s": found["velocity_m_s"]}, found.quality, found.ok))
+        for e in (
+            found,
+            Estimate({"velocity_m_s": found["velocity_m_s"]}, quality=found.quality, outcome=found.outcome),
+        )
     )
     assert polished < -13.0 and polished < plain + 0.05
 
@@ -254,7 +257,7 @@ def test_polish_after_any_estimator() -> None:
             CompressSweeps(RADAR, window_m=(1.0, 2.0))(Signal(still, RADAR.sweep_axes(256)))
         )
         fine = phase_polish(profiles.data, start=pga(profiles.data)["phase_rad"] if name == "correlation" else None)
-        both = Estimate({**coarse.value, **fine.value}, fine.quality, fine.ok)
+        both = Estimate({**coarse.value, **fine.value}, quality=fine.quality, outcome=fine.outcome)
         assert bool(fine.ok) and float(range_rms(both, truth, RADAR, pulse)) < 2e-9 < float(
             range_rms(coarse, truth, RADAR, pulse)
         ), name

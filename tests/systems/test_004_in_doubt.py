@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchsar.compensate import CorrectPulsePhase, DopplerCentroid, Sca
-from torchsar.core import Chain, Draws, Estimate, Signal, use
+from torchsar.core import Chain, Draws, Estimate, Outcome, Signal, use
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK
 from torchsar.metrics import entropy
@@ -32,7 +32,7 @@ class Distrusted(Sca):
 
     def forward(self, signal: Signal) -> Estimate:
         found = super().forward(signal)
-        return replace(found, ok=torch.zeros_like(found.ok))
+        return replace(found, outcome=Outcome.NOISE.like(found.outcome))
 
 
 @pytest.fixture(scope="module")

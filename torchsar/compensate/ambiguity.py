@@ -39,7 +39,18 @@ from torchsar.compensate.group import (
     pick_group,
     student_log_likelihood,
 )
-from torchsar.core import Estimate, Signal, Stage, checked_samples, fft_lines, power_of, settle, take, unit_level
+from torchsar.core import (
+    Estimate,
+    Outcome,
+    Signal,
+    Stage,
+    checked_samples,
+    fft_lines,
+    power_of,
+    settle,
+    take,
+    unit_level,
+)
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -403,11 +414,11 @@ class DopplerCentroid(Stage):
         }
         return Estimate(
             self._values(absolute),
-            probability,
-            reliable & (probability > 0.9),
             {"doppler_hz": std, "doppler_baseband_hz": std},
-            info,
-            self._values(self._nearest(base, absolute, reliable)),
+            probability,
+            Outcome.of(reliable & (probability > 0.9), Outcome.NOISE),
+            info=info,
+            neutral=self._values(self._nearest(base, absolute, reliable)),
         )
 
     def _nearest(self, base: Tensor, absolute: Tensor, reliable: Tensor) -> Tensor:

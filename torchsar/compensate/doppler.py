@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchsar.core import (
     Estimate,
+    Outcome,
     Signal,
     Stage,
     checked_samples,
@@ -437,10 +438,10 @@ def baseband_estimate(found: Increments, phase_rad: Tensor, prf_hz: float, **inf
     quality = (found.products.sum((-2, -1)).abs() / torch.where(total > 0, total, 1)).clamp(0, 1)
     return Estimate(
         {"doppler_baseband_hz": wrap_hz(scale * phase_rad, prf_hz)},
-        quality,
-        reliable_increment(found, phase_rad, scatter, shift),
         {"doppler_baseband_hz": scale * torch.hypot(scatter, shift)},
-        {
+        quality,
+        Outcome.of(reliable_increment(found, phase_rad, scatter, shift), Outcome.NOISE),
+        info={
             "block_hz": scale * torch.angle(found.products),
             "block_power": found.power,
             "cut_hz": scale * shift,
@@ -831,11 +832,11 @@ class RangeDependentCentroid(Stage):
         quality = (products.abs().sum(-1) / torch.where(total > 0, total, 1)).clamp(0, 1)
         return Estimate(
             {"doppler_range_hz": curve, "doppler_baseband_hz": wrap_hz(middle, prf_hz)},
-            quality,
-            ok,
             {"doppler_baseband_hz": std},
-            {"block_hz": scale * torch.angle(products), "coefficients_hz": scale * coefficients},
-            {} if doppler_hz is None else {"doppler_range_hz": doppler_hz[..., None]},
+            quality,
+            Outcome.of(ok, Outcome.NOISE),
+            info={"block_hz": scale * torch.angle(products), "coefficients_hz": scale * coefficients},
+            neutral={} if doppler_hz is None else {"doppler_range_hz": doppler_hz[..., None]},
         )
 
 

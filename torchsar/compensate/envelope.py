@@ -41,6 +41,7 @@ from torchsar.compensate.pulse_phase import autofocus, correct_pulse_phase
 from torchsar.compensate.pulse_phase.data import checked
 from torchsar.core import (
     Estimate,
+    Outcome,
     Signal,
     Stage,
     block_bytes_of,
@@ -274,8 +275,8 @@ def refine_alignment(
     confirmed = rest.ok & (rest["shift_cells"].square().mean(-1).sqrt() < GOOD_CELLS)
     return Estimate(
         {"shift_cells": shift.reshape(data.shape[:-1])},
-        phase.quality.reshape(shape),
-        (phase.ok & (confirmed | ~phase.info["homogeneous"])).reshape(shape),
+        quality=phase.quality.reshape(shape),
+        outcome=Outcome.of((phase.ok & (confirmed | ~phase.info["homogeneous"])).reshape(shape), Outcome.NOISE),
         info={"entropy_nats": least.reshape(shape)},
     )
 
@@ -323,10 +324,10 @@ def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Course]) -> 
     shape = data.shape[:-2]
     wide = std[:, None].expand_as(shift).reshape(data.shape[:-1])
     return Estimate(
-        value={"shift_cells": shift.reshape(data.shape[:-1])},
-        std={"shift_cells": wide},
-        quality=quality.reshape(shape),
-        ok=(enough & (std < GOOD_CELLS) & sure).reshape(shape),
+        {"shift_cells": shift.reshape(data.shape[:-1])},
+        {"shift_cells": wide},
+        quality.reshape(shape),
+        Outcome.of((enough & (std < GOOD_CELLS) & sure).reshape(shape), Outcome.NOISE),
         info={"present": present.reshape(data.shape[:-1])},
     )
 
@@ -410,7 +411,9 @@ class AlignEnvelopes(Stage):
             "shift_m": found["shift_cells"] * cell_m,
             "velocity_m_s": velocity if velocity_m_s is None else velocity + velocity_m_s,
         }
-        return Estimate(value, found.quality, found.ok, {"shift_m": found.std["shift_cells"] * cell_m}, found.info)
+        return Estimate(
+            value, {"shift_m": found.std["shift_cells"] * cell_m}, found.quality, found.outcome, info=found.info
+        )
 
 
 class ShiftRange(Stage):

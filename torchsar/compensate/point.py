@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.doppler import nominal_doppler, point_doppler, wrap_hz
-from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, power_of, settle, unit_level
+from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, cis, power_of, settle, unit_level
 from torchsar.metrics.bounds import tone_frequency_bound_hz
 from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import StripmapRadar
@@ -278,8 +278,8 @@ class PointDoppler(Stage):
         std = torch.hypot(tone_frequency_bound_hz(q.clamp_min(1e-12), visible), q.new_tensor(_REST_CYCLES / visible))
         return Estimate(
             {"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)},
-            1 - 1 / (1 + q),
-            finite & (floor > 0) & (0 <= crossing <= record) & above & leads,
             {"doppler_hz": std, "doppler_baseband_hz": std},
-            {"q": q},
+            1 - 1 / (1 + q),
+            Outcome.of(finite & (floor > 0) & (0 <= crossing <= record) & above & leads, Outcome.NOISE),
+            info={"q": q},
         )

@@ -29,6 +29,7 @@ from torchsar.compensate.group import (
 )
 from torchsar.core import (
     Estimate,
+    Outcome,
     Signal,
     Stage,
     checked_samples,
@@ -501,10 +502,10 @@ class EffectiveVelocity(Stage):
         )
         return Estimate(
             {"velocity_m_s": found.velocity_m_s},
-            torch.exp(-found.std_m_s / found.most_m_s.clamp_min(1e-12)),
-            found.clear & (found.std_m_s < found.most_m_s),
             {"velocity_m_s": found.std_m_s},
-            {"grid_velocity_m_s": found.grid_m_s, "grid_entropy": found.grid_entropy, "group_start": group.start},
+            torch.exp(-found.std_m_s / found.most_m_s.clamp_min(1e-12)),
+            Outcome.of(found.clear & (found.std_m_s < found.most_m_s), Outcome.NOISE),
+            info={"grid_velocity_m_s": found.grid_m_s, "grid_entropy": found.grid_entropy, "group_start": group.start},
         )
 
     @torch.no_grad()

@@ -50,6 +50,7 @@ from torchsar.core.memory import (
     machine_memory_bytes,
     wait_for_devices,
 )
+from torchsar.core.outcome import Outcome, counts, worst
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
 from torchsar.core.replace import OwnFiles, remove_empty
@@ -71,6 +72,7 @@ __all__ = [
     "Draws",
     "Estimate",
     "LargestTensor",
+    "Outcome",
     "OwnFiles",
     "PeakMemory",
     "Recording",
@@ -97,6 +99,7 @@ __all__ = [
     "checksum",
     "cholesky_factor",
     "cis",
+    "counts",
     "device_fault",
     "document",
     "fault_of_name",
@@ -146,4 +149,5 @@ __all__ = [
     "validate",
     "validation",
     "wait_for_devices",
+    "worst",
 ]

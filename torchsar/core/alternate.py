@@ -118,16 +118,15 @@ class Alternate(Stage):
         Returns:
             Estimate with the values and standard deviations of all estimators; where several
             provide the same name, the last of them counts. Per trial, `quality` is the lowest of
-            the qualities, and `ok` is False where any of the estimators, or of the values that it
-            last used, is unreliable. Keys of `info` are "TURN.KEY", with the name of the turn in
-            front.
+            the qualities, and `outcome` the worst of the estimators and of the values that they
+            last used. Keys of `info` are "TURN.KEY", with the name of the turn in front.
         """
         found: dict[str, Estimate] = {}
-        used: dict[str, list[Tensor]] = {}  # verdicts of the values of the others
+        used: dict[str, list[Tensor]] = {}  # outcomes of the values of the others
         for _ in range(self.rounds):
             for name, estimator in self.estimators.items():
                 values = {key: value for estimate in found.values() for key, value in estimate.value.items()}
-                used[name] = [estimate.ok for other, estimate in found.items() if other != name]
+                used[name] = [estimate.outcome for other, estimate in found.items() if other != name]
                 result = estimator(self._without_others(signal, name, found), **_accepted(estimator, values))
                 if not isinstance(result, Estimate):
                     raise TypeError(
@@ -135,7 +134,7 @@ class Alternate(Stage):
                         f"{type(result).__name__}"
                     )
                 found[name] = result
-        return _merged(found, [ok for verdicts in used.values() for ok in verdicts])
+        return _merged(found, [outcome for outcomes in used.values() for outcome in outcomes])
 
     def _without_others(self, signal: Signal, name: str, found: dict[str, Estimate]) -> Signal:
         """Signal after the correctors of all turns but one."""
@@ -161,12 +160,12 @@ def _accepted(stage: nn.Module, values: Mapping[str, Tensor]) -> dict[str, Tenso
 
 
 def _merged(found: dict[str, Estimate], used: Sequence[Tensor]) -> Estimate:
-    """Estimate of all values; `ok` is False where a part is unreliable, or a verdict in `used`."""
+    """Estimate of all values, with the worst outcome of all parts and of those in `used`."""
     parts = list(found.values())
     quality = functools.reduce(torch.minimum, [part.quality.double() for part in parts])
-    ok = functools.reduce(torch.logical_and, [*(part.ok for part in parts), *used])
+    outcome = functools.reduce(torch.maximum, [*(part.outcome for part in parts), *used])
     value, std = (
         {key: entry for part in parts for key, entry in getattr(part, table).items()} for table in ("value", "std")
     )
     info = {f"{name}.{key}": entry for name, part in found.items() for key, entry in part.info.items()}
-    return Estimate(value, quality, ok, std, info)
+    return Estimate(value, std, quality, outcome, info)

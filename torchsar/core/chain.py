@@ -28,32 +28,32 @@ class Use(nn.Module):
         names: Source of each parameter of `forward`: "STAGE.VALUE" for the value VALUE that the
             stage named STAGE of the chain estimates, "aux.NAME" for side data of the recording, or
             "given.NAME" for a value that the caller of the chain gives.
-        in_doubt: What the stage does in trials whose estimates are not ok, see `use`.
+        in_doubt: What the stage does in trials whose estimates are doubtful, see `use`.
     """
 
-    def __init__(self, stage: nn.Module, names: Mapping[str, str], in_doubt: str = "neutral") -> None:
+    def __init__(self, stage: nn.Module, names: Mapping[str, str], in_doubt: str = "apply") -> None:
         super().__init__()
         self.stage = stage
         self.names = dict(names)
         self.in_doubt = in_doubt
 
 
-def use(stage: nn.Module, *, in_doubt: str = "neutral", **names: str) -> Use:
+def use(stage: nn.Module, *, in_doubt: str = "apply", **names: str) -> Use:
     """Connect parameters of a stage to values of earlier stages or to recorded side data.
 
     In the following example the values come from the stages named "doppler" and "velocity".
 
         use(OmegaK(radar), doppler_hz="doppler", velocity_m_s="velocity")
 
-    Where `ok` of an estimate is False, the stage gets the neutral value of the estimator in place
-    of the estimated one, for example no phase error or the nominal velocity. A stage that both
-    estimates and corrects an error leaves the signal unchanged there. With `in_doubt="apply"` the
-    stage uses all estimates, whether they are ok or not.
+    Where an estimate failed (`Estimate.failed`), the stage gets the neutral value of the estimator
+    in place of the estimated one, for example no phase error or the nominal velocity. A stage that
+    both estimates and corrects an error leaves the signal unchanged there. Doubtful estimates are
+    used, unless `in_doubt="neutral"` treats them as failed ones.
 
     Args:
         stage: Stage whose `forward` takes the values.
-        in_doubt: What the stage does in trials whose estimates are not ok: "neutral" takes neutral
-            values, "apply" the estimated ones.
+        in_doubt: What the stage does in trials whose estimates are doubtful: "apply" takes the
+            estimated values, "neutral" the neutral ones.
         **names: Source of each parameter: "STAGE.VALUE", or "STAGE" alone if the value has the name
             of the parameter, or "aux.NAME" for side data of the recording, or "given.NAME" for a
             value that the caller of the chain gives.
@@ -70,7 +70,7 @@ def use(stage: nn.Module, *, in_doubt: str = "neutral", **names: str) -> Use:
         raise TypeError("the stage has its connections from `use` already; connect all its parameters in one call")
     if in_doubt not in ("neutral", "apply"):
         raise ValueError(
-            f"in_doubt must be 'neutral' (neutral values where an estimate is not ok) or 'apply' (the estimated ones), "
+            f"in_doubt must be 'apply' (estimated values where an estimate is doubtful) or 'neutral' (neutral ones), "
             f"got {in_doubt!r}"
         )
     for parameter, source in names.items():
@@ -94,12 +94,14 @@ class Trace(Shown):
         values: Estimated and given values under "STAGE.VALUE", side data under "aux.NAME".
         seconds: Wall time of each stage, in seconds; empty inside a program of `torch.compile`.
         bytes: Size of the samples after each stage, in bytes.
-        neutral: Trials in which a stage did not use an estimate because it is not ok, bool with the
-            shape of `ok`: under "STAGE.PARAMETER" those in which this parameter of the stage got a
-            neutral value, and under "STAGE" those in which a stage that both estimates and corrects
-            left the signal unchanged.
+        neutral: Trials in which a stage did not use an estimate, because it failed or, with
+            `in_doubt="neutral"`, because it is doubtful; bool with the shape of `outcome`: under
+            "STAGE.PARAMETER" those in which this parameter of the stage got a neutral value, and
+            under "STAGE" those in which a stage that both estimates and corrects left the signal
+            unchanged.
+        doubtful: Trials in which a stage used a doubtful estimate, by the same names.
         arguments: Values that each stage received from its connections, by its name and parameter;
-            neutral where the estimate is not ok.
+            neutral where the estimate was not used.
     """
 
     inputs: Mapping[str, Signal]
@@ -109,6 +111,7 @@ class Trace(Shown):
     seconds: Mapping[str, float]
     bytes: Mapping[str, int]
     neutral: Mapping[str, Tensor] = field(default_factory=dict)
+    doubtful: Mapping[str, Tensor] = field(default_factory=dict)
     arguments: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
 
     @property
@@ -155,15 +158,15 @@ class _Known:
         self.estimates[name] = estimate
         self.values |= {f"{name}.{key}": v for key, v in estimate.value.items() if f"{name}.{key}" not in self.held}
 
-    def trusted(self, source: str) -> tuple[Tensor, Tensor] | None:
-        """An estimated value that is neutral where it is not ok, and these trials; None if the
-        value is not estimated or has no neutral one.
+    def origin(self, source: str) -> tuple[Estimate, str] | None:
+        """The estimate that a value comes from, and its name there; None if the value is not
+        estimated or has no neutral one.
         """
         name, _, key = source.partition(".")
         estimate = self.estimates.get(name)
         if estimate is None or key not in estimate.neutral or self.values[source] is not estimate.value[key]:
             return None
-        return estimate.trusted(key), ~estimate.ok
+        return estimate, key
 
 
 @dataclass
@@ -175,11 +178,12 @@ class _Log:
     seconds: dict[str, float] = field(default_factory=dict)
     bytes: dict[str, int] = field(default_factory=dict)
     neutral: dict[str, Tensor] = field(default_factory=dict)
+    doubtful: dict[str, Tensor] = field(default_factory=dict)
     arguments: dict[str, Mapping[str, Tensor]] = field(default_factory=dict)
 
     def trace(self, known: _Known) -> Trace:
         """The trace of the run, with these values and estimates."""
-        parts = {name: getattr(self, name) for name in ("seconds", "bytes", "neutral", "arguments")}
+        parts = {name: getattr(self, name) for name in ("seconds", "bytes", "neutral", "doubtful", "arguments")}
         return Trace(self.inputs, self.outputs, known.estimates, known.values, **parts)
 
 
@@ -193,10 +197,10 @@ class Chain(Shown, nn.Module):
     of a minimum-entropy search. A stage that returns only an Estimate leaves the signal unchanged.
     Connections made by `use` are checked when the chain is built.
 
-    An estimate is used only in the trials in which it is ok. In the others, later stages get the
-    neutral value of the estimator (see `Stage`), and a stage that both estimates and corrects
-    leaves the signal unchanged, unless `use` says otherwise. The Trace holds the estimates
-    themselves, and shows in `neutral` where they were not used.
+    An estimate is used except in the trials in which it failed. There later stages get the neutral
+    value of the estimator (see `Stage`), and a stage that both estimates and corrects leaves the
+    signal unchanged; see `use` for doubtful estimates. The Trace holds the estimates themselves,
+    and shows in `neutral` where they were not used, and in `doubtful` where doubtful ones were.
 
     Args:
         **stages: Stages by name, in the order in which they run; `use` connects their parameters.
@@ -219,14 +223,14 @@ class Chain(Shown, nn.Module):
             _check_member(name, stage)
         self.stages = nn.ModuleDict(members)
         self.uses = {name: item.names if isinstance(item, Use) else {} for name, item in stages.items()}
-        self.in_doubt = {name: item.in_doubt if isinstance(item, Use) else "neutral" for name, item in stages.items()}
+        self.in_doubt = {name: item.in_doubt if isinstance(item, Use) else "apply" for name, item in stages.items()}
         self._check()
 
     def _summary(self) -> Summary:
         stages = []
         for name, stage in self.stages.items():
             uses = " and ".join(f"{parameter} from {source}" for parameter, source in self.uses[name].items())
-            doubt = " (ok or not)" if self.in_doubt[name] == "apply" else ""
+            doubt = " (if not doubtful)" if self.in_doubt[name] == "neutral" else ""
             gives = " and ".join(_provided(stage))
             row = (type(stage).__name__, uses and f"uses {uses}{doubt}", gives and f"estimates {gives}")
             stages.append((name, *row))
@@ -272,8 +276,8 @@ class Chain(Shown, nn.Module):
                 values; "given.NAME" sets a value that a stage takes from the caller. A stage for
                 which `given` holds every value that it provides does not run at all, even if it
                 would change the signal. "STAGE" with an Estimate, such as that of an earlier trace,
-                has the same effect; its values count only where they are ok, and elsewhere the
-                neutral values of the estimate, or of the stage if the estimate has none.
+                has the same effect; its values count except where they failed, and there the
+                neutral values of the estimate, or of the stage if it has none, are used.
 
         Returns:
             Signal after the last stage.
@@ -349,7 +353,8 @@ class Chain(Shown, nn.Module):
         before = [name for name in trace.inputs if name not in part]
         log = _Log({name: trace.inputs[name] for name in before}, {name: trace.outputs[name] for name in before})
         log.arguments |= {name: trace.arguments[name] for name in before}
-        log.neutral |= {key: mask for key, mask in trace.neutral.items() if key.partition(".")[0] in before}
+        for here, there in ((log.neutral, trace.neutral), (log.doubtful, trace.doubtful)):
+            here |= {key: mask for key, mask in there.items() if key.partition(".")[0] in before}
         self._run(part, trace.inputs[start], known, log)
         return log.trace(known)
 
@@ -394,10 +399,10 @@ class Chain(Shown, nn.Module):
             provided = {f"{name}.{key}" for key in _provided(stage)}
             held = name in known.stages or bool(provided and provided <= known.held)
             entered, began = signal, time.perf_counter() if timed else 0.0
-            arguments, neutral = self._arguments(name, known, required=not held)
+            arguments, neutral, doubtful = self._arguments(name, known, required=not held)
             if not held:
                 with gathered_checks(f"stage {name!r}"):
-                    signal = self._step(name, stage, signal, arguments, known, neutral)
+                    signal = self._step(name, stage, signal, arguments, known, neutral, doubtful)
             if log is not None:
                 if timed:
                     _synchronise(signal.data)
@@ -405,26 +410,33 @@ class Chain(Shown, nn.Module):
                 log.inputs[name], log.outputs[name] = entered, signal
                 log.bytes[name] = signal.data.numel() * signal.data.element_size()
                 log.arguments[name] = arguments
-                log.neutral.update({} if held and name not in known.stages else neutral)
+                if not held or name in known.stages:
+                    log.neutral.update(neutral)
+                    log.doubtful.update(doubtful)
         return signal
 
-    def _arguments(self, name: str, known: _Known, required: bool) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _arguments(
+        self, name: str, known: _Known, required: bool
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]:
         """The connected values of a stage, and by "STAGE.PARAMETER" the trials in which one is
-        neutral.
+        neutral, and those in which one is doubtful and used.
         """
-        arguments, neutral = {}, {}
+        arguments, neutral, doubtful = {}, {}, {}
         for parameter, source in self.uses[name].items():
             if source not in known.values and required:
                 raise KeyError(
                     f"stage {name!r} needs the value {source!r} for its parameter {parameter!r}, but the only values "
                     f"of this run are {sorted(known.values)}"
                 )
-            trusted = known.trusted(source) if self.in_doubt[name] == "neutral" else None
-            if trusted is not None:
-                arguments[parameter], neutral[f"{name}.{parameter}"] = trusted
+            origin, key = known.origin(source), f"{name}.{parameter}"
+            if origin is not None:
+                estimate, value = origin
+                arguments[parameter] = estimate.trusted(value, self.in_doubt[name])
+                neutral[key] = estimate.unused(self.in_doubt[name])
+                doubtful[key] = estimate.doubtful & ~neutral[key]
             elif source in known.values:
                 arguments[parameter] = known.values[source]
-        return arguments, neutral
+        return arguments, neutral, doubtful
 
     def _step(
         self,
@@ -434,8 +446,11 @@ class Chain(Shown, nn.Module):
         arguments: dict[str, Tensor],
         known: _Known,
         neutral: dict[str, Tensor],
+        doubtful: dict[str, Tensor],
     ) -> Signal:
-        """The signal after a stage; its estimate joins `known`, and doubts join `neutral`."""
+        """The signal after a stage; its estimate joins `known`, and trials in which it is not used,
+        or doubtful, join `neutral` and `doubtful`.
+        """
         result = stage(signal, **arguments)
         out, estimate = result if isinstance(result, tuple) else (result, None)
         if isinstance(out, Estimate):
@@ -447,15 +462,17 @@ class Chain(Shown, nn.Module):
             )
         if estimate is not None:
             known.add(name, estimate)
-            if self.in_doubt[name] == "neutral" and _corrected(signal, out, estimate):
-                ok = estimate.ok[(...,) + (None,) * len(out.axes)]
-                out, neutral[name] = out.with_data(torch.where(ok, out.data, signal.data)), ~estimate.ok
+            if _corrected(signal, out, estimate):
+                neutral[name] = estimate.unused(self.in_doubt[name])
+                doubtful[name] = estimate.doubtful & ~neutral[name]
+                unchanged = neutral[name][(...,) + (None,) * len(out.axes)]
+                out = out.with_data(torch.where(unchanged, signal.data, out.data))
         return out
 
 
 def _corrected(signal: Signal, out: Signal, estimate: Estimate) -> bool:
     """Whether a stage that estimates has also changed the samples, on the same axes."""
-    same = out.axes == signal.axes and out.data.shape == signal.data.shape and estimate.ok.shape == signal.trials
+    same = out.axes == signal.axes and out.data.shape == signal.data.shape and estimate.outcome.shape == signal.trials
     return same and out is not signal
 
 
@@ -474,10 +491,10 @@ def _with_neutral(estimate: Estimate, stage: nn.Module | None) -> Estimate:
 def _check_trials(name: str, estimate: Estimate) -> None:
     """Raise ValueError unless the values of a given estimate begin with its trial dimensions."""
     for key, value in estimate.value.items():
-        if value.shape[: estimate.ok.ndim] != estimate.ok.shape:
+        if value.shape[: estimate.outcome.ndim] != estimate.outcome.shape:
             raise ValueError(
                 f"`given`: the value {key!r} of the estimate {name!r} must begin with the trial dimensions "
-                f"{tuple(estimate.ok.shape)} of `ok`, got the shape {tuple(value.shape)}"
+                f"{tuple(estimate.outcome.shape)} of `outcome`, got the shape {tuple(value.shape)}"
             )
 
 

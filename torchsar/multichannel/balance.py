@@ -22,6 +22,7 @@ from torch import Tensor
 
 from torchsar.core import (
     Estimate,
+    Outcome,
     Signal,
     Stage,
     checked_samples,
@@ -310,7 +311,9 @@ def _estimate_of(
     worst = torch.maximum(worst, by_delay / _LARGEST_ACROSS_RAD)
     ok = torch.stack([v.isfinite().all(-1) for v in value.values()]).all(0) & clear & (worst < 1)
     value = {name: torch.where(ok[..., None], v, 0.0) for name, v in value.items()}
-    return Estimate(value, torch.where(ok, 1 - worst, 0.0).clamp(0, 1), ok, std, {"snr_db": snr_db})
+    return Estimate(
+        value, std, torch.where(ok, 1 - worst, 0.0).clamp(0, 1), Outcome.of(ok, Outcome.NOISE), info={"snr_db": snr_db}
+    )
 
 
 class EstimateBalance(Stage):

@@ -21,7 +21,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, fft_lines, linear_phasor
+from torchsar.core import Estimate, Outcome, Signal, Stage, fft_lines, linear_phasor
 from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.body import Body, body_echo, body_image, find_body, known_body
 from torchsar.multichannel.chip import Extraction
@@ -340,10 +340,10 @@ class ImageMovers(Stage):
         level = row([body.level for body in bodies])
         return Estimate(
             value,
-            level / (_HALF_QUALITY_LEVEL + level),
-            ok,
             {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])},
-            {"level": level},
+            level / (_HALF_QUALITY_LEVEL + level),
+            Outcome.of(ok, Outcome.NOISE),
+            info={"level": level},
         )
 
 
@@ -427,7 +427,7 @@ class MoversImage(Stage):
             info = {**one.estimate.info, "rest": one.rest.data, "conventional": one.conventional.data}
             tables = (one.estimate.value, one.estimate.std, info)
             value, std, info = ({name: x[None] for name, x in table.items()} for table in tables)
-            parts.append(Estimate(value, one.estimate.quality[None], one.estimate.ok[None], std, info))
+            parts.append(Estimate(value, std, one.estimate.quality[None], one.estimate.outcome[None], info=info))
         fused = stacked([one.fused for one in made])
         image = Signal(fused if signal.trials else fused[0], made[0].fused.axes)
         return image, Estimate.joined(parts, signal.trials)

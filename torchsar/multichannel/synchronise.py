@@ -17,7 +17,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, linear_phasor, unit_phasor
+from torchsar.core import Estimate, Outcome, Signal, Stage, linear_phasor, unit_phasor
 from torchsar.radar import BistaticRadar
 
 # The maximum of samples interpolated four times lies within an eighth of a sample of the peak.
@@ -62,7 +62,13 @@ def estimate_synchronisation(direct: Tensor, radar: BistaticRadar) -> Estimate:
     std = {"phase_rad": phase_std, "delay_s": phase_std / (2 * math.pi * frequency.square().mean().sqrt())}
     value = {"phase_rad": torch.where(detected, torch.angle(peak), 0.0), "delay_s": torch.where(detected, delay, 0.0)}
     quality = (1 - phase_std.square().mean(-1).sqrt()).clamp(0, 1)
-    return Estimate(value, quality, detected.all(-1), std, {"snr_db": 10 * torch.log10(snr.clamp_min(1e-6))})
+    return Estimate(
+        value,
+        std,
+        quality,
+        Outcome.of(detected.all(-1), Outcome.NOISE),
+        info={"snr_db": 10 * torch.log10(snr.clamp_min(1e-6))},
+    )
 
 
 def _direct_band(direct: Tensor, radar: BistaticRadar) -> tuple[Tensor, Tensor]:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchsar.core import (
     Estimate,
+    Outcome,
     Signal,
     Stage,
     checked_samples,
@@ -248,7 +249,9 @@ def _assess(x: Tensor, lag: Tensor, phase: Tensor, log_power: Tensor, blocks: _S
         & (gain_std < _MOST_STD * gain).all(-1)
     )
     value = {"gain": torch.where(ok[..., None], gain, 1), "phase_rad": torch.where(ok[..., None], phase, 0)}
-    return Estimate(value, torch.where(ok, coherence, 0), ok, {"gain": gain_std, "phase_rad": phase_std})
+    return Estimate(
+        value, {"gain": gain_std, "phase_rad": phase_std}, torch.where(ok, coherence, 0), Outcome.of(ok, Outcome.NOISE)
+    )
 
 
 def _jackknife(values: Tensor) -> Tensor:

@@ -19,7 +19,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples, host_largest, level_of, power_of, unit_level
+from torchsar.core import (
+    Estimate,
+    Outcome,
+    Signal,
+    Stage,
+    checked_samples,
+    host_largest,
+    level_of,
+    power_of,
+    unit_level,
+)
 from torchsar.repair.interference_band import find_band, subtract_band
 from torchsar.repair.interference_detect import THRESHOLD, Level, clean_level, line_spectra, stands_out
 from torchsar.repair.interference_tone import Tone, anything, find_tones, subtract_tones
@@ -315,7 +325,9 @@ class _InterferenceCorrection(Stage):
             "touched": result.touched,
             "tone_cycles_per_sample": result.tone_cycles,
         }
-        return signal.with_data(result.data), Estimate({"missing": given_up}, quality, ok, info=info)
+        return signal.with_data(result.data), Estimate(
+            {"missing": given_up}, quality=quality, outcome=Outcome.of(ok, Outcome.NOISE), info=info
+        )
 
 
 class SubtractInterference(_InterferenceCorrection):

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples
+from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples
 from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap
 
 # Largest standard deviation of an offset that is ok, in samples (-24 dB of the signal).
@@ -335,7 +335,10 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
     shape = y.shape[:-2]
     value = {"offset_samples": offsets.reshape(*shape, longest), "period": periods.reshape(shape)}
     return Estimate(
-        value, quality.clamp(0, 1).reshape(shape), ok.reshape(shape), {"offset_samples": std.reshape(*shape, longest)}
+        value,
+        {"offset_samples": std.reshape(*shape, longest)},
+        quality.clamp(0, 1).reshape(shape),
+        Outcome.of(ok.reshape(shape), Outcome.NOISE),
     )
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples, linear_phasor, unit_level
+from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, linear_phasor, unit_level
 from torchsar.repair.jitter import MIN_GAP, smallest_gap
 
 # Rounding of float64 in a record of up to 1024 samples without noise, relative to the squares of
@@ -196,10 +196,10 @@ def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: st
     quality = torch.where(ok, power / (power + noise).clamp_min(1e-300), 0)
     return Estimate(
         {"offset_samples": offsets, "period": m},
-        quality,
-        ok,
         {"offset_samples": torch.where(ok[..., None], std, 0)},
-        {"frequency_cycles": frequency},
+        quality,
+        Outcome.of(ok, Outcome.NOISE),
+        info={"frequency_cycles": frequency},
     )
 
 

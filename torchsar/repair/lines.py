@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples, host_largest, host_value
+from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, host_largest, host_value
 
 # line number of padding at the end of a trial, by convention: no line has a negative number
 PADDING = -1
@@ -381,5 +381,10 @@ class LineIntegrity(Stage):
             name: getattr(plan, name)
             for name in ("source", "number", "corrected", "repeated", "unplaced", "first_number")
         }
-        estimate = Estimate({"missing": plan.missing}, quality=plan.trusted, ok=plan.ok, info={**masks, **counts})
+        estimate = Estimate(
+            {"missing": plan.missing},
+            quality=plan.trusted,
+            outcome=Outcome.of(plan.ok, Outcome.NOISE),
+            info={**masks, **counts},
+        )
         return signal.with_axis(place_lines(signal.data, plan.source), pulse=axis), estimate

@@ -21,7 +21,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, linear_phasor, power_of, unit_level
+from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, cis, linear_phasor, power_of, unit_level
 from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.repair.response import (
     GRID,
@@ -430,9 +430,9 @@ def _phase_estimate(phase_rad: Tensor, std: Tensor, trials: torch.Size) -> Estim
     quality = torch.where(ok.reshape(trials), 1 / (1 + std[..., 0].square()), 0)
     return Estimate(
         {"phase_rad": phase_rad, "amplitude": torch.ones_like(phase_rad)},
-        quality,
-        ok.reshape(trials),
         {"phase_rad": std},
+        quality,
+        Outcome.of(ok.reshape(trials), Outcome.NOISE),
     )
 
 

@@ -36,7 +36,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, checked_samples, real_dtype, take, unit_level, unit_phasor
+from torchsar.core import Estimate, Outcome, checked_samples, real_dtype, take, unit_level, unit_phasor
 from torchsar.radar import TriangularLadar
 from torchsar.repair.analytic import delayed
 
@@ -301,7 +301,12 @@ def _assess(
         "fringe_sigmas": fringe,
         "coarse_s": torch.nan_to_num(middle - 0.5 - half_transient) / radar.sample_rate_hz,
     }
-    return Estimate({"trigger_s": start / radar.sample_rate_hz}, torch.where(ok, depth.clamp(0, 1), 0), ok, info=info)
+    return Estimate(
+        {"trigger_s": start / radar.sample_rate_hz},
+        quality=torch.where(ok, depth.clamp(0, 1), 0),
+        outcome=Outcome.of(ok, Outcome.NOISE),
+        info=info,
+    )
 
 
 def _meeting(phase_difference: Tensor, plus_cycles: Tensor, expected: Tensor) -> Tensor:

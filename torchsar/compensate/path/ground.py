@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import without_line
-from torchsar.core import Estimate
+from torchsar.core import Estimate, Outcome
 from torchsar.focus import ImageGrid, TileOperator, TilePlan
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.spotlight import frequency_step_hz
@@ -69,10 +69,10 @@ def for_each(
 
     return Estimate(
         {key: joined([one.value[key] for one in found]) for key in found[0].value},
-        joined([one.quality for one in found]),
-        joined([one.ok for one in found]),
         {key: joined([one.std[key] for one in found]) for key in found[0].std},
-        {key: joined([one.info[key] for one in found]) for key in found[0].info},
+        joined([one.quality for one in found]),
+        Outcome.of(joined([one.ok for one in found]), Outcome.NOISE),
+        info={key: joined([one.info[key] for one in found]) for key in found[0].info},
     )
 
 

@@ -21,7 +21,7 @@ from torchsar.compensate.pulse_phase.verdict import (
     sharpness_beyond_speckle,
     sharpness_of_noise,
 )
-from torchsar.core import Estimate, checked_samples
+from torchsar.core import Estimate, Outcome, checked_samples
 from torchsar.focus import TileOperator
 from torchsar.metrics import entropy, residual_phase
 from torchsar.radar import AntennaPath
@@ -170,7 +170,7 @@ def _nothing(rows: Tensor) -> Estimate:
     none = zero.new_zeros(())
     info = {"roughness": none + 1, "entropy_nats": none}
     value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
-    return Estimate(value, none, none > 0, {"line_of_sight_m": zero + 1}, info)
+    return Estimate(value, {"line_of_sight_m": zero + 1}, none, Outcome.of(none > 0, Outcome.NOISE), info=info)
 
 
 def _spread(found: Estimate, present: Tensor) -> Estimate:
@@ -185,7 +185,9 @@ def _spread(found: Estimate, present: Tensor) -> Estimate:
         return x[high - 1] * (1 - part) + x[high] * part
 
     value = {name: of(x) for name, x in found.value.items()}
-    return Estimate(value, found.quality, found.ok, {name: of(x) for name, x in found.std.items()}, found.info)
+    return Estimate(
+        value, {name: of(x) for name, x in found.std.items()}, found.quality, found.outcome, info=found.info
+    )
 
 
 def _judged(search: Search, imaging: Callable[[float], TileOperator], rounds: int) -> Estimate:
@@ -228,7 +230,7 @@ def _judged(search: Search, imaging: Callable[[float], TileOperator], rounds: in
             found = replace(found, motion_m=last.motion_m, offset_m=last.offset_m)
     value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
     info = {"roughness": rough, "entropy_nats": entropy(found.image).double()}
-    return Estimate(value, quality, ok, {"line_of_sight_m": std_m}, info)
+    return Estimate(value, {"line_of_sight_m": std_m}, quality, Outcome.of(ok, Outcome.NOISE), info=info)
 
 
 def _sharpness(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchsar.compensate.path.line_of_sight import path_autofocus
 from torchsar.compensate.path.phase import path_phase
 from torchsar.compensate.path.strip import strip_autofocus
-from torchsar.core import Estimate, Signal, Stage
+from torchsar.core import Estimate, Outcome, Signal, Stage
 from torchsar.radar import AntennaPath
 
 
@@ -154,4 +154,4 @@ class CorrectPath(Stage):
         places = {"transmitter_m": transmitter_m, "receiver_m": receiver_m}
         value = {name: place - offset_m for name, place in places.items() if place is not None}
         sure = signal.data.real.new_ones(value["transmitter_m"].shape[:-2])
-        return Estimate(value, sure, sure > 0)
+        return Estimate(value, quality=sure, outcome=Outcome.of(sure > 0, Outcome.NOISE))

@@ -15,7 +15,7 @@ from torchsar.compensate.path.motion import cosines, expected_power
 from torchsar.compensate.path.scatterers import Echoes, prominent_places
 from torchsar.compensate.pulse_phase.data import or_one, without_line
 from torchsar.compensate.pulse_phase.verdict import LEAST_STREHL
-from torchsar.core import Estimate, checked_samples, cis
+from torchsar.core import Estimate, Outcome, checked_samples, cis
 from torchsar.focus import ImageGrid, ProcessedBeam, TilePlan
 from torchsar.focus.image_grid import level_plane
 from torchsar.focus.spotlight import window_weights
@@ -350,7 +350,9 @@ def _judged(strip: _Strip) -> Estimate:
     ok = covered & (strehl(_SPREAD) > LEAST_STREHL) & (change < spread)
     value = {"line_of_sight_m": strip.line_free(strip.motion_m[:, 0]), "offset_m": strip.offset_m}
     count = spread.new_tensor(float(len(echoes.seen)))
-    return Estimate(value, strehl(1.0), ok, {"line_of_sight_m": std_m}, {"scatterers": count})
+    return Estimate(
+        value, {"line_of_sight_m": std_m}, strehl(1.0), Outcome.of(ok, Outcome.NOISE), info={"scatterers": count}
+    )
 
 
 def _nothing(strip: _Strip) -> Estimate:
@@ -358,7 +360,9 @@ def _nothing(strip: _Strip) -> Estimate:
     zero = torch.zeros(len(strip.judged), dtype=torch.float64, device=strip.judged.device)
     none = zero.new_zeros(())
     value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
-    return Estimate(value, none, none > 0, {"line_of_sight_m": zero + 1}, {"scatterers": none})
+    return Estimate(
+        value, {"line_of_sight_m": zero + 1}, none, Outcome.of(none > 0, Outcome.NOISE), info={"scatterers": none}
+    )
 
 
 def _std_m(strip: _Strip, solution: Solution) -> Tensor:

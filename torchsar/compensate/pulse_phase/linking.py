@@ -34,7 +34,7 @@ from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum, windowed_spectrum
 from torchsar.compensate.pulse_phase.verdict import LEAST_ROWS, LEAST_STREHL, occupied_band
-from torchsar.core import Estimate, cis, over_blocks, power_of
+from torchsar.core import Estimate, Outcome, cis, over_blocks, power_of
 
 # Longest block whose phases are found by themselves, in pulses; bands of their first guesses as
 # shares of the pulse rate.
@@ -125,7 +125,9 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         sharp = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
         scene = describe(pulses.rows, sharp, occupied_band(pulses.rows))
         likelier = (found.info["gain_nats"].flatten() > scene.sparse) & (scene.ratio > 0)
-    return replace(found, ok=found.ok & likelier.reshape(pulses.trials))
+    return replace(
+        found, outcome=torch.maximum(found.outcome, Outcome.of(likelier.reshape(pulses.trials), Outcome.SPARSE))
+    )
 
 
 def may_be_ok(rows: Tensor) -> Tensor:
@@ -217,10 +219,10 @@ def _estimate(pulses: Pulses, found: _Linked, crossed: Crossed, moved: Displacem
     fitted = fitted & ((crossed.excess < _UNLIKE) | (crossed.rows > _MANY_ROWS)) & (gain > _MARGIN * noise)
     fitted = fitted & (crossed.rows > LEAST_ROWS)
     return Estimate(
-        value={"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
-        std={"phase_rad": std.reshape(*trials, pulses.n).to(real)},
-        quality=(strehl * scene).reshape(trials).to(real),
-        ok=(fitted & moved.aligned & (boundary > _LEAST_SHARE)).reshape(trials),
+        {"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
+        {"phase_rad": std.reshape(*trials, pulses.n).to(real)},
+        (strehl * scene).reshape(trials).to(real),
+        Outcome.of((fitted & moved.aligned & (boundary > _LEAST_SHARE)).reshape(trials), Outcome.NOISE),
         info={
             "gain_nats": gain.reshape(trials),
             "fit_nats": fit.reshape(trials),

@@ -26,7 +26,7 @@ from torchsar.compensate.pulse_phase.sharpen import (
     in_turn,
 )
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
-from torchsar.core import Estimate, host_value, host_values, power_of, true_positions
+from torchsar.core import Estimate, Outcome, host_value, host_values, power_of, true_positions
 from torchsar.metrics import entropy
 
 # floor of the entropy fixed point in mean powers, found by trial: a lower floor includes noise, a
@@ -258,10 +258,10 @@ def _with_linked(pulses: Pulses, sharpest: Estimate) -> Estimate:
         return flat.index_copy(0, at, of_some[likelier].to(of_all.dtype)).reshape(of_all.shape)
 
     return Estimate(
-        value={"phase_rad": mixed(sharpest["phase_rad"], some["phase_rad"])},
-        std={"phase_rad": mixed(sharpest.std["phase_rad"], some.std["phase_rad"])},
-        quality=mixed(sharpest.quality, some.quality),
-        ok=mixed(ok, some.ok),
+        {"phase_rad": mixed(sharpest["phase_rad"], some["phase_rad"])},
+        {"phase_rad": mixed(sharpest.std["phase_rad"], some.std["phase_rad"])},
+        mixed(sharpest.quality, some.quality),
+        Outcome.of(mixed(ok, some.ok), Outcome.NOISE),
         info=info,
     )
 

@@ -29,7 +29,7 @@ from torchsar.compensate.pulse_phase.homogeneous import describe
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.compensate.pulse_phase.points import FEW_ROWS, phases_of_points
 from torchsar.compensate.pulse_phase.quarters import one_scene
-from torchsar.core import Estimate, block_bytes_of, host_value, over_blocks, power_of, true_positions
+from torchsar.core import Estimate, Outcome, block_bytes_of, host_value, over_blocks, power_of, true_positions
 from torchsar.metrics.phase import phase_rmse
 
 # difference of the entropies of a uniform row and of speckle, whose power has an exponential
@@ -359,10 +359,10 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     }
     std = std_rad[:, None].expand(-1, pulses.n).to(phase.dtype)
     return Estimate(
-        value={"phase_rad": phase.reshape(*shape, pulses.n)},
-        std={"phase_rad": std.reshape(*shape, pulses.n)},
-        quality=quality.reshape(shape).to(phase.dtype),
-        ok=(if_sparse & ~homogeneous).reshape(shape),
+        {"phase_rad": phase.reshape(*shape, pulses.n)},
+        {"phase_rad": std.reshape(*shape, pulses.n)},
+        quality.reshape(shape).to(phase.dtype),
+        Outcome.of((if_sparse & ~homogeneous).reshape(shape), Outcome.NOISE),
         info={
             "present": present.reshape(*shape, pulses.n),
             **{name: value.reshape(shape) for name, value in info.items()},

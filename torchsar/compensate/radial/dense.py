@@ -16,7 +16,7 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare
 from torchsar.compensate.pulse_phase.homogeneous import power_groups
 from torchsar.compensate.pulse_phase.linking import linked
-from torchsar.core import Estimate, cis, power_of
+from torchsar.core import Estimate, Outcome, cis, power_of
 from torchsar.core.spline import UniformSpline
 
 # Pulses are averaged to about so many blocks, over which the residual phase is smooth; it makes the
@@ -81,9 +81,9 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
     block = ((at - first) / size).floor().clamp(0, count - 1).long()
     return Estimate(
         {"phase_rad": UniformSpline(walk, middle, size).at(at)},
-        quality=torch.exp(-spread.square().mean(-1)),
-        ok=ok[best, trial] & (apart < _SAME_RAD),
-        std={"phase_rad": spread[:, block]},
+        {"phase_rad": spread[:, block]},
+        torch.exp(-spread.square().mean(-1)),
+        Outcome.of(ok[best, trial] & (apart < _SAME_RAD), Outcome.NOISE),
     )
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import prepare
-from torchsar.core import Estimate, checked_samples, cis, power_of, refuse_non_finite_values
+from torchsar.core import Estimate, Outcome, checked_samples, cis, power_of, refuse_non_finite_values
 
 LEAST_GAIN = 0.05  # least gain of a pulse: a lost pulse is not amplified more than 20 times
 _PAD = 4  # zero-padding of the transform: a peak is then found to an eighth of a cell
@@ -61,7 +61,7 @@ def pulse_gain(data: Tensor) -> Estimate:
     return Estimate(
         {"gain": gain.to(torch.float64).reshape(*shape, n)},
         quality=explained.to(torch.float64).reshape(shape),
-        ok=ok.reshape(shape),
+        outcome=Outcome.of(ok.reshape(shape), Outcome.NOISE),
     )
 
 

@@ -26,7 +26,7 @@ from torchsar.compensate.radial.dense import linked_walk, phase_difference
 from torchsar.compensate.radial.mirror import Intercept, mirror_estimate, refuse_other_intercept
 from torchsar.compensate.radial.polish import ENOUGH_STD_RAD, scene_cells, sharpened
 from torchsar.compensate.radial.trajectory import integrated_range, sweep_motion
-from torchsar.core import Axis, Estimate, host_values, power_of, true_positions
+from torchsar.core import Axis, Estimate, Outcome, host_values, power_of, true_positions
 from torchsar.core.spline import UniformSpline
 from torchsar.focus.triangular import deramp_azimuth, profile_axes
 from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
@@ -147,9 +147,9 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
         per_velocity,
         Estimate(
             {**coarse.value, "phase_rad": phase},
-            quality=coarse.quality,
-            ok=coarse.ok & (std < ENOUGH_STD_RAD) & enough.reshape(pulses.trials),
-            std={**coarse.std, "phase_rad": std[..., None].expand_as(phase)},
+            {**coarse.std, "phase_rad": std[..., None].expand_as(phase)},
+            coarse.quality,
+            Outcome.of(coarse.ok & (std < ENOUGH_STD_RAD) & enough.reshape(pulses.trials), Outcome.NOISE),
             info={
                 **coarse.info,
                 "iterations": taken.reshape(pulses.trials),

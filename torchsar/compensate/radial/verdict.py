@@ -11,7 +11,7 @@ from torch import Tensor
 from torchsar.compensate.radial.bands import Bands, filled
 from torchsar.compensate.radial.newton import climbed
 from torchsar.compensate.radial.trajectory import geometric_velocity_m_s
-from torchsar.core import Axis, Estimate, cis, power_of, settle
+from torchsar.core import Axis, Estimate, Outcome, cis, power_of, settle
 
 Intercept = Literal["known", "record", "free"]
 # SNR of a sweep after compression below which noise may exceed the peak in single periods and the
@@ -292,14 +292,17 @@ def velocity_estimate(
     geometric = geometric_velocity_m_s(radar, pulse, azimuth_m, centre, velocity.device)
     return Estimate(
         {"velocity_m_s": velocity - geometric},
-        quality=torch.where(found, signal / (signal + noise).clamp_min(tiny), 0),
-        ok=enough
-        & finite.all(-1)
-        & found
-        & lit.any(-1)
-        & ~contradicted
-        & (_mean(square, product.lit)[..., 0] < (_USELESS * bin_m_s) ** 2),
-        std={"velocity_m_s": std},
+        {"velocity_m_s": std},
+        torch.where(found, signal / (signal + noise).clamp_min(tiny), 0),
+        Outcome.of(
+            enough
+            & finite.all(-1)
+            & found
+            & lit.any(-1)
+            & ~contradicted
+            & (_mean(square, product.lit)[..., 0] < (_USELESS * bin_m_s) ** 2),
+            Outcome.NOISE,
+        ),
         info={
             "snr_db": snr_db,
             "noise_m_s": torch.hypot(expected, torch.full_like(expected, floor_m_s)),

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
 from torchsar.compensate.rotation.unknowns import k_name, uniform_rotation
 from torchsar.compensate.rotation.verdicts import MOST_PHASE_ERROR_RAD
-from torchsar.core import Draws, Estimate, Signal, Stage, settle
+from torchsar.core import Draws, Estimate, Outcome, Signal, Stage, settle
 from torchsar.optim import Descent, Searched, differential_evolution, genetic, grid_search, lbfgs, newton
 from torchsar.radar import InverseRadar
 
@@ -274,8 +274,10 @@ def _estimate(figure: ImageEntropy, x: Tensor, cost: Tensor, ok: Tensor, info: d
     error = figure.phase_error(rotation)
     return Estimate(
         value,
-        quality,
-        ok & finite & rotation.feasible & (gain > _GAIN_NATS) & (error < MOST_PHASE_ERROR_RAD),
+        quality=quality,
+        outcome=Outcome.of(
+            ok & finite & rotation.feasible & (gain > _GAIN_NATS) & (error < MOST_PHASE_ERROR_RAD), Outcome.NOISE
+        ),
         info={**info, "entropy_nats": cost, "uncompensated_entropy_nats": before, "phase_error_rad": error},
     )
 

@@ -23,6 +23,7 @@ from torchsar.compensate.rotation.verdicts import (
 )
 from torchsar.core import (
     Estimate,
+    Outcome,
     block_bytes_of,
     checked_samples,
     host_values,
@@ -266,7 +267,9 @@ def _over_trials(
             else {}
         )
         seen = (rows[part] != 0).flatten(1).any(-1)
-        parts[first] = replace(found, ok=found.ok & seen, info={**found.info, **scaled})
+        parts[first] = replace(
+            found, outcome=torch.maximum(found.outcome, Outcome.of(seen, Outcome.NOISE)), info={**found.info, **scaled}
+        )
 
     starts = range(0, rows.shape[0], height)
     over_blocks(work, starts, rows)
@@ -325,7 +328,7 @@ def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> 
     certain = fit.certain[:, fit.motion.k.shape[-1]].clamp_min(torch.finfo(torch.float64).tiny).sqrt()
     scaled = (_SURE * std["omega_rad_s"] < _RATE_TOLERANCE * fit.motion.omega_rad_s * certain) & (fit.motion.w > 0)
     info = {**found.info, "focused": focused, "scatterers": count, "noise_power": fit.noise, "steps": fit.steps}
-    return Estimate(found.value, focus.explained, focused & scaled, std, info)
+    return Estimate(found.value, std, focus.explained, Outcome.of(focused & scaled, Outcome.NOISE), info=info)
 
 
 def _with_more_scatterers(
@@ -348,9 +351,9 @@ def _with_more_scatterers(
 
     return Estimate(
         mixed(found.value, again.value),
-        quality=found.quality.index_copy(0, at, again.quality),
-        ok=found.ok.index_copy(0, at, again.ok),
-        std=mixed(found.std, again.std),
+        mixed(found.std, again.std),
+        found.quality.index_copy(0, at, again.quality),
+        Outcome.of(found.ok.index_copy(0, at, again.ok), Outcome.NOISE),
         info=mixed(found.info, again.info),
     )
 
@@ -385,7 +388,9 @@ def _confirmed(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
     found = _assessed(rows, sampling, motion)
     error, count = warp_phase_error(rows, sampling, motion)
     ok = found.ok & (error < MOST_PHASE_ERROR_RAD)
-    return replace(found, ok=ok, info={**found.info, "phase_error_rad": error, "scatterers": count})
+    return replace(
+        found, outcome=Outcome.of(ok, Outcome.NOISE), info={**found.info, "phase_error_rad": error, "scatterers": count}
+    )
 
 
 def _assessed(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
@@ -402,5 +407,8 @@ def _assessed(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
     gained = (before - after).double()
     quality = (1 - torch.exp(-gained)).clamp(0, 1)
     return Estimate(
-        value, quality, gained > -_ENTROPY_ROUNDING, info={"entropy_nats": after, "uncompensated_entropy_nats": before}
+        value,
+        quality=quality,
+        outcome=Outcome.of(gained > -_ENTROPY_ROUNDING, Outcome.NOISE),
+        info={"entropy_nats": after, "uncompensated_entropy_nats": before},
     )

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, unit_phasor
+from torchsar.core import Estimate, Outcome, unit_phasor
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
@@ -180,7 +180,11 @@ def _estimate_at(
     beside = _noise_beside(data, radar, motion, weight).diagonal(dim1=-2, dim2=-1).mean(-1)
     std = torch.where(energy > 0, torch.sqrt(beside / curvature.clamp_min(_TINY)), torch.inf)
     return Estimate(
-        value, torch.sigmoid((snr - DETECTED_DB) / 3), ok, {"u_a_m_s": std}, {"snr_db": snr, "at_the_end": ended}
+        value,
+        {"u_a_m_s": std},
+        torch.sigmoid((snr - DETECTED_DB) / 3),
+        Outcome.of(ok, Outcome.NOISE),
+        info={"snr_db": snr, "at_the_end": ended},
     )
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, unit_level
+from torchsar.core import Estimate, Outcome, unit_level
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.bank import sharpest_tone
@@ -107,4 +107,8 @@ def warned_of_ambiguity(
         warnings.warn(
             f"{what}; use a wider search (MovingPointVelocity), or the range walk (WalkAmbiguity)", stacklevel=4
         )
-    return replace(estimate, ok=estimate.ok & (off == 0) & sure, info={**estimate.info, "pulse_rates": off})
+    return replace(
+        estimate,
+        outcome=torch.maximum(estimate.outcome, Outcome.of((off == 0) & sure, Outcome.AMBIGUOUS)),
+        info={**estimate.info, "pulse_rates": off},
+    )

@@ -16,7 +16,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate
+from torchsar.core import Estimate, Outcome
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
@@ -101,7 +101,12 @@ def interferometry(
     estimate = estimate_of(found, snr >= DETECTED_DB, _quality(snr))
     if check_ambiguity:
         estimate = warned_of_ambiguity(estimate, data, radar, motion, aperture, exclude=True)
-    return replace(estimate, ok=estimate.ok & lit_as_expected(data, radar, motion, aperture))
+    return replace(
+        estimate,
+        outcome=torch.maximum(
+            estimate.outcome, Outcome.of(lit_as_expected(data, radar, motion, aperture), Outcome.MISFIT)
+        ),
+    )
 
 
 def _quality(snr_db: Tensor) -> Tensor:

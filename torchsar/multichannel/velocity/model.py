@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, cholesky_factor, linear_solve, matrix_inverse, unit_phasor
+from torchsar.core import Estimate, Outcome, cholesky_factor, linear_solve, matrix_inverse, unit_phasor
 from torchsar.multichannel.motion import PointMotion
 from torchsar.radar import BistaticRadar, receive_range
 
@@ -303,4 +303,10 @@ def estimate_of(found: Found, ok: Tensor, quality: Tensor, **info: Tensor) -> Es
     value = {name: getattr(motion, name).expand(shape) for name in UNKNOWNS}
     std_all = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     std = {name: std_all[..., i] for i, name in enumerate(found.unknowns)}
-    return Estimate(value, quality, ok, std, {"snr_db": found.snr_db, "noise_power": found.noise_power, **info})
+    return Estimate(
+        value,
+        std,
+        quality,
+        Outcome.of(ok, Outcome.NOISE),
+        info={"snr_db": found.snr_db, "noise_power": found.noise_power, **info},
+    )

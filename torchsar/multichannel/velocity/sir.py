@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, take
+from torchsar.core import Estimate, Outcome, Signal, Stage, take
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
@@ -291,14 +291,16 @@ class SignalIntensityRatio(Stage):
         motion = self._motion(lines, found["u_r_m_s"], u_a_m_s, y0_m)
         line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
         dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2
-        found = replace(found, ok=found.ok & _is_point(line, self.radar, motion))
+        found = replace(
+            found, outcome=torch.maximum(found.outcome, Outcome.of(_is_point(line, self.radar, motion), Outcome.MISFIT))
+        )
         # clutter and other targets displace the maximum of the ratio, but not the tone of a point
         tone = interferometry(line, self.radar, motion, Dwell(dwell_s), check_ambiguity=False)
         there = replace(motion, u_r_m_s=tone["u_r_m_s"], y0_m=tone["y0_m"])
         found = warned_of_ambiguity(found, line, self.radar, there, Dwell(dwell_s), exclude=not self.bounded)
         apart, std = (found["u_r_m_s"] - tone["u_r_m_s"]).abs(), found.std["u_r_m_s"]
         std = torch.where(apart > _UNLIKELY * std, apart, std)
-        return replace(found, ok=found.ok & tone.ok, std={"u_r_m_s": std})
+        return replace(found, outcome=torch.maximum(found.outcome, tone.outcome), std={"u_r_m_s": std})
 
     def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
         """Return the motion with a candidate of u_r."""
@@ -313,10 +315,10 @@ class SignalIntensityRatio(Stage):
         inside = (coarse - low).abs().minimum((coarse - high).abs()) > self.step_m_s / 2
         return Estimate(
             {"u_r_m_s": value},
-            quality,
-            has_data & inside & (quality >= self.least_quality),
             {"u_r_m_s": std},
-            {"log_ratio": -costs},
+            quality,
+            Outcome.of(has_data & inside & (quality >= self.least_quality), Outcome.NOISE),
+            info={"log_ratio": -costs},
         )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, best_of
+from torchsar.core import Estimate, Outcome, Signal, Stage, best_of
 from torchsar.multichannel.migration import Frame, Keystone, Migration, correct_migration
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.radar import BistaticRadar
@@ -110,7 +110,7 @@ class WalkAmbiguity(Stage):
         number, contrast, line = walk_ambiguity(signal.data, Frame.of(self.radar, signal), reference, self.most)
         return Estimate(
             {"ambiguity": number},
-            contrast / (5 + contrast),
-            contrast > 5,
+            quality=contrast / (5 + contrast),
+            outcome=Outcome.of(contrast > 5, Outcome.NOISE),
             info={"line": line.to(torch.float64), "contrast": contrast},
         )
