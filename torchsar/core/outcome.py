@@ -37,8 +37,8 @@ class Outcome(IntEnum):
     TOO_FEW = 19
     IN_DOUBT = 20
     NOISE = 30
-    EMPTY = 31
-    SINGULAR = 32
+    SINGULAR = 31
+    EMPTY = 32
 
     @property
     def message(self) -> str:
@@ -88,8 +88,8 @@ _MESSAGES = {
     Outcome.TOO_FEW: "too few pulses, range cells or scatterers to judge the estimate: use more data",
     Outcome.IN_DOUBT: "an estimate on which this one depends is doubtful",
     Outcome.NOISE: "nothing rises above the noise: raise the SNR, or use more pulses or range cells",
+    Outcome.SINGULAR: "the data do not determine the values: use more of them, or fewer unknowns",
     Outcome.EMPTY: "there are no samples other than zero",
-    Outcome.SINGULAR: "the data do not determine the values",
 }
 
 

@@ -15,12 +15,8 @@ from torchsar.compensate.path.axes import Found, three_axes
 from torchsar.compensate.path.envelopes import moved
 from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, placed, trials_of
 from torchsar.compensate.path.search import Search
-from torchsar.compensate.pulse_phase.verdict import (
-    LEAST_ROWS,
-    LEAST_STREHL,
-    sharpness_beyond_speckle,
-    sharpness_of_noise,
-)
+from torchsar.compensate.pulse_phase.assess import LEAST_STREHL
+from torchsar.compensate.pulse_phase.sharpness import sharpness_beyond_speckle, sharpness_of_noise
 from torchsar.core import Estimate, Outcome, checked_samples
 from torchsar.focus import TileOperator
 from torchsar.metrics import entropy, residual_phase
@@ -199,7 +195,7 @@ def _judged(search: Search, imaging: Callable[[float], TileOperator], rounds: in
 
     def refined(range_m: Tensor) -> Found:
         range_m = search.polished(range_m, fine)
-        sharp, noise, _ = _sharpness(fine.image(moved(search.rows, search.frequency_hz, range_m)[None])[0])
+        sharp, noise = _sharpness(fine.image(moved(search.rows, search.frequency_hz, range_m)[None])[0])
         return three_axes(search.rows, fine, range_m, search.present, rounds if sharp > _HOPE * noise else 1)
 
     def strehl(std_m: Tensor) -> Tensor:
@@ -211,13 +207,12 @@ def _judged(search: Search, imaging: Callable[[float], TileOperator], rounds: in
     if alone or strehl(_SPREAD * doubt_m) <= LEAST_STREHL:
         results.append(refined(search.by_envelopes(_OTHER_BAND)[0]))
         found, std_m, doubt_m, _ = _sharpest(results, search)
-    sharp, noise, telling = _sharpness(found.image)
+    sharp, noise = _sharpness(found.image)
     quality = strehl(doubt_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
     least = torch.stack([one.noise for one in results]).amin()
     least = _WORSE * least + _UNFIT * search.rows.abs().square().double().mean()
     sure = [
         sharp > _MARGIN * noise,
-        telling > LEAST_ROWS,
         strehl(_SPREAD * doubt_m) > LEAST_STREHL,
         found.restless <= _RESTLESS,
         found.noise <= least,
@@ -233,12 +228,10 @@ def _judged(search: Search, imaging: Callable[[float], TileOperator], rounds: in
     return Estimate(value, {"line_of_sight_m": std_m}, quality, Outcome.of(ok, Outcome.NOISE), info=info)
 
 
-def _sharpness(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Sharpness of an image (azimuth, range), that of noise, and the number of range cells that
-    contribute to it.
-    """
-    sharp, effective, telling = sharpness_beyond_speckle(image.mT)
-    return sharp, sharpness_of_noise((effective * FINE_STEP).clamp_min(1)), telling
+def _sharpness(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Sharpness of an image (azimuth, range), and that of noise."""
+    sharp, effective = sharpness_beyond_speckle(image.mT)
+    return sharp, sharpness_of_noise((effective * FINE_STEP).clamp_min(1))
 
 
 def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor, Tensor, bool]:

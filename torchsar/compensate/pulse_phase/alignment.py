@@ -19,7 +19,7 @@ from torchsar.core import power_of
 # Displacements in cells rms from which on profiles are not aligned, from pulse to pulse and slow
 # ones. Found by trial on 2 to 300 scatterers: the phases may be wrong from 0.2 and 0.45 on, and
 # interference of scatterers that are not resolved displaces aligned profiles by 0.25 at most.
-_LARGEST_JITTER, _LARGEST_MIGRATION = 0.25, 0.4
+LARGEST_JITTER, LARGEST_MIGRATION = 0.25, 0.4
 # standard deviations by which a displacement must differ from zero, in halves of the band and in
 # halves of the range cells
 _SIGNIFICANT = 3.0
@@ -44,11 +44,11 @@ class Displacement:
     @property
     def aligned(self) -> Tensor:
         """True where the jitter is below 0.25 cell and the migration below 0.4 cell, (trial,)."""
-        return (self.jitter < _LARGEST_JITTER) & (self.migration < _LARGEST_MIGRATION)
+        return (self.jitter < LARGEST_JITTER) & (self.migration < LARGEST_MIGRATION)
 
 
 @torch.no_grad()
-def displacement(rows: Tensor, present: Tensor) -> Displacement:
+def displacement(spectrum: Tensor, present: Tensor) -> Displacement:
     """Estimate the rms displacement in range of the profiles of pulses from their mean.
 
     The displacement of a pulse is the projection of its profile |s| on the derivative of the mean
@@ -62,44 +62,49 @@ def displacement(rows: Tensor, present: Tensor) -> Displacement:
     the standard deviation of the phases is large there.
 
     Args:
-        rows: Pulses, shape (trial, range, pulse), complex.
+        spectrum: Fourier transform of the pulses along range, shape (trial, range, pulse), complex.
         present: False where a pulse holds only zeros, shape (trial, pulse).
 
     Returns:
         The displacements; 0 where they do not differ from none by 3 standard deviations, and where
         there are fewer than 8 range cells or 8 pulses.
     """
-    cells, n = rows.shape[-2:]
+    cells, n = spectrum.shape[-2:]
     if cells < _LEAST_CELLS or n < _LEAST_PULSES:
-        return Displacement(*torch.zeros(2, len(rows), dtype=torch.float64, device=rows.device))
-    powers = [power_of(half).to(torch.float64) for half in _halves(rows)]
+        return Displacement(*torch.zeros(2, len(spectrum), dtype=torch.float64, device=spectrum.device))
+    one, other = (power_of(half) for half in _halves(spectrum))
     length = -(-n // _GROUPS)
 
     def grouped(x: Tensor) -> Tensor:
         return torch.nn.functional.pad(x, (0, -n % length)).unflatten(-1, (-1, length))
 
     count = grouped(present).sum(-1)
+    groups = [grouped(power).sum(-1) for power in (one, other)]
+    near = _near_half(one + other)
 
-    def fast(power: Tensor, cells: Tensor | None = None) -> Tensor:
-        single = grouped(_displacements(power, present, cells))
-        within = single - (single.sum(-1) / count.clamp_min(1))[..., None]
-        return torch.where(grouped(present), within, 0).flatten(-2)
+    def within(single: Tensor) -> Tensor:
+        parts = grouped(single)
+        return torch.where(grouped(present), parts - _mean(parts, grouped(present))[..., None], 0).flatten(-2)
 
-    def slow(power: Tensor, cells: Tensor | None = None) -> Tensor:
-        return _displacements(grouped(power).sum(-1), count > 0, cells)
-
-    whole = powers[0] + powers[1]
-    near = _near_half(whole)
+    fast = [within(x) for x in _four_displacements(one, other, near, present)]
+    slow = _four_displacements(groups[0], groups[1], near, count > 0)
     free = present.sum(-1) - (count > 0).sum(-1), (count > 0).sum(-1)
-    found = [
-        torch.where(
-            _agreement([of(whole, near), of(whole, ~near)], values) > _SIGNIFICANT,
-            _common([of(power) for power in powers], values),
-            0,
-        )
-        for of, values in zip((fast, slow), free, strict=True)
+    return Displacement(*(_shared(parts, values) for parts, values in zip((fast, slow), free, strict=True)))
+
+
+def _four_displacements(one: Tensor, other: Tensor, near: Tensor, present: Tensor) -> list[Tensor]:
+    """Displacements by both halves of the band, and by the nearer and the farther range cells of
+    the whole band, (trial, pulse) each, float64.
+    """
+    return [
+        *(_displacements(power, present, [torch.ones_like(near)])[0] for power in (one, other)),
+        *_displacements(one + other, present, [near, ~near]),
     ]
-    return Displacement(*found)
+
+
+def _shared(parts: list[Tensor], count: Tensor) -> Tensor:
+    """Displacement in cells rms that the halves of the band share, if those of the cells agree."""
+    return torch.where(_agreement(parts[2:], count) > _SIGNIFICANT, _common(parts[:2], count), 0)
 
 
 @torch.no_grad()
@@ -123,7 +128,8 @@ def coherent_jitter(rows: Tensor, present: Tensor) -> Tensor:
     cells, n = rows.shape[-2:]
     if cells < _LEAST_CELLS or n < _LEAST_PULSES:
         return torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
-    spectrum, offset = _about_centroid(rows)
+    spectrum = torch.fft.fft(rows, dim=-2)
+    offset = _about_centroid(spectrum)
     products = spectrum[..., 1:] * spectrum[..., :-1].conj()
     both = present[:, 1:] & present[:, :-1]
     steps = torch.linspace(-_FARTHEST, _FARTHEST, _STEPS, dtype=offset.dtype, device=rows.device)
@@ -135,23 +141,22 @@ def coherent_jitter(rows: Tensor, present: Tensor) -> Tensor:
     return _common(slopes, both.sum(-1)) / 2**0.5
 
 
-def _halves(rows: Tensor) -> list[Tensor]:
+def _halves(spectrum: Tensor) -> list[Tensor]:
     """Profiles of the two halves of the band, about its centroid, on the same range cells."""
-    spectrum, offset = _about_centroid(rows)
+    offset = _about_centroid(spectrum)
     return [torch.fft.ifft(spectrum * half[..., None], dim=-2) for half in (offset > 0, offset <= 0)]
 
 
-def _about_centroid(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Spectrum along range (trial, range, pulse), and frequencies from the centroid of its band.
+def _about_centroid(spectrum: Tensor) -> Tensor:
+    """Frequencies from the centroid of the band within -0.5 to 0.5 cycles per cell, (trial, range).
 
-    The latter have the shape (trial, range) and lie within -0.5 to 0.5 cycles per cell.
+    spectrum: along range, (trial, range, pulse).
     """
-    spectrum = torch.fft.fft(rows, dim=-2)
-    frequency = torch.fft.fftfreq(rows.shape[-2], dtype=torch.float64, device=rows.device)
+    frequency = torch.fft.fftfreq(spectrum.shape[-2], dtype=torch.float64, device=spectrum.device)
     density = power_of(spectrum).sum(-1, dtype=torch.float64)
     turn = torch.exp(2j * torch.pi * frequency)
     centre = (density.to(turn.dtype) @ turn)[:, None]
-    return spectrum, (turn * centre.conj()).angle() / (2 * torch.pi)
+    return (turn * centre.conj()).angle() / (2 * torch.pi)
 
 
 def _common(halves: list[Tensor], count: Tensor) -> Tensor:
@@ -182,16 +187,17 @@ def _near_half(power: Tensor) -> Tensor:
     return 2 * (weight.cumsum(-1) - weight / 2) < weight.sum(-1, keepdim=True)
 
 
-def _displacements(power: Tensor, present: Tensor, cells: Tensor | None = None) -> Tensor:
-    """Displacements in cells, (trial, pulse), of mean zero, and zero where no pulse is present.
+def _displacements(power: Tensor, present: Tensor, parts: list[Tensor]) -> list[Tensor]:
+    """Displacements in cells by each of several parts of the range cells, (trial, pulse) each, of
+    mean zero, and zero where no pulse is present.
 
-    cells: the range cells that are used, (trial, cell), bool; None for all.
+    parts: the range cells that are used, (trial, cell), bool.
     """
     profile, slope = _profiles(power)
-    slope = slope if cells is None else slope * cells
+    slopes = torch.stack([slope * part for part in parts], -2)
     count = present.sum(-1, keepdim=True).clamp_min(1)
-    found = -(profile * slope[..., None]).sum(-2) * count / or_one(slope.square().sum(-1, keepdim=True))
-    return torch.where(present, found - _mean(found, present)[:, None], 0)
+    found = -(slopes @ profile).double() * count[:, None] / or_one(slopes.square().sum(-1, keepdim=True)).double()
+    return [torch.where(present, x - _mean(x, present)[..., None], 0) for x in found.unbind(-2)]
 
 
 def _mean(values: Tensor, present: Tensor) -> Tensor:

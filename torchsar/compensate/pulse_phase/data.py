@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import checked_samples, cis, is_plain, power_of, unit_level
+from torchsar.core import block_bytes_of, checked_samples, cis, is_plain, over_blocks, power_of, unit_level
 
 # largest rounding error of a start, far below the accuracy of any estimate
 _PHASE_ERROR_RAD = 1e-3
+
+# a method: (rows, present, phase to start from) -> phase, iterations
+Find = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -138,6 +143,66 @@ def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | 
     return torch.where(large, on_the_circle(phase.to(torch.float64)), phase).to(
         dtype=working, device=pulses.rows.device
     )
+
+
+def by_blocks(
+    pulses: Pulses, work: Callable[[slice], tuple[Tensor, ...]], whole: bool, gradients: bool = False
+) -> tuple[Tensor, ...]:
+    """Process blocks of trials that fit into the cache, and join their results.
+
+    Args:
+        pulses: The pulses.
+        work: Function of a slice of the trials that returns tensors (trial, ...).
+        whole: Whether to process all trials at once.
+        gradients: Whether gradients are required; then all trials are processed at once.
+
+    Returns:
+        The tensors of all trials.
+    """
+    rows = pulses.rows
+    if whole or gradients or len(rows) <= 1:
+        with contextlib.nullcontext() if gradients else torch.no_grad():
+            return work(slice(None))
+    height = max(1, block_bytes_of(rows.device) // (rows[0].numel() * rows.element_size()))
+    parts = [slice(first, first + height) for first in range(0, len(rows), height)]
+    done: dict[int, tuple[Tensor, ...]] = {}
+
+    def into(part: slice) -> None:
+        done[part.start] = work(part)
+
+    with torch.no_grad():
+        over_blocks(into, parts, rows)
+    return tuple(torch.cat(pieces) for pieces in zip(*(done[part.start] for part in parts), strict=True))
+
+
+def find_phases(
+    pulses: Pulses, find: Find, start: Tensor | None = None, tuned: Sequence[Tensor | float] = (), whole: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Run an autofocus method on all trials, in blocks of trials that fit into the cache.
+
+    Args:
+        pulses: The pulses.
+        find: The method: a function of (rows, present, start) that returns the phase (trial, pulse)
+            and the number of iterations (trial,).
+        start: Phase to start from in rad, one row per trial, or None.
+        tuned: Settings of the method; where one of them, the start or the rows require a gradient,
+            all trials are processed at once.
+        whole: Whether to process all trials at once.
+
+    Returns:
+        The phases in rad, shape (trial, pulse), and the numbers of iterations, shape (trial,); zero
+        with fewer than three pulses.
+    """
+    rows = pulses.rows
+    if not len(rows) or pulses.n < 3:
+        return rows.real.sum(-2) * 0, torch.zeros(len(rows), dtype=torch.int64, device=rows.device)
+
+    def work(part: slice) -> tuple[Tensor, Tensor]:
+        return find(rows[part], pulses.present[part], None if start is None else start[part])
+
+    of_gradients = any(isinstance(x, Tensor) and x.requires_grad for x in (rows, start, *tuned))
+    phase, taken = by_blocks(pulses, work, whole, of_gradients and torch.is_grad_enabled())
+    return phase, taken
 
 
 def refuse_odd_counts(name: str, least: int, **counts: int) -> None:
@@ -278,23 +343,3 @@ def noise_power(rows: Tensor, present: Tensor, phase_rad: Tensor) -> Tensor:
     # the window that the pulses had in the image
     window = torch.fft.ifft(without_lobes(torch.fft.fft(present.to(torch.complex128))))
     return median / (math.log(2) * or_one(window.real.square().mean(-1)))
-
-
-def dealt(energy: Tensor, parts: int) -> Tensor:
-    """Deal range cells into parts of similar energy that have no scatterer in common.
-
-    Cells between two minima of the energy, which one scatterer fills, stay together. These groups
-    are dealt in turn, the strongest first.
-
-    Args:
-        energy: Energy of the range cells, shape (trial, range).
-        parts: Number of parts.
-
-    Returns:
-        Number of the part of each cell, 0 or more, shape (trial, range), int64.
-    """
-    edge = torch.full_like(energy[:, :1], -1.0)
-    before, after = torch.cat([edge, energy[:, :-1]], -1), torch.cat([energy[:, 1:], edge], -1)
-    group = ((energy < before) & (energy <= after)).long().cumsum(-1)
-    of_group = torch.zeros_like(energy).scatter_add(-1, group, energy)
-    return of_group.argsort(-1, descending=True).argsort(-1).gather(-1, group) % parts

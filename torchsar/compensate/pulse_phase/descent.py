@@ -14,11 +14,11 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import Pulses, on_the_circle, prepare, rotate, starting_phase
+from torchsar.compensate.pulse_phase.assess import conclude
+from torchsar.compensate.pulse_phase.data import Pulses, find_phases, on_the_circle, prepare, rotate, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
-from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate, centred_ifft, cis
 from torchsar.metrics.image import contrast, entropy
 from torchsar.optim import Descent, adam, lbfgs
@@ -59,8 +59,15 @@ def sharpest_phase(
     steps: int | None = None,
     tolerance: float = 1e-3,
     imaging: Imaging | None = None,
+    assess: bool = True,
 ) -> Estimate:
     """Find the phase of each pulse that minimises a cost of the image, by gradient descent.
+
+    >>> import torch
+    >>> from torchsar.compensate import sharpest_phase
+    >>> points = torch.eye(8, dtype=torch.complex64).repeat(4, 1)  # of 32 pulses, 8 range cells
+    >>> sharpest_phase(points, objective="contrast", assess=False)["phase_rad"].shape
+    torch.Size([32])
 
     Each trial descends separately into a minimum near its start.
 
@@ -92,15 +99,13 @@ def sharpest_phase(
             `torchsar.focus.azimuth_transform`. If range migration makes the sharpness depend on
             where the target lies in the image, start from the phase that `autofocus` finds with
             the same `imaging`.
+        assess: Whether to add the standard deviation and the outcome.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. Gradients do
-        not pass through it. Pulses without samples have the phase of the start or, with a basis,
-        that of the fitted functions. `ok` is False unless the image is 1.5 times as sharp as
-        autofocus can make pure noise, more than one range cell or a single point makes the
-        sharpness, the pulses show one scene (see `autofocus`), and the Strehl ratio predicted from
-        the standard deviation exceeds 0.8. Sharpness is the amount by which the image entropy lies
-        below that of speckle. info["iterations"] is the number of steps.
+        `phase_rad` of shape (..., pulse), to be removed. Gradients do not pass through it. Pulses
+        without samples have the phase of the start or, with a basis, that of the fitted functions.
+        With `assess`, standard deviation, quality, outcome and info as by `autofocus`.
+        info["iterations"] is the number of steps.
 
     Raises:
         TypeError: If the data are not complex, or the start, mask or basis is not a tensor.
@@ -115,23 +120,24 @@ def sharpest_phase(
     cost, space = _cost_of(objective, mask, imaging, pulses), _space_of(basis, pulses)
     descend = _descent_of(method, steps, tolerance)
 
-    def find(rows: Tensor, present: Tensor, which: Tensor | None) -> Found:
+    def find(rows: Tensor, present: Tensor, which: Tensor | None) -> tuple[Tensor, Tensor]:
         assert which is not None
         rows, own = rows.detach(), space.of(which)
         first = pair_phase(rows, present) if begin is None else begin[which]
         found = descend(_InCoordinates(cost(rows, which), own), own.coordinates(first))
-        moved = own.phase(found.x) if basis is not None else torch.where(present, found.x, first)
-
-        def again(some: Tensor, of: Tensor | slice, at: Tensor) -> Tensor:
-            start, held = moved[of], space.of(which[of])
-            at = start + held.phase(held.coordinates(at - start))  # without what the basis does not hold
-            return at + held.phase(held.coordinates(on_the_circle(fixed_point(some, at, continued)[0] - at)))
-
-        return moved, found.steps, again
+        return own.phase(found.x) if basis is not None else torch.where(present, found.x, first), found.steps
 
     # the start passed to `find` is the indices of the trials of a block, because masks, starts and
     # basis functions may differ between trials
-    return estimated(pulses, torch.arange(len(pulses.rows), device=pulses.rows.device), find)
+    phase, taken = find_phases(pulses, find, torch.arange(len(pulses.rows), device=pulses.rows.device))
+
+    def again(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
+        """Continue without what the basis does not hold."""
+        held, from_ = space.of(which), phase[which]
+        at = from_ + held.phase(held.coordinates(at - from_))
+        return at + held.phase(held.coordinates(on_the_circle(fixed_point(rows, at, continued)[0] - at)))
+
+    return conclude(pulses, phase, taken, assess, again)
 
 
 def minimum_entropy(data: Tensor, **options: Any) -> Estimate:
@@ -168,7 +174,7 @@ class _Space(Protocol):
     `of` selects trials; `projected` maps a gradient of phases to one of coordinates.
     """
 
-    def of(self, which: Tensor) -> _Space: ...
+    def of(self, which: Tensor | slice) -> _Space: ...
 
     def phase(self, x: Tensor) -> Tensor: ...
 
@@ -180,7 +186,7 @@ class _Space(Protocol):
 class _Free:
     """Every pulse has a coordinate of its own."""
 
-    def of(self, which: Tensor) -> _Free:
+    def of(self, which: Tensor | slice) -> _Free:
         return self
 
     def phase(self, x: Tensor) -> Tensor:
@@ -202,7 +208,7 @@ class _Spanned:
 
     functions: Tensor
 
-    def of(self, which: Tensor) -> _Spanned:
+    def of(self, which: Tensor | slice) -> _Spanned:
         return _Spanned(self.functions[which]) if self.functions.ndim > 2 else self
 
     def phase(self, x: Tensor) -> Tensor:

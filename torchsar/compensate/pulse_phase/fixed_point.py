@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import prepare, starting_phase
+from torchsar.compensate.pulse_phase.assess import conclude
+from torchsar.compensate.pulse_phase.data import find_phases, prepare, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, in_turn, settled
-from torchsar.compensate.pulse_phase.verdict import Found, estimated
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, in_turn
 from torchsar.core import Estimate
 
 
@@ -22,8 +22,15 @@ def entropy_fixed_point(
     relaxation: Tensor | float = 1.8,
     tolerance_rad: float = 1e-3,
     imaging: Imaging | None = None,
+    assess: bool = True,
 ) -> Estimate:
-    """Estimate the phase of each pulse by a fixed-point iteration that lowers the image entropy.
+    r"""Estimate the phase of each pulse by a fixed-point iteration that lowers the image entropy.
+
+    >>> import torch
+    >>> from torchsar.compensate import entropy_fixed_point
+    >>> points = torch.eye(8, dtype=torch.complex64).repeat(4, 1)  # of 32 pulses, 8 range cells
+    >>> entropy_fixed_point(points, assess=False)["phase_rad"].shape
+    torch.Size([32])
 
     Each iteration forms the image and weights its cells with ln(max(p, floor) / floor), where p is
     the power of a cell over the mean power. It transforms the weighted image back to pulses and
@@ -46,13 +53,11 @@ def entropy_fixed_point(
         imaging: Image formation whose image is sharpened, by default a Fourier transform along
             pulses; any object with the methods `image` and `adjoint` for profiles of shape (...,
             pulse, range), such as `torchsar.focus.PolarOperator`.
+        assess: Whether to add the standard deviation and the outcome.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
-        unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
-        cell or a single point makes the sharpness, the pulses show one scene (see `autofocus`), and
-        the Strehl ratio predicted from the standard deviation exceeds 0.8. Sharpness is the amount
-        by which the image entropy lies below that of speckle.
+        `phase_rad` of shape (..., pulse), to be removed. With `assess`, standard deviation,
+        quality, outcome and info as by `autofocus`.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -65,13 +70,14 @@ def entropy_fixed_point(
             "entropy_fixed_point: floors must be pairs of a floor above 0 and a number of iterations of 1 or more, "
             f"and relaxation must lie between 0 and 2, got floors {list(floors)} and relaxation {relaxation}"
         )
-    operator = AlongPulses() if imaging is None else Through(imaging)
+    through = None if imaging is None else Through(imaging)
+    operator = AlongPulses() if through is None else through
     runs = [Run(LogAbove(floor), operator, count, relaxation, tolerance_rad) for floor, count in floors]
 
-    def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:
-        phase, taken = in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
-        return phase, taken, settled
+    def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:
+        return in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
 
     begin = starting_phase(start, pulses, "entropy_fixed_point")
     tuned = (relaxation, *(floor for floor, _ in floors))
-    return estimated(pulses, begin, find, at_rest=True, compare=imaging is None, tuned=tuned)
+    found = find_phases(pulses, find, begin, tuned, through is not None)
+    return conclude(pulses, *found, assess, through=through)

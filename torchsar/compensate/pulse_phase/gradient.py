@@ -18,7 +18,9 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.assess import conclude
 from torchsar.compensate.pulse_phase.data import (
+    find_phases,
     prepare,
     refuse_odd_counts,
     rotate,
@@ -27,8 +29,6 @@ from torchsar.compensate.pulse_phase.data import (
     without_line,
 )
 from torchsar.compensate.pulse_phase.pairs import pair_phase, pair_products, running_sum
-from torchsar.compensate.pulse_phase.sharpen import settled
-from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate, power_of, unit_phasor
 from torchsar.core.arguments import names_arguments
 
@@ -180,8 +180,15 @@ def pga(
     windows: Windows | None = None,
     iterations: int = 20,
     patience: int = 6,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the phase of each pulse by phase gradient autofocus.
+
+    >>> import torch
+    >>> from torchsar.compensate import pga
+    >>> points = torch.eye(8, dtype=torch.complex64).repeat(4, 1)  # of 32 pulses, 8 range cells
+    >>> pga(points, kernel="ml", assess=False)["phase_rad"].shape
+    torch.Size([32])
 
     Every iteration works on the original data with the present phase removed. It shifts the
     strongest cell of each range cell to zero Doppler, applies a window, transforms back to pulses,
@@ -206,13 +213,11 @@ def pga(
         windows: Schedule of window widths, by default `Shrinking()`.
         iterations: Largest number of iterations.
         patience: Number of iterations without a lower image entropy after which a trial ends.
+        assess: Whether to add the standard deviation and the outcome.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
-        unless the image is 1.5 times as sharp as autofocus can make pure noise, more than one range
-        cell or a single point makes the sharpness, the pulses show one scene (see `autofocus`), and
-        the Strehl ratio predicted from the standard deviation exceeds 0.8. Sharpness is the amount
-        by which the image entropy lies below that of speckle.
+        `phase_rad` of shape (..., pulse), to be removed. With `assess`, standard deviation,
+        quality, outcome and info as by `autofocus`.
 
     Raises:
         TypeError: If the data are not complex, the start is not a tensor, or `windows` is not a
@@ -227,14 +232,20 @@ def pga(
     pulses = prepare(data, "pga")
     search = _Search(_solver(kernel), windows or Shrinking(), iterations, patience)
 
-    def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:
-        return *search(rows, present, torch.zeros_like(rows[:, 0].real) if begin is None else begin), settled
+    def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:
+        return search(rows, present, torch.zeros_like(rows[:, 0].real) if begin is None else begin)
 
-    return estimated(pulses, starting_phase(start, pulses, "pga"), find)
+    return conclude(pulses, *find_phases(pulses, find, starting_phase(start, pulses, "pga")), assess)
 
 
 def pga_sca(
-    data: Tensor, *, kernel: Kernel = "ml", windows: Windows | None = None, iterations: int = 20, patience: int = 6
+    data: Tensor,
+    *,
+    kernel: Kernel = "ml",
+    windows: Windows | None = None,
+    iterations: int = 20,
+    patience: int = 6,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the phase of each pulse by phase gradient autofocus (PGA) that starts from `sca`.
 
@@ -248,10 +259,11 @@ def pga_sca(
         windows: Schedule of window widths, by default `Shrinking()`.
         iterations: Largest number of iterations.
         patience: Number of iterations without a lower image entropy after which a trial ends.
+        assess: Whether to add the standard deviation and the outcome.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `quality`,
-        `ok` and `info` are those of `pga`.
+        `phase_rad` of shape (..., pulse), to be removed. With `assess`, standard deviation,
+        quality, outcome and info as by `autofocus`.
 
     Raises:
         TypeError: If the data are not complex or `windows` is not a schedule.
@@ -263,10 +275,11 @@ def pga_sca(
     """
     search = _Search(_solver(kernel), windows or Shrinking(), iterations, patience)
 
-    def find(rows: Tensor, present: Tensor, _: Tensor | None) -> Found:
-        return *search(rows, present, pair_phase(rows, present)), settled
+    def find(rows: Tensor, present: Tensor, _: Tensor | None) -> tuple[Tensor, Tensor]:
+        return search(rows, present, pair_phase(rows, present))
 
-    return estimated(prepare(data, "pga_sca"), None, find)
+    pulses = prepare(data, "pga_sca")
+    return conclude(pulses, *find_phases(pulses, find), assess)
 
 
 Solver = Callable[["_Rows", "_View"], Tensor]

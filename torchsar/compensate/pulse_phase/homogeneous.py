@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import or_one, rising, rotate
+from torchsar.compensate.pulse_phase.data import or_one, rotate
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 from torchsar.core import power_of
 
@@ -22,12 +22,14 @@ from torchsar.core import power_of
 _GROUP_RATIO, _GROUPS = 4.0, 4
 # least spectral density relative to its mean: it keeps R invertible where noise is weak
 SPECTRAL_FLOOR = 1e-4
-_LAGS = 8  # distances of the pulses whose coherence is compared with that of noise
+_LAGS = 4  # distances of the pulses whose coherence is compared with that of noise
 _LEAST_REST = 1e-14  # power of the weak cells relative to the mean: below it sums are inexact
 # independent range cells below which a spectrum fits single scatterers as well as speckle: found by
 # trial on 4 to 20 cells of few points
 LEAST_LOOKS = 10.0
+_COMPARED = 64  # rows of a group, the strongest, whose products are compared
 _SURE = 4.0  # standard deviations by which coherence must exceed that of noise
+_BIN_NATS = 0.02  # width of the bins of logarithmic power in which strong cells are counted
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,22 @@ class Descriptions:
     def homogeneous(self) -> Tensor:
         """True where the homogeneous description is more likely, shape (trial,), bool."""
         return self.ratio > 1
+
+
+def occupied_band(spectrum: Tensor) -> Tensor:
+    """Compute the share of the range band that the data occupy.
+
+    It is the share of the rows (range cells) that are independent: 1 / 4 in noise that is sampled
+    four times too finely, for example.
+
+    Args:
+        spectrum: Fourier transform of the pulses along range, shape (trial, range, pulse), complex.
+
+    Returns:
+        The share 0..1, shape (trial,), float64.
+    """
+    density = power_of(spectrum).mean(-1, dtype=torch.float64)
+    return torch.where(density.sum(-1) > 0, density.mean(-1).square() / or_one(density.square().mean(-1)), 1)
 
 
 def power_groups(power: Tensor) -> Tensor:
@@ -105,7 +123,8 @@ def sparse_gain_nats(power: Tensor) -> Tensor:
     """Compute the gain of the log likelihood if the strongest cells each have a power of their own.
 
     All other cells share one power. The number of strong cells, K of N, is the one of the greatest
-    gain. Each costs 2 + ln(N / K) nats, for its power and its place.
+    gain. Each costs 2 + ln(N / K) nats, for its power and its place. Cells are counted in bins of
+    2 % of their power, instead of sorting them.
 
     Args:
         power: Powers of the image with a mean of 1, shape (trial, range, Doppler).
@@ -113,15 +132,20 @@ def sparse_gain_nats(power: Tensor) -> Tensor:
     Returns:
         The gain over N cells of one power in nats, shape (trial,), 0 or more, float64.
     """
-    total = power[0].numel() if len(power) else 1
-    smallest = torch.finfo(power.dtype).tiny
-    strongest = rising(power.flatten(1)).flip(-1).to(torch.float64)[:, : max(1, total - 1)]
-    count = torch.arange(1, strongest.shape[-1] + 1, dtype=torch.float64, device=power.device)
-    whole = power.sum((-2, -1), dtype=torch.float64)[:, None]
-    rest = ((whole - strongest.cumsum(-1)) / (total - count).clamp_min(1)).clamp_min(_LEAST_REST)
-    own = strongest.clamp_min(smallest).log().cumsum(-1) + count * (2 + torch.log(total / count))
-    gain = total - own - (total - count) * (1 + rest.log())
-    return torch.where(whole[:, 0] > 0, gain.amax(-1).clamp_min(0), 0)
+    total, least = power[0].numel() if len(power) else 1, math.log(_LEAST_REST)
+    bins = math.ceil((math.log(total) - least) / _BIN_NATS) + 1
+    level = ((power.flatten(1).clamp_min(_LEAST_REST).log() - least) / _BIN_NATS).long().clamp(0, bins - 1)
+    cells = torch.zeros(len(power), bins, device=power.device)
+    cells = cells.scatter_add(-1, level, torch.ones_like(power.flatten(1)).to(cells)).to(torch.float64)
+    nats = least + _BIN_NATS * (torch.arange(bins, dtype=torch.float64, device=power.device) + 0.5)
+    # of the cells in a bin and above, and of those below
+    count, own = (x.flip(-1).cumsum(-1).flip(-1) for x in (cells, cells * nats))
+    rest = (cells * nats.exp()).cumsum(-1).roll(1, -1)[:, 1:] / (total - count[:, 1:]).clamp_min(1)
+    count, own = count[:, 1:], own[:, 1:]
+    cost = count * (2 + torch.log(total / or_one(count)))
+    gain = total - own - cost - (total - count) * (1 + rest.clamp_min(_LEAST_REST).log())
+    filled = (power > 0).flatten(1).any(-1)
+    return torch.where(filled, gain.amax(-1).clamp_min(0), 0)
 
 
 def _whittle(power: Tensor, looks: Tensor) -> Tensor:
@@ -135,8 +159,9 @@ def _whittle(power: Tensor, looks: Tensor) -> Tensor:
 def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor) -> tuple[Tensor, Tensor]:
     """Gain by the coherence of neighbouring pulses and its standard deviation in noise, (trial,).
 
-    Groups of fewer than ten independent range cells are left out. To second order in the coherence
-    the gain of a sample is the sum of its squares over the lags.
+    Groups of fewer than ten independent range cells are left out, also where the cells are many but
+    hold the side lobes of few points. To second order in the coherence the gain of a sample is the
+    sum of its squares over the lags.
     """
     n, energy = rows.shape[-1], power_of(rows)
     kinds = groups.to(energy.dtype)
@@ -149,6 +174,22 @@ def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor)
         product = torch.einsum("gtr,trp->gtp", kinds.to(rows.dtype), rows[..., lag:] * rows[..., :-lag].conj())
         square = power_of(product).sum(-1)
         excess = excess + square / or_one((pulse[..., lag:] * pulse[..., :-lag]).sum(-1)) - 1 / looks.clamp_min(1)
-    weight = torch.where(looks >= LEAST_LOOKS, n * cells, 0)
+    many = torch.stack([_rank(rows, energy.sum(-1) * kind) for kind in kinds]) >= LEAST_LOOKS
+    weight = torch.where((looks >= LEAST_LOOKS) & many, n * cells, 0)
     deviation = weight * math.sqrt(lags / n) / looks.clamp_min(1)
     return (weight * excess).sum(0).to(torch.float64), deviation.square().sum(0).sqrt().to(torch.float64)
+
+
+def _rank(rows: Tensor, energy: Tensor) -> Tensor:
+    """Effective number of different rows among the strongest of a group, (trial,).
+
+    It is (tr G)^2 / (tr G^2 - (tr G)^2 / P) for the products G of the rows over P pulses: the
+    number of rows in white noise, and that of the points whose side lobes the rows are.
+
+    energy: energy of the rows, 0 for those that are not of the group, (trial, range).
+    """
+    power, strongest = energy.topk(min(_COMPARED, energy.shape[-1]), -1)
+    some = rows.gather(1, strongest[..., None].expand(-1, -1, rows.shape[-1])) * (power > 0)[..., None]
+    products = some @ some.mH
+    total = products.diagonal(dim1=-2, dim2=-1).real.sum(-1).double().square()
+    return total / or_one(power_of(products).sum((-2, -1)).double() - total / rows.shape[-1])

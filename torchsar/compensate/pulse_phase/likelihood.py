@@ -14,15 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import dealt, or_one
-from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, SPECTRAL_FLOOR, power_groups
+from torchsar.compensate.pulse_phase.data import or_one
+from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, occupied_band, power_groups
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
-from torchsar.compensate.pulse_phase.verdict import occupied_band
 from torchsar.core import cholesky_factor, cis, linear_solve, matrix_inverse, power_of
 
 _IN_BAND = 0.85  # share of the power in the band of a first guess
@@ -30,12 +28,6 @@ _STEPS = 4  # Newton steps of the phases after each estimate of the spectrum
 # least density of an adapted spectrum relative to its mean, which rounding allows
 _LEAST_FLOOR = 1e-8
 PRIOR = 3 / math.pi**2  # information in 1/rad^2 of a phase that is uniform over a turn
-# parts of the range cells, each judged by the spectra of the others; found by trial: 2 to 8 predict
-# about the same
-_PARTS = 4
-# Share of the energy that the cells must hold which share their spectrum with others: cells with
-# the side lobes of few points do so too. It is a quarter in clutter with five points of +15 dB.
-LEAST_ENERGY = 0.2
 
 Smooth = Callable[[Tensor, Tensor], Tensor]
 
@@ -55,25 +47,6 @@ class Fit:
     inverses: list[Tensor]
     matrix: Tensor
     constant: Tensor
-
-
-class Crossed(NamedTuple):
-    """What the range cells tell that share their spectrum with others, by spectra of others.
-
-    These are the groups of ten or more independent cells.
-
-    Args:
-        std: Standard deviation of each phase by their Fisher information in rad, (trial, pulse).
-        excess: Factor by which the scatter of the cells exceeds it, (trial,); about 1 where they
-            do have the same spectrum, infinite where their curvature does not hold the phases.
-        shift: Distance in rad rms by which they move the phases, (trial,).
-        rows: Effective number of these cells, (trial,).
-    """
-
-    std: Tensor
-    excess: Tensor
-    shift: Tensor
-    rows: Tensor
 
 
 @dataclass(frozen=True)
@@ -107,7 +80,7 @@ class Speckle:
             if bool(inside.any()):
                 own = z * inside[:, None, :]
                 groups.append((own, own @ own.mH, inside.sum(-1).to(torch.float64)))
-        return Speckle(groups, present, samples, occupied_band(rows))
+        return Speckle(groups, present, samples, occupied_band(torch.fft.fft(rows, dim=-2)))
 
     def trials(self, at: Tensor) -> Speckle:
         """The scenes of some of the trials, given by their indices."""
@@ -237,11 +210,6 @@ class Speckle:
         covariances = [self._toeplitz(torch.fft.ifft(spectrum)) for spectrum in fit.spectra]
         return [2 * ((one * other).real - eye) for one, other in zip(fit.inverses, covariances, strict=True)]
 
-    def looks(self, u: Tensor, fit: Fit, each: list[Tensor]) -> list[Tensor]:
-        """Number of independent range cells of each group, (trial,) each."""
-        shares = [self.independent_share(u, fit, each, slice(k, k + 1)) for k in range(len(each))]
-        return [share * cells for share, (*_, cells) in zip(shares, self.groups, strict=True)]
-
     def independent_share(self, u: Tensor, fit: Fit, each: list[Tensor], of: slice = slice(None)) -> Tensor:
         """Share of the information that counts, because range cells depend on each other, (trial,).
 
@@ -272,56 +240,6 @@ class Speckle:
         both = (weight[:, None, :] @ (excess @ weight[..., None]))[:, 0, 0] - (weight.square() * (level > 0)).sum(-1)
         total = weight.square().sum(-1)
         return torch.where(total > 0, total / or_one(total + both.clamp_min(0)), 1)
-
-    def crossed(self, u: Tensor, fit: Fit, each: list[Tensor], looks: list[Tensor], independent: Tensor) -> Crossed:
-        """Phases by the range cells that share their spectrum with others, and their scatter.
-
-        The Fisher information takes all cells of a group to have the same spectrum, and the fitted
-        one to be true. But cells of few scatterers each have their own, and a spectrum that is
-        fitted to few cells adapts to slow phase errors. Here each cell moves the phases by a Newton
-        step for spectra that other cells fit, with the curvature that these spectra give. The
-        squares of the steps add up to a variance ("sandwich" of curvature and scatter).
-
-        Args:
-            u: Phases as exp(j phase), shape (trial, pulse).
-            fit: The fit to all range cells.
-            each: Information of a range cell of each group, see `information_each`.
-            looks: Number of independent cells of each group, see `looks`.
-            independent: Share of the information that counts, see `independent_share`.
-
-        Reference:
-            White, Maximum likelihood estimation of misspecified models, Econometrica 50(1), 1982.
-        """
-        energy = torch.stack([own.abs().square().sum(-2) for own, *_ in self.groups]).sum(0)
-        part = dealt(energy, _PARTS)
-        sharing = [count >= LEAST_LOOKS for count in looks]
-        bend, slopes = torch.zeros_like(self.groups[0][1].real), torch.zeros_like(self.groups[0][0].real)
-        for number in range(_PARTS):
-            judged, others = self.cells(part == number), self.cells(part != number)
-            adapted = zip(others.adapted(u, fit), sharing, strict=True)
-            crossed = others.fit([torch.where(shared[:, None], spectrum, 1) for spectrum, shared in adapted])
-            turned = (u.conj()[:, :, None] * judged.matrix(crossed.inverses) * u[:, None, :]).real
-            bend = bend + 2 * (turned - torch.diag_embed(turned.sum(-1)))
-            for (own, *_), inverse in zip(judged.groups, crossed.inverses, strict=True):
-                straight = own * u.conj()[..., None]
-                slopes = slopes - 2 * (straight.conj() * (inverse.mT @ straight)).imag
-        eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
-        lower, failed = torch.linalg.cholesky_ex(bend + PRIOR * eye)
-        lower = torch.where((failed == 0)[:, None, None], lower, eye)
-        steps = _without_line(u.shape[-1], u.device) @ torch.cholesky_solve(slopes, lower)
-
-        each = [shared[:, None, None] * own for shared, own in zip(sharing, each, strict=True)]
-        std = deviation(independent[:, None, None] * self.summed(each))
-        scatter = (steps.square().sum(-1) / independent[:, None]).sqrt()
-        some = energy * sum(
-            shared[:, None] * (own != 0).any(-2) for (own, *_), shared in zip(self.groups, sharing, strict=True)
-        )
-        known = (failed == 0) & (some.sum(-1) > LEAST_ENERGY * energy.sum(-1))
-        excess = torch.where(
-            known, rms_of_pulses(scatter, self.present) / or_one(rms_of_pulses(std, self.present)), torch.inf
-        )
-        shift = torch.where(known, rms_of_pulses(steps.sum(-1), self.present), torch.inf)
-        return Crossed(std, excess, shift, some.sum(-1).square() / or_one(some.square().sum(-1)))
 
     def matrix(self, inverses: list[Tensor]) -> Tensor:
         """R^-T o C, summed over the range cells, for the R^-T of each group."""
@@ -450,26 +368,18 @@ def deviation(information: Tensor) -> Tensor:
     """
     n = information.shape[-1]
     eye = torch.eye(n, dtype=torch.float64, device=information.device)
-    flat = _without_line(n, information.device)
+    flat = without_line_matrix(n, information.device)
     covariance = flat @ matrix_inverse(information + PRIOR * eye) @ flat
     return torch.diagonal(covariance, dim1=-2, dim2=-1).clamp_min(0).sqrt()
 
 
 def rms_of_pulses(x: Tensor, present: Tensor) -> Tensor:
-    """Compute the rms over the present pulses.
-
-    Args:
-        x: Values, shape (trial, pulse).
-        present: True for present pulses, shape (trial, pulse), bool.
-
-    Returns:
-        The rms, shape (trial,).
-    """
+    """Compute the rms of x (trial, pulse) over the present pulses, shape (trial,)."""
     return ((x.square() * present).sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
 
 
-def _without_line(n: int, device: torch.device) -> Tensor:
-    """Projection of n phases that removes their constant and linear part, (n, n)."""
+def without_line_matrix(n: int, device: torch.device) -> Tensor:
+    """Return the projection of n phases that removes their constant and linear part, (n, n)."""
     pulse = torch.linspace(-1, 1, n, dtype=torch.float64, device=device)
     line = torch.linalg.qr(torch.stack([torch.ones_like(pulse), pulse], -1)).Q
     return torch.eye(n, dtype=torch.float64, device=device) - line @ line.mT

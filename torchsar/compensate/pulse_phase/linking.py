@@ -8,20 +8,12 @@ Doppler spectrum of the scene maximise a likelihood (module `likelihood`).
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.alignment import Displacement, coherent_jitter, displacement
 from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare, starting_phase
-from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, describe, power_groups
-from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.likelihood import (
-    LEAST_ENERGY,
-    PRIOR,
-    Crossed,
     Fit,
     Speckle,
     deviation,
@@ -30,11 +22,9 @@ from torchsar.compensate.pulse_phase.likelihood import (
     newton_step,
     rms_of_pulses,
 )
-from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
+from torchsar.compensate.pulse_phase.linking_assess import Judged, judged, outcome_of
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum, windowed_spectrum
-from torchsar.compensate.pulse_phase.verdict import LEAST_ROWS, LEAST_STREHL, occupied_band
-from torchsar.core import Estimate, Outcome, cis, over_blocks, power_of
+from torchsar.core import Estimate, Outcome, cis, over_blocks
 
 # Longest block whose phases are found by themselves, in pulses; bands of their first guesses as
 # shares of the pulse rate.
@@ -45,33 +35,17 @@ _ROUNDS, _JOINT_ROUNDS, _COARSE_ROUNDS = 8, 3, 2
 # Triples of rounds with adapted spectra; longest extrapolation; change, as a share of the predicted
 # standard deviation, that ends them.
 _REFINEMENTS, _LONGEST, _SMALL = 6, 8.0, 0.3
-# Gain of the log likelihood per pulse by which the phases fit circular noise: 1.1 to 2.3 nats were
-# measured for 4 to 192 range cells and 64 to 256 pulses. A scene must gain twice as much.
-_NOISE_NATS, _MARGIN = 2.0, 2.0
-# The errors of neighbouring pulses depend on each other, and where the spectrum has no edges a slow
-# phase error hardly changes it, so that the rms error of a scene may exceed its standard deviation
-# by this factor.
-_SPREAD = 1.9
-# Range cells from which on the errors are so predictable; with fewer the factor is larger. Found by
-# trial.
-_CELLS = 24
-# Excess of the deviation (see `Crossed`) up to which range cells of similar power have the same
-# spectrum: it was 0.8 to 1.1 in 90 % of the scenes of clutter, 1.2 to 9 where each cell holds few
-# scatterers. In that case only the scatter of many cells predicts the errors: where less than so
-# many hold the energy, up to 6 % of scenes that change were wrong by more than five deviations.
-_UNLIKE, _MANY_ROWS = 1.2, 30.0
-_MOVED = 1.5  # deviations by which such cells may move the phases of all
-# Share of the coherence across a boundary between pulses that the fitted spectra must find: of
-# homogeneous scenes the least one was 0.6 to 0.9 over all boundaries, of scenes that change at a
-# pulse 0.1 to 0.5. Boundaries in the first and last sixteenth of the pulses are left out.
-_LEAST_SHARE, _OUTER = 0.55, 16
-# the phases that sharpen a sparse scene, as in `autofocus`
-_SHARPEN = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)
 _BLOCK_BYTES = 64 << 20  # limits the memory of a block of trials
 
 
-def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
+def link_phases(data: Tensor, *, start: Tensor | None = None, assess: bool = True) -> Estimate:
     """Estimate the phase of each pulse of a homogeneous scene by maximum likelihood.
+
+    >>> import torch
+    >>> from torchsar.compensate import link_phases
+    >>> clutter = torch.randn(16, 32, dtype=torch.complex64)
+    >>> link_phases(clutter, assess=False)["phase_rad"].shape
+    torch.Size([16])
 
     The scene is speckle with any Doppler spectrum. Its error does not depend on the size or kind of
     the phase errors. The time grows with the cube of the number of pulses, and the memory with its
@@ -82,32 +56,25 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
         start: Phase to start from in rad, shape (..., pulse), if it is known to about a radian; by
             default the search starts from phases that fit one of several Doppler bands best.
+        assess: Whether to add the standard deviation and the outcome.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed. The standard deviation of each pulse is
-        the Cramer-Rao bound for the estimated spectrum, in which range cells that depend on each
-        other count less, raised by the share of the likelihood that the phases gain on noise. The
-        bound takes range cells of similar power to have one spectrum. Where each holds few
-        scatterers, they have not; the deviation is therefore raised to what the scatter of the
-        range cells shows, each judged by the spectra of others. A constant and a linear phase only
-        add a phase to the image and shift it; they are left out of the standard deviation.
-        `quality` is the predicted Strehl ratio times the share of the likelihood that noise does
-        not explain. `ok` is judged by the range cells that have ten or more independent ones of
-        similar power beside them. It is False where these hold less than a fifth of the energy, as
-        in scenes of few points, for which `autofocus` is made; where the Strehl ratio for 1.9 times
-        the standard deviation by these cells (more where fewer than 24 of them hold the energy) is
-        below 0.8; where they alone would move the phases by 1.5 deviations; and where their scatter
-        exceeds the bound by a factor of 1.2 and less than 30 of them hold the energy. It is also
-        False where the gain in likelihood is below twice that of noise, the range profiles are not
-        aligned (see `Displacement`), the pulses before and after a boundary are less than 0.55
-        times as coherent as the spectra predict (where the scene changes, or pulses are copies of
-        each other), adjacent pulses are not coherent in any ten range cells of similar power, or a
-        sparse description of the scene with the phases that sharpen it is more likely. `info`
-        holds, of shape (...,), "gain_nats" (log likelihood minus that of white noise), "fit_nats"
-        (the same as if range cells were independent, by which phases of one scene compare),
-        "excess_deviation" (that scatter over the bound, infinite where it is not known),
-        "weakest_boundary" (the least coherence across a boundary relative to the prediction),
-        "jitter_cells" and "migration_cells".
+        `phase_rad` of shape (..., pulse), to be removed. `info` holds, of shape (...,), "gain_nats"
+        (log likelihood minus that of white noise) and "fit_nats" (the same as if range cells were
+        independent, by which phases of one scene compare).
+
+        With `assess`, the standard deviation of each pulse is the Cramer-Rao bound for the
+        estimated spectrum, in which range cells that depend on each other count less, raised by the
+        share of the likelihood that the phases gain on noise, and to what the scatter of the range
+        cells shows, each judged by the spectra of others. A constant and a linear phase, which only
+        shift the image, are left out of it. `quality` is the predicted Strehl ratio times the share
+        of the likelihood that noise does not explain. Outcomes: EMPTY; SINGULAR with fewer than
+        three pulses; NOISE if the likelihood gains less than twice as much as on noise; INEXACT if
+        the Strehl ratio for 1.9 standard deviations (more below 24 range cells) is below 0.8;
+        PARTS_DISAGREE if range cells of similar power have different spectra or ask for other
+        phases, or the pulses before and after a boundary are less than 0.55 times as coherent as
+        predicted; SPARSE if a sparse description is likelier, or few range cells have similar
+        power; DISPLACED.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -118,35 +85,10 @@ def link_phases(data: Tensor, *, start: Tensor | None = None) -> Estimate:
         Guarnieri and Tebaldini, IEEE Trans. Geosci. Remote Sens. 46(11), 2008 (phase linking).
     """
     pulses = prepare(data, "link_phases")
-    found = linked(pulses, starting_phase(start, pulses, "link_phases"))
-    if pulses.n < 3 or not len(pulses.rows):
-        return found
-    with torch.no_grad():
-        sharp = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
-        scene = describe(pulses.rows, sharp, occupied_band(pulses.rows))
-        likelier = (found.info["gain_nats"].flatten() > scene.sparse) & (scene.ratio > 0)
-    return replace(
-        found, outcome=torch.maximum(found.outcome, Outcome.of(likelier.reshape(pulses.trials), Outcome.SPARSE))
-    )
+    return linked(pulses, starting_phase(start, pulses, "link_phases"), assess=assess)
 
 
-def may_be_ok(rows: Tensor) -> Tensor:
-    """Tell where linked phases may be ok: range cells of similar power are not too few.
-
-    Args:
-        rows: Pulses, shape (trial, range, pulse), complex.
-
-    Returns:
-        False where the range cells that have nine or more of similar power beside them hold less
-        than a fifth of the energy, shape (trial,), bool.
-    """
-    energy = power_of(rows.detach()).sum(-1, dtype=torch.float64)
-    groups = power_groups(energy)
-    many = groups.sum(-1, keepdim=True) >= LEAST_LOOKS
-    return (groups * many * energy).sum((0, -1)) > LEAST_ENERGY * energy.sum(-1)
-
-
-def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False) -> Estimate:
+def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False, assess: bool = True) -> Estimate:
     """Estimate the phases of pulses that were checked; see `link_phases`.
 
     Args:
@@ -154,27 +96,24 @@ def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False) -> 
         start: Phase to start from in rad, shape (trial, pulse), or None.
         still: True if scatterers do not change and the caller confirms the phases, as by several
             starts. The Cramer-Rao bound for one spectrum of similar range cells then is the
-            deviation, also of few cells.
+            deviation, also of few cells, and a sparse description is not considered.
+        assess: Whether to add the standard deviation and the outcome.
 
     Returns:
         The `Estimate` that `link_phases` returns.
     """
-    rows, n = pulses.rows, pulses.n
-    if not len(rows):
-        none = torch.zeros(0, n, dtype=torch.float64, device=rows.device)
-        each = none[:, 0]
-        return _estimate(
-            pulses, _Linked(none, none, each, each, each), Crossed(none, each, each, each), Displacement(each, each)
-        )
+    rows, n, trials = pulses.rows, pulses.n, pulses.trials
+    if not len(rows) or n < 3:  # nothing to distinguish a phase error from a shift of the image
+        zero, none = torch.zeros(*trials, n, dtype=rows.real.dtype, device=rows.device), rows.real.sum((-2, -1)) * 0
+        info = {"gain_nats": none.reshape(trials), "fit_nats": none.reshape(trials)}
+        return Estimate({"phase_rad": zero}, outcome=Outcome.SINGULAR.like(info["gain_nats"]), info=info)
     size = max(1, _BLOCK_BYTES // (16 * n * (6 * n + 2 * rows.shape[1])))
     parts = [slice(first, first + size) for first in range(0, len(rows), size)]
     done: dict[int, tuple[Tensor, ...]] = {}
 
     def work(part: slice) -> None:
-        found, crossed = _linked(rows[part], pulses.present[part], None if start is None else start[part], still)
-        moved = displacement(rows[part], pulses.present[part])
-        jitter = torch.maximum(moved.jitter, coherent_jitter(rows[part], pulses.present[part]))
-        done[part.start] = *found, *crossed, jitter, moved.migration
+        begin = None if start is None else start[part]
+        done[part.start] = _linked(rows[part], pulses.present[part], begin, still, assess)
 
     if rows.requires_grad and torch.is_grad_enabled():
         for part in parts:
@@ -182,107 +121,40 @@ def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False) -> 
     else:
         with torch.no_grad():
             over_blocks(work, parts, rows)
-    results = [torch.cat(pieces) for pieces in zip(*(done[part.start] for part in parts), strict=True)]
-    return _estimate(pulses, _Linked(*results[:5]), Crossed(*results[5:9]), Displacement(*results[9:]))
-
-
-class _Linked(NamedTuple):
-    """Result of the linking of a block of trials.
-
-    Args:
-        phase: Phases in rad, (trial, pulse).
-        std: Their standard deviations in rad, (trial, pulse).
-        fit: Log likelihood minus that of white noise in nats, as if the range cells were
-            independent but for the band that they occupy, (trial,).
-        gain: The part of it that counts because range cells depend on each other, (trial,).
-        boundary: See `_weakest_boundary`, (trial,).
-    """
-
-    phase: Tensor
-    std: Tensor
-    fit: Tensor
-    gain: Tensor
-    boundary: Tensor
-
-
-def _estimate(pulses: Pulses, found: _Linked, crossed: Crossed, moved: Displacement) -> Estimate:
-    phase, std, fit, gain, boundary = found
-    real, trials = pulses.rows.real.dtype, pulses.trials
-    noise = _NOISE_NATS * pulses.present.sum(-1)
-    scene = (1 - noise / or_one(gain)).clamp(0, 1)
-    lost = torch.where(scene > 0, or_one(scene).rsqrt(), torch.inf)
-    std = (std * lost[:, None]).clamp_max(PRIOR**-0.5)
-    strehl = torch.exp(-rms_of_pulses(std, pulses.present).square())
-    alone = rms_of_pulses(crossed.std, pulses.present) * crossed.excess.clamp_min(1)
-    spread = _SPREAD**2 * (_CELLS / crossed.rows.clamp_min(1)).clamp_min(1)
-    fitted = (spread * (lost * alone).square() < -math.log(LEAST_STREHL)) & (crossed.shift < _MOVED * alone)
-    fitted = fitted & ((crossed.excess < _UNLIKE) | (crossed.rows > _MANY_ROWS)) & (gain > _MARGIN * noise)
-    fitted = fitted & (crossed.rows > LEAST_ROWS)
+    phase, fit, gain, *rest = (torch.cat(x) for x in zip(*(done[part.start] for part in parts), strict=True))
+    value = {"phase_rad": phase.reshape(*trials, n).to(rows.real.dtype)}
+    info = {"gain_nats": gain.reshape(trials), "fit_nats": fit.reshape(trials)}
+    if not assess:
+        return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(info["gain_nats"]), info=info)
+    with torch.no_grad():
+        found = Judged(*rest)
+        outcome, std, quality = outcome_of(pulses, found, gain, sparse=not still)
+    info |= {"excess_deviation": found.excess.reshape(trials), "weakest_boundary": found.boundary.reshape(trials)}
     return Estimate(
-        {"phase_rad": phase.reshape(*trials, pulses.n).to(real)},
-        {"phase_rad": std.reshape(*trials, pulses.n).to(real)},
-        (strehl * scene).reshape(trials).to(real),
-        Outcome.of((fitted & moved.aligned & (boundary > _LEAST_SHARE)).reshape(trials), Outcome.NOISE),
-        info={
-            "gain_nats": gain.reshape(trials),
-            "fit_nats": fit.reshape(trials),
-            "excess_deviation": crossed.excess.reshape(trials),
-            "weakest_boundary": boundary.reshape(trials),
-            "jitter_cells": moved.jitter.reshape(trials),
-            "migration_cells": moved.migration.reshape(trials),
-        },
+        value,
+        {"phase_rad": std.reshape(*trials, n).to(rows.real.dtype)},
+        quality.reshape(trials).to(rows.real.dtype),
+        outcome.reshape(trials),
+        info,
     )
 
 
-def _linked(rows: Tensor, present: Tensor, start: Tensor | None, still: bool) -> tuple[_Linked, Crossed]:
-    """Link the pulses of a block of trials."""
-    if rows.shape[-1] < 3:  # nothing to distinguish a phase error from a shift of the image
-        zero = torch.zeros(present.shape, dtype=torch.float64, device=rows.device)
-        none = zero[:, 0]
-        return _Linked(zero, zero + torch.inf, none, none, none), Crossed(zero, none, none, none)
+def _linked(rows: Tensor, present: Tensor, start: Tensor | None, still: bool, assess: bool) -> tuple[Tensor, ...]:
+    """Phases (trial, pulse) of a block of trials, their log likelihood minus that of white noise as
+    if range cells were independent, the part of it that counts because they depend on each other,
+    (trial,) each, and what they tell, see `Judged`.
+    """
     with torch.no_grad():
         scene = Speckle.of(rows.detach(), present)
         u, fit = _refined(scene, _grown(scene) if start is None else cis(start.to(torch.float64)))
-        each = scene.information_each(fit)
-        information, independent = scene.summed(each), scene.independent_share(u, fit, each)
         gain = scene.gain(u, fit)
-        if still:
-            energy = power_of(rows).sum(-1, dtype=torch.float64)
-            effective = energy.sum(-1).square() / or_one(energy.square().sum(-1))
-            std = deviation(independent[:, None, None] * information)
-            crossed = Crossed(std, torch.ones_like(effective), torch.zeros_like(effective), effective)
-        else:
-            looks = scene.looks(u, fit, each)
-            # phases follow the noise of few cells and leave less of it, so that these seem to tell
-            # more; one cell alone tells nothing, and the square was found by trial
-            kept = [own * (1 - count.clamp_min(1) ** -2)[:, None, None] for own, count in zip(each, looks, strict=True)]
-            crossed = scene.crossed(u, fit, kept, looks, independent)
-            std = deviation(independent[:, None, None] * scene.summed(kept)) * crossed.excess.clamp_min(1)[:, None]
-        gains = scene.independent * gain, independent * gain
-        judged = std, *gains, _weakest_boundary(fit.matrix, u, information)
-    if not rows.requires_grad or not torch.is_grad_enabled():
-        return _Linked(torch.angle(u), *judged), crossed
-    step = newton_step(Speckle.of(rows, present).matrix(fit.inverses), u)
-    return _Linked(torch.angle(u) + step - step.detach(), *judged), crossed
-
-
-def _weakest_boundary(matrix: Tensor, u: Tensor, information: Tensor) -> Tensor:
-    """Least coherence of the pulses before and after a boundary, over that of the model, (trial,).
-
-    It is the part of the log likelihood that pairs of pulses across the boundary contribute: it
-    would change its sign with the phases of all later pulses. Its expectation for a covariance R
-    is that of u^H (R^-T o C) u, which is half of the Fisher information.
-    """
-    skipped = u.shape[-1] // _OUTER
-
-    def across(pairs: Tensor) -> Tensor:
-        sums = pairs.cumsum(-2).cumsum(-1)
-        whole = sums[..., -1] - torch.diagonal(sums, dim1=-2, dim2=-1)
-        return whole[:, skipped : whole.shape[-1] - 1 - skipped]
-
-    found = across((u.conj()[:, :, None] * matrix * u[:, None, :]).real)
-    expected = across(information) / 2
-    return torch.where(expected < 0, found / torch.where(expected < 0, expected, -1), 1).amin(-1)
+        share = scene.independent_share(u, fit, scene.information_each(fit))
+        found = judged(scene, u, fit, still) if assess else ()
+    phase = torch.angle(u)
+    if rows.requires_grad and torch.is_grad_enabled():
+        step = newton_step(Speckle.of(rows, present).matrix(fit.inverses), u)
+        phase = phase + step - step.detach()
+    return phase, scene.independent * gain, share * gain, *found
 
 
 def _grown(scene: Speckle) -> Tensor:

@@ -16,7 +16,7 @@ from torchsar.compensate.pulse_phase.fixed_point import entropy_fixed_point
 from torchsar.compensate.pulse_phase.gradient import Kernel, Listed, Measured, Shrinking, Windows, pga, pga_sca
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.compensate.pulse_phase.linking import link_phases
-from torchsar.compensate.pulse_phase.recommended import autofocus
+from torchsar.compensate.pulse_phase.recommended import Scene, autofocus
 from torchsar.compensate.pulse_phase.sca import sca
 from torchsar.core import Estimate, Signal, Stage, checked_samples, real_dtype, refuse_non_finite
 from torchsar.focus import TargetImage
@@ -74,10 +74,18 @@ class CorrectPulsePhase(Stage):
 
 
 class Sca(Stage):
-    """Phase per pulse by the spatial correlation algorithm; see `sca`."""
+    """Phase per pulse by the spatial correlation algorithm; see `sca`.
+
+    Args:
+        assess: Whether to add the standard deviation and the outcome.
+    """
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
+
+    def __init__(self, assess: bool = True) -> None:
+        super().__init__()
+        self.assess = assess
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -85,14 +93,22 @@ class Sca(Stage):
         Returns:
             `Estimate` by the function `sca` with `phase_rad` of shape (..., pulse), to be removed.
         """
-        return sca(signal.data)
+        return sca(signal.data, assess=self.assess)
 
 
 class LinkPhases(Stage):
-    """Phase per pulse of a homogeneous scene by maximum likelihood; see `link_phases`."""
+    """Phase per pulse of a homogeneous scene by maximum likelihood; see `link_phases`.
+
+    Args:
+        assess: Whether to add the standard deviation and the outcome.
+    """
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
+
+    def __init__(self, assess: bool = True) -> None:
+        super().__init__()
+        self.assess = assess
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -105,7 +121,7 @@ class LinkPhases(Stage):
             `Estimate` by the function `link_phases` with `phase_rad` of shape (..., pulse), to be
             removed.
         """
-        return link_phases(signal.data, start=start)
+        return link_phases(signal.data, start=start, assess=self.assess)
 
 
 def windows_of(windows: Literal["shrinking", "measured"] | list[float]) -> Windows:
@@ -134,6 +150,7 @@ class Pga(Stage):
             `windows_of`.
         iterations: Largest number of iterations.
         patience: Number of iterations without a lower image entropy after which a trial ends.
+        assess: Whether to add the standard deviation and the outcome.
     """
 
     provides = ("phase_rad",)
@@ -145,10 +162,11 @@ class Pga(Stage):
         windows: Literal["shrinking", "measured"] | list[float] = "shrinking",
         iterations: int = 20,
         patience: int = 6,
+        assess: bool = True,
     ) -> None:
         super().__init__()
         self.kernel: Kernel = kernel
-        self.windows, self.iterations, self.patience = windows_of(windows), iterations, patience
+        self.windows, self.iterations, self.patience, self.assess = windows_of(windows), iterations, patience, assess
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -167,6 +185,7 @@ class Pga(Stage):
             windows=self.windows,
             iterations=self.iterations,
             patience=self.patience,
+            assess=self.assess,
         )
 
 
@@ -180,6 +199,7 @@ class PgaSca(Pga):
             `windows_of`.
         iterations: Largest number of iterations.
         patience: Number of iterations without a lower image entropy after which a trial ends.
+        assess: Whether to add the standard deviation and the outcome.
     """
 
     def __init__(
@@ -188,8 +208,9 @@ class PgaSca(Pga):
         windows: Literal["shrinking", "measured"] | list[float] = "shrinking",
         iterations: int = 20,
         patience: int = 6,
+        assess: bool = True,
     ) -> None:
-        super().__init__(kernel, windows, iterations, patience)
+        super().__init__(kernel, windows, iterations, patience, assess)
 
     def forward(self, signal: Signal) -> Estimate:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -199,7 +220,12 @@ class PgaSca(Pga):
             removed.
         """
         return pga_sca(
-            signal.data, kernel=self.kernel, windows=self.windows, iterations=self.iterations, patience=self.patience
+            signal.data,
+            kernel=self.kernel,
+            windows=self.windows,
+            iterations=self.iterations,
+            patience=self.patience,
+            assess=self.assess,
         )
 
 
@@ -213,6 +239,7 @@ class EntropyFixedPoint(Stage):
         relaxation: Factor applied to the phase step. An nn.Parameter stays tunable.
         imaging: Image formation whose image is sharpened; by default a Fourier transform along
             pulses.
+        assess: Whether to add the standard deviation and the outcome.
 
     Raises:
         ValueError: If `floors` and `iterations` differ in length.
@@ -227,6 +254,7 @@ class EntropyFixedPoint(Stage):
         iterations: list[int] | tuple[int, ...] = (12, 12),
         relaxation: float | nn.Parameter = 1.8,
         imaging: Imaging | None = None,
+        assess: bool = True,
     ) -> None:
         super().__init__()
         if len(floors) != len(iterations):
@@ -235,6 +263,7 @@ class EntropyFixedPoint(Stage):
                 f"{list(floors)} and iterations {list(iterations)}"
             )
         self.floors, self.iterations, self.relaxation, self.imaging = floors, iterations, relaxation, imaging
+        self.assess = assess
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -250,7 +279,12 @@ class EntropyFixedPoint(Stage):
         """
         floors = tuple(zip(self.floors, self.iterations))
         return entropy_fixed_point(
-            signal.data, start=start, floors=floors, relaxation=self.relaxation, imaging=self.imaging
+            signal.data,
+            start=start,
+            floors=floors,
+            relaxation=self.relaxation,
+            imaging=self.imaging,
+            assess=self.assess,
         )
 
 
@@ -263,14 +297,24 @@ class Autofocus(Stage):
             estimate of the scene.
         imaging: Image formation whose image is sharpened; by default a Fourier transform along
             pulses.
+        scene: Kind of the scene: "sparse", "points", "clutter" or "auto", see `autofocus`.
+        assess: Whether to add the standard deviation and the outcome.
     """
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
 
-    def __init__(self, search: int = 120, polish: int = 20, imaging: Imaging | None = None) -> None:
+    def __init__(
+        self,
+        search: int = 120,
+        polish: int = 20,
+        imaging: Imaging | None = None,
+        scene: Scene = "sparse",
+        assess: bool = True,
+    ) -> None:
         super().__init__()
-        self.search, self.polish, self.imaging = search, polish, imaging
+        self.search, self.polish, self.imaging, self.assess = search, polish, imaging, assess
+        self.scene: Scene = scene
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -284,7 +328,19 @@ class Autofocus(Stage):
             `Estimate` by the function `autofocus` with `phase_rad` of shape (..., pulse), to be
             removed.
         """
-        return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=self.imaging)
+        return autofocus(
+            signal.data,
+            start=start,
+            scene=self.scene,
+            search=self.search,
+            polish=self.polish,
+            imaging=self.imaging_of(signal),
+            assess=self.assess,
+        )
+
+    def imaging_of(self, signal: Signal) -> Imaging | None:
+        """Return the image formation for a signal."""
+        return self.imaging
 
 
 class TargetAutofocus(Autofocus):
@@ -299,28 +355,26 @@ class TargetAutofocus(Autofocus):
         search: Largest number of iterations of the entropy fixed point, approximately.
         polish: Largest number of further iterations, which compare each pulse with a Wiener
             estimate of the scene.
+        scene: Kind of the scene: "sparse", "points", "clutter" or "auto", see `autofocus`; with a
+            geometry it is taken to be sparse.
+        assess: Whether to add the standard deviation and the outcome.
     """
 
     def __init__(
-        self, radar: InverseRadar, geometry: FarField | Spotlight | None = None, search: int = 120, polish: int = 20
+        self,
+        radar: InverseRadar,
+        geometry: FarField | Spotlight | None = None,
+        search: int = 120,
+        polish: int = 20,
+        scene: Scene = "sparse",
+        assess: bool = True,
     ) -> None:
-        super().__init__(search, polish)
+        super().__init__(search, polish, scene=scene, assess=assess)
         self.target = None if geometry is None else TargetImage(radar, geometry)
 
-    def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
-
-        Args:
-            signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            start: Phase to start from in rad, shape (..., pulse); by default that of the
-                spatial correlation algorithm (function `sca`).
-
-        Returns:
-            `Estimate` by the function `autofocus` with `phase_rad` of shape (..., pulse), to be
-            removed.
-        """
-        imaging = None if self.target is None else self.target.operator(signal.data)
-        return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=imaging)
+    def imaging_of(self, signal: Signal) -> Imaging | None:
+        """Return the polar-format image formation for a signal, if the geometry is known."""
+        return None if self.target is None else self.target.operator(signal.data)
 
 
 class SharpestPhase(Stage):
@@ -330,6 +384,7 @@ class SharpestPhase(Stage):
         objective: "power_entropy" or "amplitude_entropy" (minimised), or "contrast" (maximised).
         method: Gradient descent: "lbfgs", or "adam" for rough objectives.
         steps: Largest number of steps.
+        assess: Whether to add the standard deviation and the outcome.
     """
 
     provides = ("phase_rad",)
@@ -340,11 +395,12 @@ class SharpestPhase(Stage):
         objective: Literal["power_entropy", "amplitude_entropy", "contrast"] = "power_entropy",
         method: Literal["lbfgs", "adam"] = "lbfgs",
         steps: int = 100,
+        assess: bool = True,
     ) -> None:
         super().__init__()
         self.objective: Literal["power_entropy", "amplitude_entropy", "contrast"] = objective
         self.method: Literal["lbfgs", "adam"] = method
-        self.steps = steps
+        self.steps, self.assess = steps, assess
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -358,4 +414,6 @@ class SharpestPhase(Stage):
             `Estimate` by the function `sharpest_phase` with `phase_rad` of shape (..., pulse), to
             be removed.
         """
-        return sharpest_phase(signal.data, objective=self.objective, method=self.method, steps=self.steps, start=start)
+        return sharpest_phase(
+            signal.data, objective=self.objective, method=self.method, steps=self.steps, start=start, assess=self.assess
+        )

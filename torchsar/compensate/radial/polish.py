@@ -12,10 +12,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, starting_phase
+from torchsar.compensate.pulse_phase.assess import conclude
+from torchsar.compensate.pulse_phase.data import find_phases, prepare, refuse_odd_counts, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import Run, Wiener, bright, in_turn
-from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate, power_of
 
 # standard deviation of the phase from which on it is not ok: a Strehl ratio of exp(-0.25) = 0.78
@@ -78,12 +78,14 @@ def phase_polish(
     refuse_odd_counts("phase_polish", 1, iterations=iterations)
     begin = starting_phase(start, pulses, "phase_polish")
 
-    def find(rows: Tensor, present: Tensor, at: Tensor | None) -> Found:
-        phase, taken = sharpened(rows, at, iterations, tolerance_rad)
-        again = [Run(_SCENE, AlongPulses(), 4, _RELAXATION, 0.0), Run(_near_peak, AlongPulses(2), 5, 1.0, 0.0)]
-        return phase, taken, lambda some, _, here: in_turn(some, here, again)[0]
+    def find(rows: Tensor, present: Tensor, at: Tensor | None) -> tuple[Tensor, Tensor]:
+        return sharpened(rows, at, iterations, tolerance_rad)
 
-    found = estimated(pulses, begin, find, at_rest=True)
+    def again(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
+        runs = [Run(_SCENE, AlongPulses(), 4, _RELAXATION, 0.0), Run(_near_peak, AlongPulses(2), 5, 1.0, 0.0)]
+        return in_turn(rows, at, runs)[0]
+
+    found = conclude(pulses, *find_phases(pulses, find, begin), True, again)
     return replace(found, value={"phase_rad": found["phase_rad"].to(torch.float64)})
 
 

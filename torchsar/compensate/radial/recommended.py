@@ -14,11 +14,10 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase import Listed, pga
 from torchsar.compensate.pulse_phase.data import or_one, prepare, rotate, starting_phase
-from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, describe
+from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, describe, occupied_band
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
-from torchsar.compensate.pulse_phase.verdict import occupied_band
 from torchsar.compensate.radial.bands import Bands, bands_of, filled, refuse_other_sweeps
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
@@ -216,7 +215,7 @@ def _confirmed(lines: Tensor, phase: Tensor, lit: Tensor, range_cells: Tensor) -
     """
     pulses = prepare(lines, "radial_motion")
     other = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
-    coherent = describe(pulses.rows, phase.to(other.dtype), occupied_band(pulses.rows)).ratio > 0
+    coherent = describe(pulses.rows, phase.to(other.dtype), occupied_band(torch.fft.fft(pulses.rows, dim=-2))).ratio > 0
     apart = 2 * phase_difference(phase, other.to(phase.dtype), lit)
     return (coherent | (range_cells < LEAST_LOOKS)) & (apart < _ENOUGH_APART_RAD), apart
 

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase import autofocus
-from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, starting_phase
+from torchsar.compensate.pulse_phase.assess import conclude
+from torchsar.compensate.pulse_phase.data import find_phases, prepare, refuse_odd_counts, starting_phase
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
-from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.compensate.rotation.motion import SEARCH_EPS
 from torchsar.compensate.rotation.recommended import coarse_rotation, phase_fit_rotation, uneven_rotation
 from torchsar.compensate.rotation.scatterers import ROUNDS
@@ -292,10 +292,12 @@ def rotating_autofocus(
     ]
     again = Run(Wiener(), through, 6, 1.0, _TOLERANCE_RAD)
 
-    def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:
-        phase, taken = in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
-        return phase, taken, lambda some, _, at: fixed_point(some, at, again)[0]
+    def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:
+        return in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
+
+    def continued(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
+        return fixed_point(rows, at, again)[0]
 
     with torch.no_grad():
         begin = starting_phase(start, pulses, "rotating_autofocus")
-        return estimated(pulses, begin, find, compare=False, imaging=through)
+        return conclude(pulses, *find_phases(pulses, find, begin, whole=True), True, continued, through)

@@ -1,0 +1,270 @@
+"""Assessment of the phases of pulses: whether they can be trusted, and how exact they are.
+
+Five questions are asked of any phases, whatever method found them:
+
+1. Is the image sharper than the one that autofocus makes of noise?
+2. Is a homogeneous description of the scene not likelier (`describe`)?
+3. Does no block of neighbouring range cells get sharper with phases of its own than noise explains?
+4. How far apart are the phases of two halves of the range cells? This is the standard deviation.
+5. Are the range profiles aligned (`displacement`)?
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.pulse_phase.alignment import LARGEST_JITTER, LARGEST_MIGRATION, displacement
+from torchsar.compensate.pulse_phase.data import Pulses, by_blocks, on_the_circle, or_one, rotate, without_line
+from torchsar.compensate.pulse_phase.homogeneous import describe, occupied_band
+from torchsar.compensate.pulse_phase.imaging import AlongPulses, Through
+from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
+from torchsar.compensate.pulse_phase.sharpness import sharpness_beyond_speckle, sharpness_of_noise
+from torchsar.core import Estimate, Outcome, host_value, power_of, worst
+from torchsar.metrics.phase import phase_rmse, residual_phase
+
+# continues a method: (rows, which of the trials these are, phase to start from) -> phase
+Again = Callable[[Tensor, Tensor | slice, Tensor], Tensor]
+
+UNKNOWN_RAD = math.pi / math.sqrt(3)  # standard deviation of a random phase
+LEAST_STREHL = 0.8  # Strehl ratio of a well-focused image, a convention (Marechal)
+# factor by which the sharpness must exceed that of noise: `sharpness_of_noise` errs by up to 15 %
+_MARGIN = 1.5
+# Blocks of neighbouring range cells, the cells of each that are judged (the strongest), iterations
+# of their own phases, and the largest gain in sharpness in units of that of noise. In 99 % of the
+# right trials with 3 to 25 points it was up to 2.2, and in 90 % of those in which a vehicle as
+# strong as 30 points moves on its own beyond 2.4. More or fewer blocks separate both less.
+_BLOCKS, _JUDGED, _ITERATIONS, _LARGEST_GAIN = 3, 64, 12, 2.2
+# Phases from which the halves start are apart by a walk of so many rad rms; they go on for so many
+# rounds at most, until a round moves them by less than this. Found by trial: what the scene does
+# not hold stays apart, and weak targets are found again.
+_DISTURBED_RAD, _RETURNED_RAD, _ROUNDS = 0.4, 0.04, 2
+# difference of halves from which on a phase counts as unknown: half of the difference of uniformly
+# distributed phases is half of their error
+_APART_RAD = 2.0
+_STRIP = 4  # lines of an image in a strip, by choice: more than the response of a point is wide
+
+
+def conclude(
+    pulses: Pulses,
+    phase_rad: Tensor,
+    iterations: Tensor,
+    assess: bool,
+    again: Again | None = None,
+    through: Through | None = None,
+) -> Estimate:
+    """Make the estimate of phases that a method found, assessed or not.
+
+    Args:
+        pulses: The pulses.
+        phase_rad: Phases that the method found in rad, shape (trial, pulse).
+        iterations: Number of its iterations, shape (trial,).
+        assess: Whether to assess the phases.
+        again: Continues the method from a phase, on some of the rows; by default four iterations of
+            the entropy fixed point (`settled`).
+        through: Image formation that the method sharpens; by default a Fourier transform along
+            pulses. With another one only the sharpness and the halves of the image are assessed.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), zero with fewer than three pulses. If it is assessed, the
+        standard deviation is half of the rms difference between the phases of two halves of the
+        range cells, and at least the distance of their mean from the phase; it is divided by the
+        square root of the share of the band that the data occupy. `quality` is the Strehl ratio
+        that follows from it, times the share of the sharpness that noise does not explain.
+
+        Outcomes: EMPTY; SINGULAR with fewer than three pulses; NOISE if the image is less than 1.5
+        times as sharp as autofocus makes noise; INEXACT if the Strehl ratio is below 0.8;
+        PARTS_DISAGREE if one of three blocks of range cells gets sharper with phases of its own by
+        more than 2.2 times the sharpness of noise; HOMOGENEOUS; DISPLACED. `info` holds "present",
+        shape (..., pulse), False for pulses of zeros; and, of shape (...,), "iterations", and if
+        assessed "sharpness_nats", "noise_sharpness_nats", "gain_of_parts", "jitter_cells" and
+        "migration_cells".
+    """
+    trials, n = pulses.trials, pulses.n
+    enough = pulses.present.sum(-1) >= 3
+    value = {"phase_rad": torch.where(enough[:, None], phase_rad, 0).reshape(*trials, n)}
+    info = {"present": pulses.present.reshape(*trials, n), "iterations": iterations.reshape(trials)}
+    if not assess:
+        return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(info["iterations"]), info=info)
+    rows, present, again = pulses.rows.detach(), pulses.present, again or settled
+    seen = by_blocks(pulses, partial(_seen, rows, present, phase_rad.detach(), again, through), through is not None)
+    sharp, noise, std, gain, homogeneous, jitter, migration = (x.reshape(trials) for x in seen)
+    strehl = torch.exp(-std.square())
+    outcome = worst(
+        (Outcome.INEXACT, strehl <= LEAST_STREHL),
+        (Outcome.PARTS_DISAGREE, gain > _LARGEST_GAIN),
+        (Outcome.HOMOGENEOUS, homogeneous > 0),
+        (Outcome.DISPLACED, (jitter >= LARGEST_JITTER) | (migration >= LARGEST_MIGRATION)),
+        (Outcome.NOISE, (sharp <= _MARGIN * noise) & (homogeneous == 0)),
+        (Outcome.EMPTY, ~present.any(-1).reshape(trials)),
+        (Outcome.SINGULAR, ~enough.reshape(trials)),
+    )
+    beyond = (1 - noise / or_one(sharp)).clamp(0, 1)
+    info |= {"sharpness_nats": sharp, "noise_sharpness_nats": noise, "gain_of_parts": gain}
+    return Estimate(
+        value,
+        {"phase_rad": std[..., None].expand(*trials, n).to(phase_rad.dtype)},
+        (strehl * beyond * (outcome < Outcome.SINGULAR)).to(phase_rad.dtype),
+        outcome,
+        {**info, "jitter_cells": jitter, "migration_cells": migration},
+    )
+
+
+def settled(rows: Tensor, which: Tensor | slice, phase: Tensor) -> Tensor:
+    """Continue any method by four iterations of the entropy fixed point, see `Again`."""
+    return fixed_point(rows, phase, Run(LogAbove(2.5), AlongPulses(), 4, 1.8, 0.0))[0]
+
+
+def _seen(
+    rows: Tensor, present: Tensor, phase: Tensor, again: Again, through: Through | None, part: slice
+) -> tuple[Tensor, ...]:
+    """Sharpness, that of noise, standard deviation, gain of parts, 1 where the scene is
+    homogeneous, jitter and migration of a block of trials, (trial,) each, float64.
+    """
+    which = torch.arange(len(rows), device=rows.device)[part]
+    rows, present, phase = rows[part], present[part], phase[part]
+    focused = rotate(rows, phase)
+    image = torch.fft.fft(focused, norm="ortho") if through is None else through.image(focused).mT
+    sharp, count = sharpness_beyond_speckle(image)
+    noise, zero = sharpness_of_noise(count.clamp_min(1)), torch.zeros_like(sharp)
+    if through is not None:
+        halves = halves_of_image(through, rows, phase)
+        return sharp, noise, half_difference(halves, present, phase, partial(_from, again, which)), *(zero,) * 4
+    spectrum = torch.fft.fft(rows, dim=-2)
+    band = occupied_band(spectrum)
+    apart = half_difference(halves_of_rows(rows), present, phase, partial(_disturbed, again, which, present))
+    moved = displacement(spectrum, present)
+    return (
+        sharp,
+        noise,
+        apart / band.sqrt(),
+        gain_of_parts(rows, present, phase),
+        describe(rows, phase, band).homogeneous.double(),
+        moved.jitter,
+        moved.migration,
+    )
+
+
+def gain_of_parts(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
+    """Compute how much sharper blocks of neighbouring range cells get with phases of their own.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        present: False where a pulse holds only zeros, shape (trial, pulse).
+        phase: Phases of all range cells in rad, shape (trial, pulse).
+
+    Returns:
+        The largest gain of three blocks in units of the sharpness that autofocus makes of noise in
+        as many range cells, shape (trial,), float64.
+    """
+    gains = [torch.zeros(len(rows), dtype=torch.float64, device=rows.device)]
+    for block in rows.tensor_split(_BLOCKS, -2):
+        if not block.shape[-2]:
+            continue
+        energy = power_of(block).sum(-1)
+        strongest = energy.topk(min(_JUDGED, block.shape[-2]), -1).indices
+        block = block.gather(-2, strongest[..., None].expand(-1, -1, rows.shape[-1]))
+        own = fixed_point(block, pair_phase(block, present), Run(LogAbove(2.5), AlongPulses(), _ITERATIONS, 1.8, 0.01))[
+            0
+        ]
+        images = (torch.fft.fft(rotate(block, at), norm="ortho") for at in (own, phase))
+        (alone, count), (common, _) = (sharpness_beyond_speckle(image) for image in images)
+        gains.append((alone - common) / sharpness_of_noise(count.clamp_min(1)))
+    return torch.stack(gains).amax(0)
+
+
+def halves_of_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Divide the rows (trial, range, pulse), sorted by energy, alternately into two halves."""
+    order = power_of(rows).sum(-1).argsort(-1, descending=True)
+    one, other = (
+        rows.gather(1, order[:, part::2].sort(-1).values[..., None].expand(-1, -1, rows.shape[-1])) for part in (0, 1)
+    )
+    return one, other
+
+
+def halves_of_image(through: Through, rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
+    """Divide pulses into those of two halves of their image, of the shape of the rows.
+
+    Range cells do not divide scatterers that migrate through them. Strips of four range lines of
+    the image (fewer if there are less than eight), sorted by energy, are taken alternately.
+    """
+    image = through.image(rotate(rows, phase))
+    lines = image.shape[-1]
+    strip = torch.arange(lines, device=image.device) // max(1, min(_STRIP, lines // 2))
+    energy = power_of(image).sum(-2)
+    strips = energy.new_zeros(len(energy), int(strip[-1]) + 1).index_add_(1, strip, energy)
+    place = strips.argsort(-1, descending=True).argsort(-1)[:, strip]
+    one, other = (rotate(through.adjoint(torch.where(place[:, None] % 2 == half, image, 0)), -phase) for half in (0, 1))
+    return one, other
+
+
+def half_difference(
+    halves: Sequence[Tensor],
+    present: Tensor,
+    phase: Tensor,
+    continued: Callable[[Sequence[Tensor], Tensor], Sequence[Tensor]],
+) -> Tensor:
+    """Predict the error of phases from the difference between the phases of two halves.
+
+    Args:
+        halves: Rows of both, shape (trial, range of the half, pulse) each, complex.
+        present: False where a pulse holds only zeros, shape (trial, pulse).
+        phase: Phase of both together in rad, shape (trial, pulse).
+        continued: Function of (halves, phase) that returns the phases of both.
+
+    Returns:
+        Half of the difference, and at least the distance of their mean from the phase, in rad rms,
+        shape (trial,), float64; that of a random phase if a half is empty. Differences of more than
+        2 rad count in full.
+    """
+    if not all(half.shape[-2] for half in halves):
+        return torch.full_like(phase[:, 0], UNKNOWN_RAD, dtype=torch.float64)
+    filled = torch.stack([(half != 0).flatten(1).any(-1) for half in halves]).all(0)
+    one, other = continued(halves, phase)
+    apart = residual_phase(one, other, present)
+    moved = phase_rmse(one - apart / 2, phase, present)
+    apart = torch.where(apart.abs() > _APART_RAD, apart, apart / 2)
+    apart = (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
+    return torch.where(filled, torch.maximum(apart, moved), UNKNOWN_RAD).double()
+
+
+def _from(again: Again, which: Tensor, halves: Sequence[Tensor], phase: Tensor) -> Sequence[Tensor]:
+    """Phases of halves that continue from the phase itself."""
+    return [again(half, which, phase) for half in halves]
+
+
+def _disturbed(
+    again: Again, which: Tensor, present: Tensor, halves: Sequence[Tensor], phase: Tensor
+) -> Sequence[Tensor]:
+    """Phases of halves that continue from either side of the phase until they return or settle."""
+    walk = _walk(phase)
+    ends: Sequence[Tensor] = (phase + walk, phase - walk)
+    active = torch.ones_like(phase[:, 0], dtype=torch.bool)
+    for number in range(1, _ROUNDS + 1):
+        reached = [again(half, which, at) for half, at in zip(halves, ends, strict=True)]
+        far = torch.stack([_moved(*pair, present) for pair in zip(reached, ends, strict=True)]) >= _RETURNED_RAD
+        ends = [torch.where(active[:, None], new, old) for new, old in zip(reached, ends, strict=True)]
+        active = active & far.any(0)
+        if number < _ROUNDS and not host_value(active.any(), True):
+            break
+    return ends
+
+
+def _moved(new: Tensor, old: Tensor, present: Tensor) -> Tensor:
+    """Rms of the change of phases (trial, pulse) about its mean and slope in rad, (trial,)."""
+    step = without_line(on_the_circle(new - old), present)
+    return (torch.where(present, step, 0).square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
+
+
+def _walk(phase: Tensor) -> Tensor:
+    """Walk of phases in rad without a straight line, (pulse,): the same in every trial."""
+    pulse = torch.arange(phase.shape[-1], dtype=torch.float64, device=phase.device)
+    # steps that repeat nowhere: the angles are irrational parts of a turn times squares
+    walk = torch.cos(math.pi * (math.sqrt(5) - 1) * pulse.square()).cumsum(-1)
+    walk = without_line(walk, torch.ones_like(walk, dtype=torch.bool))
+    return (_DISTURBED_RAD / walk.square().mean().sqrt() * walk).to(phase.dtype)

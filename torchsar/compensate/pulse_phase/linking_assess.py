@@ -1,0 +1,212 @@
+"""Assessment of linked phases: whether they can be trusted, and how exact they are.
+
+The questions are those of other phases, asked of the likelihood: is the gain over white noise more
+than that of phases of noise; is a sparse description of the scene not likelier; do parts of the
+range cells, each judged by the spectra of the others, ask for the same phases; do the pulses before
+and after every boundary belong to one scene; are the range profiles aligned?
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.pulse_phase.alignment import LARGEST_JITTER, LARGEST_MIGRATION, coherent_jitter, displacement
+from torchsar.compensate.pulse_phase.assess import LEAST_STREHL
+from torchsar.compensate.pulse_phase.data import Pulses, or_one
+from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, describe, occupied_band
+from torchsar.compensate.pulse_phase.imaging import AlongPulses
+from torchsar.compensate.pulse_phase.likelihood import (
+    PRIOR,
+    Fit,
+    Speckle,
+    deviation,
+    rms_of_pulses,
+    without_line_matrix,
+)
+from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
+from torchsar.core import Outcome, power_of, worst
+
+# Gain of the log likelihood per pulse by which the phases fit circular noise: 1.1 to 2.3 nats were
+# measured for 4 to 192 range cells and 64 to 256 pulses. A scene must gain twice as much.
+_NOISE_NATS, _MARGIN = 2.0, 2.0
+# The errors of neighbouring pulses depend on each other, and where the spectrum has no edges a slow
+# phase error hardly changes it, so that the rms error of a scene may exceed its standard deviation
+# by this factor, and by more with fewer range cells than `_CELLS`. Found by trial.
+_SPREAD, _CELLS = 1.9, 24
+_PARTS = 4  # parts of the range cells; 2 to 8 predict about the same
+# Share of the energy that the cells must hold which share their spectrum with others: cells with
+# the side lobes of few points do so too. It is a quarter in clutter with five points of +15 dB.
+_LEAST_ENERGY = 0.2
+# Excess of the deviation (see `Crossed`) up to which range cells of similar power have the same
+# spectrum: it was 0.8 to 1.1 in 90 % of the scenes of clutter, 1.2 to 9 where each cell holds few
+# scatterers; number of cells from which on their scatter predicts the errors all the same; and
+# deviations by which such cells may move the phases of all.
+_UNLIKE, _MANY_ROWS, _MOVED = 1.2, 30.0, 1.5
+# Share of the coherence across a boundary between pulses that the fitted spectra must find: of
+# homogeneous scenes the least one was 0.6 to 0.9 over all boundaries, of scenes that change at a
+# pulse 0.1 to 0.5. Boundaries in the first and last sixteenth of the pulses are left out.
+_LEAST_SHARE, _OUTER = 0.55, 16
+# the phases that sharpen a sparse scene, as in `autofocus`
+_SHARPEN = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)
+
+
+class Judged(NamedTuple):
+    """What a block of trials tells of its linked phases.
+
+    Args:
+        std: Standard deviation of the phase of each pulse in rad, (trial, pulse).
+        alone: That by the range cells that share their spectrum with others, rms in rad, (trial,).
+        excess: Factor by which the scatter of these cells exceeds the bound, infinite where their
+            curvature does not hold the phases, (trial,).
+        shift: Distance in rad rms by which these cells move the phases, (trial,).
+        rows: Effective number of these cells, (trial,).
+        boundary: Least coherence of pulses across a boundary relative to the prediction, (trial,).
+    """
+
+    std: Tensor
+    alone: Tensor
+    excess: Tensor
+    shift: Tensor
+    rows: Tensor
+    boundary: Tensor
+
+
+def judged(scene: Speckle, u: Tensor, fit: Fit, still: bool) -> Judged:
+    """Compute the deviation of linked phases, and what it rests on.
+
+    The Fisher information takes all cells of a group to have the same spectrum, and the fitted one
+    to be true. But cells of few scatterers each have their own, and a spectrum that is fitted to
+    few cells adapts to slow phase errors. Here each cell moves the phases by a Newton step for
+    spectra that other cells fit, with the curvature that these spectra give. The squares of the
+    steps add up to a variance ("sandwich" of curvature and scatter).
+
+    Args:
+        scene: The pulses.
+        u: Phases as exp(j phase), shape (trial, pulse).
+        fit: The fit to all range cells.
+        still: True if scatterers do not change and the caller confirms the phases, as by several
+            starts; the Cramer-Rao bound then is the deviation.
+
+    Reference:
+        White, Maximum likelihood estimation of misspecified models, Econometrica 50(1), 1982.
+    """
+    each = scene.information_each(fit)
+    independent = scene.independent_share(u, fit, each)
+    information = scene.summed(each)
+    boundary = _weakest_boundary(fit.matrix, u, information)
+    energy = torch.stack([power_of(own).sum(-2) for own, *_ in scene.groups]).sum(0)
+    if still:
+        std = deviation(independent[:, None, None] * information)
+        alone, one = rms_of_pulses(std, scene.present), torch.ones_like(boundary)
+        return Judged(std, alone, one, 0 * one, _effective(energy), boundary)
+    looks = [
+        scene.independent_share(u, fit, each, slice(k, k + 1)) * cells for k, (*_, cells) in enumerate(scene.groups)
+    ]
+    # phases follow the noise of few cells and leave less of it, so that these seem to tell more;
+    # one cell alone tells nothing, and the square was found by trial
+    each = [own * (1 - count.clamp_min(1) ** -2)[:, None, None] for own, count in zip(each, looks, strict=True)]
+    sharing = [count >= LEAST_LOOKS for count in looks]
+    bend, slopes = _crossed(scene, u, fit, sharing)
+    eye = torch.eye(u.shape[-1], dtype=torch.float64, device=u.device)
+    lower, failed = torch.linalg.cholesky_ex(bend + PRIOR * eye)
+    lower = torch.where((failed == 0)[:, None, None], lower, eye)
+    steps = without_line_matrix(u.shape[-1], u.device) @ torch.cholesky_solve(slopes, lower)
+    shared = [some[:, None, None] * own for some, own in zip(sharing, each, strict=True)]
+    alone = rms_of_pulses(deviation(independent[:, None, None] * scene.summed(shared)), scene.present)
+    scatter = (steps.square().sum(-1) / independent[:, None]).sqrt()
+    some = energy * sum(
+        here[:, None] * (own != 0).any(-2) for (own, *_), here in zip(scene.groups, sharing, strict=True)
+    )
+    known = (failed == 0) & (some.sum(-1) > _LEAST_ENERGY * energy.sum(-1))
+    excess = torch.where(known, rms_of_pulses(scatter, scene.present) / or_one(alone), torch.inf)
+    shift = torch.where(known, rms_of_pulses(steps.sum(-1), scene.present), torch.inf)
+    std = deviation(independent[:, None, None] * scene.summed(each)) * excess.clamp_min(1)[:, None]
+    return Judged(std, alone, excess, shift, _effective(some), boundary)
+
+
+def _crossed(scene: Speckle, u: Tensor, fit: Fit, sharing: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Curvature (trial, pulse, pulse) of the likelihood, and its slope by the phases for each range
+    cell, (trial, pulse, range); each part of the cells by the spectra that the others fit.
+    """
+    bend, slopes = torch.zeros_like(scene.groups[0][1].real), torch.zeros_like(scene.groups[0][0].real)
+    cells = torch.arange(slopes.shape[-1], device=u.device)
+    for part in cells.tensor_split(_PARTS):
+        inside = torch.isin(cells, part).expand(len(u), -1)
+        own_cells, others = scene.cells(inside), scene.cells(~inside)
+        adapted = zip(others.adapted(u, fit), sharing, strict=True)
+        crossed = others.fit([torch.where(some[:, None], spectrum, 1) for spectrum, some in adapted])
+        turned = (u.conj()[:, :, None] * own_cells.matrix(crossed.inverses) * u[:, None, :]).real
+        bend = bend + 2 * (turned - torch.diag_embed(turned.sum(-1)))
+        for (own, *_), inverse in zip(own_cells.groups, crossed.inverses, strict=True):
+            straight = own * u.conj()[..., None]
+            slopes = slopes - 2 * (straight.conj() * (inverse.mT @ straight)).imag
+    return bend, slopes
+
+
+def outcome_of(pulses: Pulses, found: Judged, gain: Tensor, sparse: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Conclude from what all trials tell.
+
+    Args:
+        pulses: The pulses.
+        found: What they tell.
+        gain: Log likelihood minus that of white noise in nats, shape (trial,).
+        sparse: Whether to compare with a sparse description of the scene.
+
+    Returns:
+        Outcomes; standard deviations in rad, (trial, pulse); and quality, shape (trial,).
+    """
+    noise = _NOISE_NATS * pulses.present.sum(-1)
+    share = (1 - noise / or_one(gain)).clamp(0, 1)
+    lost = torch.where(share > 0, or_one(share).rsqrt(), torch.inf)
+    std = (found.std * lost[:, None]).clamp_max(PRIOR**-0.5)
+    strehl = torch.exp(-rms_of_pulses(std, pulses.present).square())
+    alone = found.alone * found.excess.clamp_min(1)
+    spread = _SPREAD**2 * (_CELLS / found.rows.clamp_min(1)).clamp_min(1)
+    spectrum = torch.fft.fft(pulses.rows, dim=-2)
+    moved = displacement(spectrum, pulses.present)
+    jitter = torch.maximum(moved.jitter, coherent_jitter(pulses.rows, pulses.present))
+    outcome = worst(
+        (Outcome.INEXACT, spread * (lost * alone).square() >= -math.log(LEAST_STREHL)),
+        (Outcome.PARTS_DISAGREE, found.shift >= _MOVED * alone),
+        (Outcome.PARTS_DISAGREE, (found.excess >= _UNLIKE) & (found.rows <= _MANY_ROWS)),
+        (Outcome.PARTS_DISAGREE, found.boundary <= _LEAST_SHARE),
+        (Outcome.SPARSE, ~found.excess.isfinite()),
+        (Outcome.DISPLACED, (jitter >= LARGEST_JITTER) | (moved.migration >= LARGEST_MIGRATION)),
+        (Outcome.NOISE, gain <= _MARGIN * noise),
+        (Outcome.EMPTY, ~pulses.present.any(-1)),
+        (Outcome.SINGULAR, pulses.present.sum(-1) < 3),
+    )
+    if sparse:
+        sharp = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
+        scene = describe(pulses.rows, sharp, occupied_band(spectrum))
+        outcome = torch.maximum(outcome, worst((Outcome.SPARSE, (gain <= scene.sparse) | (scene.ratio <= 0))))
+    return outcome, std, strehl * share
+
+
+def _weakest_boundary(matrix: Tensor, u: Tensor, information: Tensor) -> Tensor:
+    """Least coherence of the pulses before and after a boundary, over that of the model, (trial,).
+
+    It is the part of the log likelihood that pairs of pulses across the boundary contribute: it
+    would change its sign with the phases of all later pulses. Its expectation for a covariance R
+    is that of u^H (R^-T o C) u, which is half of the Fisher information.
+    """
+    skipped = u.shape[-1] // _OUTER
+
+    def across(pairs: Tensor) -> Tensor:
+        sums = pairs.cumsum(-2).cumsum(-1)
+        whole = sums[..., -1] - torch.diagonal(sums, dim1=-2, dim2=-1)
+        return whole[:, skipped : whole.shape[-1] - 1 - skipped]
+
+    found = across((u.conj()[:, :, None] * matrix * u[:, None, :]).real)
+    expected = across(information) / 2
+    return torch.where(expected < 0, found / torch.where(expected < 0, expected, -1), 1).amin(-1)
+
+
+def _effective(energy: Tensor) -> Tensor:
+    """Effective number of range cells that hold the energy (trial, range), shape (trial,)."""
+    return energy.sum(-1).square() / or_one(energy.square().sum(-1))
