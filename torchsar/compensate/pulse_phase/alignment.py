@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
-from torchsar.core import power_of
+from torchsar.core import fft_lines, power_of
 
 # Displacements in cells rms from which on profiles are not aligned, from pulse to pulse and slow
 # ones. Found by trial on 2 to 300 scatterers: the phases may be wrong from 0.2 and 0.45 on, and
@@ -72,34 +72,43 @@ def displacement(spectrum: Tensor, present: Tensor) -> Displacement:
     cells, n = spectrum.shape[-2:]
     if cells < _LEAST_CELLS or n < _LEAST_PULSES:
         return Displacement(*torch.zeros(2, len(spectrum), dtype=torch.float64, device=spectrum.device))
-    one, other = (power_of(half) for half in _halves(spectrum))
+    one, other = _halves(spectrum)
+    whole = one + other
     length = -(-n // _GROUPS)
 
-    def grouped(x: Tensor) -> Tensor:
-        return torch.nn.functional.pad(x, (0, -n % length)).unflatten(-1, (-1, length))
+    def grouped(x: Tensor, dim: int = -1) -> Tensor:
+        more = [0] * (-2 * dim - 1) + [-n % length]
+        return torch.nn.functional.pad(x, more).unflatten(dim, (-1, length))
 
     count = grouped(present).sum(-1)
-    groups = [grouped(power).sum(-1) for power in (one, other)]
-    near = _near_half(one + other)
+    fast, near = _four_displacements(one, other, whole, present)
+    groups = [grouped(power, -2).sum(-2) for power in (one, other, whole)]
+    slow, _ = _four_displacements(groups[0], groups[1], groups[2], count > 0, near)
 
     def within(single: Tensor) -> Tensor:
         parts = grouped(single)
         return torch.where(grouped(present), parts - _mean(parts, grouped(present))[..., None], 0).flatten(-2)
 
-    fast = [within(x) for x in _four_displacements(one, other, near, present)]
-    slow = _four_displacements(groups[0], groups[1], near, count > 0)
     free = present.sum(-1) - (count > 0).sum(-1), (count > 0).sum(-1)
-    return Displacement(*(_shared(parts, values) for parts, values in zip((fast, slow), free, strict=True)))
+    return Displacement(_shared([within(x) for x in fast], free[0]), _shared(slow, free[1]))
 
 
-def _four_displacements(one: Tensor, other: Tensor, near: Tensor, present: Tensor) -> list[Tensor]:
+def _four_displacements(
+    one: Tensor, other: Tensor, whole: Tensor, present: Tensor, near: Tensor | None = None
+) -> tuple[list[Tensor], Tensor]:
     """Displacements by both halves of the band, and by the nearer and the farther range cells of
-    the whole band, (trial, pulse) each, float64.
+    the whole band, (trial, pulse) each, float64; and which are the nearer cells, (trial, cell).
+
+    one, other, whole: powers, (trial, pulse, cell). The nearer cells hold half of what shows a
+    displacement.
     """
-    return [
-        *(_displacements(power, present, [torch.ones_like(near)])[0] for power in (one, other)),
-        *_displacements(one + other, present, [near, ~near]),
-    ]
+    profiles = [_profiles(power) for power in (one, other, whole)]
+    if near is None:
+        weight = profiles[2][2].square()
+        near = 2 * (weight.cumsum(-1) - weight / 2) < weight.sum(-1, keepdim=True)
+    parts = [torch.ones_like(near)[:, None]] * 2 + [torch.stack([near, ~near], -2)]
+    found = [_displacements(*profile, cells, present) for profile, cells in zip(profiles, parts, strict=True)]
+    return [x for of_profile in found for x in of_profile], near
 
 
 def _shared(parts: list[Tensor], count: Tensor) -> Tensor:
@@ -128,7 +137,7 @@ def coherent_jitter(rows: Tensor, present: Tensor) -> Tensor:
     cells, n = rows.shape[-2:]
     if cells < _LEAST_CELLS or n < _LEAST_PULSES:
         return torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
-    spectrum = torch.fft.fft(rows, dim=-2)
+    spectrum = fft_lines(rows)
     offset = _about_centroid(spectrum)
     products = spectrum[..., 1:] * spectrum[..., :-1].conj()
     both = present[:, 1:] & present[:, :-1]
@@ -142,9 +151,11 @@ def coherent_jitter(rows: Tensor, present: Tensor) -> Tensor:
 
 
 def _halves(spectrum: Tensor) -> list[Tensor]:
-    """Profiles of the two halves of the band, about its centroid, on the same range cells."""
-    offset = _about_centroid(spectrum)
-    return [torch.fft.ifft(spectrum * half[..., None], dim=-2) for half in (offset > 0, offset <= 0)]
+    """Powers (trial, pulse, cell) of the profiles of the two halves of the band, about its
+    centroid, on the same range cells.
+    """
+    offset, lines = _about_centroid(spectrum), spectrum.mT
+    return [power_of(torch.fft.ifft(lines * half[:, None])) for half in (offset > 0, offset <= 0)]
 
 
 def _about_centroid(spectrum: Tensor) -> Tensor:
@@ -174,29 +185,25 @@ def _agreement(halves: list[Tensor], count: Tensor) -> Tensor:
     return torch.atanh(correlation) * (count - 3).clamp_min(0).sqrt()
 
 
-def _profiles(power: Tensor) -> tuple[Tensor, Tensor]:
-    """Moduli of the pulses, each of unit energy, and the slope of their sum, (trial, cell)."""
-    profile = power.sqrt() / or_one(power.sum(-2, keepdim=True)).sqrt()
-    mean = profile.sum(-1)
-    return profile, (mean.roll(-1, -1) - mean.roll(1, -1)) / 2
+def _profiles(power: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Moduli (trial, pulse, cell), the factors (trial, pulse) that give pulses unit energy, and the
+    slope (trial, cell) of the sum of the pulses.
+    """
+    profile, scale = power.sqrt(), or_one(power.sum(-1)).rsqrt()
+    mean = (scale[:, None] @ profile)[:, 0]
+    return profile, scale, (mean.roll(-1, -1) - mean.roll(1, -1)) / 2
 
 
-def _near_half(power: Tensor) -> Tensor:
-    """The nearer range cells that hold half of what shows a displacement, (trial, cell), bool."""
-    weight = _profiles(power)[1].square()
-    return 2 * (weight.cumsum(-1) - weight / 2) < weight.sum(-1, keepdim=True)
-
-
-def _displacements(power: Tensor, present: Tensor, parts: list[Tensor]) -> list[Tensor]:
+def _displacements(profile: Tensor, scale: Tensor, slope: Tensor, parts: Tensor, present: Tensor) -> list[Tensor]:
     """Displacements in cells by each of several parts of the range cells, (trial, pulse) each, of
     mean zero, and zero where no pulse is present.
 
-    parts: the range cells that are used, (trial, cell), bool.
+    profile, scale, slope: see `_profiles`. parts: the cells that are used, (trial, part, cell).
     """
-    profile, slope = _profiles(power)
-    slopes = torch.stack([slope * part for part in parts], -2)
+    slopes = slope[:, None] * parts
     count = present.sum(-1, keepdim=True).clamp_min(1)
-    found = -(slopes @ profile).double() * count[:, None] / or_one(slopes.square().sum(-1, keepdim=True)).double()
+    found = -(slopes @ profile.mT * scale[:, None]).double() * count[:, None]
+    found = found / or_one(slopes.square().sum(-1, keepdim=True)).double()
     return [torch.where(present, x - _mean(x, present)[..., None], 0) for x in found.unbind(-2)]
 
 

@@ -25,7 +25,7 @@ from torchsar.compensate.pulse_phase.imaging import AlongPulses, Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.sharpness import sharpness_beyond_speckle, sharpness_of_noise
-from torchsar.core import Estimate, Outcome, host_value, power_of, worst
+from torchsar.core import Estimate, Outcome, fft_lines, host_value, power_of, worst
 from torchsar.metrics.phase import phase_rmse, residual_phase
 
 # continues a method: (rows, which of the trials these are, phase to start from) -> phase
@@ -39,7 +39,7 @@ _MARGIN = 1.5
 # of their own phases, and the largest gain in sharpness in units of that of noise. In 99 % of the
 # right trials with 3 to 25 points it was up to 2.2, and in 90 % of those in which a vehicle as
 # strong as 30 points moves on its own beyond 2.4. More or fewer blocks separate both less.
-_BLOCKS, _JUDGED, _ITERATIONS, _LARGEST_GAIN = 3, 64, 12, 2.2
+_BLOCKS, _JUDGED, _ITERATIONS, _LARGEST_GAIN = 3, 48, 12, 2.2
 # Phases from which the halves start are apart by a walk of so many rad rms; they go on for so many
 # rounds at most, until a round moves them by less than this. Found by trial: what the scene does
 # not hold stays apart, and weak targets are found again.
@@ -65,7 +65,7 @@ def conclude(
         phase_rad: Phases that the method found in rad, shape (trial, pulse).
         iterations: Number of its iterations, shape (trial,).
         assess: Whether to assess the phases.
-        again: Continues the method from a phase, on some of the rows; by default four iterations of
+        again: Continues the method from a phase, on some of the rows; by default three iterations of
             the entropy fixed point (`settled`).
         through: Image formation that the method sharpens; by default a Fourier transform along
             pulses. With another one only the sharpness and the halves of the image are assessed.
@@ -116,8 +116,8 @@ def conclude(
 
 
 def settled(rows: Tensor, which: Tensor | slice, phase: Tensor) -> Tensor:
-    """Continue any method by four iterations of the entropy fixed point, see `Again`."""
-    return fixed_point(rows, phase, Run(LogAbove(2.5), AlongPulses(), 4, 1.8, 0.0))[0]
+    """Continue any method by three iterations of the entropy fixed point, see `Again`."""
+    return fixed_point(rows, phase, Run(LogAbove(2.5), AlongPulses(), 3, 1.8, 0.0))[0]
 
 
 def _seen(
@@ -135,7 +135,7 @@ def _seen(
     if through is not None:
         halves = halves_of_image(through, rows, phase)
         return sharp, noise, half_difference(halves, present, phase, partial(_from, again, which)), *(zero,) * 4
-    spectrum = torch.fft.fft(rows, dim=-2)
+    spectrum = fft_lines(rows)
     band = occupied_band(spectrum)
     apart = half_difference(halves_of_rows(rows), present, phase, partial(_disturbed, again, which, present))
     moved = displacement(spectrum, present)

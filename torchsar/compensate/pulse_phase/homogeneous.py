@@ -27,7 +27,8 @@ _LEAST_REST = 1e-14  # power of the weak cells relative to the mean: below it su
 # independent range cells below which a spectrum fits single scatterers as well as speckle: found by
 # trial on 4 to 20 cells of few points
 LEAST_LOOKS = 10.0
-_COMPARED = 64  # rows of a group, the strongest, whose products are compared
+# the strongest rows are described, and of each group those are compared by their products
+_DESCRIBED, _COMPARED = 256, 64
 _SURE = 4.0  # standard deviations by which coherence must exceed that of noise
 _BIN_NATS = 0.02  # width of the bins of logarithmic power in which strong cells are counted
 
@@ -100,6 +101,9 @@ def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> Descriptio
         The gains and the decision.
     """
     n = rows.shape[-1]
+    if rows.shape[-2] > _DESCRIBED:
+        strongest = power_of(rows).sum(-1).topk(_DESCRIBED, -1).indices
+        rows = rows.gather(1, strongest[..., None].expand(-1, -1, n))
     energy = power_of(rows)
     mean = energy.mean((-2, -1), dtype=torch.float64)
     power = energy.mean(-1, dtype=torch.float64) / or_one(mean)[:, None]

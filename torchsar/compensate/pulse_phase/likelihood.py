@@ -21,7 +21,7 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, occupied_band, power_groups
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
-from torchsar.core import cholesky_factor, cis, linear_solve, matrix_inverse, power_of
+from torchsar.core import cholesky_factor, cis, fft_lines, linear_solve, matrix_inverse, power_of
 
 _IN_BAND = 0.85  # share of the power in the band of a first guess
 _STEPS = 4  # Newton steps of the phases after each estimate of the spectrum
@@ -80,7 +80,7 @@ class Speckle:
             if bool(inside.any()):
                 own = z * inside[:, None, :]
                 groups.append((own, own @ own.mH, inside.sum(-1).to(torch.float64)))
-        return Speckle(groups, present, samples, occupied_band(torch.fft.fft(rows, dim=-2)))
+        return Speckle(groups, present, samples, occupied_band(fft_lines(rows)))
 
     def trials(self, at: Tensor) -> Speckle:
         """The scenes of some of the trials, given by their indices."""

@@ -29,7 +29,7 @@ from torchsar.compensate.pulse_phase.likelihood import (
 )
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
-from torchsar.core import Outcome, power_of, worst
+from torchsar.core import Outcome, fft_lines, power_of, worst
 
 # Gain of the log likelihood per pulse by which the phases fit circular noise: 1.1 to 2.3 nats were
 # measured for 4 to 192 range cells and 64 to 256 pulses. A scene must gain twice as much.
@@ -167,7 +167,7 @@ def outcome_of(pulses: Pulses, found: Judged, gain: Tensor, sparse: bool) -> tup
     strehl = torch.exp(-rms_of_pulses(std, pulses.present).square())
     alone = found.alone * found.excess.clamp_min(1)
     spread = _SPREAD**2 * (_CELLS / found.rows.clamp_min(1)).clamp_min(1)
-    spectrum = torch.fft.fft(pulses.rows, dim=-2)
+    spectrum = fft_lines(pulses.rows)
     moved = displacement(spectrum, pulses.present)
     jitter = torch.maximum(moved.jitter, coherent_jitter(pulses.rows, pulses.present))
     outcome = worst(

@@ -33,7 +33,7 @@ from torchsar.compensate.pulse_phase.sharpen import (
     fixed_point,
     in_turn,
 )
-from torchsar.core import Estimate, host_value, power_of, true_positions
+from torchsar.core import Estimate, fft_lines, host_value, power_of, true_positions
 from torchsar.metrics import entropy
 
 Scene = Literal["sparse", "points", "clutter", "auto"]
@@ -211,7 +211,7 @@ def _with_linked(pulses: Pulses, sharpest: Estimate, assess: bool) -> Estimate:
     """
     rows, phase = pulses.rows.detach(), sharpest["phase_rad"].detach().reshape(-1, pulses.n)
     with torch.no_grad():
-        described = describe(rows, phase, occupied_band(torch.fft.fft(rows, dim=-2)))
+        described = describe(rows, phase, occupied_band(fft_lines(rows)))
     at = true_positions(described.homogeneous, host_value(described.homogeneous.sum(), 0))
     if not len(at) or pulses.n < 3:
         return sharpest
