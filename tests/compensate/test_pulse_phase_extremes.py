@@ -10,7 +10,8 @@ from torch import Tensor
 
 from tests.compensate.scenes import DOUBLE, METHODS, noise, noisy, still, turned, white
 from torchsar.compensate import autofocus, correct_pulse_phase, entropy_fixed_point, link_phases, pga, phase_polish, sca
-from torchsar.compensate.pulse_phase.verdict import occupied_band, sharpness_of_noise
+from torchsar.compensate.pulse_phase.homogeneous import occupied_band
+from torchsar.compensate.pulse_phase.sharpness import sharpness_of_noise
 from torchsar.metrics import phase_rmse, residual_phase
 
 NAMES = list(METHODS)
