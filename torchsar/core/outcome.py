@@ -46,19 +46,24 @@ class Outcome(IntEnum):
         return _MESSAGES[self]
 
     @property
+    def label(self) -> str:
+        """Name in lower case with spaces, as reports show it."""
+        return self.name.lower().replace("_", " ")
+
+    @property
     def is_ok(self) -> bool:
         """True for a reliable estimate, and for one that was not assessed."""
-        return self < _DOUBTFUL
+        return self < DOUBTFUL
 
     @property
     def is_doubtful(self) -> bool:
         """True for an estimate that may be wrong, but is used."""
-        return _DOUBTFUL <= self < _FAILED
+        return DOUBTFUL <= self < FAILED
 
     @property
     def is_failed(self) -> bool:
         """True for an estimate that is not used."""
-        return self >= _FAILED
+        return self >= FAILED
 
     def like(self, x: Tensor) -> Tensor:
         """Return this code for every element of a tensor, int64."""
@@ -70,7 +75,8 @@ class Outcome(IntEnum):
         return worst((otherwise, ~ok))
 
 
-_DOUBTFUL, _FAILED = Outcome.INEXACT, Outcome.NOISE
+# first codes of their kind; plain numbers, since torch.compile compares no tensor with an enum
+DOUBTFUL, FAILED = int(Outcome.INEXACT), int(Outcome.NOISE)
 _MESSAGES = {
     Outcome.OK: "the estimate is reliable",
     Outcome.NOT_ASSESSED: "not assessed (assess=False)",
