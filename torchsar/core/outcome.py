@@ -36,9 +36,11 @@ class Outcome(IntEnum):
     NOT_CONVERGED = 18
     TOO_FEW = 19
     IN_DOUBT = 20
+    UNSPECIFIED = 21
     NOISE = 30
     EMPTY = 31
     SINGULAR = 32
+    ERROR = 33
 
     @property
     def message(self) -> str:
@@ -93,9 +95,11 @@ _MESSAGES = {
     Outcome.NOT_CONVERGED: "the iterations did not converge: allow more of them, or start nearer to the solution",
     Outcome.TOO_FEW: "too few pulses, range cells or scatterers to judge the estimate: use more data",
     Outcome.IN_DOUBT: "an estimate on which this one depends is doubtful",
+    Outcome.UNSPECIFIED: "not reliable, for a reason that was not given",
     Outcome.NOISE: "nothing rises above the noise: raise the SNR, or use more pulses or range cells",
     Outcome.EMPTY: "there are no samples other than zero",
     Outcome.SINGULAR: "the data do not determine the values",
+    Outcome.ERROR: "the method stopped with an error, which the log names",
 }
 
 

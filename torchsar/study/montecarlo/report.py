@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchsar.core import Outcome
 from torchsar.plot import axis_label
 from torchsar.study.montecarlo.pictures import label_text
 from torchsar.study.output.numbers import MISSING, number
@@ -73,7 +74,7 @@ def metric_tables(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
     for metric, points in grouped.items():
         limit = points[0].get("success_limit")
         success = [] if limit is None else [f"success (within {limit:g})"]
-        columns = [*first, "n of trials", *last, *success]
+        columns = [*first, "n of trials", *last, *success, "not ok"]
         tables.append({"title": axis_label(metric), "columns": columns, "rows": [_row(point) for point in points]})
     return tables
 
@@ -88,6 +89,7 @@ def _row(point: Mapping[str, Any]) -> list[str]:
         *(with_interval(point[value], point[interval]) for value, interval in pairs),
         number(point["std"]),
         *(with_interval(point[f"{name}_share"], point[f"{name}_interval"]) for name in shares),
+        ", ".join(f"{Outcome[name].label}: {n}" for name, n in point["outcomes"].items() if name != "OK") or MISSING,
     ]
 
 

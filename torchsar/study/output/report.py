@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -12,10 +13,12 @@ from typing import Any, Protocol
 import jinja2
 import torch
 
+from torchsar.core import Outcome
 from torchsar.plot import name_and_unit
 from torchsar.study.output.numbers import MISSING, number, quantity, scale_of
 from torchsar.study.output.pictures import Picture
 
+_NOT = {Outcome.NOT_ASSESSED.name}
 # largest number of metrics shown above the tables: two rows of four on a wide screen
 _TILES = 8
 
@@ -95,6 +98,7 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
     )
     of_targets = {name: method["targets"] for name, method in methods.items() if method["targets"]}
     theory = {"theory": metrics["theory"]} if metrics.get("theory") else {}
+    reasons = {name: rows for name, method in methods.items() if (rows := list(_reasons(method["outcomes"])))}
     return {
         "tiles": tiles,
         "cases": cases,
@@ -103,11 +107,28 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
         "methods": methods,
         "best": best,
         "estimates": [
-            (name, quantity(found["value"], name_and_unit(name)[1], found["std"]), found["ok"])
+            (name, quantity(found["value"], name_and_unit(name)[1], found["std"]), _in_words(found["outcome"]))
             for name, found in best["estimates"].items()
         ],
+        "reasons": reasons,
+        "not_assessed": [n for n, m in methods.items() if {key for of in m["outcomes"].values() for key in of} == _NOT],
         "metrics": metrics,
     }
+
+
+def _reasons(outcomes: Mapping[str, Any]) -> Iterator[tuple[str, int, str]]:
+    """Stage, number of trials and sentence of each outcome that is not ok."""
+    for stage, found in outcomes.items():
+        for name, row in found.items():
+            if not Outcome[name].is_ok:
+                yield stage, row["trials"], row["message"]
+
+
+def _in_words(outcomes: str | list[str] | None) -> str:
+    """Names of outcomes, (trial,) or one, as words such as "noise: 2, ok: 1"; empty if unknown."""
+    if outcomes is None or isinstance(outcomes, str):
+        return Outcome[outcomes].label if outcomes else MISSING
+    return ", ".join(f"{Outcome[name].label}: {n}" for name, n in Counter(outcomes).most_common())
 
 
 def _row(name: str, cells: list[str], soft: bool = False) -> dict[str, Any]:

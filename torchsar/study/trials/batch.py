@@ -1,8 +1,9 @@
-"""Batches of trials: recordings with their true values, and the outcome of every method."""
+"""Batches of trials: recordings with their true values, and the results of every method."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Recording, Signal, Trace
+from torchsar.core import Estimate, Outcome, Recording, Signal, Trace, counts
 
-OK = "ok"
+OK, OUTCOME = "ok", "outcome"
 IMAGE = ("azimuth", "range")
 Metrics = Mapping[str, Tensor]
 
@@ -55,7 +56,7 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Processed:
     """Result of one method in one batch.
 
     Args:
@@ -66,7 +67,9 @@ class Outcome:
         trace: All intermediate signals; None if nothing needs them.
         reusable: Stages that return an estimate and leave the signal unchanged.
         failed: The reason of its failure; empty if it did not fail.
+        codes: Worst code of each stage that estimates, (trial,) each, see `torchsar.Outcome`.
         neutral: Trials in which its stages used neutral values in place of estimates, see `Trace`.
+        doubtful: Trials in which its stages used doubtful estimates.
     """
 
     judged: Judged
@@ -76,7 +79,9 @@ class Outcome:
     trace: Trace | None = None
     reusable: Collection[str] = ()
     failed: str = ""
+    codes: Mapping[str, Tensor] = field(default_factory=dict)
     neutral: Mapping[str, Tensor] = field(default_factory=dict)
+    doubtful: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
     def metrics(self) -> Metrics:
@@ -88,7 +93,7 @@ class Batch:
     """The trials of one batch, and the result of every method."""
 
     trials: Trials
-    outcomes: Mapping[str, Outcome]
+    outcomes: Mapping[str, Processed]
 
 
 @dataclass(frozen=True)
@@ -102,7 +107,7 @@ class Result:
         targets: Metrics by method, target and name, (trial,).
         estimates: Estimates by method and name.
         truth: True values by name, (trial, ...).
-        neutral: Number of trials in which a stage used neutral values, by method and stage.
+        tallies: Numbers of trials by method.
     """
 
     bench: Any
@@ -111,7 +116,7 @@ class Result:
     targets: Mapping[str, Mapping[str, Metrics]]
     estimates: Mapping[str, Mapping[str, Found]]
     truth: Mapping[str, Tensor]
-    neutral: Mapping[str, Mapping[str, int]]
+    tallies: Mapping[str, Tally]
 
     @property
     def images(self) -> dict[str, Signal]:
@@ -119,17 +124,39 @@ class Result:
         signals = {name: outcome.signal for name, outcome in self.first.outcomes.items()}
         return {name: image_of(signal) for name, signal in signals.items() if signal is not None}
 
-    def first_of(self, name: str) -> Outcome:
+    def first_of(self, name: str) -> Processed:
         return self.first.outcomes[name]
 
 
 @dataclass(frozen=True)
+class Tally:
+    """Numbers of trials of a method.
+
+    Args:
+        reasons: By stage, those of each outcome of its estimate.
+        neutral: Those in which a stage used neutral values, by stage and parameter.
+        doubtful: Those in which a stage used doubtful values, by stage and parameter.
+    """
+
+    reasons: dict[str, Counter[Outcome]] = field(default_factory=dict)
+    neutral: Counter[str] = field(default_factory=Counter)
+    doubtful: Counter[str] = field(default_factory=Counter)
+
+    def add(self, result: Processed) -> None:
+        """Count the trials of a batch."""
+        for stage, codes in result.codes.items():
+            self.reasons.setdefault(stage, Counter()).update(counts(codes))
+        for total, masks in ((self.neutral, result.neutral), (self.doubtful, result.doubtful)):
+            total.update({key: int(mask.sum()) for key, mask in masks.items()})
+
+
+@dataclass(frozen=True)
 class Found:
-    """Estimates of a quantity: value, standard deviation (trial, ...) and `ok` (trial,)."""
+    """Estimates of a quantity: value and standard deviation (trial, ...), and codes (trial,)."""
 
     value: Tensor
     std: Tensor | None
-    ok: Tensor | None
+    outcome: Tensor | None
 
 
 def joined_metrics(parts: Sequence[Metrics]) -> dict[str, Tensor]:
@@ -151,17 +178,24 @@ def joined_found(parts: Sequence[Mapping[str, Found]]) -> dict[str, Found]:
         return torch.cat(there) if len(there) == len(values) else None
 
     names = [name for name in parts[0] if all(name in part for part in parts)]
-    fields = {name: [whole([getattr(p[name], f) for p in parts]) for f in ("value", "std", "ok")] for name in names}
-    return {name: Found(value, std, ok) for name, (value, std, ok) in fields.items() if value is not None}
+    fields = {
+        name: [whole([getattr(p[name], f) for p in parts]) for f in ("value", "std", "outcome")] for name in names
+    }
+    return {name: Found(value, std, codes) for name, (value, std, codes) in fields.items() if value is not None}
 
 
 def summary(metrics: Metrics) -> dict[str, float]:
     """Return the mean of each metric over the trials in which it is finite, and its standard
-    deviation as `<name>_sd` if there are several such trials.
+    deviation as `<name>_sd` if there are several such trials; of `ok` the mean over the trials that
+    were assessed.
     """
     row: dict[str, float] = {}
     for name, value in metrics.items():
+        if name == OUTCOME:
+            continue
         x = value.to(torch.float64)
+        if name == OK and OUTCOME in metrics:
+            x = torch.where(metrics[OUTCOME] == int(Outcome.NOT_ASSESSED), math.nan, x)
         there = x[torch.isfinite(x)]
         row[name] = float(there.mean()) if len(there) else math.nan
         if len(there) > 1 and name != OK:
@@ -169,12 +203,22 @@ def summary(metrics: Metrics) -> dict[str, float]:
     return row
 
 
-def verdict(estimates: Mapping[str, Estimate], count: int) -> dict[str, Tensor]:
-    """Return {"ok": whether all estimates of a trial are reliable, bool (trial,)}, or {} without
-    estimates.
+def codes_of(estimates: Mapping[str, Estimate], count: int) -> dict[str, Tensor]:
+    """Return the worst code of each estimate in every trial, (trial,), by stage."""
+    return {stage: _worst(rows(estimate.outcome, count)) for stage, estimate in estimates.items()}
+
+
+def verdict(codes: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return {"ok": whether all estimates of a trial are reliable, bool (trial,), "outcome": the
+    worst code}, or {} without estimates.
     """
-    found = [rows(estimate.ok, count).flatten(1).all(1) for estimate in estimates.values()]
-    return {OK: torch.stack(found).all(0)} if found else {}
+    worst = _worst(torch.stack(list(codes.values()), 1)) if codes else None
+    return {} if worst is None else {OK: worst < Outcome.INEXACT, OUTCOME: worst}
+
+
+def _worst(codes: Tensor) -> Tensor:
+    """The greatest code of each trial of codes (trial, ...); that of no code is OK."""
+    return codes.amax(1) if codes.shape[1] else codes.sum(1)
 
 
 def rows(x: Tensor, count: int) -> Tensor:
