@@ -270,8 +270,8 @@ def test_a_trial_function_gives_outcomes_or_ok_or_neither(tmp_path: Path) -> Non
     codes = torch.tensor([Outcome.OK, Outcome.MISFIT, Outcome.NOISE])
 
     def trial(parameters, draws):
-        m = torch.zeros(3)
-        named = {"reasons": {"m": m, "outcome": codes, "ok": m > 0}, "verdicts": {"m": m, "ok": codes == 0}}
+        m, here = torch.zeros(len(draws.trials)), codes[list(draws.trials)]
+        named = {"reasons": {"m": m, "outcome": here, "ok": m > 0}, "verdicts": {"m": m, "ok": here == 0}}
         return {**named, "neither": {"m": m}}
 
     made = sweep(trial, {"law": ["flat"]}, trials=3, out=tmp_path / "s")

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Outcome
+from torchsar.core import Outcome, counts
 from torchsar.io import write_arrays
 from torchsar.study.commands.requires import refuse_beyond_limits
 from torchsar.study.output.arrays import write_json
@@ -21,7 +21,7 @@ from torchsar.study.output.progress import Steps, Ticker
 from torchsar.study.output.report import run_fields, write_page
 from torchsar.study.settings.cases import ALL, cases_of, key_of
 from torchsar.study.settings.sections import Loaded
-from torchsar.study.trials.batch import OK, Batch, Found, Result, Tally, joined_found, joined_metrics, summary
+from torchsar.study.trials.batch import Batch, Found, Result, joined_found, joined_metrics, summary
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import per_trial_first
 
@@ -108,7 +108,7 @@ def _case(bench: Bench, name: str) -> Result:
     targets: dict[str, dict[str, list[Mapping[str, Tensor]]]] = {}
     estimates: dict[str, list[Mapping[str, Found]]] = {}
     truth: list[Mapping[str, Tensor]] = []
-    tallies: dict[str, Tally] = {}
+    marks: dict[str, list[dict[str, Mapping[str, Tensor]]]] = {}
     for chunk in _chunks(bench):
         keep = bench.chains if first is None else ()
         batch = bench.batch(bench.draws(system.address, chunk), keep=keep, detail=True)
@@ -117,14 +117,17 @@ def _case(bench: Bench, name: str) -> Result:
         for method, outcome in batch.outcomes.items():
             metrics.setdefault(method, []).append(outcome.metrics)
             estimates.setdefault(method, []).append(system.found(bench, outcome, batch.trials))
-            tallies.setdefault(method, Tally()).add(outcome)
+            marks.setdefault(method, []).append(
+                {"outcomes": outcome.codes, "neutral": outcome.neutral, "doubtful": outcome.doubtful}
+            )
             for target, found in outcome.judged.targets.items():
                 targets.setdefault(method, {}).setdefault(target, []).append(found)
     assert first is not None
     whole = {method: joined_metrics(parts) for method, parts in metrics.items()}
     of_targets = {method: {t: joined_metrics(parts) for t, parts in of.items()} for method, of in targets.items()}
     found = {method: joined_found(parts) for method, parts in estimates.items()}
-    result = Result(bench, first, whole, of_targets, found, joined_metrics(truth), tallies)
+    told = {m: {kind: joined_metrics([part[kind] for part in of]) for kind in of[0]} for m, of in marks.items()}
+    result = Result(bench, first, whole, of_targets, found, joined_metrics(truth), told)
     _warn_if_unreliable(name, result)
     log.info("%s: %.1f s", bench.loaded.name if name == ALL else name, time.perf_counter() - began)
     return result
@@ -132,14 +135,17 @@ def _case(bench: Bench, name: str) -> Result:
 
 def _warn_if_unreliable(case: str, result: Result) -> None:
     """Warn of unreliable estimates of the recommended method."""
-    verdicts = result.metrics["recommended"].get(OK)
-    if verdicts is not None and not bool((verdicts > 0).all()):
-        count, where = int((verdicts == 0).sum()), "" if case == ALL else f"{case}: "
-        log.warning("warning: %srecommended: estimates not ok in %d of %d trials", where, count, len(verdicts))
-        for stage, reasons in result.tallies["recommended"].reasons.items():
-            for code, of in sorted(reasons.items()):
-                if not code.is_ok:
-                    log.warning("  %s, %d of %d trials: %s", stage, of, len(verdicts), code.message)
+    where = "" if case == ALL else f"{case}: "
+    for stage, codes in result.marks["recommended"]["outcomes"].items():
+        for code, count in _reasons(codes).items():
+            if not code.is_ok:
+                told = (f"{where}recommended.{stage}", count, len(codes), code.message)
+                log.warning("warning: %s, not ok in %d of %d trials: %s", *told)
+
+
+def _reasons(codes: Tensor) -> dict[Outcome, int]:
+    """Number of trials of each outcome, from codes that are NaN in batches without them."""
+    return counts(codes[codes.isfinite()].long())
 
 
 def _scalars(batch: Batch) -> dict[str, Tensor]:
@@ -226,13 +232,16 @@ def _method_tree(title: str, name: str, results: Mapping[str, Result]) -> dict[s
         "seconds_by_stage": dict(first.seconds),
         "failed": "; ".join(key_of(case, o.failed) for case, o in outcomes.items() if o.failed),
         "outcomes": {
-            key_of(c, stage): {code.name: {"trials": n, "message": code.message} for code, n in sorted(reasons.items())}
+            key_of(c, stage): {code.name: {"trials": n, "message": code.message} for code, n in _reasons(codes).items()}
             for c, r in results.items()
-            for stage, reasons in r.tallies[name].reasons.items()
+            for stage, codes in r.marks[name]["outcomes"].items()
         },
         **{
             kind: {
-                key_of(c, key): n for c, r in results.items() for key, n in getattr(r.tallies[name], kind).items() if n
+                key_of(c, key): int(used.nansum())
+                for c, r in results.items()
+                for key, used in r.marks[name][kind].items()
+                if used.nansum()
             }
             for kind in ("neutral", "doubtful")
         },

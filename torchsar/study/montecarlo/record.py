@@ -14,8 +14,6 @@ from torchsar.study.montecarlo.grid import RESERVED, check_name
 from torchsar.study.settings.errors import ConfigError
 
 OK, OUTCOME = "ok", "outcome"
-# code of trials that have not run
-_NOT_RUN = 255
 Labels = dict[str, tuple[float | str, ...]]
 
 
@@ -68,7 +66,7 @@ class Record(Shown):
         """Return an array of NaN with the shape of a metric, (algorithm, *parameters, trial), or of
         a bound, (*parameters, trial).
         """
-        return np.full(self.outcome.shape if by_algorithm else self.done.shape, np.nan)
+        return blank(self.outcome.shape if by_algorithm else self.done.shape, float)
 
     def index_of(self, labels: Mapping[str, float | str]) -> tuple[int, ...]:
         """Index of a point, from its labels by parameter."""
@@ -105,7 +103,7 @@ class Record(Shown):
                 metric or bound cannot be used.
         """
         if not self.algorithms:
-            self.algorithms, self.outcome = tuple(values), not_run((len(values), *self.done.shape))
+            self.algorithms, self.outcome = tuple(values), blank((len(values), *self.done.shape), np.uint8)
         if set(values) != set(self.algorithms):
             new = next((repr(a) for a in values if a not in self.algorithms), None)
             gave = f"{', '.join(values)} alone" if new is None else f"the algorithm {new}"
@@ -198,14 +196,9 @@ def bound_name(metric: str, bound: str) -> str:
     return f"{metric}_bound_{''.join(c if c.isalnum() else '_' for c in bound.lower())}"
 
 
-def not_run(shape: tuple[int, ...]) -> np.ndarray:
-    """Return the codes of trials that have not run."""
-    return np.full(shape, _NOT_RUN, np.uint8)
-
-
-def blank_of(dtype: np.dtype) -> float:
-    """Return what an array of this dtype holds for trials that have not run."""
-    return {"b": False, "u": _NOT_RUN}.get(dtype.kind, np.nan)
+def blank(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """Return an array of trials that have not run: of False, of 255 as codes, or of NaN."""
+    return np.full(shape, {"b": False, "u": 255}.get(np.dtype(dtype).kind, np.nan), dtype)
 
 
 def _codes(values: Mapping[str, Sequence[float]]) -> Any:
@@ -216,7 +209,7 @@ def _codes(values: Mapping[str, Sequence[float]]) -> Any:
 
 
 def _enlarged(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    out = np.full((*x.shape[: x.ndim - len(shape)], *shape), blank_of(x.dtype), x.dtype)
+    out = blank((*x.shape[: x.ndim - len(shape)], *shape), x.dtype)
     out[tuple(map(slice, x.shape))] = x
     return out
 

@@ -26,7 +26,7 @@ from zarr.codecs import Crc32cCodec
 from torchsar.core import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
 from torchsar.core.memory import all_false
 from torchsar.study.montecarlo.grid import Grid
-from torchsar.study.montecarlo.record import OUTCOME, Labels, Record, blank_of, not_run
+from torchsar.study.montecarlo.record import OUTCOME, Labels, Record, blank
 from torchsar.study.settings.errors import ConfigError, one_line
 
 # number of the layout of the store; another one is refused on resume
@@ -197,7 +197,7 @@ class Store:
                 "shape": data.shape,
                 "dtype": data.dtype,
                 "chunks": (*leading, chunk),
-                "fill_value": blank_of(data.dtype),
+                "fill_value": blank((), data.dtype).item(),
                 "dimension_names": dims,
                 "attributes": about,
                 "compressors": [Crc32cCodec()],
@@ -235,7 +235,7 @@ def empty(labels: Labels, trials: int) -> Record:
     """
     shape = (*map(len, labels.values()), trials)
     try:
-        return Record((), dict(labels), all_false(shape), not_run((0, *shape)))
+        return Record((), dict(labels), all_false(shape), blank((0, *shape), np.uint8))
     except (MemoryError, ValueError):
         raise ConfigError(
             f"sweep: the results of {' x '.join(map(str, shape))} trials do not fit into memory; "
@@ -340,7 +340,7 @@ def _read(root: zarr.Group, held: Mapping[str, Any], marks: Mapping[str, Any]) -
         for first, last in marks[index]["spans"]:
             record.done[(*point, slice(first, last))] = True
     record.algorithms = tuple(held.get("algorithms", ()))
-    record.outcome = not_run((len(record.algorithms), *record.done.shape))
+    record.outcome = blank((len(record.algorithms), *record.done.shape), np.uint8)
     for name in held.get("arrays", ()):
         array: Any = root[name]
         about = _attributes(array)

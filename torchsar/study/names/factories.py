@@ -40,17 +40,16 @@ def with_assess(make: Callable[..., nn.Module]) -> Callable[..., Any]:
         if not (assess or estimators):
             raise ValueError(f"the outcome of {type(stage).__name__} cannot be left out; leave assess at true")
         for part in estimators:
-            part.assess = assess  # pyright: ignore[reportAttributeAccessIssue]
+            part.assess = assess  # pyright: ignore[reportArgumentType]
         return stage
 
-    signature = inspect.signature(make)
+    signature, hints = inspect.signature(make), {**typing.get_type_hints(make), "assess": bool}
     parameter = inspect.Parameter("assess", inspect.Parameter.KEYWORD_ONLY, default=True, annotation=bool)
-    about, reference, rest = inspect.cleandoc(make.__doc__ or "").partition("\n\nReference:")
-    added = "\n    assess: Whether the outcome and the standard deviations are determined as well."
-    made.__signature__ = signature.replace(parameters=[*signature.parameters.values(), parameter])  # pyright: ignore
-    made.__doc__, made.__annotations__ = (
-        about + added + reference + rest,
-        {**typing.get_type_hints(make), "assess": bool},
+    added = "Args:\n    assess: Whether the outcome and the standard deviations are determined as well."
+    made.__doc__ = inspect.cleandoc(make.__doc__ or "").replace("Args:", added, 1)
+    made.__signature__, made.__annotations__ = (  # pyright: ignore[reportAttributeAccessIssue]
+        signature.replace(parameters=[*signature.parameters.values(), parameter]),
+        hints,
     )
     return made
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -98,7 +98,15 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
     )
     of_targets = {name: method["targets"] for name, method in methods.items() if method["targets"]}
     theory = {"theory": metrics["theory"]} if metrics.get("theory") else {}
-    reasons = {name: rows for name, method in methods.items() if (rows := list(_reasons(method["outcomes"])))}
+    reasons = {
+        name: [
+            (stage, row["trials"], row["message"])
+            for stage, found in method["outcomes"].items()
+            for code, row in found.items()
+            if not Outcome[code].is_ok
+        ]
+        for name, method in methods.items()
+    }
     return {
         "tiles": tiles,
         "cases": cases,
@@ -110,25 +118,17 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
             (name, quantity(found["value"], name_and_unit(name)[1], found["std"]), _in_words(found["outcome"]))
             for name, found in best["estimates"].items()
         ],
-        "reasons": reasons,
+        "reasons": {name: rows for name, rows in reasons.items() if rows},
         "not_assessed": [n for n, m in methods.items() if {key for of in m["outcomes"].values() for key in of} == _NOT],
         "metrics": metrics,
     }
 
 
-def _reasons(outcomes: Mapping[str, Any]) -> Iterator[tuple[str, int, str]]:
-    """Stage, number of trials and sentence of each outcome that is not ok."""
-    for stage, found in outcomes.items():
-        for name, row in found.items():
-            if not Outcome[name].is_ok:
-                yield stage, row["trials"], row["message"]
-
-
 def _in_words(outcomes: str | list[str] | None) -> str:
-    """Names of outcomes, (trial,) or one, as words such as "noise: 2, ok: 1"; empty if unknown."""
-    if outcomes is None or isinstance(outcomes, str):
-        return Outcome[outcomes].label if outcomes else MISSING
-    return ", ".join(f"{Outcome[name].label}: {n}" for name, n in Counter(outcomes).most_common())
+    """Names of outcomes, (trial,) or one, as words such as "noise: 2, ok: 1"."""
+    found = Counter([outcomes] if isinstance(outcomes, str) else outcomes)
+    named = ((Outcome[name].label, n) for name, n in found.most_common())
+    return ", ".join(label if found.total() == 1 else f"{label}: {n}" for label, n in named) or MISSING
 
 
 def _row(name: str, cells: list[str], soft: bool = False) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Recording, Signal, Trace, counts
+from torchsar.core import Estimate, Outcome, Recording, Signal, Trace
 
 OK, OUTCOME = "ok", "outcome"
 IMAGE = ("azimuth", "range")
@@ -107,7 +106,8 @@ class Result:
         targets: Metrics by method, target and name, (trial,).
         estimates: Estimates by method and name.
         truth: True values by name, (trial, ...).
-        tallies: Numbers of trials by method.
+        marks: By method and kind ("outcomes", "neutral", "doubtful"): codes of its stages, and
+            whether they used neutral or doubtful values, (trial,) each.
     """
 
     bench: Any
@@ -116,7 +116,7 @@ class Result:
     targets: Mapping[str, Mapping[str, Metrics]]
     estimates: Mapping[str, Mapping[str, Found]]
     truth: Mapping[str, Tensor]
-    tallies: Mapping[str, Tally]
+    marks: Mapping[str, Mapping[str, Metrics]]
 
     @property
     def images(self) -> dict[str, Signal]:
@@ -126,28 +126,6 @@ class Result:
 
     def first_of(self, name: str) -> Processed:
         return self.first.outcomes[name]
-
-
-@dataclass(frozen=True)
-class Tally:
-    """Numbers of trials of a method.
-
-    Args:
-        reasons: By stage, those of each outcome of its estimate.
-        neutral: Those in which a stage used neutral values, by stage and parameter.
-        doubtful: Those in which a stage used doubtful values, by stage and parameter.
-    """
-
-    reasons: dict[str, Counter[Outcome]] = field(default_factory=dict)
-    neutral: Counter[str] = field(default_factory=Counter)
-    doubtful: Counter[str] = field(default_factory=Counter)
-
-    def add(self, result: Processed) -> None:
-        """Count the trials of a batch."""
-        for stage, codes in result.codes.items():
-            self.reasons.setdefault(stage, Counter()).update(counts(codes))
-        for total, masks in ((self.neutral, result.neutral), (self.doubtful, result.doubtful)):
-            total.update({key: int(mask.sum()) for key, mask in masks.items()})
 
 
 @dataclass(frozen=True)
@@ -205,20 +183,16 @@ def summary(metrics: Metrics) -> dict[str, float]:
 
 def codes_of(estimates: Mapping[str, Estimate], count: int) -> dict[str, Tensor]:
     """Return the worst code of each estimate in every trial, (trial,), by stage."""
-    return {stage: _worst(rows(estimate.outcome, count)) for stage, estimate in estimates.items()}
+    codes = {stage: rows(estimate.outcome, count) for stage, estimate in estimates.items()}
+    return {stage: torch.nn.functional.pad(x, (1, 0)).amax(1) for stage, x in codes.items()}
 
 
 def verdict(codes: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return {"ok": whether all estimates of a trial are reliable, bool (trial,), "outcome": the
     worst code}, or {} without estimates.
     """
-    worst = _worst(torch.stack(list(codes.values()), 1)) if codes else None
+    worst = torch.stack(list(codes.values())).amax(0) if codes else None
     return {} if worst is None else {OK: worst < Outcome.INEXACT, OUTCOME: worst}
-
-
-def _worst(codes: Tensor) -> Tensor:
-    """The greatest code of each trial of codes (trial, ...); that of no code is OK."""
-    return codes.amax(1) if codes.shape[1] else codes.sum(1)
 
 
 def rows(x: Tensor, count: int) -> Tensor:
