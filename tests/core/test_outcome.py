@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -61,3 +64,12 @@ def test_an_estimate_without_an_outcome_is_not_assessed() -> None:
 def test_an_outcome_of_another_kind_is_refused(outcome: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="integers `outcome`"):
         Estimate({"a_m": torch.zeros(1)}, quality=torch.zeros(1), outcome=outcome)
+
+
+def test_the_page_of_outcomes_lists_every_code_with_its_sentence() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "how_to" / "ok.md").read_text(encoding="utf-8")
+    rows = [row.split(" | ") for row in re.findall(r"^\| (\d+ \| `.*) \|$", page, re.MULTILINE)]
+    kinds = ["ok" if one.is_ok else "doubtful" if one.is_doubtful else "failed" for one in Outcome]
+    assert rows == [
+        [str(int(one)), f"`{one.name}`", kind, one.message] for one, kind in zip(Outcome, kinds, strict=True)
+    ]
