@@ -282,13 +282,6 @@ def test_a_trial_function_gives_outcomes_or_ok_or_neither(tmp_path: Path) -> Non
             [Outcome.NOT_ASSESSED] * 3,
         ]
         assert record.ok[:, 0, :3].sum(-1).tolist() == [1, 1, 3] and record.ok.sum() == 5
-        assert {code: n[:, 0].tolist() for code, n in record.reasons.items()} == {
-            Outcome.OK: [1, 1, 0],
-            Outcome.NOT_ASSESSED: [0, 0, 3],
-            Outcome.MISFIT: [1, 0, 0],
-            Outcome.UNSPECIFIED: [0, 2, 0],
-            Outcome.NOISE: [1, 0, 0],
-        }
 
 
 def test_a_store_of_an_earlier_layout_is_refused_with_a_sentence(

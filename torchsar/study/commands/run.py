@@ -108,7 +108,7 @@ def _case(bench: Bench, name: str) -> Result:
     targets: dict[str, dict[str, list[Mapping[str, Tensor]]]] = {}
     estimates: dict[str, list[Mapping[str, Found]]] = {}
     truth: list[Mapping[str, Tensor]] = []
-    marks: dict[str, list[dict[str, Mapping[str, Tensor]]]] = {}
+    marks: dict[str, list[Mapping[str, Mapping[str, Tensor]]]] = {}
     for chunk in _chunks(bench):
         keep = bench.chains if first is None else ()
         batch = bench.batch(bench.draws(system.address, chunk), keep=keep, detail=True)
@@ -117,16 +117,17 @@ def _case(bench: Bench, name: str) -> Result:
         for method, outcome in batch.outcomes.items():
             metrics.setdefault(method, []).append(outcome.metrics)
             estimates.setdefault(method, []).append(system.found(bench, outcome, batch.trials))
-            marks.setdefault(method, []).append(
-                {"outcomes": outcome.codes, "neutral": outcome.neutral, "doubtful": outcome.doubtful}
-            )
+            marks.setdefault(method, []).append(outcome.marks)
             for target, found in outcome.judged.targets.items():
                 targets.setdefault(method, {}).setdefault(target, []).append(found)
     assert first is not None
     whole = {method: joined_metrics(parts) for method, parts in metrics.items()}
     of_targets = {method: {t: joined_metrics(parts) for t, parts in of.items()} for method, of in targets.items()}
     found = {method: joined_found(parts) for method, parts in estimates.items()}
-    told = {m: {kind: joined_metrics([part[kind] for part in of]) for kind in of[0]} for m, of in marks.items()}
+    told = {
+        method: {k: joined_metrics([part.get(k, {}) for part in parts]) for k in ("outcomes", "neutral", "doubtful")}
+        for method, parts in marks.items()
+    }
     result = Result(bench, first, whole, of_targets, found, joined_metrics(truth), told)
     _warn_if_unreliable(name, result)
     log.info("%s: %.1f s", bench.loaded.name if name == ALL else name, time.perf_counter() - began)
@@ -139,8 +140,8 @@ def _warn_if_unreliable(case: str, result: Result) -> None:
     for stage, codes in result.marks["recommended"]["outcomes"].items():
         for code, count in _reasons(codes).items():
             if not code.is_ok:
-                told = (f"{where}recommended.{stage}", count, len(codes), code.message)
-                log.warning("warning: %s, not ok in %d of %d trials: %s", *told)
+                text = "warning: %srecommended.%s, not ok in %d of %d trials: %s"
+                log.warning(text, where, stage, count, len(codes), code.message)
 
 
 def _reasons(codes: Tensor) -> dict[Outcome, int]:

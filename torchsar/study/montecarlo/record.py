@@ -49,11 +49,6 @@ class Record(Shown):
         return self.outcome < Outcome.INEXACT
 
     @property
-    def reasons(self) -> dict[Outcome, np.ndarray]:
-        """Number of trials of each outcome that occurs, (algorithm, *parameters)."""
-        return {code: n for code in Outcome if (n := (self.outcome == code).sum(-1)).any()}
-
-    @property
     def trials(self) -> int:
         """Length of the trial dim."""
         return self.done.shape[-1]
@@ -114,8 +109,10 @@ class Record(Shown):
         indices = zip(*((*point, trial) for point, trial in zip(points, trials)))
         rows = np.ravel_multi_index(tuple(indices), self.done.shape)
         for number, algorithm in enumerate(self.algorithms):
-            self.outcome[number].reshape(-1)[rows] = _codes(values[algorithm])
-            for metric, found in values[algorithm].items():
+            given = values[algorithm]
+            verdicts = np.where(given[OK], Outcome.OK, Outcome.UNSPECIFIED) if OK in given else Outcome.NOT_ASSESSED
+            self.outcome[number].reshape(-1)[rows] = given.get(OUTCOME, verdicts)
+            for metric, found in given.items():
                 if metric not in (OK, OUTCOME):
                     self._array(self.metrics, metric, metric)[number].reshape(-1)[rows] = found
         for metric, named in bounds.items():
@@ -199,13 +196,6 @@ def bound_name(metric: str, bound: str) -> str:
 def blank(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """Return an array of trials that have not run: of False, of 255 as codes, or of NaN."""
     return np.full(shape, {"b": False, "u": 255}.get(np.dtype(dtype).kind, np.nan), dtype)
-
-
-def _codes(values: Mapping[str, Sequence[float]]) -> Any:
-    """The codes of trials from their results."""
-    if OUTCOME in values:
-        return values[OUTCOME]
-    return np.where(values[OK], Outcome.OK, Outcome.UNSPECIFIED) if OK in values else Outcome.NOT_ASSESSED
 
 
 def _enlarged(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

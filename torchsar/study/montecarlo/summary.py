@@ -127,7 +127,8 @@ def summary_of(record: Record, success: Mapping[str, float]) -> Summary:
         metric: {name: finite_rms(np.where(record.done, values, np.nan)) for name, values in named.items()}
         for metric, named in record.bounds.items()
     }
-    return Summary(record.algorithms, record.labels, figures, bounds, record.reasons)
+    outcomes = {code: n for code in Outcome if (n := (record.outcome == code).sum(-1)).any()}
+    return Summary(record.algorithms, record.labels, figures, bounds, outcomes)
 
 
 def _statistics(values: np.ndarray, seed: int) -> dict[str, np.ndarray]:

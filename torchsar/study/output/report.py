@@ -18,7 +18,6 @@ from torchsar.plot import name_and_unit
 from torchsar.study.output.numbers import MISSING, number, quantity, scale_of
 from torchsar.study.output.pictures import Picture
 
-_NOT = {Outcome.NOT_ASSESSED.name}
 # largest number of metrics shown above the tables: two rows of four on a wide screen
 _TILES = 8
 
@@ -119,7 +118,11 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
             for name, found in best["estimates"].items()
         ],
         "reasons": {name: rows for name, rows in reasons.items() if rows},
-        "not_assessed": [n for n, m in methods.items() if {key for of in m["outcomes"].values() for key in of} == _NOT],
+        "not_assessed": [
+            name
+            for name, method in methods.items()
+            if {code for found in method["outcomes"].values() for code in found} == {Outcome.NOT_ASSESSED.name}
+        ],
         "metrics": metrics,
     }
 
@@ -127,8 +130,9 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
 def _in_words(outcomes: str | list[str] | None) -> str:
     """Names of outcomes, (trial,) or one, as words such as "noise: 2, ok: 1"."""
     found = Counter([outcomes] if isinstance(outcomes, str) else outcomes)
-    named = ((Outcome[name].label, n) for name, n in found.most_common())
-    return ", ".join(label if found.total() == 1 else f"{label}: {n}" for label, n in named) or MISSING
+    return (
+        ", ".join(f"{Outcome[x].label}{f': {n}' if len(found) > 1 else ''}" for x, n in found.most_common()) or MISSING
+    )
 
 
 def _row(name: str, cells: list[str], soft: bool = False) -> dict[str, Any]:

@@ -66,9 +66,9 @@ class Processed:
         trace: All intermediate signals; None if nothing needs them.
         reusable: Stages that return an estimate and leave the signal unchanged.
         failed: The reason of its failure; empty if it did not fail.
-        codes: Worst code of each stage that estimates, (trial,) each, see `torchsar.Outcome`.
-        neutral: Trials in which its stages used neutral values in place of estimates, see `Trace`.
-        doubtful: Trials in which its stages used doubtful estimates.
+        marks: What is known of its stages in every trial, (trial,) each: "outcomes", the worst code
+            of each stage that estimates, and whether stages used "neutral" or "doubtful" values,
+            see `Trace`.
     """
 
     judged: Judged
@@ -78,9 +78,7 @@ class Processed:
     trace: Trace | None = None
     reusable: Collection[str] = ()
     failed: str = ""
-    codes: Mapping[str, Tensor] = field(default_factory=dict)
-    neutral: Mapping[str, Tensor] = field(default_factory=dict)
-    doubtful: Mapping[str, Tensor] = field(default_factory=dict)
+    marks: Mapping[str, Metrics] = field(default_factory=dict)
 
     @property
     def metrics(self) -> Metrics:
@@ -106,8 +104,7 @@ class Result:
         targets: Metrics by method, target and name, (trial,).
         estimates: Estimates by method and name.
         truth: True values by name, (trial, ...).
-        marks: By method and kind ("outcomes", "neutral", "doubtful"): codes of its stages, and
-            whether they used neutral or doubtful values, (trial,) each.
+        marks: What is known of the stages in every trial, by method; see `Processed`.
     """
 
     bench: Any
@@ -179,12 +176,6 @@ def summary(metrics: Metrics) -> dict[str, float]:
         if len(there) > 1 and name != OK:
             row[f"{name}_sd"] = float(there.std())
     return row
-
-
-def codes_of(estimates: Mapping[str, Estimate], count: int) -> dict[str, Tensor]:
-    """Return the worst code of each estimate in every trial, (trial,), by stage."""
-    codes = {stage: rows(estimate.outcome, count) for stage, estimate in estimates.items()}
-    return {stage: torch.nn.functional.pad(x, (1, 0)).amax(1) for stage, x in codes.items()}
 
 
 def verdict(codes: Mapping[str, Tensor]) -> dict[str, Tensor]:

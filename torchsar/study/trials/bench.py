@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchsar.core import (
     Chain,
@@ -29,7 +30,7 @@ from torchsar.echo import apply_impairments
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded, Method
 from torchsar.study.trials.auto import resolved
-from torchsar.study.trials.batch import Batch, Judged, Processed, Trials, codes_of, fault_of_image, rows, verdict
+from torchsar.study.trials.batch import Batch, Judged, Processed, Trials, fault_of_image, rows, verdict
 from torchsar.study.trials.chains import build_chains, reason_of, true_names
 
 log = logging.getLogger("torchsar")
@@ -186,6 +187,7 @@ class Bench:
     def _outcome(
         self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Processed], detail: bool
     ) -> Processed:
+        codes = {name: torch.full((trials.count,), int(Outcome.ERROR))}
         try:
             trace, estimates, seconds = self._run(name, method, trials, earlier)
             system = self.system
@@ -203,17 +205,15 @@ class Bench:
             if name == "recommended" or os.environ.get("TORCHSAR_DEBUG"):
                 raise ConfigError(f"{self.file}: processor.{name}: {text}") from error
             log.warning("warning: %s failed: %s", name, text)
-            codes = {name: torch.full((trials.count,), int(Outcome.ERROR))}
-            return Processed(Judged(verdict(codes)), failed=text, codes=codes)
-        codes = codes_of(estimates, trials.count)
+            return Processed(Judged(verdict(codes)), failed=text, marks={"outcomes": codes})
+        # without targets there is no code, which is OK, 0
+        codes = {stage: pad(rows(e.outcome, trials.count), (1, 0)).amax(1) for stage, e in estimates.items()}
         spent = torch.full((trials.count,), sum(seconds.values()) / trials.count, dtype=torch.float64)
         judged = replace(judged, metrics={"seconds": spent, **verdict(codes), **judged.metrics})
         left = [stage for stage in trace.inputs if trace.outputs[stage] is trace.inputs[stage]]
-        neutral, doubtful = (
-            {key: rows(mask, trials.count).any(1) for key, mask in masks.items()}
-            for masks in (trace.neutral, trace.doubtful)
-        )
-        return Processed(judged, estimates, trace.signal, seconds, trace, left, "", codes, neutral, doubtful)
+        used = {"neutral": trace.neutral, "doubtful": trace.doubtful}
+        used = {kind: {key: rows(x, trials.count).any(1) for key, x in of.items()} for kind, of in used.items()}
+        return Processed(judged, estimates, trace.signal, seconds, trace, left, marks={"outcomes": codes, **used})
 
     def _run(
         self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Processed]

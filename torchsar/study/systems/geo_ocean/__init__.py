@@ -23,7 +23,7 @@ from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.geo.radar import bistatic_radar
 from torchsar.study.systems.geo_ocean import choices, figures
 from torchsar.study.systems.geo_ocean.world import TRUTHS, Ocean
-from torchsar.study.trials.batch import OK, OUTCOME, Found, Judged, Processed, Result, Trials
+from torchsar.study.trials.batch import OK, Found, Judged, Processed, Result, Trials, verdict
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Column, System
 
@@ -177,8 +177,8 @@ class GeoOcean(System):
         if any(scene.targets is not None for scene in made):
             counts = [len(s.targets or ()) - sum(t is not None for t in f.values()) for s, f in zip(made, views)]
             whole["false_targets"] = torch.tensor(counts, dtype=torch.float64)
-            whole[OK] = torch.stack([of[OK] > 0 for of in ships.values()]).all(0)
-            whole[OUTCOME] = Outcome.of(whole[OK], Outcome.NOISE)
+            found = torch.stack([of[OK] > 0 for of in ships.values()]).all(0)
+            whole |= verdict({"ships": Outcome.of(found, Outcome.NOISE)})
         if not detail:
             whole |= {f"{ship}.{key}": x for ship, of in ships.items() for key, x in of.items() if key != OK}
         whole = {key: value.expand(trials.count) for key, value in whole.items()}
