@@ -323,7 +323,7 @@ def test_bad_recordings_are_named(
             {"iq": np.concatenate([np.ones((90, 160, 2), np.float32), np.zeros((6, 160, 2), np.float32)])},
             ["raw.npz", "6 of 96 lines hold only zeros", "line 90"],
         ),
-        ({"pilot": np.zeros(4096, np.complex64)}, ["recommended", "unreliable in 1 of 1 trials (pilot)"]),
+        ({"pilot": np.zeros(4096, np.complex64)}, ["recommended.pilot, not ok in 1 of 1 trials: "]),
     ],
 )
 def test_doubtful_recordings_are_named_in_a_warning(

@@ -6,6 +6,7 @@ import math
 import os
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ import yaml
 
 from tests.study.tiny import TINY
 from torchsar.cli import main
-from torchsar.core import PeakMemory
+from torchsar.compensate import EnergyCentre
+from torchsar.core import Outcome, PeakMemory
 from torchsar.focus import Detect, FocusStrip, QuickLook
 from torchsar.io import StripImage, read_images, read_stripmap
 from torchsar.study.table import load
@@ -226,7 +228,7 @@ def test_estimates_from_the_middle_hold_for_the_whole_strip(folder: Path, capsys
     text = config(folder / "strip.yaml", before=before).read_text(encoding="utf-8")
     assert "doppler_hz: -3000.0" in text
     (folder / "strip.yaml").write_text(
-        text.replace("doppler_hz: -3000.0", "uses: {doppler_hz: doppler.doppler_baseband_hz}, in_doubt: apply"),
+        text.replace("doppler_hz: -3000.0", "uses: {doppler_hz: doppler.doppler_baseband_hz}"),
         encoding="utf-8",
     )
     killed_in(lambda: focus(folder, "out"), 2)
@@ -236,17 +238,19 @@ def test_estimates_from_the_middle_hold_for_the_whole_strip(folder: Path, capsys
     assert set(values) == {"doppler_hz"} and abs(values["doppler_hz"]) < 1257
 
 
-def test_an_estimate_that_is_not_ok_is_shown_with_the_value_in_its_place(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+def test_an_estimate_that_failed_is_shown_with_the_reason_and_the_value_in_its_place(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    found, failed = EnergyCentre.forward, Outcome.NOISE.like(torch.zeros(()))
+    monkeypatch.setattr(EnergyCentre, "forward", lambda self, *x, **y: replace(found(self, *x, **y), outcome=failed))
     text = config(folder / "strip.yaml", before="doppler: {stage: energy_centre}").read_text(encoding="utf-8")
     connected = text.replace("doppler_hz: -3000.0", "uses: {doppler_hz: doppler.doppler_baseband_hz}")
     (folder / "strip.yaml").write_text(connected, encoding="utf-8")
     assert focus(folder, "out") == 0
     lines = capsys.readouterr().err.splitlines()
-    (found,) = (line for line in lines if line.startswith("torchsar: doppler: "))
+    (shown,) = (line for line in lines if line.startswith("torchsar: doppler: "))
     (used,) = (line for line in lines if line.startswith("torchsar: focus uses "))
-    assert found.endswith(" (not ok)") and used == "torchsar: focus uses doppler_hz 0"
+    assert shown.endswith(f" ({Outcome.NOISE.message})") and used == "torchsar: focus uses doppler_hz 0"
 
 
 def test_the_memory_is_that_of_a_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

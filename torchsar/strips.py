@@ -196,7 +196,8 @@ class _Strip:
             raise ConfigError(f"the stage {changed[0]!r} before {self._name} changes the samples; {_HINT}")
         for name, estimate in trace.estimates.items():
             shown = ", ".join(f"{key} {float(x.double().mean()):.6g}" for key, x in estimate.value.items())
-            log.info("%s: %s%s", name, shown, "" if estimate.ok.all() else " (not ok)")
+            reason = "; ".join(code.message for code in estimate.reasons if not code.is_ok)
+            log.info("%s: %s%s", name, shown, reason and f" ({reason})")
         used = {name: float(value) for name, value in trace.arguments[self._name].items()}
         log.info("%s uses %s", self._name, ", ".join(f"{key} {value:.6g}" for key, value in used.items()))
         return used

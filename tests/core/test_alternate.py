@@ -123,12 +123,12 @@ def test_the_result_has_all_values_and_the_lowest_quality() -> None:
     assert stage.provides == ("mean", "slope")
     found = stage(lines(MEAN, SLOPE))
     assert set(found.value) == {"mean", "slope"} and set(found.std) == {"mean"} and set(found.info) == {"mean.steps"}
-    assert found.ok.tolist() == [False] * 3 and found.quality.tolist() == [0.2] * 3
+    assert found.outcome.tolist() == [Outcome.NOISE] * 3 and found.quality.tolist() == [0.2] * 3
 
 
-def test_an_estimate_from_a_distrusted_value_is_not_ok() -> None:
+def test_an_estimate_from_a_doubtful_value_is_doubtful() -> None:
     class Late(Slope):
-        """Estimator that is ok from a given run on."""
+        """Estimator that is doubtful before a given run."""
 
         def __init__(self, first: int) -> None:
             super().__init__()
@@ -136,13 +136,13 @@ def test_an_estimate_from_a_distrusted_value_is_not_ok() -> None:
 
         def forward(self, signal: Signal) -> Estimate:
             self.runs += 1
-            return replace(super().forward(signal), ok=torch.full(signal.trials, self.runs >= self.first))
+            of = Outcome.OK if self.runs >= self.first else Outcome.MISFIT
+            return replace(super().forward(signal), outcome=of.like(signal.data[..., 0, 0]))
 
     for rounds, first, ok in ((3, 1, True), (3, 2, True), (3, 3, False), (3, 4, False), (1, 1, True)):
         late = Turn(Late(first), WithoutSlope())
-        assert (
-            Alternate(rounds, mean=Turn(Mean(), WithoutMean()), slope=late)(lines(MEAN, SLOPE)).ok.tolist() == [ok] * 3
-        )
+        found = Alternate(rounds, mean=Turn(Mean(), WithoutMean()), slope=late)(lines(MEAN, SLOPE))
+        assert found.outcome.tolist() == [Outcome.OK if ok else Outcome.MISFIT] * 3
 
 
 def test_a_batch_equals_its_singles() -> None:

@@ -1,4 +1,4 @@
-"""Estimates that are not ok: neutral values by default, the estimated ones where `use` says so."""
+"""Doubtful estimates are used by default, failed ones are neutral, and traces say where."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ from torchsar.core import Alternate, Axis, Chain, Estimate, Outcome, Signal, Sta
 
 F64 = torch.float64
 OK = torch.tensor([True, False, True])
+NOISE = Outcome.of(OK, Outcome.NOISE)
+# one trial of every kind: ok, doubtful, failed
+MIXED = torch.tensor([Outcome.OK, Outcome.MISFIT, Outcome.NOISE])
 
 
 class Level(Stage):
-    """Estimator of one number a pulse, which is not ok in the trials of the constructor."""
+    """Estimator of one number a pulse, with the outcomes of the constructor."""
 
     provides = ("level", "count")
     neutral = {"level": 0.0, "count": 1}
 
-    def __init__(self, ok: Tensor = OK) -> None:
+    def __init__(self, outcome: Tensor = NOISE) -> None:
         super().__init__()
-        self.ok = ok
+        self.outcome = outcome
 
     def forward(self, signal: Signal, level: Tensor | None = None) -> Estimate:
         value = {"level": signal.data.real.mean(-1), "count": torch.full(signal.trials, 7)}
-        return Estimate(value, quality=self.ok.double(), outcome=self.outcome)
+        return Estimate(value, outcome=self.outcome)
 
 
 class Free(Level):
@@ -48,10 +51,12 @@ class Double(Stage):
     provides = ("factor",)
     neutral = {"factor": 1.0}
 
+    def __init__(self, outcome: Tensor = NOISE) -> None:
+        super().__init__()
+        self.outcome = outcome
+
     def forward(self, signal: Signal) -> tuple[Signal, Estimate]:
-        return signal.with_data(2 * signal.data), Estimate(
-            {"factor": 2.0 * OK.double() + 1}, quality=OK.double(), outcome=Outcome.of(OK, Outcome.NOISE)
-        )
+        return signal.with_data(2 * signal.data), Estimate({"factor": 2.0 * OK.double() + 1}, outcome=self.outcome)
 
 
 def pulses(**kwargs: bool) -> Signal:
@@ -75,10 +80,30 @@ def test_a_value_that_is_not_ok_is_neutral_for_later_stages_and_the_trace_says_s
     assert trace.arguments["correct"]["count"].dtype == torch.int64
 
 
-def test_apply_uses_every_estimate() -> None:
-    x = pulses()
-    trace = Chain(level=Level(), correct=use(Subtract(), in_doubt="apply", level="level")).trace(x)
-    assert torch.equal(trace.signal.data, Subtract()(x, Level()(x)["level"]).data) and not trace.neutral
+@pytest.mark.parametrize(
+    ("in_doubt", "used", "doubtful"),
+    [("apply", [True, True, False], [False, True, False]), ("neutral", [True, False, False], [False] * 3)],
+)
+def test_a_doubtful_value_is_used_unless_the_connection_says_otherwise(
+    in_doubt: str, used: list[bool], doubtful: list[bool]
+) -> None:
+    x, keep = pulses(), torch.tensor(used)
+    chain = Chain(level=Level(MIXED), correct=use(Subtract(), in_doubt=in_doubt, level="level"))
+    trace, applied = chain.trace(x), Subtract()(x, Level()(x)["level"]).data
+    assert torch.equal(trace.signal.data, torch.where(keep[:, None, None], applied, x.data))
+    assert trace.neutral["correct.level"].tolist() == (~keep).tolist()
+    assert trace.doubtful["correct.level"].tolist() == doubtful
+    again = chain.retrace(trace, "correct")
+    assert again.doubtful["correct.level"].tolist() == doubtful
+
+
+@pytest.mark.parametrize(("in_doubt", "used"), [("apply", [True, True, False]), ("neutral", [True, False, False])])
+def test_a_stage_that_estimates_and_corrects_does_so_in_doubt_too(in_doubt: str, used: list[bool]) -> None:
+    x, keep = pulses(), torch.tensor(used)
+    trace = Chain(twice=use(Double(MIXED), in_doubt=in_doubt)).trace(x)
+    assert torch.equal(trace.signal.data, torch.where(keep[:, None, None], 2 * x.data, x.data))
+    assert trace.neutral["twice"].tolist() == (~keep).tolist()
+    assert trace.doubtful["twice"].tolist() == [False, in_doubt == "apply", False]
 
 
 def test_gradients_flow_where_the_estimate_is_ok() -> None:
@@ -89,18 +114,17 @@ def test_gradients_flow_where_the_estimate_is_ok() -> None:
     assert slope[OK].abs().max() < 1e-12 and torch.equal(slope[1], torch.ones_like(slope[1]))
 
 
-def test_a_stage_that_estimates_and_corrects_leaves_the_signal_unchanged_in_doubt() -> None:
+def test_a_stage_that_estimates_and_corrects_leaves_the_signal_unchanged_where_it_failed() -> None:
     x = pulses()
     trace = Chain(twice=Double()).trace(x)
     assert torch.equal(trace.signal.data[OK], 2 * x.data[OK]) and torch.equal(trace.signal.data[1], x.data[1])
     assert trace.neutral["twice"].tolist() == [False, True, False]
-    assert torch.equal(Chain(twice=use(Double(), in_doubt="apply"))(x).data, 2 * x.data)
 
 
 def test_a_value_that_is_given_takes_the_place_of_the_neutral_one() -> None:
     """Such as the start of a search, or what is known a priori."""
     x = pulses()
-    first = Level(torch.ones(3, dtype=torch.bool))
+    first = Level(Outcome.OK.like(OK))
     chain = Chain(first=first, second=use(Level(), level="first"), correct=use(Subtract(), level="second"))
     assert torch.equal(chain(x).data, Subtract()(x, first(x)["level"]).data)
 
@@ -132,15 +156,10 @@ def test_a_given_estimate_of_a_function_has_the_neutral_values_of_the_stage() ->
     """A function returns its Estimate without neutral values."""
     x, chain = pulses(), Chain(level=Level(), correct=use(Subtract(), level="level"))
     bare = Level()(x)
-    bare = Estimate(bare.value, quality=bare.quality, outcome=bare.outcome)
+    bare = Estimate(bare.value, outcome=bare.outcome)
     assert torch.equal(chain(x, given={"level": bare}).data, chain(x).data)
     with pytest.raises(ValueError, match=r"'level' of the estimate 'level' must begin with the trial dimensions"):
-        chain(
-            x,
-            given={
-                "level": Estimate(bare.value, quality=bare.quality[:2], outcome=Outcome.of(bare.ok[:2], Outcome.NOISE))
-            },
-        )
+        chain(x, given={"level": Estimate(bare.value, outcome=bare.outcome[:2])})
     with pytest.raises(TypeError, match="`given` must map names"):
         chain(x, given=[bare])  # pyright: ignore[reportArgumentType]
 
@@ -148,8 +167,8 @@ def test_a_given_estimate_of_a_function_has_the_neutral_values_of_the_stage() ->
 def test_vmap_agrees_with_the_batch() -> None:
     class Large(Level):
         def forward(self, signal: Signal, level: Tensor | None = None) -> Estimate:
-            found = super().forward(signal)
-            return replace(found, ok=signal.data.real.amax((-2, -1)) > 10, quality=signal.data.real.amax((-2, -1)))
+            large = signal.data.real.amax((-2, -1))
+            return replace(super().forward(signal), outcome=Outcome.of(large > 10, Outcome.NOISE), quality=large)
 
     x, chain = pulses(), Chain(level=Large(), correct=use(Subtract(), level="level"))
     mapped = torch.vmap(lambda data: chain(x.with_data(data)).data)(x.data)
@@ -184,5 +203,5 @@ def test_a_stage_is_connected_once() -> None:
 
 
 def test_only_two_answers_are_accepted() -> None:
-    with pytest.raises(ValueError, match=r"in_doubt must be 'neutral' .* or 'apply' .*, got 'zero'"):
+    with pytest.raises(ValueError, match=r"in_doubt must be 'apply' .* or 'neutral' .*, got 'zero'"):
         use(Subtract(), in_doubt="zero", level="level")  # pyright: ignore[reportArgumentType]

@@ -21,11 +21,12 @@ class Gain(Stage):
 
     works_on = ("pulse", "range")
     provides = ("gain_db",)
+    neutral = {"gain_db": 0.0}
 
     def forward(self, x: Signal) -> Estimate:
         trials = x.data.new_zeros(x.trials).real
-        ok = torch.arange(trials.numel()).reshape(trials.shape) > 0
-        return Estimate({"gain_db": trials + 3}, {"gain_db": trials + 0.25}, trials, Outcome.of(ok, Outcome.NOISE))
+        of = torch.tensor([Outcome.NOISE, Outcome.MISFIT, Outcome.OK])[: trials.numel()].reshape(trials.shape)
+        return Estimate({"gain_db": trials + 3}, {"gain_db": trials + 0.25}, trials, of)
 
 
 class Amplify(nn.Module):
@@ -36,7 +37,7 @@ class Amplify(nn.Module):
 
 
 def chain() -> torchsar.Chain:
-    return torchsar.Chain(gain=Gain(), louder=use(Amplify(), gain_db="gain", in_doubt="apply"))
+    return torchsar.Chain(gain=Gain(), louder=use(Amplify(), gain_db="gain"))
 
 
 def signal(*trials: int) -> Signal:
@@ -96,26 +97,35 @@ def test_a_text_that_is_too_long_has_a_line_for_each_part() -> None:
 def test_one_number_of_an_estimate_is_shown_and_several_are_not() -> None:
     one = Estimate(
         {"doppler_hz": torch.tensor(24.9)},
-        quality=torch.ones(()),
-        outcome=Outcome.of(torch.tensor(True), Outcome.NOISE),
+        outcome=Outcome.OK.like(torch.ones(())),
     )
     assert repr(one) == "Estimate(ok in 1 of 1, cpu; doppler_hz: 24.9)"
-    shown = repr(objects()["estimate"])
-    assert shown == "Estimate(ok in 2 of 3, cpu; gain_db: float32 (3,), standard deviation float32 (3,))"
+    assert repr(Estimate(one.value)) == "Estimate(not assessed, cpu; doppler_hz: 24.9)"
+
+
+def test_an_estimate_shows_the_reasons_with_their_counts() -> None:
+    assert repr(objects()["estimate"]).splitlines() == [
+        "Estimate(ok in 1 of 3 (misfit: 1, noise: 1), cpu",
+        "  gain_db: float32 (3,), standard deviation float32 (3,)",
+        f"  misfit: 1 of 3, {Outcome.MISFIT.message}",
+        f"  noise: 1 of 3, {Outcome.NOISE.message})",
+    ]
 
 
 def test_a_chain_shows_its_connections() -> None:
-    assert repr(chain()).splitlines() == [
-        "Chain(2 stages",
-        "  gain: Gain, estimates gain_db",
-        "  louder: Amplify, uses gain_db from gain.gain_db (ok or not))",
-    ]
+    parts = ("Chain(2 stages", "gain: Gain, estimates gain_db", "louder: Amplify, uses gain_db from gain.gain_db")
+    assert repr(chain()) == "; ".join(parts) + ")"
+    careful = torchsar.Chain(gain=Gain(), louder=use(Amplify(), gain_db="gain", in_doubt="neutral"))
+    assert repr(careful).splitlines() == [parts[0], f"  {parts[1]}", f"  {parts[2]} (neutral if doubtful))"]
     assert "gain_db from gain.gain_db" in Checked(chain()._repr_html_()).words
 
 
 def test_a_trace_shows_signals_verdicts_and_times() -> None:
     words = Checked(objects()["trace"]._repr_html_()).words
-    assert "complex64 (3, 4, 1000) of pulse and range" in words and "gain_db ok in 2 of 3" in words
+    assert (
+        "complex64 (3, 4, 1000) of pulse and range" in words and "gain_db ok in 1 of 3 (misfit: 1, noise: 1)" in words
+    )
+    assert "gain_db neutral in 1 of 3 and gain_db doubtful in 1 of 3" in words
     assert words.rstrip().endswith(" s")
 
 
@@ -124,7 +134,7 @@ def test_a_notebook_gets_small_html_with_the_words_of_the_text(name: str) -> Non
     shown = objects()[name]
     html = shown._repr_html_()
     words = Checked(html).words
-    assert len(html) < 1500 and len(repr(shown)) < 400
+    assert len(html) < 2000 and len(repr(shown)) < 500
     for line in repr(shown).strip("()").replace("(", " ", 1).splitlines()[1:]:
         part, _, rest = line.strip(" )").partition(": ")
         assert f" {part} " in words and all(one in words for one in rest.split(", ") if "(" not in one)
@@ -156,7 +166,7 @@ def test_objects_are_shown_within_vmap() -> None:
         return x
 
     torch.func.vmap(look)(signal(3))
-    assert seen == ["Estimate(ok of shape (), cpu; a_m: float32 ())"]
+    assert seen == ["Estimate(outcome of shape (), cpu; a_m: float32 ())"]
 
 
 def test_sizes_and_lists_are_short() -> None:

@@ -86,7 +86,7 @@ def _check_methods(tree: dict, trials: int) -> None:
     assert best["metrics"]["ok"] == 1.0 and best["metrics"]["seconds"] > 0 and best["seconds_by_stage"]
     assert {name.partition("/")[0] for name in best["estimates"]} == {"one", "other_two"}
     for name, entry in best["estimates"].items():
-        assert set(entry) == {"value", "std", "ok"}, name
+        assert set(entry) == {"value", "std", "ok", "outcome"}, name
         flat = np.atleast_1d(entry["value"])
         assert len(flat) == trials and np.isfinite(flat).all() and len(np.atleast_1d(entry["ok"])) == trials, name
     assert "first case, 'one'" in tree["definitions"]["metrics"] and "snr" in tree["definitions"]

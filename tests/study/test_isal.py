@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,8 @@ import yaml
 
 from tests.study.scenes import CORRECT, IMAGE, ISAL, bench_of, loaded_as, run, world, write
 from torchsar.cli import main
-from torchsar.core import Draws
+from torchsar.compensate import Sca, TargetAutofocus
+from torchsar.core import Draws, Outcome
 from torchsar.focus import TargetImage
 from torchsar.io import read_inverse
 from torchsar.radar import geometry_of
@@ -154,18 +157,49 @@ def test_all_corrections_of_a_chain_are_judged_together(tmp_path: Path) -> None:
     assert error["started"] < error["sca"]  # a phase that was only a start is not counted twice
 
 
-def test_an_estimate_in_doubt_is_not_used_unless_the_method_says_so_and_the_report_tells(tmp_path: Path) -> None:
-    """Noise alone: no phase is removed, but for the method with `in_doubt: apply`."""
-    applied = {"phase": {"stage": "autofocus"}, "correct": {**CORRECT, "in_doubt": "apply"}, "image": IMAGE}
-    config = write(tmp_path, "isal", processor={**ISAL["processor"], "applied": {"stages": applied}})
-    methods = run(config, tmp_path / "out", "world.noise.snr_db=-60", "world.trials=2")["methods"]
-    entropy = {name: method["metrics"]["entropy_nats"] for name, method in methods.items()}
-    assert entropy["recommended"] == pytest.approx(entropy["none"], abs=1e-6) and entropy["applied"] < entropy["none"]
-    assert methods["recommended"]["neutral"] == {"correct.phase_rad": 2} and methods["applied"]["neutral"] == {}
+def test_a_run_tells_the_reasons_and_where_doubtful_and_neutral_values_were_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first trial is doubtful, and the second one failed."""
+    found = TargetAutofocus.forward
+    codes = torch.tensor([Outcome.MISFIT, Outcome.NOISE])
+    monkeypatch.setattr(TargetAutofocus, "forward", lambda self, *x, **y: replace(found(self, *x, **y), outcome=codes))
+    careful = {"phase": {"stage": "autofocus"}, "correct": {**CORRECT, "in_doubt": "neutral"}, "image": IMAGE}
+    config = write(tmp_path, "isal", processor={**ISAL["processor"], "careful": {"stages": careful}})
+    tree = run(config, tmp_path / "out", "world.trials=2")
+    best, other = tree["methods"]["recommended"], tree["methods"]["careful"]
+    assert (
+        best["outcomes"]
+        == other["outcomes"]
+        == {"phase": {code.name: {"trials": 1, "message": code.message} for code in (Outcome.MISFIT, Outcome.NOISE)}}
+    )
+    assert (best["doubtful"], best["neutral"]) == ({"correct.phase_rad": 1}, {"correct.phase_rad": 1})
+    assert (other["doubtful"], other["neutral"]) == ({}, {"correct.phase_rad": 2})
+    assert (best["in_doubt"], other["in_doubt"]) == ([], ["correct"])
+    entry = best["estimates"]["phase.phase_rad"]
+    assert entry["ok"] == [False, False] and entry["outcome"] == ["MISFIT", "NOISE"]
+    said = capsys.readouterr().err
+    for code in (Outcome.MISFIT, Outcome.NOISE):
+        assert f"warning: recommended.phase, not ok in 1 of 2 trials: {code.message}" in said
+    report = html.unescape((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
+    row = '<td>phase</td><td>1 of 2</td><td class="long">{}</td>'
+    assert report.count(row.format(Outcome.MISFIT.message)) == 3 <= report.count(row.format(Outcome.NOISE.message))
+    assert "<p>Doubtful values were used: correct.phase_rad in 1 of 2 trials.</p>" in report
+    assert "the signal was left unchanged: correct.phase_rad in 1 of 2 trials.</p>" in report
+    assert "Neutral values also where an estimate is doubtful, in the stages: correct</li>" in report
+
+
+def test_methods_that_are_not_assessed_have_no_share_of_trials_that_are_ok(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Sca.forward
+    codes = Outcome.NOT_ASSESSED.like(torch.zeros(2))
+    monkeypatch.setattr(Sca, "forward", lambda self, *x, **y: replace(found(self, *x, **y), outcome=codes))
+    methods = run(write(tmp_path, "isal"), tmp_path / "out", "world.trials=2")["methods"]
+    assert methods["sca"]["metrics"]["ok"] is None and methods["recommended"]["metrics"]["ok"] == 1
+    assert list(methods["sca"]["outcomes"]["phase"]) == ["NOT_ASSESSED"] and not methods["sca"]["neutral"]
     report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "Estimate not ok, neutral value used: correct.phase_rad in 2 of 2 trials" in report
-    assert "<b>Not reliable.</b>" in report and methods["applied"]["in_doubt"] == ["correct"]
-    assert report.count("Uses estimates even if they are not ok, in the stages: correct") == 1
+    assert report.count("Its estimates were not assessed</li>") == 1 and "Estimates that are not ok" not in report
 
 
 def test_noise_near_the_end_of_float32_leaves_figures(tmp_path: Path) -> None:

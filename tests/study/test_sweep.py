@@ -17,7 +17,7 @@ import torch
 import zarr
 
 from tests.study import toy
-from torchsar.core import Draws
+from torchsar.core import Draws, Outcome
 from torchsar.core.batches import CACHE_BYTES, rows_by_bytes, rows_by_peak, rows_by_trial
 from torchsar.study.montecarlo import Record, Stop, differences, read_sweep, sweep
 from torchsar.study.montecarlo.grid import address, make_grid
@@ -30,7 +30,7 @@ from torchsar.study.settings.errors import ConfigError
 def same(a: Record, b: Record, rtol: float = 0.0) -> None:
     assert a.labels == b.labels and a.algorithms == b.algorithms
     np.testing.assert_array_equal(a.done, b.done)
-    np.testing.assert_array_equal(a.ok, b.ok)
+    np.testing.assert_array_equal(a.outcome, b.outcome)
     for name in a.metrics:
         np.testing.assert_allclose(a.metrics[name], b.metrics[name], rtol=rtol, atol=rtol)
 
@@ -80,7 +80,9 @@ def test_results_are_labelled_and_whole(reference: Record) -> None:
     assert reference.dims == ("algorithm", "snr_db", "law", "trial")
     assert reference.metrics["level_error_m"].shape == (2, 3, 2, 40) and reference.done.all()
     assert np.isnan(reference.metrics["first_m"][0]).all() and np.isfinite(reference.metrics["first_m"][1]).all()
-    assert reference.ok[1].all()  # without a verdict of its own
+    assert (reference.outcome[1] == Outcome.NOT_ASSESSED).all() and reference.ok[
+        1
+    ].all()  # without a verdict of its own
     rmse = np.sqrt((reference.metrics["level_error_m"][0, :, 0] ** 2).mean(-1))
     np.testing.assert_allclose(rmse, reference.bounds["level_error_m"]["Cramer-Rao bound"][:, 0, 0], rtol=0.4)
 
@@ -252,6 +254,7 @@ def test_a_single_trial_that_does_not_fit_is_a_sentence() -> None:
         (lambda rows: {"m": torch.zeros(rows + 1)}, r"trial.m must hold one real number for each of the 5 trials"),
         (lambda rows: {"m": torch.zeros(rows, dtype=torch.complex64)}, "real number"),
         (lambda rows: {"ok": torch.zeros(rows)}, "ok must be bool"),
+        (lambda rows: {"outcome": torch.full((rows,), 9)}, r"outcome must hold codes of torchsar.Outcome, got \[9"),
         (lambda rows: {"m": torch.zeros(rows), "a": {"m": torch.zeros(rows)}}, "not both"),
         (lambda rows: 1 / 0, "ZeroDivisionError: division by zero"),
     ],
@@ -261,6 +264,35 @@ def test_what_a_trial_does_wrong_is_named_with_its_position(result, said: str) -
         sweep(lambda parameters, draws: result(len(draws.trials)), {"law": ["flat"]}, trials=5, chunk=5)
     assert "trials 0 to 4 of law=flat failed" in str(caught.value)
     assert caught.value.__cause__ is not None
+
+
+def test_a_trial_function_gives_outcomes_or_ok_or_neither(tmp_path: Path) -> None:
+    codes = torch.tensor([Outcome.OK, Outcome.MISFIT, Outcome.NOISE])
+
+    def trial(parameters, draws):
+        m, here = torch.zeros(len(draws.trials)), codes[list(draws.trials)]
+        named = {"reasons": {"m": m, "outcome": here, "ok": m > 0}, "verdicts": {"m": m, "ok": here == 0}}
+        return {**named, "neither": {"m": m}}
+
+    made = sweep(trial, {"law": ["flat"]}, trials=3, out=tmp_path / "s")
+    for record in (made, read_sweep(tmp_path / "s"), made.grown({"law": ("flat", "tilted")}, 5)):
+        assert record.outcome.dtype == np.uint8 and record.outcome[:, 0, :3].tolist() == [
+            codes.tolist(),
+            [Outcome.OK, Outcome.UNSPECIFIED, Outcome.UNSPECIFIED],
+            [Outcome.NOT_ASSESSED] * 3,
+        ]
+        assert record.ok[:, 0, :3].sum(-1).tolist() == [1, 1, 3] and record.ok.sum() == 5
+
+
+def test_a_store_of_an_earlier_layout_is_refused_with_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr("torchsar.study.montecarlo.store.FORMAT", 2)
+        toy.run(tmp_path / "s", trials=4)
+    for again in (lambda: read_sweep(tmp_path / "s"), lambda: toy.run(tmp_path / "s", trials=4, resume=True)):
+        with pytest.raises(ConfigError, match=r"this version of torchsar \(its layout is 2, not 3\); choose another"):
+            again()
 
 
 def test_other_algorithms_in_the_middle_are_refused() -> None:
@@ -470,11 +502,11 @@ def test_trials_that_came_out_otherwise_are_named(reference: Record) -> None:
     other = copy.deepcopy(reference)
     other.metrics["level_error_m"][1, 2, 0, 17] += 0.5
     other.metrics["first_m"][1, 0, 0, 3] *= 1 + 1e-7
-    other.ok[0, 1, 1, 5] ^= True
+    other.outcome[0, 1, 1, 5] = Outcome.MISFIT
     found = differences(reference, other, 1e-5)
     assert [(d.metric, d.algorithm, d.parameters, d.trial) for d in found] == [
         ("level_error_m", "transformed", {"snr_db": 20.0, "law": "flat"}, 17),
-        ("ok", "average", {"snr_db": 10.0, "law": "tilted"}, 5),
+        ("outcome", "average", {"snr_db": 10.0, "law": "tilted"}, 5),
     ]
     assert found[0].values[1] - found[0].values[0] == pytest.approx(0.5)
     assert differences(reference, reference, 0.0) == []

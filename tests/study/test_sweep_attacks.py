@@ -56,6 +56,7 @@ def run(out: Path | None = None, function: Any = trial, **options: Any):
         ({"a": {"x": object()}}, "differs between processes"),
         ({"done": [1]}, "cannot be called 'done'"),
         ({"ok": [1]}, "cannot be called 'ok'"),
+        ({"outcome": [1]}, "cannot be called 'outcome'"),
         ({"a/b": [1]}, "without '/'"),
         ({3: [1]}, "cannot be called 3"),
     ],
@@ -229,7 +230,7 @@ def remove(*parts: str) -> Callable[[Path], Any]:
 
 FAULTS = {
     "metric": (remove("error_m"), "'error_m' is missing"),
-    "verdicts": (remove("ok"), "'ok' is missing"),
+    "verdicts": (remove("outcome"), "'outcome' is missing"),
     "bound": (remove("error_m_bound_x"), "'error_m_bound_x' is missing"),
     "marks": (remove("done"), "'done' is missing"),
     "root": (remove("zarr.json"), "holds no results of a sweep"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.study.scenes import draw_first_panels
+from torchsar.core import Outcome
 from torchsar.plot import axis_label
 from torchsar.study.montecarlo.pictures import SweepPictures, draw_sweep
 from torchsar.study.montecarlo.record import Record
@@ -39,12 +41,14 @@ def synthetic(
     error = np.where(done, width * random.standard_normal((len(algorithms), *shape, trials)), np.nan)
     error.reshape(len(algorithms), -1, trials)[:, 0, 0] = np.inf
     entropy = np.where(done, 8 + random.random(error.shape), np.nan)
+    codes = np.where(np.isnan(error) | (np.abs(error) < 12), Outcome.OK, Outcome.MISFIT)
+    codes[np.isinf(error)] = Outcome.NOISE
     about = {"title": "A sweep <of> trials", "seed": 7, "hash": "0123abcd", "dtype": "complex64", "sessions": [SESSION]}
     return Record(
         algorithms,
         labels,
         done,
-        np.isfinite(error) & (np.abs(error) < 12),
+        np.where(done, codes, 255).astype(np.uint8),
         {"doppler_error_hz": error, "entropy_nats": entropy},
         {"doppler_error_hz": {"Cramer-Rao": bound}},
         about,
@@ -108,12 +112,19 @@ def test_summary_follows_the_schema(summary: dict[str, Any]) -> None:
         "median_interval",
         "ok_share",
         "ok_interval",
+        "outcomes",
     }
     for point in summary["points"]:
         assert set(point) == common | (
             {"success_limit", "success_share", "success_interval"} if point["metric"] == "doppler_error_hz" else set()
         )
         assert len(point["interval"]) == len(point["ok_interval"]) == 2
+        assert sum(point["outcomes"].values()) == point["trials"] and set(point["outcomes"]) <= {
+            "OK",
+            "MISFIT",
+            "NOISE",
+        }
+    assert summary["definitions"]["outcome NOISE"] == Outcome.NOISE.message
     assert {"snr", "rmse", "interval", "ok_share", "success_share", "bound"} <= set(summary["definitions"])
     assert "ok" in summary["definitions"]["statistics"]
 
@@ -132,7 +143,16 @@ def test_points_hold_the_statistics_of_their_trials(record: Record, summary: dic
     assert np.isclose(point["ok_share"], ok.mean()) and np.isclose(
         point["success_share"], np.mean(ok & (np.abs(values) <= 4.0))
     )
+    assert point["outcomes"]["NOISE"] == 1 and point["outcomes"]["OK"] == ok.sum()
     assert {bound["rms"] for bound in summary["bounds"]} == {2.0}
+
+
+def test_trials_that_were_not_assessed_count_neither_way(record: Record) -> None:
+    codes = record.outcome.copy()
+    codes[0, ..., :20], codes[1] = np.where(record.done[..., :20], Outcome.NOT_ASSESSED, 255), Outcome.NOT_ASSESSED
+    figures = summary_of(replace(record, outcome=codes), {}).figures["doppler_error_hz"]
+    assert np.isnan(figures["ok_share"][1]).all()
+    assert np.isclose(figures["ok_share"][0, 0, 0, 1], record.ok[0, 0, 0, 1, 20:].mean())
 
 
 def test_marking_failures_as_unreliable_changes_no_error(record: Record, summary: dict[str, Any]) -> None:
@@ -140,7 +160,7 @@ def test_marking_failures_as_unreliable_changes_no_error(record: Record, summary
         record.algorithms,
         record.labels,
         record.done,
-        np.zeros_like(record.ok),
+        np.where(np.isnan(record.metrics["entropy_nats"]), 255, Outcome.NOISE).astype(np.uint8),
         record.metrics,
         record.bounds,
         record.about,
@@ -319,7 +339,13 @@ def test_the_report_loads_no_external_resources(page: str, drawn: tuple[Path, li
 
 def test_report_shows_the_numbers_of_the_summary(page: str, summary: dict[str, Any]) -> None:
     rows = [row for row in read(page).rows if row and row[0] in summary["algorithms"]]
-    assert len(rows) == len(summary["points"])
+    count = len(summary["points"])
+    assert len(rows) == count + count // 2
+    told = [point for point in summary["points"] if point["metric"] == "doppler_error_hz"]
+    for row, point in zip(rows[count:], told, strict=True):
+        assert row[4:6] == [f"{point['trials']}", with_interval(point["ok_share"], point["ok_interval"])]
+        assert row[6] == ", ".join(f"{Outcome[name].label}: {n}" for name, n in point["outcomes"].items())
+    rows = rows[:count]
     for row, point in zip(rows, sorted(summary["points"], key=lambda p: p["metric"]), strict=True):
         assert row[0] == point["algorithm"] and row[4] == f"{point['n']} of {point['trials']}"
         assert row[5] == with_interval(point["rmse"], point["interval"]) and row[5].startswith(

@@ -40,10 +40,10 @@ class Alternate(Stage):
     signal, so that errors of an early round do not remain in the data. An estimator also receives,
     as arguments, the latest values (its own included) whose names are parameters of its `forward`.
     A value that no turn has estimated yet is not passed, so that the default of the parameter
-    applies. Inside a round the estimated values count whether they are ok or not, since an estimate
-    is often not ok before the other effects are corrected. The result is ok where the estimators
-    are ok and the values of the others that they last used were ok as well: an estimate from data
-    corrected by a wrong value may look right.
+    applies. Inside a round the estimated values are used whatever their outcomes, since an estimate
+    is often doubtful before the other effects are corrected. The outcome of the result is the worst
+    of the last outcomes of the estimators and of those of the values that they last used: an
+    estimate from data corrected by a wrong value may look right.
 
         Alternate(rounds=3, phase=Turn(autofocus, corrector), rotation=Turn(estimator))
 

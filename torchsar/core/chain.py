@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchsar.core.arguments import names_arguments
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import gathered_checks
-from torchsar.core.show import Shown, Summary, kind_of
+from torchsar.core.show import Shown, Summary, kind_of, one_number
 from torchsar.core.signal import Recording, Signal
 
 Given = Mapping[str, Tensor | Estimate]
@@ -125,8 +125,20 @@ class Trace(Shown):
             estimate, seconds = self.estimates.get(name), self.seconds.get(name)
             found = "" if estimate is None else f"{' and '.join(estimate.value)} {estimate._verdict}"
             took = "" if seconds is None else f"{seconds:.3g} s"
-            stages.append((name, f"{kind_of(signal.data)} of {' and '.join(signal.names)}", found, took))
+            stages.append(
+                (name, f"{kind_of(signal.data)} of {' and '.join(signal.names)}", found, self._used(name), took)
+            )
         return Summary(f"{sum(self.seconds.values()):.3g} s", {"signals, estimates and times after stages": stages})
+
+    def _used(self, name: str) -> str:
+        """Numbers of trials in which a stage used neutral or doubtful values, as words."""
+        words = []
+        for kind, masks in (("neutral", self.neutral), ("doubtful", self.doubtful)):
+            for key, mask in masks.items():
+                stage, _, parameter = key.partition(".")
+                count = one_number(mask.sum()) if stage == name else None
+                words += [f"{parameter or 'correction'} {kind} in {count} of {mask.numel()}"] if count else []
+        return " and ".join(words)
 
 
 @dataclass
@@ -230,7 +242,7 @@ class Chain(Shown, nn.Module):
         stages = []
         for name, stage in self.stages.items():
             uses = " and ".join(f"{parameter} from {source}" for parameter, source in self.uses[name].items())
-            doubt = " (if not doubtful)" if self.in_doubt[name] == "neutral" else ""
+            doubt = " (neutral if doubtful)" if self.in_doubt[name] == "neutral" else ""
             gives = " and ".join(_provided(stage))
             row = (type(stage).__name__, uses and f"uses {uses}{doubt}", gives and f"estimates {gives}")
             stages.append((name, *row))
@@ -399,10 +411,10 @@ class Chain(Shown, nn.Module):
             provided = {f"{name}.{key}" for key in _provided(stage)}
             held = name in known.stages or bool(provided and provided <= known.held)
             entered, began = signal, time.perf_counter() if timed else 0.0
-            arguments, neutral, doubtful = self._arguments(name, known, required=not held)
+            arguments, origins = self._arguments(name, known, required=not held)
             if not held:
                 with gathered_checks(f"stage {name!r}"):
-                    signal = self._step(name, stage, signal, arguments, known, neutral, doubtful)
+                    signal = self._step(name, stage, signal, arguments, known, origins)
             if log is not None:
                 if timed:
                     _synchronise(signal.data)
@@ -410,33 +422,30 @@ class Chain(Shown, nn.Module):
                 log.inputs[name], log.outputs[name] = entered, signal
                 log.bytes[name] = signal.data.numel() * signal.data.element_size()
                 log.arguments[name] = arguments
-                if not held or name in known.stages:
-                    log.neutral.update(neutral)
-                    log.doubtful.update(doubtful)
+                for key, estimate in origins.items() if not held or name in known.stages else ():
+                    log.neutral[key] = estimate.unused(self.in_doubt[name])
+                    log.doubtful[key] = estimate.doubtful & ~log.neutral[key]
         return signal
 
-    def _arguments(
-        self, name: str, known: _Known, required: bool
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]:
-        """The connected values of a stage, and by "STAGE.PARAMETER" the trials in which one is
-        neutral, and those in which one is doubtful and used.
+    def _arguments(self, name: str, known: _Known, required: bool) -> tuple[dict[str, Tensor], dict[str, Estimate]]:
+        """The connected values of a stage, and by "STAGE.PARAMETER" the estimates they come from,
+        as far as these have neutral values.
         """
-        arguments, neutral, doubtful = {}, {}, {}
+        arguments, origins = {}, {}
         for parameter, source in self.uses[name].items():
             if source not in known.values and required:
                 raise KeyError(
                     f"stage {name!r} needs the value {source!r} for its parameter {parameter!r}, but the only values "
                     f"of this run are {sorted(known.values)}"
                 )
-            origin, key = known.origin(source), f"{name}.{parameter}"
+            origin = known.origin(source)
             if origin is not None:
                 estimate, value = origin
                 arguments[parameter] = estimate.trusted(value, self.in_doubt[name])
-                neutral[key] = estimate.unused(self.in_doubt[name])
-                doubtful[key] = estimate.doubtful & ~neutral[key]
+                origins[f"{name}.{parameter}"] = estimate
             elif source in known.values:
                 arguments[parameter] = known.values[source]
-        return arguments, neutral, doubtful
+        return arguments, origins
 
     def _step(
         self,
@@ -445,11 +454,10 @@ class Chain(Shown, nn.Module):
         signal: Signal,
         arguments: dict[str, Tensor],
         known: _Known,
-        neutral: dict[str, Tensor],
-        doubtful: dict[str, Tensor],
+        origins: dict[str, Estimate],
     ) -> Signal:
-        """The signal after a stage; its estimate joins `known`, and trials in which it is not used,
-        or doubtful, join `neutral` and `doubtful`.
+        """The signal after a stage; its estimate joins `known`, and `origins` if the stage corrects
+        by it.
         """
         result = stage(signal, **arguments)
         out, estimate = result if isinstance(result, tuple) else (result, None)
@@ -463,9 +471,8 @@ class Chain(Shown, nn.Module):
         if estimate is not None:
             known.add(name, estimate)
             if _corrected(signal, out, estimate):
-                neutral[name] = estimate.unused(self.in_doubt[name])
-                doubtful[name] = estimate.doubtful & ~neutral[name]
-                unchanged = neutral[name][(...,) + (None,) * len(out.axes)]
+                origins[name] = estimate
+                unchanged = estimate.unused(self.in_doubt[name])[(...,) + (None,) * len(out.axes)]
                 out = out.with_data(torch.where(unchanged, signal.data, out.data))
         return out
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core.arguments import names_arguments
-from torchsar.core.outcome import Outcome, counts
+from torchsar.core.outcome import DOUBTFUL, FAILED, Outcome, counts
 from torchsar.core.show import Shown, Summary, content, one_number
 
 
@@ -96,12 +96,12 @@ class Estimate(Shown):
     @property
     def ok(self) -> Tensor:
         """True where the estimate is reliable or was not assessed, bool, shape (...,)."""
-        return self.outcome < Outcome.INEXACT
+        return self.outcome < DOUBTFUL
 
     @property
     def failed(self) -> Tensor:
         """True where nothing was found and the neutral value is used, bool, shape (...,)."""
-        return self.outcome >= Outcome.NOISE
+        return self.outcome >= FAILED
 
     @property
     def doubtful(self) -> Tensor:
@@ -139,23 +139,32 @@ class Estimate(Shown):
         return self.failed if in_doubt == "apply" else ~self.ok
 
     @property
+    def reasons(self) -> dict[Outcome, int]:
+        """Number of trials of each outcome other than OK; empty where the codes cannot be read, as
+        within `torch.func.vmap`.
+        """
+        known = self.outcome.numel() and one_number(self.outcome.sum()) is not None
+        return {code: n for code, n in counts(self.outcome).items() if code != Outcome.OK} if known else {}
+
+    @property
     def _verdict(self) -> str:
         """Number of trials in which the estimate is ok, and the reasons where it is not, as words,
-        such as "ok in 3 of 4 (1 noise)".
+        such as "ok in 3 of 4 (noise: 1)".
         """
-        count, total = one_number(self.ok.sum()), self.outcome.numel()
+        count, total, reasons = one_number(self.ok.sum()), self.outcome.numel(), self.reasons
         if count is None:
             return f"outcome of shape {tuple(self.outcome.shape)}"
-        reasons = {code: n for code, n in counts(self.outcome).items() if code != Outcome.OK}
         if reasons == {Outcome.NOT_ASSESSED: total}:
             return "not assessed"
-        named = ", ".join(f"{n} {code.name.lower().replace('_', ' ')}" for code, n in reasons.items())
+        named = ", ".join(f"{code.label}: {n}" for code, n in reasons.items())
         return f"ok in {count} of {total}{f' ({named})' if named else ''}"
 
     def _summary(self) -> Summary:
         std = {name: f"standard deviation {content(value)}" for name, value in self.std.items()}
         values = [(name, content(value), std.get(name, "")) for name, value in self.value.items()]
-        return Summary(f"{self._verdict}, {self.outcome.device}", {"values": values})
+        total = self.outcome.numel()
+        reasons = [(code.label, f"{n} of {total}", code.message) for code, n in self.reasons.items() if not code.is_ok]
+        return Summary(f"{self._verdict}, {self.outcome.device}", {"values": values, "reasons": reasons})
 
     @staticmethod
     def joined(parts: Sequence[Estimate], trials: torch.Size) -> Estimate:

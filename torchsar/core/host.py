@@ -68,7 +68,7 @@ class validate:
 
     Called without `with`, as `torchsar.validate("off")`, it holds until the next call. It holds for
     the thread that calls it. Types, shapes and dtypes are checked in any case, and an estimator
-    that fails in a trial still says so by `ok`.
+    that fails in a trial still says so by its outcome.
 
     - "eager", the default: a stage raises an error if one of its own values is not acceptable, such
       as a sample that is NaN. On an accelerator the checks of a stage wait for the next value that

@@ -36,9 +36,11 @@ class Outcome(IntEnum):
     NOT_CONVERGED = 18
     TOO_FEW = 19
     IN_DOUBT = 20
+    UNSPECIFIED = 21
     NOISE = 30
     SINGULAR = 31
     EMPTY = 32
+    ERROR = 33
 
     @property
     def message(self) -> str:
@@ -46,19 +48,24 @@ class Outcome(IntEnum):
         return _MESSAGES[self]
 
     @property
+    def label(self) -> str:
+        """Name in lower case with spaces, as reports show it."""
+        return self.name.lower().replace("_", " ")
+
+    @property
     def is_ok(self) -> bool:
         """True for a reliable estimate, and for one that was not assessed."""
-        return self < _DOUBTFUL
+        return self < DOUBTFUL
 
     @property
     def is_doubtful(self) -> bool:
         """True for an estimate that may be wrong, but is used."""
-        return _DOUBTFUL <= self < _FAILED
+        return DOUBTFUL <= self < FAILED
 
     @property
     def is_failed(self) -> bool:
         """True for an estimate that is not used."""
-        return self >= _FAILED
+        return self >= FAILED
 
     def like(self, x: Tensor) -> Tensor:
         """Return this code for every element of a tensor, int64."""
@@ -70,7 +77,8 @@ class Outcome(IntEnum):
         return worst((otherwise, ~ok))
 
 
-_DOUBTFUL, _FAILED = Outcome.INEXACT, Outcome.NOISE
+# first codes of their kind; plain numbers, since torch.compile compares no tensor with an enum
+DOUBTFUL, FAILED = int(Outcome.INEXACT), int(Outcome.NOISE)
 _MESSAGES = {
     Outcome.OK: "the estimate is reliable",
     Outcome.NOT_ASSESSED: "not assessed (assess=False)",
@@ -87,9 +95,11 @@ _MESSAGES = {
     Outcome.NOT_CONVERGED: "the iterations did not converge: allow more of them, or start nearer to the solution",
     Outcome.TOO_FEW: "too few pulses, range cells or scatterers to judge the estimate: use more data",
     Outcome.IN_DOUBT: "an estimate on which this one depends is doubtful",
+    Outcome.UNSPECIFIED: "not reliable, for a reason that was not given",
     Outcome.NOISE: "nothing rises above the noise: raise the SNR, or use more pulses or range cells",
     Outcome.SINGULAR: "the data do not determine the values: use more of them, or fewer unknowns",
     Outcome.EMPTY: "there are no samples other than zero",
+    Outcome.ERROR: "the method stopped with an error, which the log names",
 }
 
 

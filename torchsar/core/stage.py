@@ -28,9 +28,9 @@ class Stage(nn.Module):
     - `works_on`: names of the trailing axes that it needs.
     - `also_on`: further tuples of axes that it accepts.
     - `provides`: names of the values in its Estimate.
-    - `neutral`: for each of them the number to assume in trials that are not ok: one without effect
-      (a phase of 0, a gain of 1), or a nominal one. If there is none, a sentence that says why; the
-      estimated value is then used in all trials.
+    - `neutral`: for each of them the number to assume in trials in which the estimate failed: one
+      without effect (a phase of 0, a gain of 1), or a nominal one. If there is none, a sentence
+      that says why; the estimated value is then used in all trials.
     - `takes_real`: True if it also accepts the real samples of a one-channel detector.
     - `fixed`: names of values on whose numbers the plan of the computation depends. torch.compile
       makes constants of them, and the program raises RuntimeError if they change.

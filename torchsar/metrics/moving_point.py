@@ -50,12 +50,12 @@ class FoundMotion:
     Args:
         value: Estimates by name, (row,) each; values that the chain was given are left out.
         std: Predicted standard deviations of the estimates, by the same names.
-        ok: Whether the estimates are reliable, by the same names, (row,) each.
+        outcome: Codes of the estimates by the same names, (row,) each; see `torchsar.Outcome`.
     """
 
     value: Mapping[str, Tensor]
     std: Mapping[str, Tensor]
-    ok: Mapping[str, Tensor]
+    outcome: Mapping[str, Tensor]
 
     @staticmethod
     def by(estimates: Mapping[str, Estimate]) -> FoundMotion:
@@ -71,7 +71,7 @@ class FoundMotion:
         return FoundMotion(
             {key: e.value[key] for key, e in last.items()},
             {key: e.std[key] for key, e in last.items()},
-            {key: e.ok for key, e in last.items()},
+            {key: e.outcome for key, e in last.items()},
         )
 
     def errors(self, truth: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchsar.core import Outcome, counts
 from torchsar.io import write_arrays
 from torchsar.study.commands.requires import refuse_beyond_limits
 from torchsar.study.output.arrays import write_json
@@ -21,7 +21,7 @@ from torchsar.study.output.progress import Steps, Ticker
 from torchsar.study.output.report import run_fields, write_page
 from torchsar.study.settings.cases import ALL, cases_of, key_of
 from torchsar.study.settings.sections import Loaded
-from torchsar.study.trials.batch import OK, Batch, Found, Result, joined_found, joined_metrics, summary
+from torchsar.study.trials.batch import Batch, Found, Result, joined_found, joined_metrics, summary
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import per_trial_first
 
@@ -108,7 +108,7 @@ def _case(bench: Bench, name: str) -> Result:
     targets: dict[str, dict[str, list[Mapping[str, Tensor]]]] = {}
     estimates: dict[str, list[Mapping[str, Found]]] = {}
     truth: list[Mapping[str, Tensor]] = []
-    neutral: dict[str, Counter[str]] = {}
+    marks: dict[str, list[Mapping[str, Mapping[str, Tensor]]]] = {}
     for chunk in _chunks(bench):
         keep = bench.chains if first is None else ()
         batch = bench.batch(bench.draws(system.address, chunk), keep=keep, detail=True)
@@ -117,14 +117,18 @@ def _case(bench: Bench, name: str) -> Result:
         for method, outcome in batch.outcomes.items():
             metrics.setdefault(method, []).append(outcome.metrics)
             estimates.setdefault(method, []).append(system.found(bench, outcome, batch.trials))
-            neutral.setdefault(method, Counter()).update({k: int(x.sum()) for k, x in outcome.neutral.items()})
+            marks.setdefault(method, []).append(outcome.marks)
             for target, found in outcome.judged.targets.items():
                 targets.setdefault(method, {}).setdefault(target, []).append(found)
     assert first is not None
     whole = {method: joined_metrics(parts) for method, parts in metrics.items()}
     of_targets = {method: {t: joined_metrics(parts) for t, parts in of.items()} for method, of in targets.items()}
     found = {method: joined_found(parts) for method, parts in estimates.items()}
-    result = Result(bench, first, whole, of_targets, found, joined_metrics(truth), neutral)
+    told = {
+        method: {k: joined_metrics([part.get(k, {}) for part in parts]) for k in ("outcomes", "neutral", "doubtful")}
+        for method, parts in marks.items()
+    }
+    result = Result(bench, first, whole, of_targets, found, joined_metrics(truth), told)
     _warn_if_unreliable(name, result)
     log.info("%s: %.1f s", bench.loaded.name if name == ALL else name, time.perf_counter() - began)
     return result
@@ -132,17 +136,17 @@ def _case(bench: Bench, name: str) -> Result:
 
 def _warn_if_unreliable(case: str, result: Result) -> None:
     """Warn of unreliable estimates of the recommended method."""
-    verdicts = result.metrics["recommended"].get(OK)
-    if verdicts is not None and not bool((verdicts > 0).all()):
-        count, where = int((verdicts == 0).sum()), "" if case == ALL else f"{case}: "
-        stages = ", ".join(n for n, e in result.first_of("recommended").estimates.items() if not e.ok.all())
-        log.warning(
-            "warning: %srecommended: estimates unreliable in %d of %d trials%s",
-            where,
-            count,
-            len(verdicts),
-            f" ({stages})" if stages else "",
-        )
+    where = "" if case == ALL else f"{case}: "
+    for stage, codes in result.marks["recommended"]["outcomes"].items():
+        for code, count in _reasons(codes).items():
+            if not code.is_ok:
+                text = "warning: %srecommended.%s, not ok in %d of %d trials: %s"
+                log.warning(text, where, stage, count, len(codes), code.message)
+
+
+def _reasons(codes: Tensor) -> dict[Outcome, int]:
+    """Number of trials of each outcome, from codes that are NaN in batches without them."""
+    return counts(codes[codes.isfinite()].long())
 
 
 def _scalars(batch: Batch) -> dict[str, Tensor]:
@@ -183,10 +187,15 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any
         f"{next(iter(results))!r}; methods.NAME.cases has all cases, with standard deviations over trials as _sd",
         "estimates": f"an estimate of more than {_LISTED} numbers per trial is given by its mean and its rms standard "
         "deviation; arrays.zarr has all numbers",
-        "neutral": "methods.NAME.neutral: number of trials in which an estimate is not ok and was not used, by stage "
-        "and parameter: the stage got a neutral value, or left the signal unchanged",
-        "in_doubt": "methods.NAME.in_doubt: stages that use estimates even if they are not ok (in_doubt: apply)",
-        "ok": "whether all estimates of the method are reliable; its mean is the share of such trials",
+        "outcomes": "methods.NAME.outcomes: by stage that estimates, the number of trials of each outcome, with its "
+        "sentence: what was seen, and what to try; of several targets the worst one counts",
+        "neutral": "methods.NAME.neutral: number of trials in which an estimate was not used, because it failed, by "
+        "stage and parameter: the stage got a neutral value, or left the signal unchanged",
+        "doubtful": "methods.NAME.doubtful: number of trials in which a doubtful estimate was used, by stage and "
+        "parameter",
+        "in_doubt": "methods.NAME.in_doubt: stages that use neutral values also where an estimate is doubtful "
+        "(in_doubt: neutral)",
+        "ok": "whether all estimates of the method are reliable; its mean is over the trials that were assessed",
         "seconds": "wall time of the chain of the method per trial; shared estimates count in every method",
         "targets_outside": "named targets outside the image, or never in the beam; a case has their number",
     }
@@ -223,24 +232,43 @@ def _method_tree(title: str, name: str, results: Mapping[str, Result]) -> dict[s
         "targets_outside": [key_of(case, target) for case, names in outside.items() for target in names],
         "seconds_by_stage": dict(first.seconds),
         "failed": "; ".join(key_of(case, o.failed) for case, o in outcomes.items() if o.failed),
-        "neutral": {key_of(c, key): n for c, r in results.items() for key, n in r.neutral[name].items() if n},
+        "outcomes": {
+            key_of(c, stage): {code.name: {"trials": n, "message": code.message} for code, n in _reasons(codes).items()}
+            for c, r in results.items()
+            for stage, codes in r.marks[name]["outcomes"].items()
+        },
+        **{
+            kind: {
+                key_of(c, key): int(used.nansum())
+                for c, r in results.items()
+                for key, used in r.marks[name][kind].items()
+                if used.nansum()
+            }
+            for kind in ("neutral", "doubtful")
+        },
         "in_doubt": [
             stage
             for stage, doubt in results[next(iter(results))].bench.chains[name].in_doubt.items()
-            if doubt == "apply"
+            if doubt == "neutral"
         ],
     }
 
 
 def _entry(found: Found) -> dict[str, Any]:
-    """Value, standard deviation and `ok` of an estimate: lists over trials, or one entry."""
-    value, std = found.value, found.std
+    """Value, standard deviation, `ok` and name of the outcome: lists over trials, or one entry."""
+    value, std, codes = found.value, found.std, found.outcome
     if value[0].numel() > _LISTED:
         value = value.double().flatten(1).mean(1)
         std = None if std is None else std.double().flatten(1).square().mean(1).sqrt()
-    return {"value": _listed(value), "std": _listed(std), "ok": _listed(found.ok)}
+    outcomes = None if codes is None else list(map(Outcome, codes.tolist()))
+    return {
+        "value": _listed(value),
+        "std": _listed(std),
+        "ok": _listed(outcomes and [code.is_ok for code in outcomes]),
+        "outcome": _listed(outcomes and [code.name for code in outcomes]),
+    }
 
 
-def _listed(x: Tensor | None) -> Any:
-    listed: Sequence[Any] | None = None if x is None else x.tolist()
+def _listed(x: Tensor | list[Any] | None) -> Any:
+    listed: Sequence[Any] | None = x.tolist() if isinstance(x, Tensor) else x
     return listed[0] if listed is not None and len(listed) == 1 else listed

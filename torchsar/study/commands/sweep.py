@@ -33,7 +33,7 @@ from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import opened
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.settings.sections import Config, Loaded, Sweep
-from torchsar.study.trials.batch import Outcome
+from torchsar.study.trials.batch import OK, Processed
 from torchsar.study.trials.bench import Bench
 
 log = logging.getLogger("torchsar")
@@ -41,8 +41,8 @@ log = logging.getLogger("torchsar")
 _NOT_IDENTITY: Any = dict.fromkeys(("sweep", "trade", "title", "seed", "random", "cases", "beyond_limits"), True) | {
     "processor": {"__all__": {"title"}}
 }
-# results that the same trial does not give again
-_NOT_RESULTS = ("seconds",)
+# results that the same trial does not give again, and what follows from others
+_NOT_RESULTS = ("seconds", OK)
 _FIXED = ("sweep", "seed", "random", "data", "title", "trade", "system", "cases")
 
 
@@ -92,7 +92,7 @@ class SweepTrial:
         return {**found, BOUNDS: bench.system.bounds(bench, batch), SAVED: saved}
 
 
-def _saved(outcome: Outcome, taps: list[str]) -> dict[str, Tensor]:
+def _saved(outcome: Processed, taps: list[str]) -> dict[str, Tensor]:
     """The last signal of a method, and the outputs of the stages that sweep.save.taps names."""
     if outcome.signal is None:
         return {}

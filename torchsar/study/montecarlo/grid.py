@@ -16,7 +16,7 @@ from torchsar.core import address, canonical, fault_of_name
 from torchsar.study.settings.errors import ConfigError
 
 # names of dims and parts of results
-RESERVED = ("algorithm", "trial", "method", "ok", "done", "saved")
+RESERVED = ("algorithm", "trial", "method", "ok", "outcome", "done", "saved")
 _LONGEST = 200  # bytes: file systems allow 255, and names of bounds and figures are longer
 
 

@@ -19,7 +19,7 @@ from torchsar.core import Draws, Source, device_fault, fingerprint
 from torchsar.metrics.intervals import half_width_ratio
 from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import Grid, make_grid
-from torchsar.study.montecarlo.record import OK, Record
+from torchsar.study.montecarlo.record import OK, OUTCOME, Record
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
 from torchsar.study.montecarlo.work import Chunk, Computed, Trial, Work, cut, rows_of
 from torchsar.study.output.folder import ResultFolder, opened
@@ -138,7 +138,13 @@ class Plan:
             ConfigError: If a metric is missing; the message names the first one.
         """
         parts = self.work(trial).compute(Chunk(0, (0,), (0,))).parts if self.needs else []
-        given = {metric for part in parts for metrics in part.values.values() for metric in metrics if metric != OK}
+        given = {
+            metric
+            for part in parts
+            for metrics in part.values.values()
+            for metric in metrics
+            if metric not in (OK, OUTCOME)
+        }
         for where, metric in self.needs:
             if metric not in given:
                 raise ConfigError(
@@ -175,9 +181,10 @@ def sweep(
         trial: Function of (parameters, draws), called for a batch of trials, one per row. It gets
             the parameters by name, and `Draws` with the random numbers of the rows. It returns
             {metric: (rows,) tensor}, or {algorithm: {metric: tensor}} to compare algorithms on the
-            same noise. The metric `ok` (bool) says whether an estimate is reliable. Two further
-            keys are optional: "bounds", {metric: {name: (rows,) tensor}}, and "saved",
-            {algorithm: {name: (rows, ...) tensor}}, arrays that are kept for the trials in `save`.
+            same noise. The metric `ok` (bool) says whether an estimate is reliable; in its place,
+            `outcome` (codes of `torchsar.Outcome`) says also why not. Two further keys are
+            optional: "bounds", {metric: {name: (rows,) tensor}}, and "saved", {algorithm: {name:
+            (rows, ...) tensor}}, arrays that are kept for the trials in `save`.
         grid: {name: values} of each parameter, or {name: {label: value}} for values that are
             neither numbers nor words.
         trials: Number of trials of each point. With `resume`, a larger number extends a finished

@@ -8,25 +8,28 @@ from typing import Any
 
 import numpy as np
 
-from torchsar.core import checksum, library
+from torchsar.core import Outcome, checksum, library
 from torchsar.core.show import Shown, Summary, some_of
 from torchsar.study.montecarlo.grid import RESERVED, check_name
 from torchsar.study.settings.errors import ConfigError
 
-OK = "ok"
+OK, OUTCOME = "ok", "outcome"
 Labels = dict[str, tuple[float | str, ...]]
 
 
 @dataclass(repr=False)
 class Record(Shown):
-    """Results of a sweep. A trial that has not run is NaN in every metric and False in `done`.
+    """Results of a sweep.
+
+    A trial that has not run is NaN in every metric, False in `done` and `ok`, and 255 in `outcome`.
 
     Args:
-        algorithms: Names of the algorithms, along the first dim of `ok` and of the metrics.
+        algorithms: Names of the algorithms, along the first dim of `outcome` and of the metrics.
         labels: Values of each parameter by name, numbers or words, in the order of the dims.
         done: Which trials have run, bool (*parameters, trial); points that ended early have fewer
             than others.
-        ok: Whether each estimate is reliable, bool (algorithm, *parameters, trial).
+        outcome: Code of a `torchsar.Outcome` of each trial, the worst one where there are several
+            estimates, uint8 (algorithm, *parameters, trial).
         metrics: Metrics by name, float64 (algorithm, *parameters, trial).
         bounds: Lower bounds by metric and name of the bound, float64 (*parameters, trial).
         about: Title, resolved config, hash, seed, versions, device and timings of the run.
@@ -35,10 +38,15 @@ class Record(Shown):
     algorithms: tuple[str, ...]
     labels: Labels
     done: np.ndarray
-    ok: np.ndarray
+    outcome: np.ndarray
     metrics: dict[str, np.ndarray] = field(default_factory=dict)
     bounds: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     about: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> np.ndarray:
+        """Whether each trial is ok or was not assessed, bool (algorithm, *parameters, trial)."""
+        return self.outcome < Outcome.INEXACT
 
     @property
     def trials(self) -> int:
@@ -53,7 +61,7 @@ class Record(Shown):
         """Return an array of NaN with the shape of a metric, (algorithm, *parameters, trial), or of
         a bound, (*parameters, trial).
         """
-        return np.full(self.ok.shape if by_algorithm else self.done.shape, np.nan)
+        return blank(self.outcome.shape if by_algorithm else self.done.shape, float)
 
     def index_of(self, labels: Mapping[str, float | str]) -> tuple[int, ...]:
         """Index of a point, from its labels by parameter."""
@@ -67,7 +75,7 @@ class Record(Shown):
         """Checksum of all numbers of the trials that are done at a point."""
         rows = {name: x[(..., *point, self.done[point])] for name, (x, _, _) in self.variables().items()}
         # a metric that the trials of a point do not have may become known later
-        return checksum({name: x for name, x in rows.items() if (x if x.dtype == bool else ~np.isnan(x)).any()})
+        return checksum({name: x for name, x in rows.items() if x.dtype != float or not np.isnan(x).all()})
 
     def add(
         self,
@@ -81,8 +89,8 @@ class Record(Shown):
         Args:
             points: Index of the grid point of each row.
             trials: Trial number of each row.
-            values: Metrics by algorithm and name, (rows,) each; without the metric `ok` every trial
-                counts as reliable.
+            values: Metrics by algorithm and name, (rows,) each. `outcome` holds codes; without it,
+                `ok` says which trials are reliable, and without both none was assessed.
             bounds: Lower bounds by metric and name of the bound, (rows,) each.
 
         Raises:
@@ -90,7 +98,7 @@ class Record(Shown):
                 metric or bound cannot be used.
         """
         if not self.algorithms:
-            self.algorithms, self.ok = tuple(values), np.zeros((len(values), *self.done.shape), bool)
+            self.algorithms, self.outcome = tuple(values), blank((len(values), *self.done.shape), np.uint8)
         if set(values) != set(self.algorithms):
             new = next((repr(a) for a in values if a not in self.algorithms), None)
             gave = f"{', '.join(values)} alone" if new is None else f"the algorithm {new}"
@@ -101,9 +109,11 @@ class Record(Shown):
         indices = zip(*((*point, trial) for point, trial in zip(points, trials)))
         rows = np.ravel_multi_index(tuple(indices), self.done.shape)
         for number, algorithm in enumerate(self.algorithms):
-            self.ok[number].reshape(-1)[rows] = values[algorithm].get(OK, True)
-            for metric, found in values[algorithm].items():
-                if metric != OK:
+            given = values[algorithm]
+            verdicts = np.where(given[OK], Outcome.OK, Outcome.UNSPECIFIED) if OK in given else Outcome.NOT_ASSESSED
+            self.outcome[number].reshape(-1)[rows] = given.get(OUTCOME, verdicts)
+            for metric, found in given.items():
+                if metric not in (OK, OUTCOME):
                     self._array(self.metrics, metric, metric)[number].reshape(-1)[rows] = found
         for metric, named in bounds.items():
             known = self.bounds.setdefault(metric, {})
@@ -121,7 +131,7 @@ class Record(Shown):
 
     def variables(self) -> dict[str, tuple[np.ndarray, tuple[str, ...], dict[str, str]]]:
         """Return every array of results by its name in the store, as (data, dims, attributes)."""
-        found = {OK: (self.ok, self.dims, {"kind": OK})}
+        found = {OUTCOME: (self.outcome, self.dims, {"kind": OUTCOME})}
         found |= {name: (x, self.dims, {"kind": "metric"}) for name, x in self.metrics.items()}
         for metric, named in self.bounds.items():
             for name, x in named.items():
@@ -148,7 +158,7 @@ class Record(Shown):
             self,
             labels=labels,
             done=change(self.done),
-            ok=change(self.ok),
+            outcome=change(self.outcome),
             metrics={name: change(x) for name, x in self.metrics.items()},
             bounds=bounds,
         )
@@ -163,8 +173,9 @@ class Record(Shown):
         """
         xarray = library("xarray", "xarray", "to_xarray")
         coordinates = {"algorithm": self.algorithms, **self.labels, "trial": range(self.trials)}
+        arrays = {name: (dims, x, about) for name, (x, dims, about) in self.variables().items()}
         return xarray.Dataset(
-            {"done": (self.dims[1:], self.done), **{name: (d, x, a) for name, (x, d, a) in self.variables().items()}},
+            {"done": (self.dims[1:], self.done), OK: (self.dims, self.ok, {"kind": OK}), **arrays},
             {name: list(values) for name, values in coordinates.items()},
         )
 
@@ -182,15 +193,20 @@ def bound_name(metric: str, bound: str) -> str:
     return f"{metric}_bound_{''.join(c if c.isalnum() else '_' for c in bound.lower())}"
 
 
+def blank(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """Return an array of trials that have not run: of False, of 255 as codes, or of NaN."""
+    return np.full(shape, {"b": False, "u": 255}.get(np.dtype(dtype).kind, np.nan), dtype)
+
+
 def _enlarged(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    out = np.full((*x.shape[: x.ndim - len(shape)], *shape), False if x.dtype == bool else np.nan, x.dtype)
+    out = blank((*x.shape[: x.ndim - len(shape)], *shape), x.dtype)
     out[tuple(map(slice, x.shape))] = x
     return out
 
 
 @dataclass(frozen=True)
 class Difference:
-    """A trial of one algorithm in which two records have different values of a metric."""
+    """A trial of one algorithm in which two records have different values of a metric, or codes."""
 
     metric: str
     algorithm: str
@@ -200,7 +216,7 @@ class Difference:
 
 
 def differences(a: Record, b: Record, tolerance: float) -> list[Difference]:
-    """Return the trials that both records hold and in which a metric or `ok` differs.
+    """Return the trials that both records hold and in which a metric or `outcome` differs.
 
     Two runs with different batch sizes or numbers of threads differ only by rounding, except in
     trials in which rounding changes a decision (the choice of a peak or the end of an iteration).
@@ -211,7 +227,7 @@ def differences(a: Record, b: Record, tolerance: float) -> list[Difference]:
         a: The one record.
         b: The other record.
         tolerance: Largest accepted difference of a metric, relative to the larger of the two
-            magnitudes; `ok` must be equal.
+            magnitudes; `outcome` must be equal.
 
     Raises:
         ConfigError: If the records differ in their algorithms or parameter values.
@@ -224,7 +240,7 @@ def differences(a: Record, b: Record, tolerance: float) -> list[Difference]:
     n = min(a.trials, b.trials)
     both = a.done[..., :n] & b.done[..., :n]
     pairs = {name: (a.metrics[name], b.metrics[name], tolerance) for name in a.metrics if name in b.metrics}
-    pairs[OK] = (a.ok.astype(float), b.ok.astype(float), 0.0)
+    pairs[OUTCOME] = (a.outcome.astype(float), b.outcome.astype(float), 0.0)
     found = []
     for name, (x, y, allowed) in pairs.items():
         x, y = x[..., :n], y[..., :n]

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchsar.core import Outcome
 from torchsar.plot import axis_label
 from torchsar.study.montecarlo.pictures import label_text
 from torchsar.study.output.numbers import MISSING, number
@@ -31,7 +32,7 @@ def write_sweep_report(
         config_text: The resolved config.
         command: The command that made it.
     """
-    tables = [*metric_tables(tree), *bound_tables(tree)]
+    tables = [*metric_tables(tree), *outcome_tables(tree), *bound_tables(tree)]
     fields = {"facts": facts(tree), "tables": tables, "origin": list(origin(tree["about"]))}
     shown = {"title": tree["title"], "definitions": tree["definitions"], "config": config_text, "command": command}
     write_page(path, "sweep.html.j2", pictures, figures, **shown, **fields)
@@ -89,6 +90,21 @@ def _row(point: Mapping[str, Any]) -> list[str]:
         number(point["std"]),
         *(with_interval(point[f"{name}_share"], point[f"{name}_interval"]) for name in shares),
     ]
+
+
+def outcome_tables(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """One table of the outcomes of each algorithm at every point, if there are any."""
+    rows = [
+        [
+            *(point["algorithm"], *map(label_text, point["parameters"].values()), f"{point['trials']}"),
+            with_interval(point["ok_share"], point["ok_interval"]),
+            ", ".join(f"{Outcome[name].label}: {n}" for name, n in point["outcomes"].items()),
+        ]
+        for point in tree["points"]
+        if point["metric"] == tree["points"][0]["metric"]
+    ]
+    columns = ["algorithm", *map(axis_label, tree["parameters"]), "trials", "ok share", "outcomes"]
+    return [{"title": "outcomes", "columns": columns, "rows": rows}] if rows else []
 
 
 def bound_tables(tree: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -26,11 +26,11 @@ from zarr.codecs import Crc32cCodec
 from torchsar.core import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
 from torchsar.core.memory import all_false
 from torchsar.study.montecarlo.grid import Grid
-from torchsar.study.montecarlo.record import OK, Labels, Record
+from torchsar.study.montecarlo.record import OUTCOME, Labels, Record, blank
 from torchsar.study.settings.errors import ConfigError, one_line
 
 # number of the layout of the store; another one is refused on resume
-FORMAT = 2
+FORMAT = 3
 # numbers in a zarr chunk at most: half a megabyte, which is written whole for every change
 _CHUNK_NUMBERS = 1 << 16
 # results are written every so many seconds, or more often if writing takes half a percent of the
@@ -45,8 +45,8 @@ class Store:
     """results.zarr of one sweep, open for writing; made by `create` or `resume`.
 
     Root attributes: format, identity and hash (what the results depend on), labels and values of
-    the parameters, algorithms, trials, about, sessions. Arrays: one for each metric, `ok`, one for
-    each bound, and the coordinates. Group `done`: for each point, by its index, the ranges of
+    the parameters, algorithms, trials, about, sessions. Arrays: one for each metric, `outcome`, one
+    for each bound, and the coordinates. Group `done`: for each point, by its index, the ranges of
     trials that are recorded with the checksum of their numbers, and the checksum of each entry of
     `saved`. Group `saved`: images and outputs of stages for chosen trials.
 
@@ -197,7 +197,7 @@ class Store:
                 "shape": data.shape,
                 "dtype": data.dtype,
                 "chunks": (*leading, chunk),
-                "fill_value": False if data.dtype == bool else np.nan,
+                "fill_value": blank((), data.dtype).item(),
                 "dimension_names": dims,
                 "attributes": about,
                 "compressors": [Crc32cCodec()],
@@ -235,7 +235,7 @@ def empty(labels: Labels, trials: int) -> Record:
     """
     shape = (*map(len, labels.values()), trials)
     try:
-        return Record((), dict(labels), all_false(shape), np.zeros((0, *shape), bool))
+        return Record((), dict(labels), all_false(shape), blank((0, *shape), np.uint8))
     except (MemoryError, ValueError):
         raise ConfigError(
             f"sweep: the results of {' x '.join(map(str, shape))} trials do not fit into memory; "
@@ -273,7 +273,8 @@ def _opened(path: Path, mode: Any, needed: Collection[str] = ("labels", "identit
         root, held = zarr.open_group(str(path), mode=mode), group_attributes(path, {"format": FORMAT})
     if needed and (held.get("format") != FORMAT or not set(needed) <= set(held)):
         raise ConfigError(
-            f"{path} was not written by a sweep of this version of torchsar; choose another folder, or move it"
+            f"{path} was not written by a sweep of this version of torchsar (its layout is {held.get('format')}, not "
+            f"{FORMAT}); choose another folder, or move it"
         )
     return root
 
@@ -339,12 +340,12 @@ def _read(root: zarr.Group, held: Mapping[str, Any], marks: Mapping[str, Any]) -
         for first, last in marks[index]["spans"]:
             record.done[(*point, slice(first, last))] = True
     record.algorithms = tuple(held.get("algorithms", ()))
-    record.ok = np.zeros((len(record.algorithms), *record.done.shape), bool)
+    record.outcome = blank((len(record.algorithms), *record.done.shape), np.uint8)
     for name in held.get("arrays", ()):
         array: Any = root[name]
         about = _attributes(array)
-        if about["kind"] == OK:
-            target = record.ok
+        if about["kind"] == OUTCOME:
+            target = record.outcome
         elif about["kind"] == "metric":
             target = record.metrics.setdefault(name, record.blank())
         else:

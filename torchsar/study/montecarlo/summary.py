@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from torchsar.core import Outcome
 from torchsar.metrics.intervals import LEVEL, RESAMPLES, finite_rms, share_interval, trial_statistics
 from torchsar.study.montecarlo.record import Labels, Record
 
@@ -27,9 +28,10 @@ _DEFINITIONS = {
         f"{LEVEL:.0%}; none for fewer than six trials"
     ),
     "ok_share": (
-        "share of the trials done that the algorithm itself marks as reliable (trusted), with its exact "
+        "share of the trials done and assessed that the algorithm itself marks as reliable (trusted), with its exact "
         f"{LEVEL:.0%} interval (Clopper-Pearson)"
     ),
+    "outcomes": "number of trials of each outcome; of several estimates of a trial the worst outcome counts",
 }
 _SUCCESS = (
     "share of the trials done that the algorithm marks as reliable (trusted), with the metric within success_limit of "
@@ -49,12 +51,14 @@ class Summary:
             intervals have a last dim of 2 for their lower and upper end.
         bounds: Lower bounds by metric and name of the bound, each as the root mean square over
             trials, shape (*parameters).
+        outcomes: Number of trials of each outcome that occurs, (algorithm, *parameters).
     """
 
     algorithms: tuple[str, ...]
     labels: Labels
     figures: Mapping[str, Mapping[str, np.ndarray]]
     bounds: Mapping[str, Mapping[str, np.ndarray]]
+    outcomes: Mapping[Outcome, np.ndarray] = field(default_factory=dict)
 
     def points(self) -> Iterator[tuple[tuple[int, ...], dict[str, float | str]]]:
         """Yield index and labels of every point of the grid; the last parameter runs fastest."""
@@ -68,9 +72,10 @@ class Summary:
             about: Title and description of the sweep, as in `Record.about`.
             definitions: Definitions of terms, in addition to those of the statistics.
         """
-        points = [
+        points: list[dict[str, Any]] = [
             {"algorithm": algorithm, "parameters": parameters, "metric": metric}
             | {name: array[(i, *index)].tolist() for name, array in fields.items()}
+            | {"outcomes": {code.name: int(n[(i, *index)]) for code, n in self.outcomes.items() if n[(i, *index)]}}
             for i, algorithm in enumerate(self.algorithms)
             for index, parameters in self.points()
             for metric, fields in self.figures.items()
@@ -89,7 +94,13 @@ class Summary:
             "trials": max((point["trials"] for point in points), default=0),
             "points": points,
             "bounds": bounds,
-            "definitions": {**_DEFINITIONS, **success, **({"bound": _BOUND} if bounds else {}), **definitions},
+            "definitions": {
+                **_DEFINITIONS,
+                **{f"outcome {code.name}": code.message for code in self.outcomes},
+                **success,
+                **({"bound": _BOUND} if bounds else {}),
+                **definitions,
+            },
             "about": dict(about),
         }
 
@@ -102,7 +113,8 @@ def summary_of(record: Record, success: Mapping[str, float]) -> Summary:
         success: For each metric, the largest magnitude that counts as a success.
     """
     done = record.done[None]
-    trials = {"trials": np.broadcast_to(done.sum(-1), record.ok.shape[:-1]), **_shares(record.ok, done, "ok")}
+    assessed = done & (record.outcome != Outcome.NOT_ASSESSED)
+    trials = {"trials": np.broadcast_to(done.sum(-1), record.ok.shape[:-1]), **_shares(record.ok, assessed, "ok")}
     figures = {
         name: {
             **_statistics(values, int(record.about["seed"])),
@@ -115,7 +127,8 @@ def summary_of(record: Record, success: Mapping[str, float]) -> Summary:
         metric: {name: finite_rms(np.where(record.done, values, np.nan)) for name, values in named.items()}
         for metric, named in record.bounds.items()
     }
-    return Summary(record.algorithms, record.labels, figures, bounds)
+    outcomes = {code: n for code in Outcome if (n := (record.outcome == code).sum(-1)).any()}
+    return Summary(record.algorithms, record.labels, figures, bounds, outcomes)
 
 
 def _statistics(values: np.ndarray, seed: int) -> dict[str, np.ndarray]:

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, LargestTensor, is_out_of_memory
+from torchsar.core import Draws, LargestTensor, Outcome, is_out_of_memory
 from torchsar.core.batches import rows_by_bytes, rows_by_trial
 from torchsar.study.montecarlo.grid import Case, Grid
-from torchsar.study.montecarlo.record import OK
+from torchsar.study.montecarlo.record import OK, OUTCOME
 from torchsar.study.settings.errors import ConfigError, one_line
 
 log = logging.getLogger("torchsar")
@@ -53,7 +53,7 @@ class Chunk:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Part:
     """Results of one batch of trials.
 
     Args:
@@ -79,7 +79,7 @@ class Computed:
         warnings: Warnings that the trials logged.
     """
 
-    parts: list[Outcome]
+    parts: list[Part]
     fits: int | None
     warnings: tuple[str, ...]
 
@@ -144,7 +144,7 @@ class Work:
             )
         return given
 
-    def _once(self, chunk: Chunk) -> Outcome:
+    def _once(self, chunk: Chunk) -> Part:
         addresses = tuple(self.cases[chunk.case].points[p].address for p in chunk.points)
         given = self.trial(self.parameters(chunk), replace(self.draws, case=addresses, trials=list(chunk.trials)))
         if not isinstance(given, Mapping):
@@ -172,7 +172,7 @@ class Work:
                 raise ValueError(text)
         kept = {f"{algorithm}.{name}": value for algorithm, named in saved.items() for name, value in named.items()}
         n, rows = len(chunk), [row for row, trial in enumerate(chunk.trials) if trial in self.save]
-        return Outcome(
+        return Part(
             chunk,
             _numbers(nested or {_name(self.trial): found}, n),
             _numbers(bounds, n, f"{BOUNDS}."),
@@ -239,6 +239,8 @@ def _rows(value: Any, rows: int, what: str) -> list[float]:
         raise ValueError(f"{expected} {x.dtype} of shape {tuple(x.shape)}")
     if what.endswith(f".{OK}") and x.dtype != torch.bool:
         raise ValueError(f"{what} must be bool, got {x.dtype}")
+    if what.endswith(f".{OUTCOME}") and not set(x.reshape(-1).tolist()) <= set(Outcome):
+        raise ValueError(f"{what} must hold codes of torchsar.Outcome, got {x.reshape(-1).tolist()[:5]}")
     return x.tolist() if x.ndim else [x.item()] * rows
 
 

@@ -33,6 +33,7 @@ from torchsar.multichannel import (
     StationaryImage,
 )
 from torchsar.radar import BistaticRadar
+from torchsar.study.names.factories import with_assess
 
 Unknown = Literal["u_r_m_s", "u_a_m_s", "y0_m"]
 Method = Literal["least_squares", "mmse"]
@@ -93,6 +94,7 @@ def rebuild_bands(
     return Reconstruct(radar, _rebuild(bands, method, band_hz, snr_db), range_m)
 
 
+@with_assess
 def channel_balance(
     radar: BistaticRadar, band_hz: float | None = None, bands: int | None = None, delays: bool = True
 ) -> EstimateBalance:
@@ -108,6 +110,7 @@ def channel_balance(
     return EstimateBalance(radar, _prior(band_hz), bands, delays)
 
 
+@with_assess
 def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: float | None = None) -> Interferometry:
     """Estimator of the slant-range speed u_r of a target by along-track interferometry, for a given
     along-track speed u_a.
@@ -121,6 +124,7 @@ def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: 
     return Interferometry(radar, _aperture(dwell_s), range_m)
 
 
+@with_assess
 def along_track_autofocus(
     radar: BistaticRadar, dwell_s: float | None = None, half_m_s: float = 20.0, range_m: float | None = None
 ) -> AlongTrackAutofocus:
@@ -137,6 +141,7 @@ def along_track_autofocus(
     return AlongTrackAutofocus(radar, _aperture(dwell_s), range_m, half_m_s)
 
 
+@with_assess
 def likelihood_velocity(
     radar: BistaticRadar,
     dwell_s: float | None = None,
@@ -158,6 +163,7 @@ def likelihood_velocity(
     return LikelihoodVelocity(radar, _aperture(dwell_s), range_m, unknowns)
 
 
+@with_assess
 def gradient_velocity(
     radar: BistaticRadar,
     dwell_s: float | None = None,
@@ -179,6 +185,7 @@ def gradient_velocity(
     return GradientVelocity(radar, _aperture(dwell_s), range_m, unknowns)
 
 
+@with_assess
 def moving_point_velocity(
     radar: BistaticRadar,
     dwell_s: float | None = None,
@@ -209,6 +216,7 @@ def moving_point_velocity(
     )
 
 
+@with_assess
 def intensity_ratio(
     radar: BistaticRadar,
     bandwidth_hz: float,
@@ -235,6 +243,7 @@ def intensity_ratio(
     return SignalIntensityRatio(radar, bandwidth_hz, rebuild, search_m_s, step_m_s, range_m)
 
 
+@with_assess
 def alternate_velocity(
     radar: BistaticRadar,
     bandwidth_hz: float,

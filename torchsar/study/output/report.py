@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -12,6 +13,7 @@ from typing import Any, Protocol
 import jinja2
 import torch
 
+from torchsar.core import Outcome
 from torchsar.plot import name_and_unit
 from torchsar.study.output.numbers import MISSING, number, quantity, scale_of
 from torchsar.study.output.pictures import Picture
@@ -95,6 +97,15 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
     )
     of_targets = {name: method["targets"] for name, method in methods.items() if method["targets"]}
     theory = {"theory": metrics["theory"]} if metrics.get("theory") else {}
+    reasons = {
+        name: [
+            (stage, row["trials"], row["message"])
+            for stage, found in method["outcomes"].items()
+            for code, row in found.items()
+            if not Outcome[code].is_ok
+        ]
+        for name, method in methods.items()
+    }
     return {
         "tiles": tiles,
         "cases": cases,
@@ -103,11 +114,25 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
         "methods": methods,
         "best": best,
         "estimates": [
-            (name, quantity(found["value"], name_and_unit(name)[1], found["std"]), found["ok"])
+            (name, quantity(found["value"], name_and_unit(name)[1], found["std"]), _in_words(found["outcome"]))
             for name, found in best["estimates"].items()
+        ],
+        "reasons": {name: rows for name, rows in reasons.items() if rows},
+        "not_assessed": [
+            name
+            for name, method in methods.items()
+            if {code for found in method["outcomes"].values() for code in found} == {Outcome.NOT_ASSESSED.name}
         ],
         "metrics": metrics,
     }
+
+
+def _in_words(outcomes: str | list[str] | None) -> str:
+    """Names of outcomes, (trial,) or one, as words such as "noise: 2, ok: 1"."""
+    found = Counter([outcomes] if isinstance(outcomes, str) else outcomes)
+    return (
+        ", ".join(f"{Outcome[x].label}{f': {n}' if len(found) > 1 else ''}" for x, n in found.most_common()) or MISSING
+    )
 
 
 def _row(name: str, cells: list[str], soft: bool = False) -> dict[str, Any]:

@@ -294,8 +294,8 @@ def _method(method: Method, where: str, system: Any, file: str) -> Method:
             raise ConfigError(f"{file}: {where}.stages.{name}.uses: {old!r} is now called {new!r}; rename it")
         if entry.get("in_doubt", "apply") not in ("neutral", "apply"):
             raise ConfigError(
-                f"{file}: {where}.stages.{name}.in_doubt must be 'neutral' (neutral values in trials where an estimate "
-                f"is not ok) or 'apply' (the estimated ones), got {entry['in_doubt']!r}"
+                f"{file}: {where}.stages.{name}.in_doubt must be 'apply' (estimated values in trials where an estimate "
+                f"is doubtful) or 'neutral' (neutral ones), got {entry['in_doubt']!r}"
             )
         rest = {key: value for key, value in entry.items() if key not in OF_CHAIN}
         kept = {key: entry[key] for key in OF_CHAIN if entry.get(key)}

@@ -1,4 +1,4 @@
-"""Batches of trials: recordings with their true values, and the outcome of every method."""
+"""Batches of trials: recordings with their true values, and the results of every method."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Recording, Signal, Trace
+from torchsar.core import Estimate, Outcome, Recording, Signal, Trace
 
-OK = "ok"
+OK, OUTCOME = "ok", "outcome"
 IMAGE = ("azimuth", "range")
 Metrics = Mapping[str, Tensor]
 
@@ -55,7 +55,7 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Processed:
     """Result of one method in one batch.
 
     Args:
@@ -66,7 +66,9 @@ class Outcome:
         trace: All intermediate signals; None if nothing needs them.
         reusable: Stages that return an estimate and leave the signal unchanged.
         failed: The reason of its failure; empty if it did not fail.
-        neutral: Trials in which its stages used neutral values in place of estimates, see `Trace`.
+        marks: What is known of its stages in every trial, (trial,) each: "outcomes", the worst code
+            of each stage that estimates, and whether stages used "neutral" or "doubtful" values,
+            see `Trace`.
     """
 
     judged: Judged
@@ -76,7 +78,7 @@ class Outcome:
     trace: Trace | None = None
     reusable: Collection[str] = ()
     failed: str = ""
-    neutral: Mapping[str, Tensor] = field(default_factory=dict)
+    marks: Mapping[str, Metrics] = field(default_factory=dict)
 
     @property
     def metrics(self) -> Metrics:
@@ -88,7 +90,7 @@ class Batch:
     """The trials of one batch, and the result of every method."""
 
     trials: Trials
-    outcomes: Mapping[str, Outcome]
+    outcomes: Mapping[str, Processed]
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ class Result:
         targets: Metrics by method, target and name, (trial,).
         estimates: Estimates by method and name.
         truth: True values by name, (trial, ...).
-        neutral: Number of trials in which a stage used neutral values, by method and stage.
+        marks: What is known of the stages in every trial, by method; see `Processed`.
     """
 
     bench: Any
@@ -111,7 +113,7 @@ class Result:
     targets: Mapping[str, Mapping[str, Metrics]]
     estimates: Mapping[str, Mapping[str, Found]]
     truth: Mapping[str, Tensor]
-    neutral: Mapping[str, Mapping[str, int]]
+    marks: Mapping[str, Mapping[str, Metrics]]
 
     @property
     def images(self) -> dict[str, Signal]:
@@ -119,17 +121,17 @@ class Result:
         signals = {name: outcome.signal for name, outcome in self.first.outcomes.items()}
         return {name: image_of(signal) for name, signal in signals.items() if signal is not None}
 
-    def first_of(self, name: str) -> Outcome:
+    def first_of(self, name: str) -> Processed:
         return self.first.outcomes[name]
 
 
 @dataclass(frozen=True)
 class Found:
-    """Estimates of a quantity: value, standard deviation (trial, ...) and `ok` (trial,)."""
+    """Estimates of a quantity: value and standard deviation (trial, ...), and codes (trial,)."""
 
     value: Tensor
     std: Tensor | None
-    ok: Tensor | None
+    outcome: Tensor | None
 
 
 def joined_metrics(parts: Sequence[Metrics]) -> dict[str, Tensor]:
@@ -151,17 +153,24 @@ def joined_found(parts: Sequence[Mapping[str, Found]]) -> dict[str, Found]:
         return torch.cat(there) if len(there) == len(values) else None
 
     names = [name for name in parts[0] if all(name in part for part in parts)]
-    fields = {name: [whole([getattr(p[name], f) for p in parts]) for f in ("value", "std", "ok")] for name in names}
-    return {name: Found(value, std, ok) for name, (value, std, ok) in fields.items() if value is not None}
+    fields = {
+        name: [whole([getattr(p[name], f) for p in parts]) for f in ("value", "std", "outcome")] for name in names
+    }
+    return {name: Found(value, std, codes) for name, (value, std, codes) in fields.items() if value is not None}
 
 
 def summary(metrics: Metrics) -> dict[str, float]:
     """Return the mean of each metric over the trials in which it is finite, and its standard
-    deviation as `<name>_sd` if there are several such trials.
+    deviation as `<name>_sd` if there are several such trials; of `ok` the mean over the trials that
+    were assessed.
     """
     row: dict[str, float] = {}
     for name, value in metrics.items():
+        if name == OUTCOME:
+            continue
         x = value.to(torch.float64)
+        if name == OK and OUTCOME in metrics:
+            x = torch.where(metrics[OUTCOME] == int(Outcome.NOT_ASSESSED), math.nan, x)
         there = x[torch.isfinite(x)]
         row[name] = float(there.mean()) if len(there) else math.nan
         if len(there) > 1 and name != OK:
@@ -169,12 +178,12 @@ def summary(metrics: Metrics) -> dict[str, float]:
     return row
 
 
-def verdict(estimates: Mapping[str, Estimate], count: int) -> dict[str, Tensor]:
-    """Return {"ok": whether all estimates of a trial are reliable, bool (trial,)}, or {} without
-    estimates.
+def verdict(codes: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return {"ok": whether all estimates of a trial are reliable, bool (trial,), "outcome": the
+    worst code}, or {} without estimates.
     """
-    found = [rows(estimate.ok, count).flatten(1).all(1) for estimate in estimates.values()]
-    return {OK: torch.stack(found).all(0)} if found else {}
+    worst = torch.stack(list(codes.values())).amax(0) if codes else None
+    return {} if worst is None else {OK: worst < Outcome.INEXACT, OUTCOME: worst}
 
 
 def rows(x: Tensor, count: int) -> Tensor:

@@ -13,11 +13,13 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchsar.core import (
     Chain,
     Draws,
     Estimate,
+    Outcome,
     Recording,
     Trace,
     gathered_checks,
@@ -28,7 +30,7 @@ from torchsar.echo import apply_impairments
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded, Method
 from torchsar.study.trials.auto import resolved
-from torchsar.study.trials.batch import Batch, Judged, Outcome, Trials, fault_of_image, rows, verdict
+from torchsar.study.trials.batch import Batch, Judged, Processed, Trials, fault_of_image, rows, verdict
 from torchsar.study.trials.chains import build_chains, reason_of, true_names
 
 log = logging.getLogger("torchsar")
@@ -171,7 +173,7 @@ class Bench:
         """
         self.announce("", "recording" if self.recording is not None else "simulation")
         trials = self.trials(draws, given)
-        outcomes: dict[str, Outcome] = {}
+        outcomes: dict[str, Processed] = {}
         later = [method.rerun.method for method in self.config.processor.values() if method.rerun is not None]
         for name, method in self.config.processor.items():
             if methods and name not in methods:
@@ -183,8 +185,9 @@ class Bench:
         return Batch(trials, self._compared(outcomes))
 
     def _outcome(
-        self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Outcome], detail: bool
-    ) -> Outcome:
+        self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Processed], detail: bool
+    ) -> Processed:
+        codes = {name: torch.full((trials.count,), int(Outcome.ERROR))}
         try:
             trace, estimates, seconds = self._run(name, method, trials, earlier)
             system = self.system
@@ -202,15 +205,18 @@ class Bench:
             if name == "recommended" or os.environ.get("TORCHSAR_DEBUG"):
                 raise ConfigError(f"{self.file}: processor.{name}: {text}") from error
             log.warning("warning: %s failed: %s", name, text)
-            return Outcome(Judged({"ok": torch.zeros(trials.count, dtype=torch.bool)}), failed=text)
+            return Processed(Judged(verdict(codes)), failed=text, marks={"outcomes": codes})
+        # without targets there is no code, which is OK, 0
+        codes = {stage: pad(rows(e.outcome, trials.count), (1, 0)).amax(1) for stage, e in estimates.items()}
         spent = torch.full((trials.count,), sum(seconds.values()) / trials.count, dtype=torch.float64)
-        judged = replace(judged, metrics={"seconds": spent, **verdict(estimates, trials.count), **judged.metrics})
+        judged = replace(judged, metrics={"seconds": spent, **verdict(codes), **judged.metrics})
         left = [stage for stage in trace.inputs if trace.outputs[stage] is trace.inputs[stage]]
-        neutral = {key: rows(mask, trials.count).any(1) for key, mask in trace.neutral.items()}
-        return Outcome(judged, estimates, trace.signal, seconds, trace, left, neutral=neutral)
+        used = {"neutral": trace.neutral, "doubtful": trace.doubtful}
+        used = {kind: {key: rows(x, trials.count).any(1) for key, x in of.items()} for kind, of in used.items()}
+        return Processed(judged, estimates, trace.signal, seconds, trace, left, marks={"outcomes": codes, **used})
 
     def _run(
-        self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Outcome]
+        self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Processed]
     ) -> tuple[Trace, Mapping[str, Estimate], Mapping[str, float]]:
         """The trace of a method, its estimates and its times. Estimates of earlier methods by the
         same stages from the same data are reused.
@@ -233,9 +239,9 @@ class Bench:
         spent = {stage: shared.seconds[stage] for stage in shared.estimates}
         return trace, trace.estimates, {**trace.seconds, **spent}
 
-    def _shared(self, method: Method, earlier: Mapping[str, Outcome]) -> Outcome:
+    def _shared(self, method: Method, earlier: Mapping[str, Processed]) -> Processed:
         """Reusable estimates of the earlier method with the most initial stages in common."""
-        best, found = [], Outcome(Judged({}))
+        best, found = [], Processed(Judged({}))
         for name, outcome in earlier.items():
             other = self.config.processor[name]
             if other.input == method.input and other.stages and not outcome.failed:
@@ -247,7 +253,7 @@ class Bench:
         kept = {stage: e for stage, e in found.estimates.items() if stage in best and stage in found.reusable}
         return replace(found, estimates=kept)
 
-    def _compared(self, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
+    def _compared(self, outcomes: Mapping[str, Processed]) -> dict[str, Processed]:
         """The outcomes with the metrics relative to the reference."""
         reference = getattr(self.judging, "reference", None)
         ideal = outcomes.get(reference or "")

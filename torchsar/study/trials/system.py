@@ -18,7 +18,7 @@ from torchsar.study.names.registry import stages
 from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.settings.signature import Catalogue, Section
-from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Outcome, Result, Trials
+from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Choice
 
@@ -176,7 +176,7 @@ class System(ABC):
     def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
         """Check that the axes of a grid are consistent. Raises ConfigError."""
 
-    def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
+    def compare(self, bench: Bench, outcome: Processed, ideal: Processed | None) -> Judged:
         """Return the metrics of a method, with those relative to the reference method."""
         judged, key = outcome.judged, "entropy_nats"
         if ideal is None or ideal is outcome or key not in judged.metrics or key not in ideal.metrics:
@@ -188,15 +188,15 @@ class System(ABC):
         """Return lower bounds of errors, (trial,), by metric and name of the bound."""
         return {}
 
-    def found(self, bench: Bench, outcome: Outcome, trials: Trials) -> dict[str, Found]:
+    def found(self, bench: Bench, outcome: Processed, trials: Trials) -> dict[str, Found]:
         """Return the estimates of a method by `stage.value`."""
         n, table = trials.count, {}
         for stage, estimate in outcome.estimates.items():
-            ok = estimate.ok.expand(n) if estimate.ok.numel() in (1, n) else None
+            codes = estimate.outcome.expand(n) if estimate.outcome.numel() in (1, n) else None
             for key, value in estimate.value.items():
                 std = estimate.std.get(key)
                 spread = None if std is None else per_trial_first(std, n)
-                table[f"{stage}.{key}"] = Found(per_trial_first(value, n), spread, ok)
+                table[f"{stage}.{key}"] = Found(per_trial_first(value, n), spread, codes)
         return table
 
     def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:

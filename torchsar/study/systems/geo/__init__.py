@@ -30,7 +30,7 @@ from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.geo import choices, figures
 from torchsar.study.systems.geo.radar import bistatic_radar
 from torchsar.study.systems.geo.world import TRUTHS, Points, compression_gain_db
-from torchsar.study.trials.batch import Batch, Found, Judged, Outcome, Result, Trials
+from torchsar.study.trials.batch import OK, Batch, Found, Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Column, System
 
@@ -173,7 +173,7 @@ class Geo(System):
         verdicts = {}
         if trace.estimates:
             found = [estimate.ok.expand(rows) for estimate in trace.estimates.values()]
-            verdicts = {"ok": torch.stack(found).all(0).reshape(trials.count, -1)}
+            verdicts = {OK: torch.stack(found).all(0).reshape(trials.count, -1)}
         table = {key: value.reshape(trials.count, -1) for key, value in metrics.items()}
         whole = {key: value.double().nanmean(-1) for key, value in table.items()}
         each = {**table, **verdicts}
@@ -183,12 +183,12 @@ class Geo(System):
         shown = {t: {key: x for key, x in row.items() if seen[key][i]} for i, (t, row) in enumerate(targets.items())}
         return Judged(whole, shown, missing, view)
 
-    def found(self, bench: Bench, outcome: Outcome, trials: Trials) -> dict[str, Found]:
+    def found(self, bench: Bench, outcome: Processed, trials: Trials) -> dict[str, Found]:
         motion, n = FoundMotion.by(outcome.estimates), trials.count
         table: dict[str, Found] = {}
         for i, target in enumerate(bench.world().targets):
             for key, value in motion.value.items():
-                parts = (value, motion.std[key], motion.ok[key].expand(value.shape))
+                parts = (value, motion.std[key], motion.outcome[key].expand(value.shape))
                 table[f"{target}.{key}"] = Found(*(x.reshape(n, -1)[:, i] for x in parts))
         return table
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.core import Chain, Draws, Signal, Trace
+from torchsar.core import Chain, Draws, Outcome, Signal, Trace
 from torchsar.metrics.ship_scene import FoundTarget, MadeScene, made_scenes, matched, ship_metrics
 from torchsar.multichannel import Extraction, PointMotion, StationaryImage
 from torchsar.multichannel.response import LeastSquares, condition_number, noise_gain_db
@@ -23,7 +23,7 @@ from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.geo.radar import bistatic_radar
 from torchsar.study.systems.geo_ocean import choices, figures
 from torchsar.study.systems.geo_ocean.world import TRUTHS, Ocean
-from torchsar.study.trials.batch import Found, Judged, Outcome, Result, Trials
+from torchsar.study.trials.batch import OK, Found, Judged, Processed, Result, Trials, verdict
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Column, System
 
@@ -177,23 +177,24 @@ class GeoOcean(System):
         if any(scene.targets is not None for scene in made):
             counts = [len(s.targets or ()) - sum(t is not None for t in f.values()) for s, f in zip(made, views)]
             whole["false_targets"] = torch.tensor(counts, dtype=torch.float64)
-            whole["ok"] = torch.stack([of["ok"] > 0 for of in ships.values()]).all(0)
+            found = torch.stack([of[OK] > 0 for of in ships.values()]).all(0)
+            whole |= verdict({"ships": Outcome.of(found, Outcome.NOISE)})
         if not detail:
-            whole |= {f"{ship}.{key}": x for ship, of in ships.items() for key, x in of.items() if key != "ok"}
+            whole |= {f"{ship}.{key}": x for ship, of in ships.items() for key, x in of.items() if key != OK}
         whole = {key: value.expand(trials.count) for key, value in whole.items()}
         return Judged(whole, ships, view=View(made, views))
 
-    def found(self, bench: Bench, outcome: Outcome, trials: Trials) -> dict[str, Found]:
+    def found(self, bench: Bench, outcome: Processed, trials: Trials) -> dict[str, Found]:
         """Return the estimated motion of every ship; NaN in trials in which it was not found."""
         if outcome.failed or outcome.judged.view.made[0].targets is None:
             return {}
         rows = outcome.judged.view.found
         table: dict[str, Found] = {}
         for ship in bench.world().targets:
-            ok = torch.tensor([row[ship] is not None and bool(row[ship].ok) for row in rows])
+            codes = Outcome.of(torch.tensor([row[ship] is not None for row in rows]), Outcome.NOISE)
             for key in TRUTHS:
                 values = [math.nan if row[ship] is None else float(getattr(row[ship].motion, key)) for row in rows]
-                table[f"{ship}.{key}"] = Found(torch.tensor(values, dtype=torch.float64), None, ok)
+                table[f"{ship}.{key}"] = Found(torch.tensor(values, dtype=torch.float64), None, codes)
         return table
 
     limits = staticmethod(choices.limits)  # pyright: ignore[reportAssignmentType]

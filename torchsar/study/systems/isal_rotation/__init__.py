@@ -22,7 +22,7 @@ from torchsar.study.names.registry import TARGET_IMPAIRMENTS
 from torchsar.study.output.pictures import Drawn
 from torchsar.study.systems.isal_rotation import choices, figures
 from torchsar.study.systems.isal_rotation.world import Rotating
-from torchsar.study.trials.batch import IMAGE, Batch, Judged, Outcome, Result, Trials
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Column, System
 
@@ -167,7 +167,7 @@ class IsalRotation(System):
         flat = image.with_data(image.data.reshape(-1, *image.data.shape[-2:]).expand(len(rate), -1, -1))
         return cross_range_cut(flat, x, y, scale, bench.judging.search_m, 0.5 / lines[-1] if lines else 0.0)
 
-    def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
+    def compare(self, bench: Bench, outcome: Processed, ideal: Processed | None) -> Judged:
         judged, levels = super().compare(bench, outcome, ideal), {} if ideal is None else ideal.judged.targets
         targets = {}
         for target, row in judged.targets.items():

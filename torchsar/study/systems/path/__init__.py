@@ -26,7 +26,7 @@ from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.systems.path import figures
 from torchsar.study.systems.path import judge as judging
 from torchsar.study.systems.path.world import Flown, path_radar
-from torchsar.study.trials.batch import Judged, Outcome, Result, Trials
+from torchsar.study.trials.batch import Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.system import Column, System
@@ -98,7 +98,7 @@ class AnyPath(System):
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
         return judging.judge(bench, name, trace, trials, detail)
 
-    def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
+    def compare(self, bench: Bench, outcome: Processed, ideal: Processed | None) -> Judged:
         judged = super().compare(bench, outcome, ideal)
         signals = [one.signal for one in (outcome, ideal) if one is not None and one.signal is not None]
         if ideal is outcome or len({signal.axes for signal in signals}) != 1 or len(signals) != 2:

@@ -15,7 +15,7 @@ from torchsar.focus import ClosestRange
 from torchsar.focus.skew import common_lines
 from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
 from torchsar.metrics.strip_image import Margin, Used, window
-from torchsar.study.trials.batch import IMAGE, Judged, Outcome, Trials
+from torchsar.study.trials.batch import IMAGE, Judged, Processed, Trials
 from torchsar.study.trials.bench import Bench
 
 _UNIT = re.compile(r"_(hz|m_s|m|s|rad|deg|db)$")
@@ -87,7 +87,7 @@ def error_name(name: str) -> str:
     return _UNIT.sub(r"_error_\1", name) if _UNIT.search(name) else f"{name}_error"
 
 
-def compare(bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
+def compare(bench: Bench, outcome: Processed, ideal: Processed | None) -> Judged:
     """Return the metrics of a method, with image error and correlation relative to the reference
     method, and with statistics over its point targets.
     """
