@@ -323,15 +323,15 @@ def test_a_sweep_draws_from_its_source_and_goes_on_with_no_other(tmp_path: Path)
     def drawn(parameters: Mapping[str, Any], draws: Draws) -> dict[str, torch.Tensor]:
         return {"x": draws.normal("x")}
 
-    records = {s: sweep(drawn, {}, trials=3, out=tmp_path / s, random=s) for s in ("numpy", "philox")}
-    expected = Draws(1, (address({}),) * 3, range(3), "philox").normal("x")
-    assert records["philox"].metrics["x"][0].tolist() == expected.tolist()
+    records = {s: sweep(drawn, {}, trials=3, out=tmp_path / s, random=s) for s in ("numpy", "torch")}
+    expected = Draws(1, (address({}),) * 3, range(3), "torch").normal("x")
+    assert records["torch"].metrics["x"][0].tolist() == expected.tolist()
     assert records["numpy"].metrics["x"][0].tolist() != expected.tolist()
-    longer = sweep(drawn, {}, trials=4, out=tmp_path / "philox", random="philox", resume=True)
-    assert longer.about["random"] == "philox" and longer.metrics["x"][0, :3].tolist() == expected.tolist()
-    with pytest.raises(ConfigError, match="random was philox and is absent"):
-        sweep(drawn, {}, trials=3, out=tmp_path / "philox", resume=True)
-    with pytest.raises(ConfigError, match="random must be one of numpy, philox, threefry, got 'mersenne'"):
+    longer = sweep(drawn, {}, trials=4, out=tmp_path / "torch", random="torch", resume=True)
+    assert longer.about["random"] == "torch" and longer.metrics["x"][0, :3].tolist() == expected.tolist()
+    with pytest.raises(ConfigError, match="random was torch and is absent"):
+        sweep(drawn, {}, trials=3, out=tmp_path / "torch", resume=True)
+    with pytest.raises(ConfigError, match="random must be one of numpy, torch, got 'mersenne'"):
         sweep(drawn, {}, random="mersenne")  # type: ignore[arg-type]
 
 
