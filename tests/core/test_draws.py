@@ -12,7 +12,8 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.contract.pretended import DEVICE, Pretended, pretended_device, to_host
-from torchsar.core import Draws, LargestTensor, Source
+from torchsar.core import Draws, Source
+from torchsar.study.montecarlo.batches import LargestTensor
 
 
 @pytest.mark.parametrize("source", ["numpy", "torch"])

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-Row = TypeVar("Row")
-Generator = TypeVar("Generator")
 # numbers of a trial from which on trials are drawn by several threads
 _MANY = 1 << 15
 
@@ -82,7 +80,7 @@ def permutation(keys: Sequence[int], counts: Sequence[int], device: torch.device
     return torch.from_numpy(out).to(device)
 
 
-def fill(draw: Callable[[Row, Generator], object], rows: Sequence[Row], generators: list[Generator], n: int) -> None:
+def fill(draw: Callable[[Any, Any], object], rows: Sequence[Any], generators: Sequence[Any], n: int) -> None:
     """Draw the numbers of all trials: by several threads if a trial has many.
 
     Args:

@@ -3,17 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
-from torchsar.core.memory import PeakMemory
+from torchsar.core import PeakMemory
 
-# larger batches do not fit the cache of a CPU and take more time per trial, as measured
-CACHE_BYTES = 12 << 20
+# smaller batches take more time per trial for the calls, larger ones for want of cache; measured
+# with sweeps of four systems, whose trials have tensors of 1.6 to 15 MB
+CACHE_BYTES = 32 << 20
 # Share of the free memory of a GPU that a batch takes (with 0.9, gaps between tensors left no room
 # in two of four sweeps), ratio of the sizes of batches whose memory is measured one after the
 # other, and memory that a process takes for itself.
 _GPU_SHARE, _LARGER, _CONTEXT_BYTES = 0.8, 8, 600 << 20
+
+
+class LargestTensor(TorchDispatchMode):
+    """Context manager that records the largest tensor that any operation of torch returns.
+
+    Attributes:
+        bytes: Size of its storage in bytes.
+    """
+
+    bytes = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        for leaf in tree_leaves(result):
+            if isinstance(leaf, Tensor):
+                self.bytes = max(self.bytes, leaf.untyped_storage().nbytes())
+        return result
 
 
 def rows_by_bytes(bytes_per_trial: int) -> int:
@@ -21,7 +43,7 @@ def rows_by_bytes(bytes_per_trial: int) -> int:
 
     Args:
         bytes_per_trial: Size in bytes of the largest tensor of one trial. For the whole batch, this
-            tensor takes at most 12 MiB, the size of a cache.
+            tensor takes at most 32 MiB, about the size of a cache.
 
     Returns:
         The number, 1 or more.
