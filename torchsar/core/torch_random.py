@@ -1,7 +1,4 @@
-"""Random numbers of torch's generator, drawn on the device where they are used.
-
-The functions have the arguments and results of those of `torchsar.core.numpy_random`.
-"""
+"""Random numbers of torch's generator, drawn on the device where they are used."""
 
 from __future__ import annotations
 
@@ -16,7 +13,18 @@ from torchsar.core.numpy_random import fill
 
 
 def normal(keys: Sequence[int], shape: Sequence[int], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Draw standard normal numbers; those of less than single precision are drawn in float32."""
+    """Draw standard normal numbers.
+
+    Args:
+        keys: Key of each trial, of 128 bits.
+        shape: Shape of the numbers of one trial.
+        dtype: Real or complex dtype; numbers of less than single precision are drawn in float32.
+        device: Device on which they are drawn.
+
+    Returns:
+        Numbers of shape (trial, *shape) with mean zero and a mean square magnitude of one; complex
+        ones are circular.
+    """
     drawn = dtype if dtype.to_real() == torch.float64 else torch.promote_types(dtype, torch.float32)
     return _filled(lambda row, generator: row.normal_(generator=generator), keys, shape, drawn, device).to(dtype)
 
@@ -24,13 +32,35 @@ def normal(keys: Sequence[int], shape: Sequence[int], dtype: torch.dtype, device
 def uniform(
     keys: Sequence[int], shape: Sequence[int], low: float, high: float, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """Draw uniform numbers, in the precision of the result."""
+    """Draw uniform numbers.
+
+    Args:
+        keys: Key of each trial, of 128 bits.
+        shape: Shape of the numbers of one trial.
+        low: Lower limit.
+        high: Upper limit.
+        dtype: Dtype in which the numbers are drawn.
+        device: Device on which they are drawn.
+
+    Returns:
+        Numbers of shape (trial, *shape).
+    """
     return _filled(lambda row, generator: row.uniform_(low, high, generator=generator), keys, shape, dtype, device)
 
 
 @untraced()
 def permutation(keys: Sequence[int], counts: Sequence[int], device: torch.device) -> Tensor:
-    """Draw whole numbers in random order."""
+    """Draw whole numbers in random order.
+
+    Args:
+        keys: Key of each trial, of 128 bits.
+        counts: Number of whole numbers of each trial.
+        device: Device on which they are drawn.
+
+    Returns:
+        Numbers 0 to count - 1 of each trial in random order, and then those from its count on in
+        rising order, (trial, largest count), int64.
+    """
     out = torch.arange(max(counts, default=0), device=device).repeat(len(keys), 1)
     for row, generator, count in zip(out, _generators(keys, device), counts, strict=True):
         torch.randperm(count, generator=generator, out=row[:count])
