@@ -112,6 +112,8 @@ def test_automatic_chunks_follow_the_bytes_of_the_largest_tensor() -> None:
     assert bytes_per_trial in (16 * 1024, 32 * 1024)
     assert rows_by_bytes(bytes_per_trial) == CACHE_BYTES // bytes_per_trial
     assert rows_by_bytes(10 * CACHE_BYTES) == 1
+    # up to four trials share the time of the calls
+    assert [rows_by_bytes(size << 20) for size in (1, 3, 5, 8, 9, 15, 17)] == [12, 4, 4, 4, 3, 2, 1]
     trial.bytes_per_trial = lambda fixed: 12345
     assert probed_bytes(work, 0) == 12345
 
