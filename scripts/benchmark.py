@@ -183,7 +183,7 @@ def measured(
     found.add("memory", "", peak_bytes=peak_bytes(bench.device))
     for source in sources:
         others = replace(draws, source=source)
-        bench.trials(others)  # the first draws of a process compile
+        bench.trials(others)  # the first draws of a process take longer
         with drawing(raw.device) as spent:
             found.time("batch", source, lambda d=others: bench.batch(d, methods=["recommended"]), raw)
         found.add("draws", source, seconds=sum(spent) / found.calls, over_floor=None)

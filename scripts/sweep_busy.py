@@ -3,7 +3,7 @@
     python scripts/sweep_busy.py --out FILE.json [SWEEP ...] [--workers N] [--seconds S] [--batch N]
 
 Every process computes one batch after the other: of a point of the grid, or of all points that may
-share a batch, with random numbers from `philox`. A row holds the `sweep`, the number of `trials` in
+share a batch, with random numbers from `torch`. A row holds the `sweep`, the number of `trials` in
 a batch, the `trials_per_s` of all processes together, and `busy`, the share of the time in which
 the GPU computes, as `nvidia-smi` reports it (none on a CPU). Both are counted from the moment when
 as many batches are done as there are processes. The file is written after each sweep.
@@ -67,11 +67,11 @@ def batches(points: int, trials: int) -> Iterator[Task]:
 
 def measured(name: str, chosen: Engine, options: argparse.Namespace, usage: Usage | None) -> dict[str, Any]:
     """The row of one sweep."""
-    loaded = load(name, ["random=philox"])
+    loaded = load(name, ["random=torch"])
     trial = SweepTrial(loaded, options.device)
     whole = sweep_grid(loaded, trial)
     first = (p if p.batched else replace(p, labels=p.labels[:1], values=p.values[:1]) for p in whole.parameters)
-    work = Plan(Grid(tuple(first)), seed=loaded.config.seed, device=options.device, random="philox").work(trial)
+    work = Plan(Grid(tuple(first)), seed=loaded.config.seed, device=options.device, random="torch").work(trial)
     points = len(work.cases[0].points)
     trials = min(options.batch, -(-loaded.config.sweep.trials * points // chosen.workers))
     began, ended, done = 0.0, 0.0, 0

@@ -20,8 +20,8 @@ from dataclasses import replace
 import torch
 
 from torchsar.core import keep_freed_memory
-from torchsar.core.batches import rows_by_bytes
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
+from torchsar.study.montecarlo.batches import rows_by_bytes
 from torchsar.study.montecarlo.engines import Engine, InProcess, engine
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.loop import Plan, run_plan

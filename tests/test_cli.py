@@ -163,7 +163,7 @@ def test_devices_that_cannot_compute_are_refused(
 
 @pytest.mark.parametrize(
     "words, said",
-    [([], "random=philox"), (["random=philox"], "with --workers 6\n"), (["--workers", "2"], ""), (["cpu"], "")],
+    [([], "random=torch"), (["random=torch"], "with --workers 6\n"), (["--workers", "2"], ""), (["cpu"], "")],
 )
 def test_a_sweep_of_one_process_on_a_gpu_tells_of_workers(
     words: list[str],

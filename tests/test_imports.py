@@ -65,7 +65,7 @@ SHARED = {"isal_rotation": {"isal"}, "geo_ocean": {"geo"}, "path": {"isal"}}
 # statements that the system `path` adds at most; those of all of `study`, and of its systems alone
 PATH_STATEMENTS = 300
 MOST_STATEMENTS = {
-    "torchsar.study": 6560 + PATH_STATEMENTS,
+    "torchsar.study": 6620 + PATH_STATEMENTS,  # with the sizes of batches and the measurement of memory
     "torchsar.study.systems": 3500,
     "torchsar.study.systems.path": PATH_STATEMENTS,
 }

@@ -243,7 +243,7 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
         from torchsar.study.commands.sweep import sweep
 
         if torch.device(options.device).type != "cpu" and not options.workers and not options.cluster:
-            drawn = "" if loaded.config.random != "numpy" else ", and draw the random numbers there with random=philox"
+            drawn = "" if loaded.config.random != "numpy" else ", and draw the random numbers there with random=torch"
             logging.getLogger("torchsar").info(
                 "one process keeps %s busy only in part; let several share it with --workers 6%s", options.device, drawn
             )

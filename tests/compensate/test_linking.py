@@ -14,8 +14,9 @@ from torchsar.compensate.pulse_phase.homogeneous import describe, sparse_gain_na
 from torchsar.compensate.pulse_phase.likelihood import Speckle
 from torchsar.compensate.pulse_phase.linking import _grown
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
-from torchsar.core import Axis, LargestTensor, Signal
+from torchsar.core import Axis, Signal
 from torchsar.metrics.phase import phase_rmse
+from torchsar.study.montecarlo.batches import LargestTensor
 
 F64 = torch.float64
 N, ROWS = 128, 48

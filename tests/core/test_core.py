@@ -1,4 +1,4 @@
-"""Axes, signals, transforms, phases and random draws."""
+"""Axes, signals, transforms and phases."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import torch
 
 from torchsar.core import (
     Axis,
-    Draws,
     Recording,
     Signal,
     best_of,
@@ -172,86 +171,6 @@ def test_transform_in_blocks_equals_the_plain_one(dim):
     expected = torch.fft.fft(x, dim=dim)
     torch.testing.assert_close(transform_in_blocks(x.clone(), dim, block_bytes=5000), expected)
     torch.testing.assert_close(transform_in_blocks(expected.clone(), dim, inverse=True, block_bytes=5000), x)
-
-
-@pytest.mark.parametrize("source", ["numpy", "philox"])
-class TestDraws:
-    def test_chunks_and_order_do_not_matter(self, source):
-        draws = Draws(7, trials=range(6), source=source)
-        whole = draws.normal("noise", (4, 5), torch.complex64)
-        parts = torch.cat(
-            [draws.for_trials(t).normal("noise", (4, 5), torch.complex64) for t in ([0, 1], [2], [3, 4, 5])]
-        )
-        assert torch.equal(whole, parts)
-        assert torch.equal(draws.for_trials([5, 0]).normal("noise", (4, 5), torch.complex64), whole[[5, 0]])
-
-    def test_a_number_of_trials_in_place_of_indices_is_refused(self, source):
-        with pytest.raises(TypeError, match=r"trials=range\(4\)"):
-            Draws(7, trials=4, source=source)  # type: ignore[arg-type]
-
-    def test_an_unknown_source_is_refused(self, source):
-        with pytest.raises(
-            ValueError, match=f"source of Draws must be one of 'numpy', 'philox', 'threefry', got '{source}s'"
-        ):
-            Draws(7, source=f"{source}s")  # type: ignore[arg-type]
-
-    @pytest.mark.parametrize("dtype", [torch.complex64, torch.float64, torch.bfloat16])
-    def test_threads_do_not_matter(self, source, dtype):
-        draws, threads = Draws(7, trials=range(3), source=source), torch.get_num_threads()
-        try:
-            torch.set_num_threads(2)
-            many = draws.normal("noise", (50_000,), dtype)
-        finally:
-            torch.set_num_threads(threads)
-        assert torch.equal(many, draws.normal("noise", (50_000,), dtype))
-        assert torch.equal(draws.for_trials([2]).normal("noise", (50_000,), dtype), many[2:])
-
-    @pytest.mark.parametrize("dtype", [torch.complex64, torch.float32])
-    def test_no_trials_and_no_numbers(self, source, dtype):
-        draws = Draws(7, trials=range(3), source=source)
-        none = draws.for_trials([])
-        assert none.normal("noise", (4,), dtype).shape == (0, 4) == none.uniform("u", (4,)).shape
-        assert none.permutation("order", []).shape == (0, 0)
-        assert draws.normal("noise", (0, 4), dtype).shape == (3, 0, 4)
-
-    def test_earlier_draws_do_not_change_a_draw(self, source):
-        a, b = Draws(7, source=source), Draws(7, source=source)
-        b.uniform("something else", (1000,))
-        assert torch.equal(a.normal("noise", (9,)), b.normal("noise", (9,)))
-
-    @pytest.mark.parametrize(
-        "change",
-        [
-            lambda draws: replace(draws, seed=8),
-            lambda draws: replace(draws, case="snr=3"),
-            lambda draws: draws.part("sea"),
-            lambda draws: draws.for_trials([1]),
-        ],
-    )
-    def test_every_part_of_the_address_changes_the_draw(self, source, change):
-        draws = Draws(7, source=source)
-        assert not torch.equal(draws.normal("noise", (9,)), change(draws).normal("noise", (9,)).reshape(-1))
-
-    def test_precisions_draw_the_same_noise(self, source):
-        double = Draws(7, source=source).normal("noise", (99,), torch.complex128)
-        assert torch.equal(double.to(torch.complex64), Draws(7, source=source).normal("noise", (99,), torch.complex64))
-
-    def test_moments(self, source):
-        x = Draws(3, source=source).normal("noise", (200_000,), torch.complex128)
-        assert float(x.abs().square().mean()) == pytest.approx(1, abs=0.02)
-        assert abs(complex((x * x).mean())) < 0.02
-
-    def test_subset_has_no_repetition(self, source):
-        picked = Draws(1, trials=range(3), source=source).subset("lost", 50, 20)
-        assert picked.shape == (3, 20) and all(len(set(row.tolist())) == 20 for row in picked)
-
-    def test_a_permutation_begins_with_the_subset(self, source):
-        draws = Draws(1, trials=range(3), source=source)
-        order = draws.permutation("lost", 50)
-        assert torch.equal(order[:, :20].sort(-1).values, draws.subset("lost", 50, 20))
-        uneven = draws.permutation("lost", [50, 7, 30])
-        assert torch.equal(uneven[0], order[0]) and uneven[1, 7:].tolist() == list(range(7, 50))
-        assert torch.equal(uneven[1, :7], Draws(1, trials=[1], source=source).permutation("lost", 7)[0])
 
 
 def test_take_and_best_of_choose_per_trial():

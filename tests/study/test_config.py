@@ -196,7 +196,7 @@ def test_unknown_config_names_what_there_is() -> None:
         (["seed=-1"], ["'seed' has the value -1"]),
         (["seed=1.5"], ["'seed' has the value 1.5", "integer"]),
         (["precision=float32"], ["precision", "'complex64' or 'complex128'"]),
-        (["random=mersenne"], ["random", "'numpy', 'philox' or 'threefry'"]),
+        (["random=philox"], ["key 'random' has the value 'philox'", "it should be 'numpy' or 'torch'"]),
         (["data.file=/nowhere/raw.npz"], ["data.file", "'/nowhere/raw.npz' does not exist"]),
         (["nonsense"], ["'nonsense' is not an override"]),
         (["=3"], ["is not an override"]),

@@ -154,7 +154,7 @@ def test_all_random_numbers_of_a_world_are_of_the_source_of_the_config(
 ) -> None:
     """Functions of numpy's source fail here; `scene_seed` draws apart from the noise."""
     own = ["world.scene_seed=5"] if system == "isal_rotation" else []
-    plain, other = (bench_of(tmp_path, system, *own, random=source) for source in ("numpy", "philox"))
+    plain, other = (bench_of(tmp_path, system, *own, random=source) for source in ("numpy", "torch"))
     by_numpy = plain.trials(plain.draws("run", [0]))
     for name in ("normal", "uniform", "permutation"):
         monkeypatch.delattr(numpy_random, name)

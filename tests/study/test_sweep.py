@@ -18,8 +18,8 @@ import zarr
 
 from tests.study import toy
 from torchsar.core import Draws, Outcome
-from torchsar.core.batches import CACHE_BYTES, rows_by_bytes, rows_by_peak, rows_by_trial
 from torchsar.study.montecarlo import Record, Stop, differences, read_sweep, sweep
+from torchsar.study.montecarlo.batches import CACHE_BYTES, rows_by_bytes, rows_by_peak, rows_by_trial
 from torchsar.study.montecarlo.grid import address, make_grid
 from torchsar.study.montecarlo.loop import looks
 from torchsar.study.montecarlo.work import Work, cut, probed_bytes, rows_of
@@ -114,6 +114,8 @@ def test_automatic_chunks_follow_the_bytes_of_the_largest_tensor() -> None:
     assert bytes_per_trial in (16 * 1024, 32 * 1024)
     assert rows_by_bytes(bytes_per_trial) == CACHE_BYTES // bytes_per_trial
     assert rows_by_bytes(10 * CACHE_BYTES) == 1
+    # up to four trials share the time of the calls
+    assert [rows_by_bytes(size << 20) for size in (1, 3, 5, 8, 9, 15, 17)] == [12, 4, 4, 4, 3, 2, 1]
     trial.bytes_per_trial = lambda fixed: 12345
     assert probed_bytes(work, 0) == 12345
 
@@ -136,7 +138,7 @@ def pretend_gpus(monkeypatch: pytest.MonkeyPatch, count: int, peak: Callable[[],
         def __exit__(self, *_: object) -> None:
             self.bytes = peak()
 
-    monkeypatch.setattr("torchsar.core.batches.PeakMemory", Peak)
+    monkeypatch.setattr("torchsar.study.montecarlo.batches.PeakMemory", Peak)
     for name, value in {"empty_cache": None, "mem_get_info": (10_000_000_000, 0), "device_count": count}.items():
         monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
 
@@ -355,15 +357,15 @@ def test_a_sweep_draws_from_its_source_and_goes_on_with_no_other(tmp_path: Path)
     def drawn(parameters: Mapping[str, Any], draws: Draws) -> dict[str, torch.Tensor]:
         return {"x": draws.normal("x")}
 
-    records = {s: sweep(drawn, {}, trials=3, out=tmp_path / s, random=s) for s in ("numpy", "philox")}
-    expected = Draws(1, (address({}),) * 3, range(3), "philox").normal("x")
-    assert records["philox"].metrics["x"][0].tolist() == expected.tolist()
+    records = {s: sweep(drawn, {}, trials=3, out=tmp_path / s, random=s) for s in ("numpy", "torch")}
+    expected = Draws(1, (address({}),) * 3, range(3), "torch").normal("x")
+    assert records["torch"].metrics["x"][0].tolist() == expected.tolist()
     assert records["numpy"].metrics["x"][0].tolist() != expected.tolist()
-    longer = sweep(drawn, {}, trials=4, out=tmp_path / "philox", random="philox", resume=True)
-    assert longer.about["random"] == "philox" and longer.metrics["x"][0, :3].tolist() == expected.tolist()
-    with pytest.raises(ConfigError, match="random was philox and is absent"):
-        sweep(drawn, {}, trials=3, out=tmp_path / "philox", resume=True)
-    with pytest.raises(ConfigError, match="random must be one of numpy, philox, threefry, got 'mersenne'"):
+    longer = sweep(drawn, {}, trials=4, out=tmp_path / "torch", random="torch", resume=True)
+    assert longer.about["random"] == "torch" and longer.metrics["x"][0, :3].tolist() == expected.tolist()
+    with pytest.raises(ConfigError, match="random was torch and is absent"):
+        sweep(drawn, {}, trials=3, out=tmp_path / "torch", resume=True)
+    with pytest.raises(ConfigError, match="random must be one of numpy, torch, got 'mersenne'"):
         sweep(drawn, {}, random="mersenne")  # type: ignore[arg-type]
 
 

@@ -43,7 +43,6 @@ from torchsar.core.host import (
 from torchsar.core.libraries import library
 from torchsar.core.linear import cholesky_factor, linear_solve, matrix_inverse
 from torchsar.core.memory import (
-    LargestTensor,
     PeakMemory,
     is_out_of_memory,
     keep_freed_memory,
@@ -71,7 +70,6 @@ __all__ = [
     "Chain",
     "Draws",
     "Estimate",
-    "LargestTensor",
     "Outcome",
     "OwnFiles",
     "PeakMemory",

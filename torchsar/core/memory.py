@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 # parameters of mallopt in malloc.h of the GNU C library
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
@@ -57,26 +51,6 @@ def machine_memory_bytes() -> int | None:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         return None
-
-
-def all_false(shape: tuple[int, ...]) -> np.ndarray:
-    """Make an array of False that fits the main memory.
-
-    Some systems promise more memory than there is: the array could be made there, but not used.
-
-    Args:
-        shape: Shape of the array.
-
-    Returns:
-        The array, bool.
-
-    Raises:
-        MemoryError: If it does not fit.
-        ValueError: If it has more elements than an array can have.
-    """
-    if math.prod(shape) > (machine_memory_bytes() or math.inf):
-        raise MemoryError
-    return np.zeros(shape, bool)
 
 
 def _of_c_library(name: str) -> Callable[..., int] | None:
@@ -141,23 +115,6 @@ def wait_for_devices() -> None:
     """Wait until CUDA has computed what was asked of it, if it is in use."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.synchronize()
-
-
-class LargestTensor(TorchDispatchMode):
-    """Context manager that records the largest tensor that any operation of torch returns.
-
-    Attributes:
-        bytes: Size of its storage in bytes.
-    """
-
-    bytes = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
-        for leaf in tree_leaves(result):
-            if isinstance(leaf, Tensor):
-                self.bytes = max(self.bytes, leaf.untyped_storage().nbytes())
-        return result
 
 
 def is_out_of_memory(error: Exception) -> bool:

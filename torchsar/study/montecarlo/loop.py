@@ -207,9 +207,8 @@ def sweep(
             it is resumed only if the code of `trial`, what it closes over and the global names that
             it uses are unchanged; see `torchsar.core.fingerprint`. Give a version if these change
             without an effect on the results, or if results depend on more than these.
-        random: Source of the random numbers: "numpy" draws them on the CPU, "philox" and
-            "threefry" compute other numbers on the device where they are used; see
-            `torchsar.Draws`.
+        random: Source of the random numbers: "numpy" draws them on the CPU, "torch" other ones on
+            the device where they are used; see `torchsar.Draws`.
 
     Returns:
         The results, with the dims (algorithm, *parameters, trial).

@@ -12,6 +12,7 @@ of the metadata of all arrays, and of the attributes themselves.
 from __future__ import annotations
 
 import json
+import math
 import time
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -23,8 +24,17 @@ import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec
 
-from torchsar.core import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
-from torchsar.core.memory import all_false
+from torchsar.core import (
+    SEAL,
+    address,
+    array_metadata,
+    canonical,
+    checksum,
+    document,
+    group_attributes,
+    machine_memory_bytes,
+    sealed,
+)
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.record import OUTCOME, Labels, Record, blank
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -225,6 +235,16 @@ class Store:
                 if known.shape != values.shape:
                     known.resize(values.shape)
                 known[...] = values
+
+
+def all_false(shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array of False, or raise MemoryError if it does not fit the main memory.
+
+    Some systems promise more memory than there is: the array could be made there, but not used.
+    """
+    if math.prod(shape) > (machine_memory_bytes() or math.inf):
+        raise MemoryError
+    return np.zeros(shape, bool)
 
 
 def empty(labels: Labels, trials: int) -> Record:

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, LargestTensor, Outcome, is_out_of_memory
-from torchsar.core.batches import rows_by_bytes, rows_by_trial
+from torchsar.core import Draws, Outcome, is_out_of_memory
+from torchsar.study.montecarlo.batches import LargestTensor, rows_by_bytes, rows_by_trial
 from torchsar.study.montecarlo.grid import Case, Grid
 from torchsar.study.montecarlo.record import OK, OUTCOME
 from torchsar.study.settings.errors import ConfigError, one_line

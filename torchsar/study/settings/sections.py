@@ -148,9 +148,8 @@ class Config(Strict):
 
     Fields:
         seed: Seed of all random numbers of the world.
-        random: Source of these numbers: `numpy` draws them on the CPU, `philox` and
-            `threefry` compute other numbers on the device of the trials; see
-            `torchsar.Draws`.
+        random: Source of these numbers: `numpy` draws them on the CPU, `torch` other ones on the
+            device of the trials; see `torchsar.Draws`.
         cases: Values by dotted key that each case changes, by name of the case.
         beyond_limits: Methods that are deliberately used beyond their limits.
     """
