@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate import autofocus, entropy_fixed_point, link_phases
-from torchsar.compensate.pulse_phase.alignment import coherent_jitter, displacement
+from torchsar.compensate.pulse_phase.alignment import Displacement, coherent_jitter
+from torchsar.compensate.pulse_phase.alignment import displacement as displacement_of
 from torchsar.metrics.phase import phase_rmse
 
 PULSES, CELLS = 192, 96
@@ -21,6 +22,11 @@ COURSES = {
     "drift": 10 * TIME,
     "parabola": 12 * TIME**2,
 }
+
+
+def displacement(rows: Tensor, present: Tensor) -> Displacement:
+    """Displacement of pulses (trial, range, pulse)."""
+    return displacement_of(torch.fft.fft(rows, dim=-2), present)
 
 
 def displaced(course: Tensor, points: int, snr_db: float, trials: int, seed: int) -> tuple[Tensor, Tensor]:

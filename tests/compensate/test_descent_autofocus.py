@@ -202,7 +202,7 @@ def test_start_mask_and_basis_follow_their_trials(monkeypatch: pytest.MonkeyPatc
         "basis": smooth() + torch.rand(4, 1, 48, generator=torch.Generator().manual_seed(3)),
     }
     whole = minimum_entropy(data, steps=3, **own)["phase_rad"]
-    monkeypatch.setattr("torchsar.compensate.pulse_phase.verdict.block_bytes_of", lambda _: 1)
+    monkeypatch.setattr("torchsar.compensate.pulse_phase.data.block_bytes_of", lambda _: 1)
     torch.testing.assert_close(minimum_entropy(data, steps=3, **own)["phase_rad"], whole, atol=1e-8, rtol=0)
     free = minimum_entropy(data, steps=3, start=start)["phase_rad"]
     assert (phase_rmse(free, start) > 1e-2).all()

@@ -12,6 +12,7 @@ from tests.compensate.scenes import spread_points
 from torchsar.compensate import autofocus
 from torchsar.compensate.pulse_phase.data import noise_power
 from torchsar.compensate.pulse_phase.gaps import have_gaps, longest_gap, side_lobes
+from torchsar.core import Outcome
 from torchsar.metrics import phase_rmse
 
 PULSES = 128
@@ -44,17 +45,12 @@ def test_missing_pulses_do_not_make_phases_wrong(missing: str, pulses: tuple[Ten
     assert not (found.ok & ((error > 5 * std) | (error > 0.5))).any()
 
 
-@pytest.mark.parametrize(("points", "least"), [(3, 0.8), (10, 0.0)])
-def test_a_gap_of_two_fifths_is_not_sure_and_wrong(points: int, least: float) -> None:
-    """10 of 24 trials of three points were, and 19 of ten: the noise was taken to be a third of
-    what it is. Three points explain the pulses and are right; more of them do not.
-    """
-    data, phase = spread_points(24, points, 15.0, seed=4)
+@pytest.mark.parametrize("points", [3, 10])
+def test_a_gap_of_two_fifths_is_doubtful(points: int) -> None:
+    """10 of 24 trials of three points were ok and wrong, and 19 of ten."""
+    data, _ = spread_points(24, points, 15.0, seed=4)
     present = ((TIME < 38) | (TIME >= 90)).expand(len(data), -1)
-    found = autofocus(torch.where(present[..., None], data, 0))
-    error, std = phase_rmse(found["phase_rad"], phase, present), found.std["phase_rad"][:, 0]
-    assert found.ok.double().mean() >= least
-    assert not (found.ok & ((error > 3 * std) & (error > 0.1))).any()
+    assert (autofocus(torch.where(present[..., None], data, 0)).outcome >= Outcome.TOO_FEW).all()
 
 
 @pytest.mark.parametrize("missing", ["none", "middle", "end", "rows"])

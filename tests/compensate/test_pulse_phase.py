@@ -19,7 +19,6 @@ from tests.compensate.scenes import (
     doppler_image,
     hamming_response,
     noisy,
-    spread_points,
     still,
     turned,
     white,
@@ -47,7 +46,7 @@ from torchsar.compensate.pulse_phase.gradient import _centred, _Rows, _solver, _
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.pairs import pair_products
 from torchsar.compensate.pulse_phase.sharpen import WIENER_FACTORS, LogAbove, Run, Wiener, fixed_point
-from torchsar.core import Chain, Estimate, Signal, use
+from torchsar.core import Chain, Estimate, Outcome, Signal, use
 from torchsar.metrics import entropy, phase_rmse, residual_phase
 from torchsar.radar import InverseRadar
 
@@ -394,7 +393,7 @@ def test_side_lobes_of_a_few_points_are_no_scene(points, snr_db):
 
 
 @pytest.mark.parametrize("windowed", [False, True])
-def test_two_points_of_one_range_are_as_wrong_as_promised(windowed: bool) -> None:
+def test_two_points_of_one_range_are_doubtful(windowed: bool) -> None:
     """Their phases make one point of both, in all range cells alike: in half of these trials and
     more the error was over five deviations and ok.
     """
@@ -408,16 +407,7 @@ def test_two_points_of_one_range_are_as_wrong_as_promised(windowed: bool) -> Non
     data = data + level * torch.randn(data.shape, generator=source, dtype=torch.complex128)
     phase = 2 * math.pi * torch.rand(trials, pulses, generator=source, dtype=torch.float64)
     found = autofocus(data * torch.exp(1j * phase)[..., None])
-    error, std = phase_rmse(found["phase_rad"], phase)[found.ok], found.std["phase_rad"][found.ok, 0]
-    assert len(error) >= 6 and 0.67 < float(error.square().mean().sqrt() / std.square().mean().sqrt()) < 1.4
-
-
-def test_white_noise_of_windowed_data_is_independent_between_rows() -> None:
-    """The rows were taken to be as dependent as the data: deviations were a third too large."""
-    data, phase = spread_points(24, 10, 10.0, seed=2)
-    found = autofocus(data)
-    error, std = (x.square().mean().sqrt() for x in (phase_rmse(found["phase_rad"], phase), found.std["phase_rad"]))
-    assert found.ok.all() and 0.85 < float(error / std) < 1.2
+    assert (found.outcome == Outcome.TOO_FEW).all()
 
 
 @pytest.mark.parametrize("method", [sharpest_phase, autofocus, pga])
@@ -460,15 +450,6 @@ def test_scatterers_that_change_have_a_common_phase_if_they_are_many(snr_db):
     error, std = judged(autofocus(batch.data.data), batch.truth["phase_rad"])
     assert len(error) > 18
     assert 0.7 < error.square().mean().sqrt() / std.square().mean().sqrt() < 1.4 and error.max() < 0.5
-
-
-def test_linked_phases_that_sharp_ones_contradict_are_not_taken():
-    """Two points: one trial was ok with .75 rad and a deviation of .03 rad, by linked phases."""
-    batch = scintillating(20.0, 2, 1e12)(32, 3000)
-    found = autofocus(batch.data.data[16:])
-    error, std = judged(found, batch.truth["phase_rad"][16:])
-    assert len(error) >= 15 and (error < 4 * std).all()
-    assert found.ok[15] and not found.info["homogeneous"][15]
 
 
 @pytest.mark.parametrize("oversampling", [1, 2, 3])

@@ -12,6 +12,7 @@ from tests.compensate.scenes import DOUBLE, METHODS, noise, noisy, still, turned
 from torchsar.compensate import autofocus, correct_pulse_phase, entropy_fixed_point, link_phases, pga, phase_polish, sca
 from torchsar.compensate.pulse_phase.homogeneous import occupied_band
 from torchsar.compensate.pulse_phase.sharpness import sharpness_of_noise
+from torchsar.core import Outcome
 from torchsar.metrics import phase_rmse, residual_phase
 
 NAMES = list(METHODS)
@@ -232,7 +233,10 @@ def test_oversampled_noise_is_not_ok(name, oversampling):
     spectrum[..., : 160 // oversampling] = noise(8, 96, 160 // oversampling)
     x = torch.fft.ifft(spectrum, dim=-1)
     torch.testing.assert_close(
-        occupied_band(x.mT), torch.full((8,), 1 / oversampling, dtype=torch.float64), atol=0, rtol=0.05
+        occupied_band(torch.fft.fft(x.mT, dim=-2)),
+        torch.full((8,), 1 / oversampling, dtype=torch.float64),
+        atol=0,
+        rtol=0.05,
     )
     assert not METHODS[name](x).ok.any()
 
@@ -283,14 +287,14 @@ def test_fitted_sharpness_of_noise_equals_the_measured_one(rows):
 @pytest.mark.parametrize("above_db", [20, 60, 100])
 @pytest.mark.parametrize("name", ["sca", "pga_sca", "entropy_fixed_point", "autofocus"])
 def test_a_strong_scatterer_determines_the_phase(name, above_db):
-    """It also makes all of the sharpness; the steady modulus of its echo confirms the phases."""
+    """It makes all of the sharpness: its own motion would be a phase error too."""
     x, a = still(2, width=0.8), white(2)
     k = torch.arange(128, dtype=torch.float64)
     x[..., 20] += 10 ** (above_db / 20) * x.abs().amax() * torch.exp(2j * math.pi * 0.1371 * k)
     found = METHODS[name](turned(x, a).to(torch.complex64))
     error = phase_rmse(found["phase_rad"], a)
-    assert float(error.max()) < 0.6 * 10 ** (-above_db / 20) + 1e-5 and found.ok.all()
-    assert (error < 1.5 * found.std["phase_rad"][:, 0] + 1e-5).all()
+    assert float(error.max()) < 0.6 * 10 ** (-above_db / 20) + 1e-5
+    assert (found.outcome == Outcome.TOO_FEW).all()
 
 
 # layout, batches, threads

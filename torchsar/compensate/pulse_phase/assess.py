@@ -20,7 +20,8 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.alignment import LARGEST_JITTER, LARGEST_MIGRATION, displacement
 from torchsar.compensate.pulse_phase.data import Pulses, by_blocks, on_the_circle, or_one, rotate, without_line
-from torchsar.compensate.pulse_phase.homogeneous import describe, occupied_band
+from torchsar.compensate.pulse_phase.gaps import longest_gap
+from torchsar.compensate.pulse_phase.homogeneous import describe, different_rows, occupied_band
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
@@ -47,6 +48,10 @@ _DISTURBED_RAD, _RETURNED_RAD, _ROUNDS = 0.4, 0.04, 2
 # difference of halves from which on a phase counts as unknown: half of the difference of uniformly
 # distributed phases is half of their error
 _APART_RAD = 2.0
+# Effective number of ranges below which all scatterers have one: phases can then be found that make
+# one point of them. Longest gap as a share of the pulses from the first to the last, up to which
+# scenes of many points tell how the phases before and after it go together.
+_ONE_RANGE, _LONGEST_GAP = 1.2, 0.36
 _STRIP = 4  # lines of an image in a strip, by choice: more than the response of a point is wide
 
 
@@ -65,8 +70,8 @@ def conclude(
         phase_rad: Phases that the method found in rad, shape (trial, pulse).
         iterations: Number of its iterations, shape (trial,).
         assess: Whether to assess the phases.
-        again: Continues the method from a phase, on some of the rows; by default three iterations of
-            the entropy fixed point (`settled`).
+        again: Continues the method from a phase, on some of the rows; by default three iterations
+            of the entropy fixed point (`settled`).
         through: Image formation that the method sharpens; by default a Fourier transform along
             pulses. With another one only the sharpness and the halves of the image are assessed.
 
@@ -80,7 +85,8 @@ def conclude(
         Outcomes: EMPTY; SINGULAR with fewer than three pulses; NOISE if the image is less than 1.5
         times as sharp as autofocus makes noise; INEXACT if the Strehl ratio is below 0.8;
         PARTS_DISAGREE if one of three blocks of range cells gets sharper with phases of its own by
-        more than 2.2 times the sharpness of noise; HOMOGENEOUS; DISPLACED. `info` holds "present",
+        more than 2.2 times the sharpness of noise; HOMOGENEOUS; TOO_FEW if all scatterers have one
+        range, or one gap takes more than 0.36 of the pulses; DISPLACED. `info` holds "present",
         shape (..., pulse), False for pulses of zeros; and, of shape (...,), "iterations", and if
         assessed "sharpness_nats", "noise_sharpness_nats", "gain_of_parts", "jitter_cells" and
         "migration_cells".
@@ -91,14 +97,20 @@ def conclude(
     info = {"present": pulses.present.reshape(*trials, n), "iterations": iterations.reshape(trials)}
     if not assess:
         return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(info["iterations"]), info=info)
+    if not len(pulses.rows) or n < 3:
+        unknown = {"phase_rad": torch.full_like(value["phase_rad"], UNKNOWN_RAD)}
+        outcome = Outcome.SINGULAR.like(info["iterations"])
+        return Estimate(value, unknown, torch.zeros_like(outcome).to(phase_rad.dtype), outcome, info)
     rows, present, again = pulses.rows.detach(), pulses.present, again or settled
     seen = by_blocks(pulses, partial(_seen, rows, present, phase_rad.detach(), again, through), through is not None)
-    sharp, noise, std, gain, homogeneous, jitter, migration = (x.reshape(trials) for x in seen)
+    sharp, noise, std, gain, ranges, homogeneous, jitter, migration = (x.reshape(trials) for x in seen)
+    gap = longest_gap(pulses.present).reshape(trials)
     strehl = torch.exp(-std.square())
     outcome = worst(
         (Outcome.INEXACT, strehl <= LEAST_STREHL),
         (Outcome.PARTS_DISAGREE, gain > _LARGEST_GAIN),
         (Outcome.HOMOGENEOUS, homogeneous > 0),
+        (Outcome.TOO_FEW, (ranges < _ONE_RANGE) | (gap > _LONGEST_GAP)),
         (Outcome.DISPLACED, (jitter >= LARGEST_JITTER) | (migration >= LARGEST_MIGRATION)),
         (Outcome.NOISE, (sharp <= _MARGIN * noise) & (homogeneous == 0)),
         (Outcome.EMPTY, ~present.any(-1).reshape(trials)),
@@ -123,8 +135,9 @@ def settled(rows: Tensor, which: Tensor | slice, phase: Tensor) -> Tensor:
 def _seen(
     rows: Tensor, present: Tensor, phase: Tensor, again: Again, through: Through | None, part: slice
 ) -> tuple[Tensor, ...]:
-    """Sharpness, that of noise, standard deviation, gain of parts, 1 where the scene is
-    homogeneous, jitter and migration of a block of trials, (trial,) each, float64.
+    """Sharpness, that of noise, standard deviation, gain of parts, number of ranges that hold
+    scatterers, 1 where the scene is homogeneous, jitter and migration of a block of trials,
+    (trial,) each, float64.
     """
     which = torch.arange(len(rows), device=rows.device)[part]
     rows, present, phase = rows[part], present[part], phase[part]
@@ -134,7 +147,14 @@ def _seen(
     noise, zero = sharpness_of_noise(count.clamp_min(1)), torch.zeros_like(sharp)
     if through is not None:
         halves = halves_of_image(through, rows, phase)
-        return sharp, noise, half_difference(halves, present, phase, partial(_from, again, which)), *(zero,) * 4
+        return (
+            sharp,
+            noise,
+            half_difference(halves, present, phase, partial(_from, again, which)),
+            zero,
+            zero + 2,
+            *(zero,) * 3,
+        )
     spectrum = fft_lines(rows)
     band = occupied_band(spectrum)
     apart = half_difference(halves_of_rows(rows), present, phase, partial(_disturbed, again, which, present))
@@ -144,6 +164,7 @@ def _seen(
         noise,
         apart / band.sqrt(),
         gain_of_parts(rows, present, phase),
+        different_rows(rows, power_of(rows).sum(-1)),
         describe(rows, phase, band).homogeneous.double(),
         moved.jitter,
         moved.migration,

@@ -178,19 +178,24 @@ def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor)
         product = torch.einsum("gtr,trp->gtp", kinds.to(rows.dtype), rows[..., lag:] * rows[..., :-lag].conj())
         square = power_of(product).sum(-1)
         excess = excess + square / or_one((pulse[..., lag:] * pulse[..., :-lag]).sum(-1)) - 1 / looks.clamp_min(1)
-    many = torch.stack([_rank(rows, energy.sum(-1) * kind) for kind in kinds]) >= LEAST_LOOKS
+    many = torch.stack([different_rows(rows, energy.sum(-1) * kind) for kind in kinds]) >= LEAST_LOOKS
     weight = torch.where((looks >= LEAST_LOOKS) & many, n * cells, 0)
     deviation = weight * math.sqrt(lags / n) / looks.clamp_min(1)
     return (weight * excess).sum(0).to(torch.float64), deviation.square().sum(0).sqrt().to(torch.float64)
 
 
-def _rank(rows: Tensor, energy: Tensor) -> Tensor:
-    """Effective number of different rows among the strongest of a group, (trial,).
+def different_rows(rows: Tensor, energy: Tensor) -> Tensor:
+    """Compute the effective number of different rows among the strongest.
 
     It is (tr G)^2 / (tr G^2 - (tr G)^2 / P) for the products G of the rows over P pulses: the
     number of rows in white noise, and that of the points whose side lobes the rows are.
 
-    energy: energy of the rows, 0 for those that are not of the group, (trial, range).
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        energy: Energy of the rows, 0 for those that do not count, shape (trial, range).
+
+    Returns:
+        The number, shape (trial,), float64.
     """
     power, strongest = energy.topk(min(_COMPARED, energy.shape[-1]), -1)
     some = rows.gather(1, strongest[..., None].expand(-1, -1, rows.shape[-1])) * (power > 0)[..., None]

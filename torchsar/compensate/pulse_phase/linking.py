@@ -127,9 +127,8 @@ def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False, ass
     if not assess:
         return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(info["gain_nats"]), info=info)
     with torch.no_grad():
-        found = Judged(*rest)
-        outcome, std, quality = outcome_of(pulses, found, gain, sparse=not still)
-    info |= {"excess_deviation": found.excess.reshape(trials), "weakest_boundary": found.boundary.reshape(trials)}
+        outcome, std, quality, seen = outcome_of(pulses, Judged(*rest), gain, sparse=not still)
+    info |= {name: x.reshape(trials) for name, x in seen.items()}
     return Estimate(
         value,
         {"phase_rad": std.reshape(*trials, n).to(rows.real.dtype)},

@@ -148,7 +148,9 @@ def _crossed(scene: Speckle, u: Tensor, fit: Fit, sharing: list[Tensor]) -> tupl
     return bend, slopes
 
 
-def outcome_of(pulses: Pulses, found: Judged, gain: Tensor, sparse: bool) -> tuple[Tensor, Tensor, Tensor]:
+def outcome_of(
+    pulses: Pulses, found: Judged, gain: Tensor, sparse: bool
+) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
     """Conclude from what all trials tell.
 
     Args:
@@ -158,7 +160,8 @@ def outcome_of(pulses: Pulses, found: Judged, gain: Tensor, sparse: bool) -> tup
         sparse: Whether to compare with a sparse description of the scene.
 
     Returns:
-        Outcomes; standard deviations in rad, (trial, pulse); and quality, shape (trial,).
+        Outcomes; standard deviations in rad, (trial, pulse); quality; and what is for reports;
+        shape (trial,).
     """
     noise = _NOISE_NATS * pulses.present.sum(-1)
     share = (1 - noise / or_one(gain)).clamp(0, 1)
@@ -185,7 +188,13 @@ def outcome_of(pulses: Pulses, found: Judged, gain: Tensor, sparse: bool) -> tup
         sharp = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
         scene = describe(pulses.rows, sharp, occupied_band(spectrum))
         outcome = torch.maximum(outcome, worst((Outcome.SPARSE, (gain <= scene.sparse) | (scene.ratio <= 0))))
-    return outcome, std, strehl * share
+    info = {
+        "excess_deviation": found.excess,
+        "weakest_boundary": found.boundary,
+        "jitter_cells": jitter,
+        "migration_cells": moved.migration,
+    }
+    return outcome, std, strehl * share, info
 
 
 def _weakest_boundary(matrix: Tensor, u: Tensor, information: Tensor) -> Tensor:

@@ -154,7 +154,6 @@ def autofocus(
     quick = through is None and pulses.n >= LEAST_PULSES_OF_FACTORS
     factors, few_iterations = (WIENER_FACTORS, len(WIENER_FACTORS)) if quick else (1.0, 6)
     of_points = scene != "sparse" and through is None and polish > 0
-    gaps = have_gaps(pulses.present) & (through is None and polish > 0)
 
     def iterations(imaging: AlongPulses | Through) -> Run:
         return Run(LogAbove(_FLOOR), imaging, search, _RELAXATION, search_tolerance_rad)
@@ -188,7 +187,8 @@ def autofocus(
         if not polish:
             return fixed_point(rows, at, Run(LogAbove(_FLOOR), AlongPulses(), 4, _RELAXATION, 0.0))[0]
         reached = fixed_point(rows, at, polishing(along, few_iterations))[0]
-        return _filled(rows, reached, at, gaps[which], _FILLING * few_iterations, tolerance_rad / 10)
+        gaps = have_gaps(pulses.present[which]) & (through is None)
+        return _filled(rows, reached, at, gaps, _FILLING * few_iterations, tolerance_rad / 10)
 
     begin = starting_phase(start, pulses, "autofocus")
     phase, taken = find_phases(pulses, find, begin, whole=through is not None)
