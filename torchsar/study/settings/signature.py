@@ -185,6 +185,7 @@ class Catalogue:
         automatic: Sequence[str] = (),
     ) -> None:
         self.what, self.key, self.entries = what, key, dict(entries)
+        self.automatic = automatic
         free = [key.split(".") for key in automatic]
         self.sections = {
             n: Section(target, given, [k for m, k in free if m == n]) for n, target in self.entries.items()

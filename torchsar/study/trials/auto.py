@@ -4,7 +4,7 @@ most exact one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from torchsar.study.settings.errors import ConfigError, one_line
@@ -64,7 +64,7 @@ def resolved(loaded: Loaded, bench_of: Callable[[Loaded], Any]) -> tuple[Loaded,
     Raises:
         ConfigError: If the system has no alternatives for a key with the value `auto`.
     """
-    found = list(_automatic(loaded.config))
+    found = list(_automatic(loaded.config, loaded.system.stages.automatic))
     if not found:
         return loaded, ()
     exact = loaded.system.exact
@@ -91,8 +91,11 @@ def resolved(loaded: Loaded, bench_of: Callable[[Loaded], Any]) -> tuple[Loaded,
     return loaded.changed(changes, "auto"), tuple(reasons)
 
 
-def _automatic(config: Config) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """Every `auto`: the key of its choice (`Choice.at`), the path of its mapping, the mapping."""
+def _automatic(config: Config, keys: Collection[str]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Every `auto`: the key of its choice (`Choice.at`), the path of its mapping, the mapping.
+
+    keys: "STAGE.KEY" of the keys that may be left to choose; other keys may have such a value too.
+    """
     for key, value in (config.world or {}).items():
         if isinstance(value, Mapping) and value.get("kind") == AUTO:
             yield f"world.{key}", f"world.{key}", value
@@ -102,4 +105,5 @@ def _automatic(config: Config) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
             if entry["stage"] == AUTO:
                 yield "stage", path, entry
             for key in (key for key, value in entry.items() if value == AUTO and key != "stage"):
-                yield f"{entry['stage']}.{key}", path, entry
+                if f"{entry['stage']}.{key}" in keys:
+                    yield f"{entry['stage']}.{key}", path, entry
