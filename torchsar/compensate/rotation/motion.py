@@ -172,6 +172,20 @@ class Motion:
         """
         return Motion(self.k[trials], self.w[trials], self.v[trials], self.centre_m[trials])
 
+    def moved(self, change: Tensor) -> Motion:
+        """Change the rotation.
+
+        Args:
+            change: Changes of k1, k2, ..., of w and, if the centre is estimated, of v, shape (trial,
+                parameter).
+
+        Returns:
+            The changed rotation.
+        """
+        order = self.k.shape[-1]
+        k, w, v = change.split([order, 1, change.shape[-1] - order - 1], -1)
+        return Motion(self.k + k, self.w + w[:, 0], self.v + v.sum(-1), self.centre_m)
+
     def where(self, keep: Tensor, other: Motion) -> Motion:
         """Choose, for each trial, between this rotation and another.
 

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from torchsar.compensate.rotation.assess import judged_fit, judged_motion
 from torchsar.compensate.rotation.coarse import coarse_warp
-from torchsar.compensate.rotation.histories import refined_by_histories
-from torchsar.compensate.rotation.motion import LEAST_PULSES, Motion, Sampling, image_of
-from torchsar.compensate.rotation.scatterers import MOST, ROUNDS, Fit, fit_scatterers, usual_count
-from torchsar.compensate.rotation.unknowns import k_name
-from torchsar.compensate.rotation.verdicts import (
+from torchsar.compensate.rotation.histories import HALF_CELLS, refined_by_histories
+from torchsar.compensate.rotation.motion import LEAST_PULSES, Motion, Sampling
+from torchsar.compensate.rotation.scatterers import (
     LEAST_EXPLAINED,
-    MOST_PHASE_ERROR_RAD,
-    covariance_of,
-    focus_of,
-    warp_phase_error,
+    MOST,
+    ROUNDS,
+    Fit,
+    explained_share,
+    fit_scatterers,
+    usual_count,
 )
+from torchsar.compensate.rotation.unknowns import values_of
 from torchsar.core import (
     Estimate,
-    Outcome,
     block_bytes_of,
     checked_samples,
     host_values,
@@ -33,17 +34,13 @@ from torchsar.core import (
     settle,
 )
 from torchsar.core.warp import k_of_shape, shape_of
-from torchsar.metrics import entropy
 
-# relative error of the rate up to which it scales images, a convention, and the standard deviations
-# that it must exceed: a rate that is found too large also looks too accurate
-_RATE_TOLERANCE, _SURE = 0.1, 2.7
-_ENTROPY_ROUNDING = 1e-3  # tolerance in nats of a comparison of entropies in float32
 # size of a block of trials over the size that is best for one operation, found by trial
 _BLOCKS = 8
-_HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
+HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
 
-Part = Callable[[Tensor, Sampling, Tensor | None], Estimate]
+Found = Motion | Fit
+Part = Callable[[Tensor, Sampling, Tensor | None], Found]
 
 
 def uneven_rotation(
@@ -56,6 +53,7 @@ def uneven_rotation(
     yc_m: Tensor | float | None = None,
     scatterers: int | None = None,
     rounds: int = ROUNDS,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the rotation of a target with non-uniform rotation; the recommended estimator.
 
@@ -111,17 +109,21 @@ def uneven_rotation(
     """
     _check_counts("uneven_rotation", 1, order=order, rounds=rounds, scatterers=1 if scatterers is None else scatterers)
 
-    def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
-        motion, _ = refined_by_histories(
-            rows, sampling, _start(rows, sampling, order, known), free_centre=known is None
-        )
-        fit = fit_scatterers(rows, sampling, motion, free_centre=known is None, count=scatterers, rounds=rounds)
-        found = _estimate(rows, sampling, fit, known is None)
+    def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Fit:
+        options = {"free_centre": known is None}
+        motion = refined_by_histories(rows, sampling, _start(rows, sampling, order, known), **options)
+        fit = fit_scatterers(rows, sampling, motion, **options, count=scatterers, rounds=rounds)
         if scatterers is None:
-            return _with_more_scatterers(rows, sampling, fit.motion, found, known is None, rounds)
-        return found
+            # many more scatterers than usual leave most of the energy unexplained
+            count = usual_count(sampling)
+            poor = explained_share(rows, fit)[0] < LEAST_EXPLAINED
+            at = (poor & (2 * fit.scatterers.count > count)).nonzero()[:, 0]
+            if len(at):
+                options |= {"count": min(MOST, 2 * count), "rounds": rounds}
+                fit = fit.replaced(at, fit_scatterers(rows[at], sampling, fit.motion.part(at), **options))
+        return fit
 
-    return _over_trials("uneven_rotation", find, data, wavelength_m, prf_hz, range_m, yc_m)
+    return _over_trials("uneven_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
 def coarse_rotation(
@@ -132,6 +134,7 @@ def coarse_rotation(
     range_m: Tensor,
     order: int = 3,
     yc_m: Tensor | float | None = None,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate k1 and k2 from the spectra of short sections, the first step of `uneven_rotation`.
 
@@ -165,10 +168,10 @@ def coarse_rotation(
     """
     _check_counts("coarse_rotation", 1, order=order)
 
-    def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
-        return _confirmed(rows, sampling, _start(rows, sampling, order, known))
+    def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
+        return _start(rows, sampling, order, known)
 
-    return _over_trials("coarse_rotation", find, data, wavelength_m, prf_hz, range_m, yc_m)
+    return _over_trials("coarse_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
 def phase_fit_rotation(
@@ -179,8 +182,9 @@ def phase_fit_rotation(
     range_m: Tensor,
     order: int = 3,
     yc_m: Tensor | float | None = None,
-    steps: int = _HISTORY_STEPS,
-    half_cells: int = 24,
+    steps: int = HISTORY_STEPS,
+    half_cells: int = HALF_CELLS,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the rotation by the first two steps of `uneven_rotation`.
 
@@ -216,13 +220,13 @@ def phase_fit_rotation(
     _check_counts("phase_fit_rotation", 1, order=order, steps=steps)
     _check_counts("phase_fit_rotation", 4, half_cells=half_cells)
 
-    def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
+    def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
         motion = _start(rows, sampling, order, known)
         for _ in range(steps):
-            motion, _ = refined_by_histories(rows, sampling, motion, free_centre=known is None, half_cells=half_cells)
-        return _confirmed(rows, sampling, motion)
+            motion = refined_by_histories(rows, sampling, motion, free_centre=known is None, half_cells=half_cells)
+        return motion
 
-    return _over_trials("phase_fit_rotation", find, data, wavelength_m, prf_hz, range_m, yc_m)
+    return _over_trials("phase_fit_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
 def _start(rows: Tensor, sampling: Sampling, order: int, known: Tensor | None) -> Motion:
@@ -240,6 +244,7 @@ def _start(rows: Tensor, sampling: Sampling, order: int, known: Tensor | None) -
 def _over_trials(
     name: str,
     find: Part,
+    assess: bool,
     data: Tensor,
     wavelength_m: float,
     prf_hz: float,
@@ -259,21 +264,32 @@ def _over_trials(
     @torch.no_grad()
     def work(first: int) -> None:
         part = slice(first, first + height)
-        peak = level_of(rows[part])
-        found = find(rows[part] / peak, sampling, None if known is None else known[part])
-        scaled = (
-            {"noise_power": found.info["noise_power"] * peak[:, 0, 0].double().square()}
-            if "noise_power" in found.info
-            else {}
-        )
-        seen = (rows[part] != 0).flatten(1).any(-1)
-        parts[first] = replace(
-            found, outcome=torch.maximum(found.outcome, Outcome.of(seen, Outcome.NOISE)), info={**found.info, **scaled}
-        )
+        level = level_of(rows[part])
+        some = rows[part] / level
+        found = find(some, sampling, None if known is None else known[part])
+        parts[first] = _estimate(some, sampling, found, level[:, 0, 0].double(), assess)
 
     starts = range(0, rows.shape[0], height)
     over_blocks(work, starts, rows)
     return Estimate.joined([parts[first] for first in starts], trials)
+
+
+def _estimate(rows: Tensor, sampling: Sampling, found: Found, level: Tensor, assess: bool) -> Estimate:
+    """Estimate from a rotation or a joint fit of data that are divided by their level."""
+    motion, info = found.motion if isinstance(found, Fit) else found, {}
+    motion = replace(motion, **{name: settle(getattr(motion, name), 0.0)[0] for name in ("k", "w", "v")})
+    value = values_of(motion.omega_rad_s, motion.k, motion.yc_m)
+    if isinstance(found, Fit):
+        info = {
+            "scatterers": found.scatterers.count,
+            "noise_power": found.noise * level.square(),
+            "steps": found.steps,
+        }
+    if not assess:
+        return Estimate(value, info=info)
+    fit = isinstance(found, Fit)
+    judged = judged_fit(rows, sampling, found) if fit else judged_motion(rows, sampling, motion)
+    return Estimate(value, judged.std, judged.quality, judged.outcome, {**judged.info, **info})
 
 
 def _check_counts(name: str, least: int, **counts: int) -> None:
@@ -318,97 +334,3 @@ def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_
             "range first"
         )
     return Sampling(wavelength_m, prf_hz, data.shape[-2], data.shape[-1], first, step)
-
-
-def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> Estimate:
-    """Estimate from a fit, with standard deviations and reliability."""
-    found, focus = _assessed(rows, sampling, fit.motion), focus_of(rows, sampling, fit)
-    focused, std = found.ok & focus.right, _standard_deviations(fit, focus.accounted, free_centre)
-    count = (fit.scatterers.amplitude != 0).sum(-1)
-    certain = fit.certain[:, fit.motion.k.shape[-1]].clamp_min(torch.finfo(torch.float64).tiny).sqrt()
-    scaled = (_SURE * std["omega_rad_s"] < _RATE_TOLERANCE * fit.motion.omega_rad_s * certain) & (fit.motion.w > 0)
-    info = {**found.info, "focused": focused, "scatterers": count, "noise_power": fit.noise, "steps": fit.steps}
-    return Estimate(found.value, std, focus.explained, Outcome.of(focused & scaled, Outcome.NOISE), info=info)
-
-
-def _with_more_scatterers(
-    rows: Tensor, sampling: Sampling, motion: Motion, found: Estimate, free_centre: bool, rounds: int
-) -> Estimate:
-    """The estimate with twice as many scatterers in trials whose energy has many more than the
-    usual number.
-    """
-    count = usual_count(sampling)
-    at = ((found.quality < LEAST_EXPLAINED) & (2 * found.info["scatterers"] > count)).nonzero()[:, 0]
-    if not len(at):
-        return found
-    fit = fit_scatterers(
-        rows[at], sampling, motion.part(at), free_centre=free_centre, count=min(MOST, 2 * count), rounds=rounds
-    )
-    again = _estimate(rows[at], sampling, fit, free_centre)
-
-    def mixed(all_of: Mapping[str, Tensor], some_of: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {name: whole.index_copy(0, at, some_of[name]) for name, whole in all_of.items()}
-
-    return Estimate(
-        mixed(found.value, again.value),
-        mixed(found.std, again.std),
-        found.quality.index_copy(0, at, again.quality),
-        Outcome.of(found.ok.index_copy(0, at, again.ok), Outcome.NOISE),
-        info=mixed(found.info, again.info),
-    )
-
-
-def _standard_deviations(fit: Fit, accounted: Tensor, free_centre: bool) -> dict[str, Tensor]:
-    """Standard deviations of the values, from the covariance of (k, w, v).
-
-    They are infinite where the data do not determine a value.
-    """
-    motion, order, covariance = fit.motion, fit.motion.k.shape[-1], covariance_of(fit, accounted)
-    k = covariance.diagonal(dim1=-2, dim2=-1)[:, :order].clamp_min(0).sqrt()
-    w = torch.where(motion.w > 0, motion.w, 0)
-    ww = covariance[:, order, order]
-    omega = ww.clamp_min(0).sqrt() / (2 * w.sqrt())
-    yc = torch.zeros_like(w)
-    if free_centre:
-        found = motion.yc_m - motion.centre_m
-        yc = (covariance[:, -1, -1] - 2 * found * covariance[:, order, -1] + found.square() * ww).clamp_min(
-            0
-        ).sqrt() / w
-    named = {
-        "warp_k": k,
-        **{k_name(i + 1): column for i, column in enumerate(k.unbind(-1))},
-        "omega_rad_s": omega,
-        "yc_m": yc,
-    }
-    return {name: torch.where(torch.isnan(value), math.inf, value) for name, value in named.items()}
-
-
-def _confirmed(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
-    """A motion as an estimate; ok where its scatterers confirm its warp."""
-    found = _assessed(rows, sampling, motion)
-    error, count = warp_phase_error(rows, sampling, motion)
-    ok = found.ok & (error < MOST_PHASE_ERROR_RAD)
-    return replace(
-        found, outcome=Outcome.of(ok, Outcome.NOISE), info={**found.info, "phase_error_rad": error, "scatterers": count}
-    )
-
-
-def _assessed(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
-    """A motion as an estimate; ok where its entropy is not above that without compensation."""
-    motion = replace(motion, k=settle(motion.k, 0.0)[0], w=settle(motion.w, 0.0)[0], v=settle(motion.v, 0.0)[0])
-    before = entropy(torch.fft.fft(rows, 2 * sampling.pulses, dim=-2))
-    after = entropy(image_of(rows, sampling, motion))
-    value = {
-        "warp_k": motion.k,
-        **{k_name(i + 1): k for i, k in enumerate(motion.k.unbind(-1))},
-        "omega_rad_s": motion.omega_rad_s,
-        "yc_m": motion.yc_m,
-    }
-    gained = (before - after).double()
-    quality = (1 - torch.exp(-gained)).clamp(0, 1)
-    return Estimate(
-        value,
-        quality=quality,
-        outcome=Outcome.of(gained > -_ENTROPY_ROUNDING, Outcome.NOISE),
-        info={"entropy_nats": after, "uncompensated_entropy_nats": before},
-    )
