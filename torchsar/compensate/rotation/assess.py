@@ -76,8 +76,8 @@ def judged_motion(rows: Tensor, sampling: Sampling, motion: Motion) -> Judged:
     """Assess the relative derivatives of the rotation rate of a rotation.
 
     The rotation is refined by the histories of bright scatterers, and compared with the result. The
-    change plus two standard deviations are given as the phase error that they cause to the
-    scatterer farthest from zero Doppler among those used. A rotation of a lower order is compared
+    phase error that is expected of the scatterer farthest from zero Doppler follows from the change
+    and its covariance. A rotation of a lower order is compared
     with one of third order, since its own order cannot show what it leaves out.
 
     Args:
@@ -136,7 +136,7 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit) -> Judged:
     own = (reduced.pull - torch.einsum("bpij,bj->bpi", reduced.curvature, change)) @ inverse
     seen = (own * (alike @ own)).sum(1) / predicted
     number = 1 / (shares * (alike @ shares)).sum(1).clamp_min(tiny)
-    wider = (number * seen + _FEW + predicted.shape[-1]) / (number + _FEW) + change.square() / predicted
+    wider = (number * seen + _FEW + number.clamp_max(predicted.shape[-1])) / (number + _FEW) + change.square() / predicted
     wider = wider.sqrt() / accounted.clamp_min(1e-6)[:, None]
     covariance = covariance * wider[:, :, None] * wider[:, None] + torch.diag_embed(torch.where(lost, math.inf, 0.0))
     std = _standard_deviations(motion, covariance, fit.free_centre)
@@ -168,7 +168,7 @@ def _questioned(
 ) -> tuple[Tensor, list[tuple[Outcome, Tensor]]]:
     """Phase error in rad, rms over the aperture, of a scatterer at the edge, (trial,); and doubts.
 
-    The error is that of the difference between two rotations and two of its standard deviations.
+    It is expected from the difference of two rotations and the covariance of that difference.
     Constant and linear phases only displace a scatterer and are left out.
     """
     count, order = found.used.sum(-1), judged.k.shape[-1]
@@ -184,13 +184,11 @@ def _questioned(
     line = line / line.square().sum(-1, keepdim=True).sqrt()
     curves = warped.slopes - (warped.slopes @ line.mT) @ line
     size, change = curves @ curves.mT / sampling.pulses, refined.k - judged.k + found.change[:, :order]
-    import os
-    _UNSURE = float(os.environ.get('UNSURE', 2))
-    moved = torch.einsum("bi,bij,bj->b", change, size, change).clamp_min(0).sqrt()
-    unsure = (size * covariance[:, :order, :order]).sum((-2, -1)).clamp_min(0).sqrt()
+    moved = torch.einsum("bi,bij,bj->b", change, size, change).clamp_min(0)
+    unsure = (size * covariance[:, :order, :order]).sum((-2, -1)).clamp_min(0)
     few = (count < _LEAST_SCATTERERS) | (edge <= 2 * math.pi)
     dark = found.least_lit < _LEAST_LIT
-    error = torch.nan_to_num(edge * (moved + _UNSURE * unsure), math.inf, math.inf)
+    error = torch.nan_to_num(edge * (moved + unsure).sqrt(), math.inf, math.inf)
     return torch.where(few | dark, math.inf, error), [(Outcome.MISFIT, dark), (Outcome.TOO_FEW, few)]
 
 
