@@ -130,7 +130,7 @@ def test_a_peak_of_the_noise_does_not_show_the_rate() -> None:
     x, y, amplitude = points(1053, 12)
     clean = echo(x, 0.0 * y, amplitude)
     found = uneven_rotation((clean + noise_std(clean, 10.0) * noise(1053, *clean.shape)).to(torch.complex64), **OPTIONS)
-    assert found.info["scatterers"] > 12 and found.info["focused"] and not found.ok
+    assert found.info["scatterers"] > 12 and found.doubtful
 
 
 def test_each_step_reduces_the_error() -> None:

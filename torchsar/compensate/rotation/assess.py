@@ -98,7 +98,10 @@ def judged_motion(rows: Tensor, sampling: Sampling, motion: Motion) -> Judged:
     entropies, quality = _entropies(rows, sampling, motion)
     info = {**entropies, "phase_error_rad": error, "scatterers": found.used.sum(-1)}
     outcome = worst(
-        *reasons, (Outcome.PARTS_DISAGREE, error >= MOST_PHASE_ERROR_RAD), (Outcome.NOISE, found.level < _CLEAR), _empty(rows)
+        *reasons,
+        (Outcome.PARTS_DISAGREE, error >= MOST_PHASE_ERROR_RAD),
+        (Outcome.NOISE, found.level < _CLEAR),
+        _empty(rows),
     )
     return Judged(outcome, quality, {}, info)
 
@@ -136,7 +139,9 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit) -> Judged:
     own = (reduced.pull - torch.einsum("bpij,bj->bpi", reduced.curvature, change)) @ inverse
     seen = (own * (alike @ own)).sum(1) / predicted
     number = 1 / (shares * (alike @ shares)).sum(1).clamp_min(tiny)
-    wider = (number * seen + _FEW + number.clamp_max(predicted.shape[-1])) / (number + _FEW) + change.square() / predicted
+    wider = (number * seen + _FEW + number.clamp_max(predicted.shape[-1])) / (
+        number + _FEW
+    ) + change.square() / predicted
     wider = wider.sqrt() / accounted.clamp_min(1e-6)[:, None]
     covariance = covariance * wider[:, :, None] * wider[:, None] + torch.diag_embed(torch.where(lost, math.inf, 0.0))
     std = _standard_deviations(motion, covariance, fit.free_centre)
