@@ -309,7 +309,7 @@ def test_invalid_input_is_rejected() -> None:
         figure(data.real)
     with pytest.raises(ValueError, match="NaN or Inf"):
         figure(data * torch.nan)
-    with pytest.raises(ValueError, match="range_m must hold the 8 coordinates"):
+    with pytest.raises(ValueError, match="range_m must be a tensor of the 8 coordinates"):
         figure(data[:, :8])
     with pytest.raises(ValueError, match="order must be 2 or more without the range term, got 1"):
         figure(data, order=1, range_term=False)

@@ -29,7 +29,6 @@ from torchsar.compensate.rotation.couplings import Neighbours, inner_products
 from torchsar.compensate.rotation.histories import histories_of, inverted, refined_by_histories
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of, without_range_term
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
-from torchsar.compensate.rotation.range_response import RangeResponse
 from torchsar.compensate.rotation.scatterers import Fit, Scatterers, Step, _solver
 from torchsar.core.warp import warp
 
@@ -229,7 +228,7 @@ def model(unknown: Tensor, found: Scatterers, motion: Motion) -> Tensor:
 def fit_of(motion: Motion, found: Scatterers) -> Fit:
     """State with the periodic range response of `model`."""
     one, never = torch.ones(1, dtype=F64), torch.zeros(1, dtype=torch.bool)
-    return Fit(motion, found, RangeResponse(one, CELLS), one, never.long(), never, torch.zeros(1, 4, dtype=F64))
+    return Fit(motion, found, one, one, never.long(), never, torch.zeros(1, 4, dtype=F64))
 
 
 def near_of(found: Scatterers) -> Neighbours:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchsar.compensate.rotation.assess import judged_motion
 from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
-from torchsar.compensate.rotation.motion import Motion
+from torchsar.compensate.rotation.motion import Motion, each
 from torchsar.compensate.rotation.unknowns import RotationParameters, k_name, uniform_rotation, values_of
 from torchsar.core import Draws, Estimate, Outcome, Signal, Stage, worst
 from torchsar.optim import Descent, Searched, differential_evolution, genetic, grid_search, lbfgs, newton
@@ -288,7 +288,10 @@ def _judged(figure: ImageEntropy, rotation: RotationParameters) -> tuple[Tensor,
     k = rotation.warp_k.reshape(len(w), -1)
     motion = Motion(k, w, w * rotation.yc_m.reshape(-1), torch.zeros_like(w))
     with torch.no_grad():
-        parts = [judged_motion(figure.rows[i], figure.sampling, motion.part(i)) for i in figure.blocks(len(w))]
+        parts = [
+            judged_motion(figure.rows[i], figure.sampling, each(lambda x, i=i: x[i], motion))
+            for i in figure.blocks(len(w))
+        ]
     outcome = torch.cat([part.outcome for part in parts]).reshape(figure.trials)
     return outcome, torch.cat([part.info["phase_error_rad"] for part in parts]).reshape(figure.trials)
 

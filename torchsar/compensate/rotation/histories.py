@@ -26,7 +26,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
+from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, chosen, image_of
 from torchsar.compensate.rotation.peaks import Peaks, find_peaks, noise_power, threshold
 from torchsar.core.warp import warp, warp_rate
 
@@ -88,7 +88,7 @@ def refined_by_histories(
     """
     found = histories_of(data, sampling, motion, free_centre=free_centre, half_cells=half_cells)
     moved = motion.moved(found.change)
-    return moved.where(found.used.any(-1) & moved.possible(sampling), motion)
+    return chosen(found.used.any(-1) & moved.possible(sampling), moved, motion)
 
 
 def histories_of(

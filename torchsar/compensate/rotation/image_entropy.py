@@ -98,12 +98,8 @@ class ImageEntropy:
         range_m: Tensor,
     ) -> None:
         data = checked_samples(data, "ImageEntropy", "pulse, range")
-        _check(data, wavelength_m, prf_hz, range_m)
-        self.wavelength_m, self.prf_hz, self.range_m = (
-            wavelength_m,
-            prf_hz,
-            range_m.to(device=data.device, dtype=torch.float64),
-        )
+        self.sampling = Sampling.of("ImageEntropy", data, wavelength_m, prf_hz, range_m)
+        self.range_m = range_m.to(device=data.device, dtype=torch.float64)
         self.objective, yc_m = objective, objective.yc_m
         self.unknowns = Unknowns(
             data.shape[-2] / prf_hz, objective.order, objective.range_term, yc_m is None, objective.variables
@@ -230,7 +226,7 @@ class ImageEntropy:
             The changes, positive, shape (..., n), see `Unknowns.units`.
         """
         depth_m = abs(self.sampling.step_m) * len(self.range_m)
-        return self.unknowns.units(x, self.wavelength_m, depth_m, self.rows.shape[-2])
+        return self.unknowns.units(x, self.sampling.wavelength_m, depth_m, self.rows.shape[-2])
 
     def uncompensated(self) -> Tensor:
         """Compute the entropy of the image formed as for a uniform rotation.
@@ -242,12 +238,6 @@ class ImageEntropy:
         """
         with torch.no_grad():
             return self.single(self.start(0.0, torch.zeros(self.unknowns.order - 1, dtype=torch.float64)))
-
-    @property
-    def sampling(self) -> Sampling:
-        """Sampling of the data."""
-        step = float(self.range_m[1] - self.range_m[0]) if len(self.range_m) > 1 else 1.0
-        return Sampling(self.wavelength_m, self.prf_hz, *self.rows.shape[1:], float(self.range_m[0]), step)
 
     def blocks(self, rows: int, count: int = 1) -> Iterator[slice]:
         """Divide candidates into blocks that fit into the cache.
@@ -276,8 +266,8 @@ class ImageEntropy:
             pulses = range_phase(
                 pulses,
                 self.range_m,
-                self.wavelength_m,
-                self.prf_hz,
+                self.sampling.wavelength_m,
+                self.sampling.prf_hz,
                 rotation.omega_rad_s,
                 rotation.warp_k,
                 rotation.yc_m,
@@ -288,7 +278,7 @@ class ImageEntropy:
         """Entropy of the image of pulses without their range term."""
         image = self.objective
         lines, transform = DopplerLines(image.oversampling, image.lines), Gridding(image.taps)
-        return _entropy(matched_fourier(pulses, k, self.prf_hz, lines=lines, transform=transform))
+        return _entropy(matched_fourier(pulses, k, self.sampling.prf_hz, lines=lines, transform=transform))
 
 
 def _entropy(image: Tensor) -> Tensor:
@@ -314,20 +304,3 @@ def _normalised(data: Tensor) -> Tensor:
     unit = unit_level(data)
     rms = power_of(unit).mean((-2, -1), keepdim=True).sqrt()
     return unit / torch.where(rms > 0, rms, 1)
-
-
-def _check(data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) -> None:
-    """Raise TypeError or ValueError for invalid input."""
-    if data.shape[-2] < 8:
-        raise ValueError(
-            "ImageEntropy: data must have at least 8 pulses and one range cell, shape (..., pulse, range), got "
-            f"shape {tuple(data.shape)}"
-        )
-    for name, value in (("wavelength_m", wavelength_m), ("prf_hz", prf_hz)):
-        if not value > 0:
-            raise ValueError(f"ImageEntropy: {name} must be positive, got {value}")
-    if range_m.shape != data.shape[-1:]:
-        raise ValueError(
-            f"ImageEntropy: range_m must hold the {data.shape[-1]} coordinates of the range cells (m), got "
-            f"shape {tuple(range_m.shape)}"
-        )

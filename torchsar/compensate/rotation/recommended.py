@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,7 +11,7 @@ from torch import Tensor
 from torchsar.compensate.rotation.assess import judged_fit, judged_motion
 from torchsar.compensate.rotation.coarse import coarse_warp
 from torchsar.compensate.rotation.histories import HALF_CELLS, refined_by_histories
-from torchsar.compensate.rotation.motion import LEAST_PULSES, Motion, Sampling
+from torchsar.compensate.rotation.motion import Motion, Sampling, each
 from torchsar.compensate.rotation.scatterers import (
     LEAST_EXPLAINED,
     MOST,
@@ -27,7 +26,6 @@ from torchsar.core import (
     Estimate,
     block_bytes_of,
     checked_samples,
-    host_values,
     level_of,
     over_blocks,
     refuse_non_finite,
@@ -120,7 +118,7 @@ def uneven_rotation(
             at = (poor & (2 * fit.scatterers.count > count)).nonzero()[:, 0]
             if len(at):
                 options |= {"count": min(MOST, 2 * count), "rounds": rounds}
-                fit = fit.replaced(at, fit_scatterers(rows[at], sampling, fit.motion.part(at), **options))
+                fit = fit.replaced(at, fit_scatterers(rows[at], sampling, each(lambda x: x[at], fit.motion), **options))
         return fit
 
     return _over_trials("uneven_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
@@ -253,7 +251,7 @@ def _over_trials(
 ) -> Estimate:
     """find(rows, sampling, known centre) in blocks of trials, each divided by its level."""
     data = checked_samples(data, name, "pulse, range")
-    sampling = _checked(name, data, wavelength_m, prf_hz, range_m)
+    sampling = Sampling.of(name, data, wavelength_m, prf_hz, range_m)
     trials, rows = data.shape[:-2], data.detach().reshape(-1, *data.shape[-2:])
     known = (
         None if yc_m is None else _centre(name, torch.as_tensor(yc_m, dtype=torch.float64, device=data.device), trials)
@@ -307,30 +305,3 @@ def _centre(name: str, yc_m: Tensor, trials: torch.Size) -> Tensor:
             f"{name}: yc_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(yc_m.shape)}"
         )
     return yc_m.expand(trials).reshape(-1)
-
-
-def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) -> Sampling:
-    """Sampling of the data; raises TypeError or ValueError for invalid input."""
-    if data.shape[-2] < LEAST_PULSES:
-        raise ValueError(
-            f"{name} works on samples (..., pulse, range) of at least {LEAST_PULSES} pulses and "
-            f"one range cell, got the shape {tuple(data.shape)}"
-        )
-    for what, value in (("wavelength_m", wavelength_m), ("prf_hz", prf_hz)):
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name}: {what} must be a positive number, got {value}")
-    if not isinstance(range_m, Tensor) or range_m.shape != data.shape[-1:]:
-        got = f"the shape {tuple(range_m.shape)}" if isinstance(range_m, Tensor) else type(range_m).__name__
-        raise ValueError(
-            f"{name}: range_m must be a tensor of the {data.shape[-1]} coordinates of the range cells (m), got {got}"
-        )
-    refuse_non_finite(range_m, f"{name}: range_m")
-    range_m = range_m.to(torch.float64)
-    steps = torch.diff(range_m) if len(range_m) > 1 else torch.ones_like(range_m)
-    first, step, least, largest = host_values(torch.stack([range_m[0], steps.mean(), *torch.aminmax(steps)]), 0.0)
-    if step == 0 or max(step - least, largest - step) > 1e-6 * abs(step):
-        raise ValueError(
-            f"{name}: range_m must be evenly spaced, got steps of {least:g} to {largest:g} m; resample the data in "
-            "range first"
-        )
-    return Sampling(wavelength_m, prf_hz, data.shape[-2], data.shape[-1], first, step)

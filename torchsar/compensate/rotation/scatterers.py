@@ -17,9 +17,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,9 +27,9 @@ from torch.nn.functional import pad
 
 from torchsar.compensate.rotation.couplings import Neighbours, inner_products
 from torchsar.compensate.rotation.histories import inverted
-from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
+from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, chosen, each, image_of
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
-from torchsar.compensate.rotation.range_response import Envelopes, RangeResponse
+from torchsar.compensate.rotation.range_response import Envelopes, envelopes
 from torchsar.core import power_of, real_dtype, reduced_turns, settle
 from torchsar.core.warp import least_rate
 
@@ -112,7 +112,7 @@ class Fit:
     Args:
         motion: Rotation of the target.
         scatterers: Scatterers.
-        response: Range response.
+        response: Share of the periodic range response (`envelopes`), shape (trial,).
         noise: Noise power per sample, shape (trial,).
         steps: Number of steps taken, shape (trial,).
         settled: True for trials that have ended, shape (trial,), bool.
@@ -122,7 +122,7 @@ class Fit:
 
     motion: Motion
     scatterers: Scatterers
-    response: RangeResponse
+    response: Tensor
     noise: Tensor
     steps: Tensor
     settled: Tensor
@@ -132,24 +132,6 @@ class Fit:
     def free_centre(self) -> bool:
         """True if the range of the rotation centre is estimated."""
         return self.change.shape[-1] > self.motion.k.shape[-1] + 1
-
-    def where(self, moved: Tensor, other: Fit) -> Fit:
-        """Choose the rotation and the scatterers of each trial.
-
-        Args:
-            moved: True where those of this fit are taken, shape (trial,), bool.
-            other: The fit from which the others are taken, with as many scatterers.
-
-        Returns:
-            This fit with the chosen rotation, scatterers and range response.
-        """
-        pairs = ((getattr(self.scatterers, name), getattr(other.scatterers, name)) for name in _NAMES)
-        return replace(
-            self,
-            motion=self.motion.where(moved, other.motion),
-            scatterers=Scatterers(*(torch.where(moved[:, None], new, old) for new, old in pairs)).apart(),
-            response=self.response.where(moved, other.response),
-        )
 
     def replaced(self, at: Tensor, other: Fit) -> Fit:
         """Replace trials by those of another fit.
@@ -161,20 +143,12 @@ class Fit:
         Returns:
             The fit of all trials.
         """
-        return _replaced(self, at, other)
-
-
-_NAMES = ("amplitude", "cell", "row")
-
-
-def _replaced(whole: Any, at: Tensor, some: Any) -> Any:
-    """Trials of a tensor, or of the fields of an object, replaced; missing scatterers are zero."""
-    if isinstance(whole, Tensor):
-        width = max(whole.shape[-1], some.shape[-1]) if whole.ndim == 2 else 0
-        whole, some = (pad(x, (0, width - x.shape[-1])) if width else x for x in (whole, some))
-        return whole.index_copy(0, at, some)
-    names = [field.name for field in fields(whole) if not isinstance(getattr(whole, field.name), int)]
-    return replace(whole, **{name: _replaced(getattr(whole, name), at, getattr(some, name)) for name in names})
+        width = max(fit.scatterers.cell.shape[-1] for fit in (self, other))
+        wide = [
+            replace(fit, scatterers=each(lambda x: pad(x, (0, width - x.shape[-1])), fit.scatterers))
+            for fit in (self, other)
+        ]
+        return each(lambda x, y: x.index_copy(0, at, y), *wide)
 
 
 def explained_share(data: Tensor, fit: Fit) -> tuple[Tensor, Tensor]:
@@ -242,7 +216,7 @@ def fit_scatterers(
     fit = Fit(
         start,
         Scatterers(empty.to(torch.complex128), empty, empty),
-        RangeResponse.of_unknown_share(len(data), sampling.cells, device),
+        start.w.new_full((len(data),), 0.5),  # midway between the two kinds
         start.w.new_full((len(data),), math.inf),
         torch.zeros(len(data), dtype=torch.int64, device=device),
         torch.zeros(len(data), dtype=torch.bool, device=device),
@@ -259,13 +233,10 @@ def fit_scatterers(
         if step is not None:
             fit = step.after(noise, sampling, iteration)
         if new is not None:
-            closed = fit.settled[:, None]
-            new = replace(new, amplitude=torch.where(closed, 0, new.amplitude))
-            both = [torch.cat([getattr(fit.scatterers, name), getattr(new, name)], -1) for name in _NAMES]
-            found = Scatterers(*both).apart()
+            found = each(lambda x, y: torch.cat([x, y], -1), fit.scatterers, new).apart()
             near = Neighbours.find(found.amplitude, found.cell)
-            used = (getattr(found, name)[:, : near.shape[1]] for name in _NAMES)
-            fit = replace(fit, scatterers=Scatterers(*used), noise=noise)
+            used = each(lambda x, width=near.shape[1]: x[:, :width], found)
+            fit = replace(fit, scatterers=used, noise=noise)
         # no trial settles before the search is over; an accelerator should not wait in every round
         looks = iteration > _SEARCHED and (device.type == "cpu" or iteration % _LOOK == 0)
         if iteration == rounds or (looks and bool(fit.settled.all())):
@@ -399,14 +370,14 @@ class Step:
         range_m = sampling.range_m(found.row)
         turns = torch.stack([warped.u, -square], -1)
         right = torch.stack([found.cell, motion.w[:, None] * range_m + motion.offset[:, None]], -2)
-        envelopes = fit.response.envelopes(found.row)
-        weighted = (found.amplitude[..., None] * envelopes.value).conj().to(data.dtype).resolve_conj()
-        back = envelopes.value.mH.to(data.dtype).resolve_conj()
+        around = envelopes(fit.response, found.row, sampling.cells)
+        weighted = (found.amplitude[..., None] * around.value).conj().to(data.dtype).resolve_conj()
+        back = around.value.mH.to(data.dtype).resolve_conj()
         # the bases are almost linearly dependent: with orthonormal ones the small part that shows
         # the rotation is not lost in rounding
         orthonormal, mixed = torch.linalg.qr(bases.mT)
         orthonormal = orthonormal.mT.to(data.real.dtype)
-        residual, shift = torch.empty_like(data), data.new_zeros(envelopes.value.shape)
+        residual, shift = torch.empty_like(data), data.new_zeros(around.value.shape)
         moments = bases.new_zeros(*bases.shape[:2], 2 * found.cell.shape[-1])
         for some, part in _blocks(data, count):
             echoes = _phasors(turns[some, part], right[some], data.dtype)  # conjugate, of unit amplitude
@@ -417,10 +388,10 @@ class Step:
             shift[some] += echoes.mT @ rest
         moments = torch.view_as_complex((mixed.mT @ moments).unflatten(-1, (-1, 2))).mT
         shift = shift.to(torch.complex128)
-        share = (found.amplitude.conj() * (shift * envelopes.difference.conj()).sum(-1)).real.sum(-1)
+        share = (found.amplitude.conj() * (shift * around.difference.conj()).sum(-1)).real.sum(-1)
         products = inner_products(near, sampling, motion.k, found.amplitude, found.cell, bases)
-        shift = (shift * envelopes.slope.conj()).sum(-1)
-        return residual, Step(fit, range_m, near, products, bases @ bases.mT, envelopes, moments, shift, share)
+        shift = (shift * around.slope.conj()).sum(-1)
+        return residual, Step(fit, range_m, near, products, bases @ bases.mT, around, moments, shift, share)
 
     def after(self, noise: Tensor, sampling: Sampling, iteration: int) -> Fit:
         """Take the Gauss-Newton step.
@@ -454,18 +425,12 @@ class Step:
         valid = valid & (least_rate(motion.k, sampling.duration_s) > _LEAST_RATE)
         std = (inverse.diagonal(dim1=-2, dim2=-1).clamp_min(0) / 2).sqrt() * noise.sqrt()[:, None]
         std = torch.where(lost, math.inf, std).clamp_min(torch.finfo(torch.float64).tiny)
-        small, active = (change.abs() / std).amax(-1) <= _SETTLED, ~old.settled
-        change = torch.where(valid[:, None], change, math.inf)
-        new = Fit(
-            motion,
-            moved,
-            self._changed_response(),
-            torch.where(active, noise, old.noise),
-            old.steps + active,
-            old.settled | (valid & small & (iteration > _SEARCHED)),
-            torch.where(active[:, None], change, old.change),
-        )
-        return new.where(active & valid, old)
+        small = (change.abs() / std).amax(-1) <= _SETTLED
+        new = Fit(motion, moved.apart(), self._changed_response(), noise, old.steps, old.settled, change)
+        # where the step is not possible, the fit stays; trials that have ended are not counted on
+        new = replace(chosen(valid, new, old), noise=noise, change=torch.where(valid[:, None], change, math.inf))
+        new = replace(new, steps=old.steps + 1, settled=valid & small & (iteration > _SEARCHED))
+        return chosen(old.settled, old, new)
 
     def reduced(self, robust: bool) -> Reduced:
         """Eliminate the unknowns of the scatterers.
@@ -554,7 +519,7 @@ class Step:
         factors = ((value, value), (value, slope), (slope, value), (slope, slope))
         return tuple(self.near.over_range(*pair) for pair in factors)  # pyright: ignore[reportReturnType]
 
-    def _changed_response(self) -> RangeResponse:
+    def _changed_response(self) -> Tensor:
         """Fit the share of the periodic range response to the residual by least squares.
 
         Both responses are the same where scatterers lie in the middle of their cells, as all do
@@ -562,7 +527,8 @@ class Step:
         """
         apart = self.near.over_range(self.envelopes.difference, self.envelopes.difference)
         energy = (self.products[(0, 0)] * (apart + _ALIKE * self._overlaps[0])).real[:, None]
-        return self.fit.response.moved(self.share / self.near.per_scatterer(energy).sum((-2, -1)))
+        change = torch.nan_to_num(self.share / self.near.per_scatterer(energy).sum((-2, -1)), 0.0, 0.0, 0.0)
+        return (self.fit.response + change).clamp(0, 1)
 
     def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
         """Curvature between scatterers and common unknowns, and of the common unknowns.
