@@ -211,7 +211,7 @@ def _alike(found: Scatterers) -> Tensor:
 
 
 def _entropies(rows: Tensor, sampling: Sampling, motion: Motion) -> tuple[dict[str, Tensor], Tensor]:
-    """Entropies of the image with and without compensation, and the decrease of their exponential."""
+    """Entropies of the image with and without compensation, and the decrease of exp(entropy)."""
     after, before = entropy(image_of(rows, sampling, motion)), entropy(torch.fft.fft(rows, 2 * rows.shape[-2], dim=-2))
     named = {"entropy_nats": after, "uncompensated_entropy_nats": before}
     return named, (1 - torch.exp((after - before).double())).clamp(0, 1)

@@ -48,15 +48,14 @@ def search_rotation(
         figure: Image entropy as a function of the unknowns of the rotation.
         axes: Values of each unknown, shape (m,), or (..., m) per trial.
         limit: Largest number of grid points per trial.
+        assess: False leaves out the assessment.
 
     Returns:
         `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
         the range centre deviation. `genetic_rotation` describes these values and quality in full.
-        `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
-        bright scatterers do not confirm the result (see `genetic_rotation`),
-        or the best point lies on the edge of the grid. info["entropy_grid_nats"], shape (..., m_1,
-        m_2, ...), is the entropy on the grid.
+        The outcome is OUTSIDE_SEARCH where the best point lies on the edge of the grid.
+        info["entropy_grid_nats"], shape (..., m_1, m_2, ...), is the entropy on the grid.
 
     Raises:
         ValueError: If there is not one list of values per unknown, or the grid exceeds the limit.
@@ -86,6 +85,7 @@ def genetic_rotation(
         low: Lower bounds, one per unknown (`figure.unknowns.names`), shape (n,) or (..., n).
         high: Upper bounds, same shape.
         draws: Source of random numbers, see `torchsar.optim.genetic`.
+        assess: False leaves out the assessment.
         options: Options of `torchsar.optim.genetic`.
 
     Returns:
@@ -98,13 +98,10 @@ def genetic_rotation(
         range. There are no standard deviations, because an entropy is not a likelihood.
 
         quality is the relative decrease of exp(entropy), the number of cells that the image fills,
-        due to the compensation. `ok` is False where the entropy decreases by less than 0.01 nats,
-        where the minimum lies on the edge of the box, or where at least 3 bright scatterers do not
-        confirm k1, k2, ...: info["phase_error_rad"], the phase error that their phase histories, or
-        else a joint fit of all scatterers, show for the scatterer farthest from zero Doppler, plus
-        two of its standard deviations, must be below 0.47 rad rms. Below third order it includes
-        what a rotation of third order would correct. `ok` does not refer to `omega_rad_s` and
-        `yc_m`: with few image lines they are biased, see `EntropyObjective`.
+        due to the compensation. Outcomes: those of `coarse_rotation`, OUTSIDE_SEARCH if the minimum
+        lies on the edge of the box, and NOT_CONVERGED. They do not refer to `omega_rad_s` and
+        `yc_m`: with few image lines these are biased, see `EntropyObjective`. Below third order
+        PARTS_DISAGREE includes what a rotation of third order would correct.
 
         info holds the number of evaluations; entropy_nats and uncompensated_entropy_nats, the
         entropy with and without compensation; on_edge, shape (..., n), True for unknowns on the
@@ -132,13 +129,14 @@ def evolve_rotation(
         low: Lower bounds, one per unknown, shape (n,) or (..., n).
         high: Upper bounds, same shape.
         draws: Source of random numbers, see `torchsar.optim.differential_evolution`.
+        assess: False leaves out the assessment.
         options: Options of `torchsar.optim.differential_evolution`.
 
     Returns:
         `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
-        the range centre deviation. `genetic_rotation` describes these values, quality, `ok` and
-        info in full.
+        the range centre deviation. `genetic_rotation` describes these values, quality,
+        outcomes and info in full.
 
     Raises:
         ValueError: If there is not one bound per unknown, or an option is invalid.
@@ -163,15 +161,14 @@ def newton_rotation(
         damped: True damps the steps. Undamped steps diverge on most targets, even from the true
             rotation, because the entropy is nearly flat in one direction.
         steps: Largest number of steps.
+        assess: False leaves out the assessment.
 
     Returns:
         `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
         the range centre deviation. `genetic_rotation` describes these values and quality in full.
-        `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
-        bright scatterers do not confirm the result (see `genetic_rotation`),
-        where the search diverges (the result is then its last finite point), or where it has not
-        converged after `steps` steps. info["iterations"] is the number of steps.
+        The outcome is NOT_CONVERGED where the search diverges (the result is then its last finite
+        point) or has not converged after `steps` steps. info["iterations"] is the number of steps.
 
     Raises:
         ValueError: If the start does not have one value per unknown.
@@ -203,14 +200,13 @@ def descend_rotation(
         steps: Largest number of steps.
         tolerance: A trial ends when the norm of its gradient is at most this fraction of that at
             the start.
+        assess: False leaves out the assessment.
 
     Returns:
         `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
         the range centre deviation. `genetic_rotation` describes these values and quality in full.
-        `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
-        bright scatterers do not confirm the result (see `genetic_rotation`),
-        or where a trial has not converged after `steps` steps.
+        The outcome is NOT_CONVERGED where a trial has not converged after `steps` steps.
 
     Raises:
         ValueError: If the start does not have one value per unknown.

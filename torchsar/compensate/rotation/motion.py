@@ -104,7 +104,8 @@ class Sampling:
         if not isinstance(range_m, Tensor) or range_m.shape != data.shape[-1:]:
             got = f"the shape {tuple(range_m.shape)}" if isinstance(range_m, Tensor) else type(range_m).__name__
             raise ValueError(
-                f"{name}: range_m must be a tensor of the {data.shape[-1]} coordinates of the range cells (m), got {got}"
+                f"{name}: range_m must be a tensor of the {data.shape[-1]} coordinates of the range cells (m), got "
+                f"{got}"
             )
         refuse_non_finite(range_m, f"{name}: range_m")
         range_m = range_m.to(torch.float64)
@@ -239,8 +240,8 @@ class Motion:
         """Change the rotation.
 
         Args:
-            change: Changes of k1, k2, ..., of w and, if the centre is estimated, of v, shape (trial,
-                parameter).
+            change: Changes of k1, k2, ..., of w and, if the centre is estimated, of v, shape
+                (trial, parameter).
 
         Returns:
             The changed rotation.

@@ -77,6 +77,7 @@ def uneven_rotation(
             one for every 1000 samples of a trial, within 128..800, and twice as many in trials
             where these explain less than half of the energy.
         rounds: Largest number of maximum-likelihood steps.
+        assess: False leaves out the assessment: no standard deviations, outcome NOT_ASSESSED.
 
     Returns:
         `omega_rad_s`, the rotation rate at the first pulse, shape (...,); `warp_k`, its relative
@@ -90,15 +91,15 @@ def uneven_rotation(
         mostly that of scatterers in one resolution cell, which the differences show. quality is the
         share of the energy above the noise that the scatterers explain.
 
-        info["focused"] is True where the rotation is good enough to form an image: at least 3
-        scatterers are found, they explain half of the energy or more, their phase histories agree
-        over the whole aperture, the entropy is not higher than without compensation, and the fit
-        has converged. `ok` is True where, in addition, an error of the rate above 10 % is
-        improbable: 10 % of it are 2.7 standard deviations or more, also without the scatterers that
-        may be peaks of the noise. Where only `ok` is False, the cross-range scale of the image is
-        unknown. Targets of several hundred scatterers on few pulses, of which the usual numbers
-        explain a part, are often not ok; a larger `scatterers` helps. Further info:
-        scatterers (their number), noise_power, steps, entropy_nats, uncompensated_entropy_nats.
+        Outcomes: EMPTY; NOISE if no scatterer clearly exceeds the noise; TOO_FEW with fewer than 3
+        scatterers, or if a single one shows the rate; NOT_CONVERGED; MISFIT if the scatterers
+        explain less than half of the energy or are not seen during the whole aperture;
+        PARTS_DISAGREE if the phase histories of bright scatterers ask for another rotation; INEXACT
+        if an error of the rate above 10 % is probable: 10 % of it are less than 2.7 standard
+        deviations. The image is then focused, but its cross-range scale is unknown. Targets of
+        several hundred scatterers on few pulses, of which the usual numbers explain a part, are
+        often doubtful; a larger `scatterers` helps. info: scatterers (their number), noise_power,
+        steps, and, if assessed, entropy_nats and uncompensated_entropy_nats.
 
     Raises:
         TypeError: If the data are not complex.
@@ -149,15 +150,16 @@ def coarse_rotation(
             rotation; with 2 only k1 is returned, and beyond 3 the further derivatives are 0.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
             rotation centre), if known a priori, a number or shape (...,).
+        assess: False leaves out the assessment.
 
     Returns:
         `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
         standard deviations. quality is the relative decrease of exp(entropy) of the image due to
-        the compensation. `ok` is True where the entropy is not higher than without compensation and
-        at least 3 bright scatterers confirm k1, k2, ...: the phase error info["phase_error_rad"]
-        that their phase histories, or else a joint fit of all scatterers, show for the scatterer
-        farthest from zero Doppler, plus two of its standard deviations, is below 0.47 rad rms, a
-        Strehl ratio of 0.8. `ok` does not refer to `omega_rad_s` and `yc_m`.
+        the compensation. The outcomes refer to k1, k2, ..., not to `omega_rad_s` and `yc_m`: EMPTY;
+        NOISE if no pixel clearly exceeds the noise; TOO_FEW with fewer than 3 isolated scatterers,
+        or none off zero Doppler; MISFIT if they are not seen during the whole aperture;
+        PARTS_DISAGREE if the phase error info["phase_error_rad"] that their phase histories show
+        for the scatterer farthest from zero Doppler is above 0.47 rad rms, a Strehl ratio of 0.8.
 
     Raises:
         TypeError: If the data are not complex.
@@ -201,15 +203,16 @@ def phase_fit_rotation(
             rotation centre), if known a priori, a number or shape (...,); None estimates it.
         steps: Number of times that the least-squares fit to the phase histories is repeated.
         half_cells: Half width of the windows about scatterers in Doppler cells, at least 4.
+        assess: False leaves out the assessment.
 
     Returns:
         `omega_rad_s`, `warp_k` with its entries, and `yc_m`, as from `uneven_rotation` but without
         standard deviations. quality is the relative decrease of exp(entropy) of the image due to
-        the compensation. `ok` is True where the entropy is not higher than without compensation and
-        at least 3 bright scatterers confirm k1, k2, ...: the phase error info["phase_error_rad"]
-        that their phase histories, or else a joint fit of all scatterers, show for the scatterer
-        farthest from zero Doppler, plus two of its standard deviations, is below 0.47 rad rms, a
-        Strehl ratio of 0.8. `ok` does not refer to `omega_rad_s` and `yc_m`.
+        the compensation. The outcomes refer to k1, k2, ..., not to `omega_rad_s` and `yc_m`: EMPTY;
+        NOISE if no pixel clearly exceeds the noise; TOO_FEW with fewer than 3 isolated scatterers,
+        or none off zero Doppler; MISFIT if they are not seen during the whole aperture;
+        PARTS_DISAGREE if the phase error info["phase_error_rad"] that their phase histories show
+        for the scatterer farthest from zero Doppler is above 0.47 rad rms, a Strehl ratio of 0.8.
 
     Raises:
         TypeError: If the data are not complex.

@@ -9,7 +9,7 @@ computed without the range-dependent phase, which changes them by a few percent.
 convergence, but leaves no error at the end, because the gradient follows from the exact residual.
 For the same reason side lobes leave no error. The echoes are assumed to be range-compressed with a
 flat spectrum that fills the whole band; whether their side lobes leave the window or return at its
-other end is found from the data (`RangeResponse`).
+other end is found from the data (`envelopes`).
 """
 
 from __future__ import annotations
@@ -246,7 +246,7 @@ def fit_scatterers(
 
 
 def _new_scatterers(image: Tensor, floor: Tensor, pulses: int, fit: Fit, bound: int) -> Scatterers:
-    """Scatterers that clearly exceed the residual, up to `bound` per trial with those of the fit."""
+    """Scatterers that clearly exceed the residual: up to `bound` per trial, with the known ones."""
     power = power_of(image)
     least = (floor * threshold(power[0].numel())).to(power.dtype)
     peaks = find_peaks(power, least, bound, _SHARE, _LINES, _CELLS).first(bound - fit.scatterers.count)
