@@ -145,7 +145,8 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit) -> Judged:
     wider = wider.sqrt() / accounted.clamp_min(1e-6)[:, None]
     covariance = covariance * wider[:, :, None] * wider[:, None] + torch.diag_embed(torch.where(lost, math.inf, 0.0))
     std = _standard_deviations(motion, covariance, fit.free_centre)
-    step = (change.abs() / predicted.sqrt()).amax(-1)
+    step = (fit.change.abs() / predicted.sqrt()).amax(-1)
+    # a step below three deviations, or that changes phases by less than 0.01 rad, is small
     moving = (step > 3) & (step * (fit.noise / (2 * power.sum(-1) * sampling.pulses).clamp_min(tiny)).sqrt() > 0.01)
     level = power.amax(-1) * sampling.pulses / (fit.noise * threshold(2 * rows[0].numel())).clamp_min(tiny)
     error, reasons = _questioned(sampling, motion, motion, histories_of(rows, sampling, motion))

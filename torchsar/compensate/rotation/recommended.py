@@ -118,8 +118,9 @@ def uneven_rotation(
             poor = explained_share(rows, fit)[0] < LEAST_EXPLAINED
             at = (poor & (2 * fit.scatterers.count > count)).nonzero()[:, 0]
             if len(at):
-                options |= {"count": min(MOST, 2 * count), "rounds": rounds}
-                fit = fit.replaced(at, fit_scatterers(rows[at], sampling, each(lambda x: x[at], fit.motion), **options))
+                start, count = each(lambda x: x[at], fit.motion), min(MOST, 2 * count)
+                again = fit_scatterers(rows[at], sampling, start, **options, count=count, rounds=rounds)
+                fit = fit.replaced(at, again)
         return fit
 
     return _over_trials("uneven_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
