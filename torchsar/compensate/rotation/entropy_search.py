@@ -300,9 +300,11 @@ def _box(figure: ImageEntropy, low: Vector, high: Vector) -> tuple[Tensor, Tenso
 class _Search(Stage):
     """A search for the rotation that minimises an image entropy, by one of the functions above."""
 
-    def __init__(self, radar: InverseRadar, objective: EntropyObjective, find: Callable[..., Estimate]) -> None:
+    def __init__(
+        self, radar: InverseRadar, objective: EntropyObjective, find: Callable[..., Estimate], assess: bool
+    ) -> None:
         super().__init__()
-        self.radar, self.objective, self.find = radar, objective, find
+        self.radar, self.objective, self.find, self.assess = radar, objective, find, assess
         self.provides = (
             "warp_k",
             *(k_name(i) for i in range(1, objective.order)),
@@ -335,7 +337,7 @@ class _Search(Stage):
         Returns:
             The `Estimate` of the function that the description of the stage names.
         """
-        return self.find(self.figure(signal, yc_m))
+        return self.find(self.figure(signal, yc_m), assess=self.assess)
 
 
 class RotationSearch(_Search):
@@ -377,7 +379,7 @@ class RotationSearch(_Search):
                 f"low {list(low)}, high {list(high)} and counts {list(counts)}"
             )
         axes = [torch.linspace(a, b, n, dtype=torch.float64) for a, b, n in zip(low, high, counts, strict=True)]
-        super().__init__(radar, objective, partial(search_rotation, axes=axes, limit=limit, assess=assess))
+        super().__init__(radar, objective, partial(search_rotation, axes=axes, limit=limit), assess)
 
 
 class RotationGenetic(_Search):
@@ -417,7 +419,7 @@ class RotationGenetic(_Search):
     ) -> None:
         rules = {"population": population, "generations": generations, "elites": elites, "selection": selection}
         box = {"low": tuple(low), "high": tuple(high), "draws": Draws(seed)}
-        super().__init__(radar, objective, partial(genetic_rotation, **box, **rules, assess=assess))
+        super().__init__(radar, objective, partial(genetic_rotation, **box, **rules), assess)
 
 
 class RotationEvolution(_Search):
@@ -455,7 +457,7 @@ class RotationEvolution(_Search):
     ) -> None:
         rules = {"population": population, "generations": generations, "strategy": strategy}
         box = {"low": tuple(low), "high": tuple(high), "draws": Draws(seed)}
-        super().__init__(radar, objective, partial(evolve_rotation, **box, **rules, assess=assess))
+        super().__init__(radar, objective, partial(evolve_rotation, **box, **rules), assess)
 
 
 class _Descending(_Search):
@@ -465,9 +467,14 @@ class _Descending(_Search):
     """
 
     def __init__(
-        self, radar: InverseRadar, objective: EntropyObjective, start: list[float] | None, find: Callable[..., Estimate]
+        self,
+        radar: InverseRadar,
+        objective: EntropyObjective,
+        start: list[float] | None,
+        find: Callable[..., Estimate],
+        assess: bool,
     ) -> None:
-        super().__init__(radar, objective, find)
+        super().__init__(radar, objective, find, assess)
         self.names = (*(("omega",) if objective.range_term else ()), "k1, k2, ...")
         wanted = objective.order - 1 + objective.range_term
         if start is not None and len(start) != wanted:
@@ -510,7 +517,7 @@ class _Descending(_Search):
                 f"connect {'omega_rad_s and ' if self.objective.range_term else ''}warp_k from an earlier estimator"
             )
         figure = self.figure(signal, yc_m)
-        return self.find(figure, figure.start(omega, k, yc_m))
+        return self.find(figure, figure.start(omega, k, yc_m), assess=self.assess)
 
 
 class RotationNewton(_Descending):
@@ -545,8 +552,7 @@ class RotationNewton(_Descending):
         steps: int = 20,
         assess: bool = True,
     ) -> None:
-        find = partial(newton_rotation, damped=damped, steps=steps, assess=assess)
-        super().__init__(radar, objective, start, find)
+        super().__init__(radar, objective, start, partial(newton_rotation, damped=damped, steps=steps), assess)
 
 
 class RotationDescent(_Descending):
@@ -582,4 +588,4 @@ class RotationDescent(_Descending):
         steps: int = 60,
         assess: bool = True,
     ) -> None:
-        super().__init__(radar, objective, start, partial(descend_rotation, steps=steps, assess=assess))
+        super().__init__(radar, objective, start, partial(descend_rotation, steps=steps), assess)

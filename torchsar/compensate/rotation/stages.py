@@ -38,12 +38,19 @@ class _Rotation(Stage):
     """
 
     def __init__(
-        self, radar: InverseRadar, order: int, yc_m: float | None, find: Callable[..., Estimate], **options: Any
+        self,
+        radar: InverseRadar,
+        order: int,
+        yc_m: float | None,
+        find: Callable[..., Estimate],
+        assess: bool,
+        **options: Any,
     ) -> None:
         super().__init__()
         if order < 1:
             raise ValueError(f"order of the rotation must be 1 (uniform rotation) or more, got {order}")
         self.radar, self.order, self.yc_m, self.find, self.options = radar, order, yc_m, find, options
+        self.assess = assess
         self.provides = ("omega_rad_s", "warp_k", "yc_m", *(k_name(i) for i in range(1, order)))
         self.neutral = uniform_rotation(radar, self.provides, yc_m)
 
@@ -65,6 +72,7 @@ class _Rotation(Stage):
             range_m=signal.axis("range").values(torch.device("cpu")),  # only their spacing is read, by the host
             order=self.order,
             yc_m=self.yc_m if yc_m is None else yc_m,
+            assess=self.assess,
             **self.options,
         )
 
@@ -173,7 +181,7 @@ class RotationAutofocus(Stage):
 
     def __init__(self, radar: InverseRadar, search: int = 60, polish: int = 20, assess: bool = True) -> None:
         super().__init__()
-        self.radar, self.options = radar, {"search": search, "polish": polish, "assess": assess}
+        self.radar, self.search, self.polish, self.assess = radar, search, polish, assess
 
     def forward(
         self,
@@ -203,8 +211,9 @@ class RotationAutofocus(Stage):
             TypeError: If the data are not complex or the start is not a tensor.
             ValueError: As from the two functions.
         """
+        options = {"search": self.search, "polish": self.polish, "assess": self.assess}
         if warp_k is None:
-            return autofocus(signal.data, start=phase_rad, **self.options)
+            return autofocus(signal.data, start=phase_rad, **options)
         prf_hz, data = 1 / signal.axis("pulse").step, signal.data
         if omega_rad_s is not None:
             data = range_phase(
@@ -217,7 +226,7 @@ class RotationAutofocus(Stage):
                 0.0 if yc_m is None else yc_m,
             )
         k = warp_k.expand(*signal.trials, warp_k.shape[-1]).reshape(-1, warp_k.shape[-1])
-        return rotating_autofocus(data, prf_hz, k, phase_rad, **self.options)
+        return rotating_autofocus(data, prf_hz, k, phase_rad, **options)
 
 
 def rotating_autofocus(

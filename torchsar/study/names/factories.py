@@ -106,7 +106,6 @@ def rotation_and_phase(
     scatterers: int | None = None,
     search: int = 60,
     polish: int = 20,
-    assess: bool = True,
 ) -> Alternate:
     """Alternate estimation of a phase error per pulse (`RotationAutofocus`) and of the non-uniform
     rotation (`UnevenRotation`) of a target, each from the data after correction of the other.
@@ -120,12 +119,11 @@ def rotation_and_phase(
         search: Largest number of fixed-point iterations for the phase of least image entropy.
         polish: Largest number of further iterations for the phase, which compare each pulse with a
             Wiener estimate of the scene.
-        assess: False leaves out the assessment.
     """
     return Alternate(
         rounds,
-        phase=Turn(RotationAutofocus(radar, search, polish, assess), CorrectPulsePhase()),
-        rotation=Turn(UnevenRotation(radar, order, yc_m, scatterers, assess=assess)),
+        phase=Turn(RotationAutofocus(radar, search, polish), CorrectPulsePhase()),
+        rotation=Turn(UnevenRotation(radar, order, yc_m, scatterers)),
     )
 
 
