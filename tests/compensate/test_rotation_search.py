@@ -23,8 +23,8 @@ from torchsar.compensate import (
     newton_rotation,
     search_rotation,
 )
-from torchsar.compensate.rotation import Unknowns
-from torchsar.core import Chain, Draws, Estimate, Signal, use
+from torchsar.compensate.rotation import Unknowns, entropy_search
+from torchsar.core import Chain, Draws, Estimate, Outcome, Signal, use
 from torchsar.core.warp import shape_of, warp
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
@@ -194,7 +194,7 @@ def test_the_grid_search_returns_the_entropy_on_the_grid() -> None:
     assert found.ok and found.info["evaluations"] == 15 and found.info["entropy_grid_nats"].shape == (1, 5, 3)
     torch.testing.assert_close(found["warp_k"], K, atol=0, rtol=0)
     edge = search_rotation(of, [[OMEGA], [5.0, 10.0], [1000.0]])
-    assert not edge.ok and edge.info["on_edge"].tolist() == [False, True, False]
+    assert edge.outcome == Outcome.OUTSIDE_SEARCH and edge.info["on_edge"].tolist() == [False, True, False]
 
 
 def test_the_centre_deviation_is_found_jointly() -> None:
@@ -235,7 +235,7 @@ def test_uniform_rotation_is_not_improved() -> None:
     still = target(k=torch.zeros(2, dtype=F64))
     of = figure(still, range_term=False, oversampling=2.0)
     found = descend_rotation(of, of.start(0.0, torch.zeros(2, dtype=F64)))
-    assert not found.ok and found.quality < 0.02
+    assert found.quality < 0.02
     assert abs(float(found["k1_per_s"])) < 3, "24 points shift the minimum by less than this"
 
 
@@ -309,7 +309,7 @@ def test_invalid_input_is_rejected() -> None:
         figure(data.real)
     with pytest.raises(ValueError, match="NaN or Inf"):
         figure(data * torch.nan)
-    with pytest.raises(ValueError, match="range_m must hold the 8 coordinates"):
+    with pytest.raises(ValueError, match="range_m must be a tensor of the 8 coordinates"):
         figure(data[:, :8])
     with pytest.raises(ValueError, match="order must be 2 or more without the range term, got 1"):
         figure(data, order=1, range_term=False)
@@ -352,3 +352,31 @@ def test_a_search_that_uses_up_its_steps_is_not_ok() -> None:
     of = figure(target(), variables="shape")
     start = of.start(0.9 * OMEGA, 0.9 * K)
     assert not descend_rotation(of, start, steps=2).ok and not newton_rotation(of, start, steps=2).ok
+
+
+def test_values_do_not_depend_on_the_assessment(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = torch.stack([target(0), target(1)])
+    axes = [[OMEGA], [9.0, 10.0, 11.0], [900.0, 1000.0, 1100.0]]
+
+    def searches(**options: bool) -> list[Estimate]:
+        of = figure(data, oversampling=2.0)
+        start, box = of.start(OMEGA, 0.95 * K), (0.9 * TRUTH, 1.1 * TRUTH)
+        few = {"population": 6, "generations": 2, "draws": Draws(2)}
+        return [
+            search_rotation(of, axes, **options),
+            genetic_rotation(of, *box, **few, **options),
+            evolve_rotation(of, *box, **few, **options),
+            newton_rotation(of, start, steps=2, **options),
+            descend_rotation(of, start, steps=2, **options),
+        ]
+
+    def failing(*_: object) -> None:
+        raise AssertionError("the assessment was called")
+
+    assessed = searches()
+    monkeypatch.setattr(entropy_search, "judged_motion", failing)
+    for one, bare in zip(assessed, searches(assess=False), strict=True):
+        assert all(torch.equal(value, bare[key]) for key, value in one.value.items())
+        assert (bare.outcome == Outcome.NOT_ASSESSED).all()
+    codes = [set(one.outcome.tolist()) for one in assessed]
+    assert codes[0] == {Outcome.OK} and codes[3] == codes[4] == {Outcome.NOT_CONVERGED}

@@ -38,8 +38,9 @@ from torchsar.compensate import (
     rotating_autofocus,
     uneven_rotation,
 )
+from torchsar.compensate.rotation import recommended
 from torchsar.compensate.rotation.coarse import coarse_warp
-from torchsar.core import Alternate, Chain, Draws, Estimate, Signal, Turn, use
+from torchsar.core import Alternate, Chain, Draws, Estimate, Outcome, Signal, Turn, use
 from torchsar.core.warp import least_rate, warp
 from torchsar.echo import simulate_turntable
 from torchsar.focus import RangePhase
@@ -130,7 +131,7 @@ def test_a_peak_of_the_noise_does_not_show_the_rate() -> None:
     x, y, amplitude = points(1053, 12)
     clean = echo(x, 0.0 * y, amplitude)
     found = uneven_rotation((clean + noise_std(clean, 10.0) * noise(1053, *clean.shape)).to(torch.complex64), **OPTIONS)
-    assert found.info["scatterers"] > 12 and found.info["focused"] and not found.ok
+    assert found.info["scatterers"] > 12 and found.doubtful
 
 
 def test_each_step_reduces_the_error() -> None:
@@ -237,6 +238,31 @@ def test_undetermined_rotations_are_finite_and_not_ok(name: str) -> None:
         assert known <= (set() if name == "uneven" else {"one range cell"})
 
 
+def failing(*_: object) -> None:
+    raise AssertionError("the assessment was called")
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_values_do_not_depend_on_the_assessment(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = torch.stack([target(0), target(1, -5.0), noise(0, PULSES, 24)]).to(torch.complex64)
+    assessed = ESTIMATORS[name](data, **OPTIONS)
+    for judge in ("judged_fit", "judged_motion"):
+        monkeypatch.setattr(recommended, judge, failing)
+    bare = ESTIMATORS[name](data, **OPTIONS, assess=False)
+    assert all(torch.equal(value, bare[key]) for key, value in assessed.value.items())
+    assert not bare.std and (bare.outcome == Outcome.NOT_ASSESSED).all() and bare.ok.all()
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_outcomes_name_what_was_seen(name: str) -> None:
+    kinds = degenerate()
+    data = torch.stack([target(0), kinds["empty"], kinds["noise"], kinds["one point"]])
+    found = ESTIMATORS[name](data, **OPTIONS)
+    right, empty, nothing, alone = (Outcome(code) for code in found.outcome.tolist())
+    assert (right, empty) == (Outcome.OK, Outcome.EMPTY) and nothing == Outcome.NOISE
+    assert alone.is_doubtful
+
+
 def test_results_are_reproducible() -> None:
     data = targets(2, snr_db=0.0).to(torch.complex64)
     once, again = uneven_rotation(data, **OPTIONS), uneven_rotation(data.clone(), **OPTIONS)
@@ -300,18 +326,15 @@ def test_steps_without_noise_do_not_go_back_and_forth() -> None:
     assert (after / before - 1).abs().max() < 0.003
 
 
-def test_scatterers_side_by_side_do_not_widen_the_deviation() -> None:
-    """Five found in three Doppler cells of one range cell disagree, with opposite signs, as in the
-    last trial.
-    """
+def test_deviations_hold_where_scatterers_lie_side_by_side() -> None:
+    """Several scatterers in a few Doppler cells of one range cell share errors of the model."""
     radar = InverseRadar(LIGHT_M_S / WAVELENGTH, LIGHT_M_S / (2 * 0.45), 24e3)
-    world = TurntableWorld(Satellite(60, 0.3, 2.6), rotation=PolynomialRotation(OMEGA, K.tolist()), snr_db=40.0)
-    recording, _ = simulate_turntable(radar, world, 480, 16, Draws(1175, trials=range(17)))
+    world = TurntableWorld(Satellite(60, 0.3, 2.6), rotation=PolynomialRotation(OMEGA, K.tolist()), snr_db=20.0)
+    recording, _ = simulate_turntable(radar, world, 480, 16, Draws(1175, trials=range(20)))
     found = UnevenRotation(radar)(recording.signal)
     error, std = found["k1_per_s"] - K[0], found.std["k1_per_s"]
     true, predicted = (x[found.ok].square().mean().sqrt() for x in (error, std))
     assert found.ok.sum() >= 15 and true / 1.5 < predicted < 1.5 * true
-    assert found.ok[-1] and std[-1] < 1.5 * true
 
 
 def pulse_phases() -> Tensor:

@@ -32,7 +32,9 @@ def _entropy(
     return ImageEntropy(data, settings, wavelength_m=wavelength_m, prf_hz=prf_hz, range_m=range_m)
 
 
-def descent_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **known: object) -> Estimate:
+def descent_near_truth(
+    data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, assess: bool = True, **known: object
+) -> Estimate:
     """Estimate a rotation by a descent of the image entropy that starts at 0.95 of the true values.
 
     Args:
@@ -40,16 +42,19 @@ def descent_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **know
         omega_rad_s: True rotation rate at the first pulse in rad/s, shape (...,).
         warp_k: True derivatives k1, k2, ... of the rotation rate at the first pulse, divided by
             that rate, in 1/s, 1/s^2, ..., shape (..., coefficient).
+        assess: False leaves out the assessment.
         known: The arguments wavelength_m, prf_hz, range_m, yc_m and order of `uneven_rotation`.
 
     Returns:
         The `Estimate` that the function `descend_rotation` returns.
     """
     objective = _entropy(data, "shape", **known)  # pyright: ignore[reportArgumentType]
-    return descend_rotation(objective, objective.start(0.95 * omega_rad_s, 0.95 * warp_k, None))
+    return descend_rotation(objective, objective.start(0.95 * omega_rad_s, 0.95 * warp_k, None), assess=assess)
 
 
-def genetic_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **known: object) -> Estimate:
+def genetic_near_truth(
+    data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, assess: bool = True, **known: object
+) -> Estimate:
     """Estimate a rotation by a genetic algorithm that searches within 10 % of the true values.
 
     The image entropy is minimised with 10 individuals in 4 generations.
@@ -59,6 +64,7 @@ def genetic_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **know
         omega_rad_s: True rotation rate at the first pulse in rad/s, shape (...,).
         warp_k: True derivatives k1, k2, ... of the rotation rate at the first pulse, divided by
             that rate, in 1/s, 1/s^2, ..., shape (..., coefficient).
+        assess: False leaves out the assessment.
         known: The arguments wavelength_m, prf_hz, range_m, yc_m and order of `uneven_rotation`.
 
     Returns:
@@ -68,4 +74,4 @@ def genetic_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **know
     centre = torch.cat([omega_rad_s[..., None], warp_k], -1)
     box = _PART * torch.where(centre != 0, centre.abs(), 1)
     size = {"population": _POPULATION, "generations": _GENERATIONS}
-    return genetic_rotation(objective, centre - box, centre + box, draws=Draws(1), **size)
+    return genetic_rotation(objective, centre - box, centre + box, draws=Draws(1), assess=assess, **size)

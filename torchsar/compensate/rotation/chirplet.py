@@ -138,15 +138,13 @@ class _Search:
     """Search for the strongest chirp of each row (..., pulse).
 
     Frequencies are in cycles per pulse, rates in cycles per pulse squared, times from the middle of
-    the aperture. step: spacing of the coarse rates, such that a chirp half of it away drifts by
-    half a Doppler cell of the segments.
+    the aperture.
     """
 
     n: int
     segments: int
     part: int
     rates: Tensor
-    step: float
 
     @staticmethod
     def of(n: int, sweep: float, like: Tensor) -> _Search:
@@ -161,10 +159,11 @@ class _Search:
             The search, with its coarse rates.
         """
         segments = max(4, 2 ** round(math.log2(n) / 2))
+        # a chirp half of a step away drifts by half a Doppler cell of the segments
         step = segments / n**2
         count = math.ceil(sweep / n / step)
         rates = step * torch.arange(-count, count + 1, dtype=torch.float64, device=like.device)
-        return _Search(n, segments, -(-n // (_PARTS * segments)), rates, step)
+        return _Search(n, segments, -(-n // (_PARTS * segments)), rates)
 
     @property
     def middle(self) -> float:

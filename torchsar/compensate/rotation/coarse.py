@@ -11,7 +11,6 @@ compensated data, with longer sections, which resolve scatterers better.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -39,40 +38,6 @@ _ROWS = 16  # range cells of most energy that are used, found by trial: accuracy
 # then left, found by trial
 _FEWER_SECTIONS, _LEFT = (6, 4, 4), 0.35
 _LEAST_RATE = 0.1  # least rate over that at the start; slower targets would nearly reverse
-
-
-@dataclass(frozen=True)
-class _Agreement:
-    """Correlations of pairs of sections as a function of their shift.
-
-    table: (trial, pair, shift) for shifts of -reach..reach steps. first, second: sections of the
-    pairs.
-    """
-
-    table: Tensor
-    first: Tensor
-    second: Tensor
-
-    def at(self, log_rate: Tensor) -> Tensor:
-        """Compute how well the spectra of all pairs of sections agree with candidate rates.
-
-        Args:
-            log_rate: Logarithm of the rotation rate in each section, shape (trial, candidate,
-                section).
-
-        Returns:
-            The sum of the correlations over the pairs, shape (trial, candidate); larger is better.
-        """
-        reach = (self.table.shape[-1] - 1) // 2
-        shift = (log_rate[..., self.second] - log_rate[..., self.first]) * _STEPS_PER_UNIT + reach
-        shift = shift.clamp(1, 2 * reach - 1 - 1e-3)
-        whole = shift.floor().long()
-        x = (shift - whole).to(self.table.dtype)
-        position = (torch.arange(len(self.first), device=shift.device) * self.table.shape[-1] + whole).flatten(1)
-        flat = self.table.flatten(1)
-        a, b, c, d = (torch.gather(flat, 1, position + step).view(shift.shape) for step in (-1, 0, 1, 2))
-        # through four points: a maximum between steps is not moved to one of them
-        return (b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a)))).sum(-1)
 
 
 def coarse_warp(data: Tensor, prf_hz: float) -> Tensor:
@@ -116,28 +81,64 @@ def coarse_warp(data: Tensor, prf_hz: float) -> Tensor:
 def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -> Tensor:
     """k1 and k2 (trial, 2) with which the spectra of sections agree best.
 
-    widest: largest logarithm of a ratio of rates that is searched.
+    A candidate is the pair of the logarithms of the rates in the middle and at the end of the
+    aperture over that at the first pulse. widest: largest logarithm that is searched.
     """
-    pulses = rows.shape[1]
-    length = 2 * (pulses // (sections + 1))
+    pulses, like = rows.shape[1], {"dtype": torch.float64, "device": rows.device}
+    length, duration_s = 2 * (pulses // (sections + 1)), pulses / prf_hz
     spectra = _log_spectra(rows, length)
-    middles = (
-        torch.arange(spectra.shape[1], dtype=torch.float64, device=rows.device) * (length // 2) + (length - 1) / 2
-    ) / prf_hz
-    rates = _ThirdOrderRate(middles, pulses / prf_hz)
-    step = torch.arange(-widest, widest + 1e-9, _GRID, dtype=torch.float64, device=rows.device)
+    # correlations of all pairs of sections that share no pulse
+    transform = torch.fft.rfft(spectra, 2 * spectra.shape[-1]).permute(0, 3, 1, 2).contiguous()
+    first, second = torch.tril_indices(spectra.shape[1], spectra.shape[1], -2, device=rows.device)
+    products = (transform @ transform.mH)[..., second, first].mT
+    middles = (torch.arange(spectra.shape[1], **like) * (length // 2) + (length - 1) / 2) / prf_hz
+    times = torch.linspace(0, duration_s, 33, **like)
+
+    def best_of(candidates: Tensor, table: Tensor, count: int) -> Tensor:
+        """The `count` best of candidates (trial, candidate, 2), per trial."""
+        k = _third_order(torch.exp(candidates), duration_s)
+        rate = torch.log(warp_rate(middles, k).clamp_min(_LEAST_RATE))
+        score = _agreement(table, rate[..., second] - rate[..., first]).to(torch.float64)
+        score = torch.where(warp_rate(times, k).amin(-1) > _LEAST_RATE, score, -math.inf)
+        return torch.gather(candidates, 1, score.topk(count, -1).indices[..., None].expand(-1, -1, 2))
+
+    step = torch.arange(-widest, widest + 1e-9, _GRID, **like)
     best = torch.cartesian_prod(step, step).expand(rows.shape[0], -1, -1)
-    products, first, second = _products(spectra)
-    best = _best(best, _agreement(products, first, second, _BLUR), rates, _KEPT)
+    best = best_of(best, _correlations(products, _BLUR), _KEPT)
     # the maximum is flat: rounding in single precision would move it
-    agreement = _agreement(products.to(torch.complex128), first, second, 0.0)
-    nearby = torch.cartesian_prod(*2 * [torch.linspace(-1, 1, 5, dtype=torch.float64, device=rows.device)])
+    table = _correlations(products.to(torch.complex128), 0.0)
+    nearby = torch.cartesian_prod(*2 * [torch.linspace(-1, 1, 5, **like)])
     size, kept = _GRID, _KEPT
     for _ in range(_ROUNDS):
         kept = max(1, kept // 2)
-        best = _best((best[:, :, None] + size * nearby).flatten(1, 2), agreement, rates, kept)
+        best = best_of((best[:, :, None] + size * nearby).flatten(1, 2), table, kept)
         size /= 2
-    return rates.warp_k(best[:, 0])
+    return _third_order(torch.exp(best[:, 0]), duration_s)
+
+
+def _correlations(transform: Tensor, blur: float) -> Tensor:
+    """Correlations of pairs of sections (trial, pair, shift) for shifts of -reach..reach steps.
+
+    transform: those correlations over frequency. blur: in the logarithm of Doppler.
+    """
+    n = 2 * (transform.shape[-1] - 1)
+    frequency = torch.arange(transform.shape[-1], device=transform.device) / n
+    smooth = torch.exp(-0.5 * (2 * math.pi * frequency * blur * _STEPS_PER_UNIT).square()).to(transform.real.dtype)
+    table = torch.fft.irfft(transform * smooth, n)
+    reach = min(math.ceil(_WIDEST * _STEPS_PER_UNIT), n // 2 - 1)
+    return torch.cat([table[..., -reach:], table[..., : reach + 1]], -1)
+
+
+def _agreement(table: Tensor, log_ratio: Tensor) -> Tensor:
+    """Sum (trial, candidate) of the correlations of pairs at a shift (trial, candidate, pair)."""
+    reach = (table.shape[-1] - 1) // 2
+    shift = (log_ratio * _STEPS_PER_UNIT + reach).clamp(1, 2 * reach - 1 - 1e-3)
+    whole = shift.floor().long()
+    x, flat = (shift - whole).to(table.dtype), table.flatten(1)
+    position = (torch.arange(table.shape[1], device=shift.device) * table.shape[-1] + whole).flatten(1)
+    a, b, c, d = (torch.gather(flat, 1, position + step).view(shift.shape) for step in (-1, 0, 1, 2))
+    # through four points: a maximum between steps is not moved to one of them
+    return (b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a)))).sum(-1)
 
 
 def _image(rows: Tensor, prf_hz: float, k: Tensor) -> Tensor:
@@ -159,49 +160,6 @@ def _third_order(rates: Tensor, duration_s: float) -> Tensor:
     middle, end = rates.unbind(-1)
     k2 = 4 * (end - 2 * middle + 1) / duration_s**2
     return torch.stack([(end - 1) / duration_s - k2 * duration_s / 2, k2], -1)
-
-
-@dataclass(frozen=True)
-class _ThirdOrderRate:
-    """Rotation rates of third order.
-
-    They are given by the logarithms of the rate in the middle and at the end of the aperture over
-    that at its start.
-    """
-
-    middles_s: Tensor
-    duration_s: float
-
-    def warp_k(self, logs: Tensor) -> Tensor:
-        """Compute k1 (1/s) and k2 (1/s^2), shape (..., 2), from logarithms of rates.
-
-        The logarithms are those of the rates in the middle and at the end of the aperture, relative
-        to the rate at the first pulse, shape (..., 2).
-        """
-        return _third_order(torch.exp(logs), self.duration_s)
-
-    def log_rate(self, logs: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the logarithm of the rotation rate in the middle of every section.
-
-        Args:
-            logs: Logarithms of the rates in the middle and at the end of the aperture, relative to
-                the rate at the first pulse, shape (..., 2).
-
-        Returns:
-            The logarithms relative to the rate at the first pulse, shape (..., section); and True
-            where the rate stays above a tenth of that at the first pulse over the whole aperture,
-            shape (...,), bool.
-        """
-        k = self.warp_k(logs)
-        ends = torch.linspace(0, self.duration_s, 33, dtype=torch.float64, device=logs.device)
-        return torch.log(warp_rate(self.middles_s, k).clamp_min(_LEAST_RATE)), warp_rate(ends, k).amin(-1) > _LEAST_RATE
-
-
-def _best(candidates: Tensor, agreement: _Agreement, rates: _ThirdOrderRate, count: int) -> Tensor:
-    """The `count` best of candidates (trial, candidate, 2), per trial."""
-    log_rate, valid = rates.log_rate(candidates)
-    score = torch.where(valid, agreement.at(log_rate).to(torch.float64), -math.inf)
-    return torch.gather(candidates, 1, score.topk(count, -1).indices[..., None].expand(-1, -1, 2))
 
 
 def _brightest(data: Tensor, count: int) -> Tensor:
@@ -230,23 +188,3 @@ def _log_spectra(data: Tensor, length: int) -> Tensor:
     )
     both = torch.cat([positive, negative], 2)
     return both - both.mean(-1, keepdim=True)
-
-
-def _products(spectra: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Transforms of the correlations of all pairs of sections that share no pulse.
-
-    (trial, pair, frequency), and the sections of each pair.
-    """
-    transform = torch.fft.rfft(spectra, 2 * spectra.shape[-1]).permute(0, 3, 1, 2).contiguous()
-    first, second = torch.tril_indices(transform.shape[2], transform.shape[2], -2, device=spectra.device)
-    return (transform @ transform.mH)[..., second, first].mT, first, second
-
-
-def _agreement(transform: Tensor, first: Tensor, second: Tensor, blur: float) -> _Agreement:
-    """Correlations of the pairs, blurred by `blur` in the logarithm of Doppler."""
-    n = 2 * (transform.shape[-1] - 1)
-    frequency = torch.arange(transform.shape[-1], device=transform.device) / n
-    smooth = torch.exp(-0.5 * (2 * math.pi * frequency * blur * _STEPS_PER_UNIT).square()).to(transform.real.dtype)
-    table = torch.fft.irfft(transform * smooth, n)
-    reach = min(math.ceil(_WIDEST * _STEPS_PER_UNIT), n // 2 - 1)
-    return _Agreement(torch.cat([table[..., -reach:], table[..., : reach + 1]], -1), first, second)

@@ -100,16 +100,17 @@ class Neighbours:
         flat = values.new_zeros(self.shape[0] * self.shape[1], values.shape[-1])
         return flat.index_add(0, self.trial * self.shape[1] + self.first, values).unflatten(0, self.shape)
 
-    def per_trial(self, values: Tensor) -> Tensor:
-        """Sum values of pairs over all pairs of a trial.
+    def over_range(self, first: Tensor, second: Tensor) -> Tensor:
+        """Compute inner products over range of functions of the two scatterers of each pair.
 
         Args:
-            values: Values per pair, shape (pair, n, m).
+            first: Functions of the first scatterers, shape (trial, scatterer, range), complex.
+            second: Functions of the second scatterers, same shape.
 
         Returns:
-            The sums, shape (trial, n, m).
+            The sums of conj(first) * second for each pair, shape (pair,).
         """
-        return values.new_zeros(self.shape[0], *values.shape[1:]).index_add(0, self.trial, values)
+        return (first.conj() @ second.mT)[self.trial, self.first, self.second]
 
 
 def inner_products(

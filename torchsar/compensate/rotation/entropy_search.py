@@ -6,17 +6,19 @@ L-BFGS.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from torchsar.compensate.rotation.assess import judged_motion
 from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
-from torchsar.compensate.rotation.unknowns import k_name, uniform_rotation
-from torchsar.compensate.rotation.verdicts import MOST_PHASE_ERROR_RAD
-from torchsar.core import Draws, Estimate, Outcome, Signal, Stage, settle
+from torchsar.compensate.rotation.motion import Motion, each
+from torchsar.compensate.rotation.unknowns import RotationParameters, k_name, uniform_rotation, values_of
+from torchsar.core import Draws, Estimate, Outcome, Signal, Stage, worst
 from torchsar.optim import Descent, Searched, differential_evolution, genetic, grid_search, lbfgs, newton
 from torchsar.radar import InverseRadar
 
@@ -25,9 +27,6 @@ Vector = Sequence[float] | Tensor
 # share of the width of a box from its edge within which a minimum is taken to lie outside, a
 # convention
 _EDGE = 1e-3
-# least fall of the entropy that counts as an effect of the compensation, found by trial: a smaller
-# one would accept more wrong results, a larger one reject more small effects
-_GAIN_NATS = 0.01
 # relative change of the entropy at which a descent ends, near its rounding
 _ROUNDING = {torch.complex64: 1e-8, torch.complex128: 1e-9}
 _FIRST_STEP = 0.3  # first step of a descent in units of the unknowns, of about a radian each
@@ -38,7 +37,9 @@ _FOR_NEWTON = EntropyObjective(taps=6)
 _FOR_DESCENT = EntropyObjective(variables="shape")
 
 
-def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int = 100_000) -> Estimate:
+def search_rotation(
+    figure: ImageEntropy, axes: Sequence[Vector], *, limit: int = 100_000, assess: bool = True
+) -> Estimate:
     """Find the rotation of least image entropy on a full grid.
 
     The grid of Remote Sens. 2025, 17, 3447 has 5 x 21 x 201 points.
@@ -47,28 +48,34 @@ def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int 
         figure: Image entropy as a function of the unknowns of the rotation.
         axes: Values of each unknown, shape (m,), or (..., m) per trial.
         limit: Largest number of grid points per trial.
+        assess: False leaves out the assessment.
 
     Returns:
         `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
         the range centre deviation. `genetic_rotation` describes these values and quality in full.
-        `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
-        bright scatterers do not confirm the result (see `genetic_rotation`),
-        or the best point lies on the edge of the grid. info["entropy_grid_nats"], shape (..., m_1,
-        m_2, ...), is the entropy on the grid.
+        The outcome is OUTSIDE_SEARCH where the best point lies on the edge of the grid.
+        info["entropy_grid_nats"], shape (..., m_1, m_2, ...), is the entropy on the grid.
 
     Raises:
         ValueError: If there is not one list of values per unknown, or the grid exceeds the limit.
     """
-    _check_axes(figure, axes, "search_rotation")
+    names = figure.unknowns.names
+    if len(axes) != len(names):
+        raise ValueError(
+            f"search_rotation: axes must hold a list of values for each of the {len(names)} unknowns "
+            f"{', '.join(names)}, got {len(axes)} lists"
+        )
     values = [torch.as_tensor(axis, dtype=torch.float64, device=figure.range_m.device) for axis in axes]
     found = grid_search(figure, values, trials=figure.trials, limit=limit)
     ends = [(axis.amin(-1).expand(figure.trials), axis.amax(-1).expand(figure.trials)) for axis in values]
     low, high = (torch.stack(list(bounds), -1) for bounds in zip(*ends, strict=True))
-    return _of_box(figure, found, low, high, entropy_grid_nats=found.history)
+    return _of_box(figure, found, low, high, assess, entropy_grid_nats=found.history)
 
 
-def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: Draws, **options: Any) -> Estimate:
+def genetic_rotation(
+    figure: ImageEntropy, low: Vector, high: Vector, *, draws: Draws, assess: bool = True, **options: Any
+) -> Estimate:
     """Find the rotation of least image entropy in a box by a genetic algorithm.
 
     This is the published estimator, see Reference.
@@ -78,6 +85,7 @@ def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: 
         low: Lower bounds, one per unknown (`figure.unknowns.names`), shape (n,) or (..., n).
         high: Upper bounds, same shape.
         draws: Source of random numbers, see `torchsar.optim.genetic`.
+        assess: False leaves out the assessment.
         options: Options of `torchsar.optim.genetic`.
 
     Returns:
@@ -90,13 +98,10 @@ def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: 
         range. There are no standard deviations, because an entropy is not a likelihood.
 
         quality is the relative decrease of exp(entropy), the number of cells that the image fills,
-        due to the compensation. `ok` is False where the entropy decreases by less than 0.01 nats,
-        where the minimum lies on the edge of the box, or where at least 3 bright scatterers do not
-        confirm k1, k2, ...: info["phase_error_rad"], the phase error that their phase histories, or
-        else a joint fit of all scatterers, show for the scatterer farthest from zero Doppler, plus
-        two of its standard deviations, must be below 0.47 rad rms. Below third order it includes
-        what a rotation of third order would correct. `ok` does not refer to `omega_rad_s` and
-        `yc_m`: with few image lines they are biased, see `EntropyObjective`.
+        due to the compensation. Outcomes: those of `coarse_rotation`, OUTSIDE_SEARCH if the minimum
+        lies on the edge of the box, and NOT_CONVERGED. They do not refer to `omega_rad_s` and
+        `yc_m`: with few image lines these are biased, see `EntropyObjective`. Below third order
+        PARTS_DISAGREE includes what a rotation of third order would correct.
 
         info holds the number of evaluations; entropy_nats and uncompensated_entropy_nats, the
         entropy with and without compensation; on_edge, shape (..., n), True for unknowns on the
@@ -111,10 +116,12 @@ def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: 
     """
     low, high = _box(figure, low, high)
     found = genetic(figure, low, high, draws=draws, **options)
-    return _of_box(figure, found, low, high, best_entropy_nats=found.history)
+    return _of_box(figure, found, low, high, assess, best_entropy_nats=found.history)
 
 
-def evolve_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: Draws, **options: Any) -> Estimate:
+def evolve_rotation(
+    figure: ImageEntropy, low: Vector, high: Vector, *, draws: Draws, assess: bool = True, **options: Any
+) -> Estimate:
     """Find the rotation of least image entropy in a box by differential evolution.
 
     Args:
@@ -122,23 +129,26 @@ def evolve_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: D
         low: Lower bounds, one per unknown, shape (n,) or (..., n).
         high: Upper bounds, same shape.
         draws: Source of random numbers, see `torchsar.optim.differential_evolution`.
+        assess: False leaves out the assessment.
         options: Options of `torchsar.optim.differential_evolution`.
 
     Returns:
         `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
-        the range centre deviation. `genetic_rotation` describes these values, quality, `ok` and
-        info in full.
+        the range centre deviation. `genetic_rotation` describes these values, quality,
+        outcomes and info in full.
 
     Raises:
         ValueError: If there is not one bound per unknown, or an option is invalid.
     """
     low, high = _box(figure, low, high)
     found = differential_evolution(figure, low, high, draws=draws, **options)
-    return _of_box(figure, found, low, high, best_entropy_nats=found.history)
+    return _of_box(figure, found, low, high, assess, best_entropy_nats=found.history)
 
 
-def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True, steps: int = 20) -> Estimate:
+def newton_rotation(
+    figure: ImageEntropy, start: Tensor, *, damped: bool = True, steps: int = 20, assess: bool = True
+) -> Estimate:
     """Find a rotation of least image entropy near a start by Newton's method.
 
     Remote Sens. 2025, 17, 3447 calls this method Gauss-Newton. Table 2 of that paper shows that the
@@ -151,15 +161,14 @@ def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True,
         damped: True damps the steps. Undamped steps diverge on most targets, even from the true
             rotation, because the entropy is nearly flat in one direction.
         steps: Largest number of steps.
+        assess: False leaves out the assessment.
 
     Returns:
         `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
         the range centre deviation. `genetic_rotation` describes these values and quality in full.
-        `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
-        bright scatterers do not confirm the result (see `genetic_rotation`),
-        where the search diverges (the result is then its last finite point), or where it has not
-        converged after `steps` steps. info["iterations"] is the number of steps.
+        The outcome is NOT_CONVERGED where the search diverges (the result is then its last finite
+        point) or has not converged after `steps` steps. info["iterations"] is the number of steps.
 
     Raises:
         ValueError: If the start does not have one value per unknown.
@@ -167,13 +176,14 @@ def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True,
     Reference:
         Remote Sens. 2025, 17, 3447, Table 2.
     """
-    scaled = _Scaled(figure, _feasible_start(figure, start))
-    return _of_descent(
-        figure, scaled, newton(scaled.single, scaled.start, damped=damped, steps=steps), steps, use_own_ok=True
-    )
+    x, unit = _scaled(figure, start)
+    found = newton(lambda z: figure.single(z * unit), x, damped=damped, steps=steps)
+    return _of_descent(figure, found, unit, ~found.ok, steps, assess)
 
 
-def descend_rotation(figure: ImageEntropy, start: Tensor, *, steps: int = 60, tolerance: float = 1e-4) -> Estimate:
+def descend_rotation(
+    figure: ImageEntropy, start: Tensor, *, steps: int = 60, tolerance: float = 1e-4, assess: bool = True
+) -> Estimate:
     """Find a rotation of least image entropy near a start by L-BFGS with exact gradients.
 
     The search converges best if `variables` of the `EntropyObjective` is "shape", see `Unknowns`.
@@ -190,96 +200,96 @@ def descend_rotation(figure: ImageEntropy, start: Tensor, *, steps: int = 60, to
         steps: Largest number of steps.
         tolerance: A trial ends when the norm of its gradient is at most this fraction of that at
             the start.
+        assess: False leaves out the assessment.
 
     Returns:
         `warp_k`, the relative derivatives of the rotation rate. If `figure` compensates the
         range-dependent phase, also `omega_rad_s`, the rotation rate at the first pulse, and `yc_m`,
         the range centre deviation. `genetic_rotation` describes these values and quality in full.
-        `ok` is False where the entropy is not at least 0.01 nats lower than without compensation,
-        bright scatterers do not confirm the result (see `genetic_rotation`),
-        or where a trial has not converged after `steps` steps.
+        The outcome is NOT_CONVERGED where a trial has not converged after `steps` steps.
 
     Raises:
         ValueError: If the start does not have one value per unknown.
     """
-    scaled = _Scaled(figure, _feasible_start(figure, start))
+    x, unit = _scaled(figure, start)
+
+    def with_gradient(z: Tensor) -> tuple[Tensor, Tensor]:
+        cost, gradient = figure.with_gradient(z * unit)
+        return cost, gradient * unit
+
     found = lbfgs(
-        scaled.with_gradient,
-        scaled.start,
+        with_gradient,
+        x,
         steps=steps,
         first_step=_FIRST_STEP,
         gradient_tolerance=tolerance,
         value_tolerance=_ROUNDING[figure.dtype],
         with_gradient=True,
     )
-    return _of_descent(figure, scaled, found, steps, use_own_ok=False)
+    # its own verdict also reports infeasible candidates on its path
+    return _of_descent(figure, found, unit, ~torch.isfinite(found.cost), steps, assess)
 
 
-class _Scaled:
-    """An entropy in units that make its unknowns about one."""
+def _scaled(figure: ImageEntropy, start: Tensor) -> tuple[Tensor, Tensor]:
+    """A start (..., n) in units that make the unknowns about one, and these units.
 
-    def __init__(self, figure: ImageEntropy, start: Tensor) -> None:
-        self._figure, self.unit = figure, figure.units(start)
-        self.start = start / self.unit
-
-    def single(self, z: Tensor) -> Tensor:
-        """Entropy of one vector per trial."""
-        return self._figure.single(z * self.unit)
-
-    def with_gradient(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Entropy of one vector per trial and its gradient."""
-        cost, gradient = self._figure.with_gradient(z * self.unit)
-        return cost, gradient * self.unit
-
-
-def _of_box(figure: ImageEntropy, found: Searched, low: Tensor, high: Tensor, **info: Tensor) -> Estimate:
-    """Estimate from a search in a box; not ok where the best point lies on its edge."""
-    width = high - low
-    near = torch.minimum(found.x - low, high - found.x) <= _EDGE * width
-    edge = near & (width > 0)
-    return _estimate(
-        figure,
-        found.x,
-        found.cost,
-        found.ok & ~edge.any(-1),
-        {"evaluations": found.evaluations, "on_edge": edge, **info},
-    )
-
-
-def _of_descent(figure: ImageEntropy, scaled: _Scaled, found: Descent, steps: int, use_own_ok: bool) -> Estimate:
-    """Estimate from a descent; not ok where the steps are used up.
-
-    use_own_ok: whether the verdict of the descent counts. That of L-BFGS also reports infeasible
-    candidates on its path and does not count.
+    Uniform rotation takes the place of a rotation that stops or reverses.
     """
-    ok = (found.ok if use_own_ok else torch.isfinite(found.cost)) & (found.converged | (found.steps < steps))
-    return _estimate(
-        figure,
-        found.x * scaled.unit,
-        found.cost,
-        ok,
-        {"evaluations": found.evaluations, "iterations": found.steps, "converged": found.converged},
-    )
+    x = figure.spread(figure.unknowns.vector(start, "start").detach())
+    x = torch.where(figure.turn(x).feasible[..., None], x, 0)
+    unit = figure.units(x)
+    return x / unit, unit
 
 
-def _estimate(figure: ImageEntropy, x: Tensor, cost: Tensor, ok: Tensor, info: dict[str, Tensor]) -> Estimate:
-    """Estimate from the best vectors and their entropies."""
-    rotation, before = figure.turn(x.detach()), figure.uncompensated()
-    cost, finite = settle(cost.detach(), before)
-    gain = before - cost
-    value = {"warp_k": rotation.warp_k, **{k_name(i + 1): k for i, k in enumerate(rotation.warp_k.unbind(-1))}}
-    if figure.unknowns.range_term:
-        value |= {"omega_rad_s": rotation.omega_rad_s.abs(), "yc_m": rotation.yc_m.clone()}
-    quality = (1 - torch.exp(-gain)).clamp(0, 1)
-    error = figure.phase_error(rotation)
-    return Estimate(
-        value,
-        quality=quality,
-        outcome=Outcome.of(
-            ok & finite & rotation.feasible & (gain > _GAIN_NATS) & (error < MOST_PHASE_ERROR_RAD), Outcome.NOISE
-        ),
-        info={**info, "entropy_nats": cost, "uncompensated_entropy_nats": before, "phase_error_rad": error},
-    )
+def _of_box(figure: ImageEntropy, found: Searched, low: Tensor, high: Tensor, assess: bool, **info: Tensor) -> Estimate:
+    """Estimate from a search in a box."""
+    width = high - low
+    edge = (torch.minimum(found.x - low, high - found.x) <= _EDGE * width) & (width > 0)
+    doubts = worst((Outcome.NOT_CONVERGED, ~found.ok), (Outcome.OUTSIDE_SEARCH, edge.any(-1)))
+    info |= {"evaluations": found.evaluations, "on_edge": edge}
+    return _estimate(figure, found.x, found.cost, doubts, info, assess)
+
+
+def _of_descent(
+    figure: ImageEntropy, found: Descent, unit: Tensor, diverged: Tensor, steps: int, assess: bool
+) -> Estimate:
+    """Estimate from a descent."""
+    doubts = worst((Outcome.NOT_CONVERGED, diverged | ~(found.converged | (found.steps < steps))))
+    info = {"evaluations": found.evaluations, "iterations": found.steps, "converged": found.converged}
+    return _estimate(figure, found.x * unit, found.cost, doubts, info, assess)
+
+
+def _estimate(
+    figure: ImageEntropy, x: Tensor, cost: Tensor, doubts: Tensor, info: dict[str, Tensor], assess: bool
+) -> Estimate:
+    """Estimate from the best vectors, their entropies and the doubts of the search."""
+    rotation, cost = figure.turn(x.detach()), cost.detach()
+    value = values_of(rotation.omega_rad_s.abs(), rotation.warp_k, rotation.yc_m)
+    if not figure.unknowns.range_term:
+        value = {name: value[name] for name in value if name not in ("omega_rad_s", "yc_m")}
+    info = {**info, "entropy_nats": cost}
+    if not assess:
+        return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(cost), info=info)
+    before = figure.uncompensated()
+    cost = torch.where(torch.isfinite(cost), cost, before)
+    outcome, error = _judged(figure, rotation)
+    outcome = torch.maximum(outcome, torch.maximum(doubts, worst((Outcome.NOT_CONVERGED, ~rotation.feasible))))
+    info |= {"entropy_nats": cost, "uncompensated_entropy_nats": before, "phase_error_rad": error}
+    return Estimate(value, quality=(1 - torch.exp(cost - before)).clamp(0, 1), outcome=outcome, info=info)
+
+
+def _judged(figure: ImageEntropy, rotation: RotationParameters) -> tuple[Tensor, Tensor]:
+    """Outcomes and phase errors (...,) of rotations, as bright scatterers show them."""
+    w = rotation.omega_rad_s.square().reshape(-1)
+    k = rotation.warp_k.reshape(len(w), -1)
+    motion = Motion(k, w, w * rotation.yc_m.reshape(-1), torch.zeros_like(w))
+    with torch.no_grad():
+        parts = [
+            judged_motion(figure.rows[i], figure.sampling, each(lambda x, i=i: x[i], motion))
+            for i in figure.blocks(len(w))
+        ]
+    outcome = torch.cat([part.outcome for part in parts]).reshape(figure.trials)
+    return outcome, torch.cat([part.info["phase_error_rad"] for part in parts]).reshape(figure.trials)
 
 
 def _box(figure: ImageEntropy, low: Vector, high: Vector) -> tuple[Tensor, Tensor]:
@@ -287,29 +297,14 @@ def _box(figure: ImageEntropy, low: Vector, high: Vector) -> tuple[Tensor, Tenso
     return figure.spread(figure.unknowns.vector(low, "low")), figure.spread(figure.unknowns.vector(high, "high"))
 
 
-def _feasible_start(figure: ImageEntropy, start: Tensor) -> Tensor:
-    """A start (..., n) for every trial; uniform rotation where its own warp is not monotonic."""
-    x = figure.spread(figure.unknowns.vector(start, "start").detach())
-    rotation = figure.turn(x)
-    return torch.where(rotation.feasible[..., None], x, 0)
-
-
-def _check_axes(figure: ImageEntropy, axes: Sequence[Any], who: str) -> None:
-    """Raise ValueError unless there is one list of values per unknown."""
-    names = figure.unknowns.names
-    if len(axes) != len(names):
-        raise ValueError(
-            f"{who}: axes must hold a list of values for each of the {len(names)} unknowns {', '.join(names)}, got "
-            f"{len(axes)} lists"
-        )
-
-
 class _Search(Stage):
-    """A search for the rotation that minimises an image entropy."""
+    """A search for the rotation that minimises an image entropy, by one of the functions above."""
 
-    def __init__(self, radar: InverseRadar, objective: EntropyObjective) -> None:
+    def __init__(
+        self, radar: InverseRadar, objective: EntropyObjective, find: Callable[..., Estimate], assess: bool
+    ) -> None:
         super().__init__()
-        self.radar, self.objective = radar, objective
+        self.radar, self.objective, self.find, self.assess = radar, objective, find, assess
         self.provides = (
             "warp_k",
             *(k_name(i) for i in range(1, objective.order)),
@@ -331,6 +326,19 @@ class _Search(Stage):
         known = self.objective.yc_m if yc_m is None or self.objective.yc_m is None else yc_m
         return ImageEntropy.of(signal, self.radar, replace(self.objective, yc_m=known))
 
+    def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
+        """Estimate the rotation from a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), known a priori, shape (...,).
+
+        Returns:
+            The `Estimate` of the function that the description of the stage names.
+        """
+        return self.find(self.figure(signal, yc_m), assess=self.assess)
+
 
 class RotationSearch(_Search):
     """Rotation of least image entropy on a grid; see `search_rotation`.
@@ -349,6 +357,7 @@ class RotationSearch(_Search):
             deviation), this value replaces that of the settings, unless the settings make it an
             unknown.
         limit: Largest number of grid points per trial.
+        assess: False leaves out the assessment.
 
     Raises:
         ValueError: If low, high and counts differ in length, or a count is below 1.
@@ -362,28 +371,15 @@ class RotationSearch(_Search):
         counts: list[int],
         objective: EntropyObjective = _PUBLISHED,
         limit: int = 100_000,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, objective)
         if not len(low) == len(high) == len(counts) or any(count < 1 for count in counts):
             raise ValueError(
                 "low, high and counts must hold one entry per unknown, with counts of 1 or more, got "
                 f"low {list(low)}, high {list(high)} and counts {list(counts)}"
             )
-        self.axes = [torch.linspace(a, b, n, dtype=torch.float64) for a, b, n in zip(low, high, counts, strict=True)]
-        self.limit = limit
-
-    def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
-        """Estimate the rotation from a signal of axes (pulse, range).
-
-        Args:
-            signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-                rotation centre), known a priori, shape (...,).
-
-        Returns:
-            The `Estimate` that the function `search_rotation` returns.
-        """
-        return search_rotation(self.figure(signal, yc_m), self.axes, limit=self.limit)
+        axes = [torch.linspace(a, b, n, dtype=torch.float64) for a, b, n in zip(low, high, counts, strict=True)]
+        super().__init__(radar, objective, partial(search_rotation, axes=axes, limit=limit), assess)
 
 
 class RotationGenetic(_Search):
@@ -405,6 +401,7 @@ class RotationGenetic(_Search):
         elites: Number of best candidates that pass unchanged to the next generation.
         selection: Selection of parents, "tournament" or "roulette".
         seed: Seed of the random numbers.
+        assess: False leaves out the assessment.
     """
 
     def __init__(
@@ -418,23 +415,11 @@ class RotationGenetic(_Search):
         elites: int = 2,
         selection: Literal["tournament", "roulette"] = "tournament",
         seed: int = 1,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, objective)
-        self.low, self.high, self.seed = tuple(low), tuple(high), seed
-        self.rules = {"population": population, "generations": generations, "elites": elites, "selection": selection}
-
-    def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
-        """Estimate the rotation from a signal of axes (pulse, range).
-
-        Args:
-            signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-                rotation centre), known a priori, shape (...,).
-
-        Returns:
-            The `Estimate` that the function `genetic_rotation` returns.
-        """
-        return genetic_rotation(self.figure(signal, yc_m), self.low, self.high, draws=Draws(self.seed), **self.rules)
+        rules = {"population": population, "generations": generations, "elites": elites, "selection": selection}
+        box = {"low": tuple(low), "high": tuple(high), "draws": Draws(seed)}
+        super().__init__(radar, objective, partial(genetic_rotation, **box, **rules), assess)
 
 
 class RotationEvolution(_Search):
@@ -455,6 +440,7 @@ class RotationEvolution(_Search):
         generations: Number of generations.
         strategy: Mutation strategy, "rand1bin" or "best1bin".
         seed: Seed of the random numbers.
+        assess: False leaves out the assessment.
     """
 
     def __init__(
@@ -467,23 +453,11 @@ class RotationEvolution(_Search):
         generations: int = 36,
         strategy: Literal["rand1bin", "best1bin"] = "rand1bin",
         seed: int = 1,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, objective)
-        self.low, self.high, self.seed = tuple(low), tuple(high), seed
-        self.rules = {"population": population, "generations": generations, "strategy": strategy}
-
-    def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
-        """Estimate the rotation from a signal of axes (pulse, range).
-
-        Args:
-            signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-                rotation centre), known a priori, shape (...,).
-
-        Returns:
-            The `Estimate` that the function `evolve_rotation` returns.
-        """
-        return evolve_rotation(self.figure(signal, yc_m), self.low, self.high, draws=Draws(self.seed), **self.rules)
+        rules = {"population": population, "generations": generations, "strategy": strategy}
+        box = {"low": tuple(low), "high": tuple(high), "draws": Draws(seed)}
+        super().__init__(radar, objective, partial(evolve_rotation, **box, **rules), assess)
 
 
 class _Descending(_Search):
@@ -492,91 +466,25 @@ class _Descending(_Search):
     Connected values take precedence over the entries of the start.
     """
 
-    def __init__(self, radar: InverseRadar, objective: EntropyObjective, start: list[float] | None) -> None:
-        super().__init__(radar, objective)
-        wanted = objective.order - 1 + objective.range_term
-        if start is not None and len(start) != wanted:
-            raise ValueError(
-                f"start must hold the {wanted} values {'omega, ' if objective.range_term else ''}k1, k2, "
-                f"..., got {list(start)}"
-            )
-        self.begin = None if start is None else torch.tensor(start, dtype=torch.float64)
-
-    def started(
-        self, figure: ImageEntropy, omega_rad_s: Tensor | None, warp_k: Tensor | None, yc_m: Tensor | None
-    ) -> Tensor:
-        """Build the vector of unknowns to start from.
-
-        Connected values take precedence over the entries of the stage's `start`.
-
-        Args:
-            figure: Image entropy as a function of the unknowns.
-            omega_rad_s: Connected rotation rate in rad/s, or None.
-            warp_k: Connected relative derivatives of the rotation rate, or None.
-            yc_m: Connected range centre deviation in metres, or None.
-
-        Returns:
-            The vector of every trial, shape (..., n).
-
-        Raises:
-            ValueError: If a value is neither connected nor in `start`.
-        """
-        omega = self._given()[0] if omega_rad_s is None else omega_rad_s
-        k = self._given()[1] if warp_k is None else warp_k
-        if omega is None or k is None:
-            omega_too = self.objective.range_term
-            raise ValueError(
-                f"{type(self).__name__} needs a rotation to start from: give "
-                f"start=[{'omega, ' if omega_too else ''}k1, k2, ...], or connect "
-                f"{'omega_rad_s and ' if omega_too else ''}warp_k from an earlier estimator"
-            )
-        return figure.start(omega, k, yc_m)
-
-    def _given(self) -> tuple[Tensor | float | None, Tensor | None]:
-        """Rate and warp of the start.
-
-        Where the start does not give them: the rate of the radar, an empty warp for order 1, else
-        None.
-        """
-        rate = self.radar.rotation_rad_s if self.objective.range_term else 0.0
-        if self.begin is None:
-            return rate, torch.zeros(0, dtype=torch.float64) if self.objective.order == 1 else None
-        first = int(self.objective.range_term)
-        return self.begin[0] if first else rate, self.begin[first:]
-
-
-class RotationNewton(_Descending):
-    """Rotation of least image entropy near a start by Newton's method; see `newton_rotation`.
-
-    The search starts from the values `omega_rad_s` and `warp_k` that other stages provide. A value
-    that no stage provides is taken from `start`. Without `start` the rotation rate is
-    `rotation_rad_s` of the radar.
-
-    Args:
-        radar: Radar parameters.
-        start: Values to start from, [omega (rad/s), k1 (1/s), k2 (1/s^2), ...]: the rotation rate
-            omega at the first pulse and its relative derivatives. Leave omega out if `objective`
-            does not compensate the range-dependent phase. None if other stages provide the values.
-        objective: Settings of the image entropy, by default with a gridding kernel of six taps. A
-            range centre deviation `yc_m` that another stage provides replaces that of the settings.
-            If they make it an unknown, the search starts from that of the stage, or from 0.
-        damped: True damps the steps.
-        steps: Largest number of steps.
-
-    Raises:
-        ValueError: If `start` has the wrong number of values.
-    """
-
     def __init__(
         self,
         radar: InverseRadar,
-        start: list[float] | None = None,
-        objective: EntropyObjective = _FOR_NEWTON,
-        damped: bool = True,
-        steps: int = 20,
+        objective: EntropyObjective,
+        start: list[float] | None,
+        find: Callable[..., Estimate],
+        assess: bool,
     ) -> None:
-        super().__init__(radar, objective, start)
-        self.damped, self.steps = damped, steps
+        super().__init__(radar, objective, find, assess)
+        self.names = (*(("omega",) if objective.range_term else ()), "k1, k2, ...")
+        wanted = objective.order - 1 + objective.range_term
+        if start is not None and len(start) != wanted:
+            raise ValueError(f"start must hold the {wanted} values {', '.join(self.names)}, got {list(start)}")
+        begin = None if start is None else torch.tensor(start, dtype=torch.float64)
+        self.rate, self.k = radar.rotation_rad_s if objective.range_term else 0.0, begin
+        if begin is None:
+            self.k = torch.zeros(0, dtype=torch.float64) if objective.order == 1 else None
+        elif objective.range_term:
+            self.rate, self.k = begin[0], begin[1:]
 
     def forward(
         self,
@@ -597,15 +505,54 @@ class RotationNewton(_Descending):
                 rotation centre), shape (...,); None takes that of the settings.
 
         Returns:
-            The `Estimate` that the function `newton_rotation` returns.
+            The `Estimate` of the function that the description of the stage names.
 
         Raises:
             ValueError: If there is no rotation rate or no `warp_k` to start from.
         """
+        omega, k = self.rate if omega_rad_s is None else omega_rad_s, self.k if warp_k is None else warp_k
+        if omega is None or k is None:
+            raise ValueError(
+                f"{type(self).__name__} needs a rotation to start from: give start=[{', '.join(self.names)}], or "
+                f"connect {'omega_rad_s and ' if self.objective.range_term else ''}warp_k from an earlier estimator"
+            )
         figure = self.figure(signal, yc_m)
-        return newton_rotation(
-            figure, self.started(figure, omega_rad_s, warp_k, yc_m), damped=self.damped, steps=self.steps
-        )
+        return self.find(figure, figure.start(omega, k, yc_m), assess=self.assess)
+
+
+class RotationNewton(_Descending):
+    """Rotation of least image entropy near a start by Newton's method; see `newton_rotation`.
+
+    The search starts from the values `omega_rad_s` and `warp_k` that other stages provide. A value
+    that no stage provides is taken from `start`. Without `start` the rotation rate is
+    `rotation_rad_s` of the radar.
+
+    Args:
+        radar: Radar parameters.
+        start: Values to start from, [omega (rad/s), k1 (1/s), k2 (1/s^2), ...]: the rotation rate
+            omega at the first pulse and its relative derivatives. Leave omega out if `objective`
+            does not compensate the range-dependent phase. None if other stages provide the values.
+        objective: Settings of the image entropy, by default with a gridding kernel of six taps. A
+            range centre deviation `yc_m` that another stage provides replaces that of the settings.
+            If they make it an unknown, the search starts from that of the stage, or from 0.
+        damped: True damps the steps.
+        steps: Largest number of steps.
+        assess: False leaves out the assessment.
+
+    Raises:
+        ValueError: If `start` has the wrong number of values.
+    """
+
+    def __init__(
+        self,
+        radar: InverseRadar,
+        start: list[float] | None = None,
+        objective: EntropyObjective = _FOR_NEWTON,
+        damped: bool = True,
+        steps: int = 20,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(radar, objective, start, partial(newton_rotation, damped=damped, steps=steps), assess)
 
 
 class RotationDescent(_Descending):
@@ -627,6 +574,7 @@ class RotationDescent(_Descending):
             deviation `yc_m` that another stage provides replaces that of the settings. If they make
             it an unknown, the search starts from that of the stage, or from 0.
         steps: Largest number of steps.
+        assess: False leaves out the assessment.
 
     Raises:
         ValueError: If `start` has the wrong number of values.
@@ -638,33 +586,6 @@ class RotationDescent(_Descending):
         start: list[float] | None = None,
         objective: EntropyObjective = _FOR_DESCENT,
         steps: int = 60,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, objective, start)
-        self.steps = steps
-
-    def forward(
-        self,
-        signal: Signal,
-        omega_rad_s: Tensor | None = None,
-        warp_k: Tensor | None = None,
-        yc_m: Tensor | None = None,
-    ) -> Estimate:
-        """Estimate the rotation from a signal of axes (pulse, range).
-
-        Args:
-            signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            omega_rad_s: Rotation rate in rad/s to start from, shape (...,); None takes that of the
-                stage or of the radar.
-            warp_k: Relative derivatives k1, k2, ... of the rotation rate to start from, in 1/s,
-                1/s^2, ..., shape (..., order - 1); None takes those of the stage.
-            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-                rotation centre), shape (...,); None takes that of the settings.
-
-        Returns:
-            The `Estimate` that the function `descend_rotation` returns.
-
-        Raises:
-            ValueError: If there is no rotation rate or no `warp_k` to start from.
-        """
-        figure = self.figure(signal, yc_m)
-        return descend_rotation(figure, self.started(figure, omega_rad_s, warp_k, yc_m), steps=self.steps)
+        super().__init__(radar, objective, start, partial(descend_rotation, steps=steps), assess)

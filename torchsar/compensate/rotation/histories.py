@@ -21,18 +21,19 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
+from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, chosen, image_of
 from torchsar.compensate.rotation.peaks import Peaks, find_peaks, noise_power, threshold
 from torchsar.core.warp import warp, warp_rate
 
 _OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
 # least amplitude of an isolated scatterer over the largest one within its window, found by trial
 _ISOLATED = 0.5
+_COUNT, HALF_CELLS = 128, 24  # largest number of scatterers, and half width of a window in Doppler cells
 _ENDS = 16  # a window smears a history at both ends by 1/16 of its length, which is left out
 _ROBUST_ROUNDS = 3  # reweighted fits, found by trial: enough to exclude outliers
 # eigenvalue of a normal matrix of unit diagonal below which its direction is not determined: above
@@ -41,26 +42,37 @@ _NO_INFORMATION = 1e-7
 # power over that of the brightest pixel below which side lobes are to be expected more than 24
 # cells away
 _FAINTEST = 1e-3
-# least power of the scatterers in a quarter of the aperture over that in the quarter of most power:
-# noise at the detection threshold gives 0.25
-_LEAST_LIT = 0.35
-_LEAST_FREE = 0.1  # degrees of freedom of a fit that few scatterers could not contradict
-LEAST_SCATTERERS = 3  # fewer do not determine the rotation reliably, a convention
 _SHARE_LOST = 0.01  # share of an unknown in such a direction beyond which it is not determined
 
 
-def refined_by_histories(
-    data: Tensor,
-    sampling: Sampling,
-    motion: Motion,
-    *,
-    free_centre: bool = True,
-    count: int = 128,
-    half_cells: int = 24,
-) -> tuple[Motion, Tensor]:
-    """Refine a rotation by one least-squares fit to the phase histories of bright scatterers.
+class Histories(NamedTuple):
+    """Phase histories of bright isolated scatterers, and what they show about the rotation.
 
-    A history is the signal of one scatterer over the aperture, cut out of the image by a window.
+    Args:
+        cells: Doppler of the scatterers in Doppler cells, shape (trial, peak).
+        used: True where there is a scatterer, shape (trial, peak), bool.
+        level: Greatest power of the image over the detection threshold, shape (trial,).
+        least_lit: Least power of the scatterers in a quarter of the aperture over that in the
+            quarter of most power, shape (trial,).
+        change: Change of the parameters of the rotation (`Motion.moved`) that fits the histories
+            best, shape (trial, parameter).
+        inverse: Inverse of the normal matrix of this fit, shape (trial, parameter, parameter).
+        pull: What the fit leaves of its normal equations, shape (trial, peak, parameter, sample).
+    """
+
+    cells: Tensor
+    used: Tensor
+    level: Tensor
+    least_lit: Tensor
+    change: Tensor
+    inverse: Tensor
+    pull: Tensor
+
+
+def refined_by_histories(
+    data: Tensor, sampling: Sampling, motion: Motion, *, free_centre: bool = True, half_cells: int = HALF_CELLS
+) -> Motion:
+    """Refine a rotation by one least-squares fit to the phase histories of bright scatterers.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
@@ -68,83 +80,54 @@ def refined_by_histories(
         motion: Rotation to start from.
         free_centre: True also estimates the range of the rotation centre; False keeps that of
             `motion`.
-        count: Largest number of scatterers.
         half_cells: Half width of a window in Doppler cells, wide enough for the blur that the error
             of the start causes.
 
     Returns:
-        The refined rotation, and the number of scatterers that were used, shape (trial,).
+        The refined rotation; that to start from where there is no scatterer.
     """
-    _, used, change, _, _ = _fitted_to_peaks(data, sampling, motion, free_centre, count, half_cells)
-    order = motion.k.shape[-1]
-    v = change[:, -1] if free_centre else 0
-    found = used.sum(-1)
-    moved = replace(motion, k=motion.k + change[:, :order], w=motion.w + change[:, order], v=motion.v + v)
-    return moved.where((found > 0) & moved.possible(sampling), motion), found
+    found = histories_of(data, sampling, motion, free_centre=free_centre, half_cells=half_cells)
+    moved = motion.moved(found.change)
+    return chosen(found.used.any(-1) & moved.possible(sampling), moved, motion)
 
 
-def change_by_histories(data: Tensor, sampling: Sampling, motion: Motion) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Measure how far the phase histories of bright scatterers contradict a rotation.
+def histories_of(
+    data: Tensor, sampling: Sampling, motion: Motion, *, free_centre: bool = True, half_cells: int = HALF_CELLS
+) -> Histories:
+    """Fit the change of a rotation to the phase histories of bright isolated scatterers.
 
-    Peaks that may be speckle of a bright range cell or side lobes are left out.
+    A history is the signal of one scatterer over the aperture, cut out of the image by a window.
+    Peaks that may be speckle of a bright range cell, or side lobes, are left out.
 
     Args:
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
-        motion: Rotation to be judged.
+        motion: Rotation that the image compensates.
+        free_centre: True also fits the range of the rotation centre.
+        half_cells: Half width of a window in Doppler cells.
 
     Returns:
-        The change of the relative derivatives k1, k2, ... that the histories show, shape (trial,
-        order - 1); its covariance, from the differences between scatterers, shape (trial, order -
-        1, order - 1); the largest Doppler of these scatterers, as their phase over the aperture in
-        rad, shape (trial,); and their number, shape (trial,). The Doppler is infinite where there
-        are fewer than 3 scatterers, where all of them lie within a cell of zero Doppler, or where
-        they are not seen in all quarters of the aperture, so that the rotation is extrapolated.
-    """
-    cells, used, change, covariance, lit = _fitted_to_peaks(data, sampling, motion, True, 128, 24, strict=True)
-    order, count = motion.k.shape[-1], used.sum(-1)
-    edge = 2 * math.pi * torch.where(used, cells.abs(), 0).amax(-1)
-    seen = (count >= LEAST_SCATTERERS) & (lit > _LEAST_LIT) & (edge > 2 * math.pi)
-    return change[:, :order], covariance[:, :order, :order], torch.where(seen, edge, math.inf), count
-
-
-def _fitted_to_peaks(
-    data: Tensor,
-    sampling: Sampling,
-    motion: Motion,
-    free_centre: bool,
-    count: int,
-    half_cells: int,
-    strict: bool = False,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Doppler cells of bright scatterers and whether they exist, (trial, peak); the change of the
-    rotation, (trial, unknown), that fits their histories, with its covariance; and the least power
-    of the scatterers in a quarter of the aperture over the largest, (trial,).
-
-    strict: leave out what may be speckle of a bright range cell or a side lobe of the brightest
-    scatterer.
+        The histories and the change of the rotation.
     """
     image = image_of(data, sampling, motion, oversampling=_OVERSAMPLING)
     power = image.abs().square()
-    noise = noise_power(power)
+    least = threshold(power[0].numel())
     resolved = _unambiguous(motion, sampling, image.shape[1])[..., None]
     speckle = torch.where(resolved, power, math.nan).nanmedian(1, keepdim=True).values / math.log(2)
-    power = torch.where(resolved, power, 0)
-    if strict:
-        brightest = power.amax((-2, -1), keepdim=True)
-        floor = torch.maximum(speckle * threshold(power[0].numel()), _FAINTEST * brightest)
-        power = torch.where(power > floor, power, power * 1e-30)
-    peaks = find_peaks(power, noise * threshold(power[0].numel()), count, _ISOLATED, 2 * half_cells, 1)
-    cells = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING
-    history, u = _histories(image, peaks, half_cells)
+    brightest, noise = power.amax((-2, -1)), noise_power(power) * least
+    floor = torch.maximum(speckle * least, _FAINTEST * brightest[:, None, None])
+    clear = torch.where(resolved & (power > floor), power, 0)
+    peaks = find_peaks(clear, noise, _COUNT, _ISOLATED, 2 * half_cells, 1)
+    cells, used = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING, peaks.power > 0
+    history, u = _windowed(image, peaks, half_cells)
     bases = _bases(motion, sampling, cells, sampling.range_m(peaks.cell), u, free_centre)
     keep = slice(max(1, len(u) // _ENDS), -max(1, len(u) // _ENDS))
-    used = peaks.power > 0
     history = history[..., keep]
     seen = torch.stack([part.mean(-1).abs().square() for part in history.tensor_split(4, -1)], -1)
-    seen = torch.where(used[..., None], seen, 0).sum(1)
-    lit = seen.amin(-1) / seen.amax(-1).clamp_min(torch.finfo(torch.float64).tiny)
-    return cells, used, *_fitted(history, bases[..., keep], used), lit
+    seen = (seen * used[..., None]).sum(1)
+    tiny = torch.finfo(power.dtype).tiny
+    level, least_lit = brightest / noise.clamp_min(tiny), seen.amin(-1) / seen.amax(-1).clamp_min(tiny)
+    return Histories(cells, used, level, least_lit, *_fitted(history, bases[..., keep], used))
 
 
 def _unambiguous(motion: Motion, sampling: Sampling, lines: int) -> Tensor:
@@ -159,7 +142,7 @@ def _unambiguous(motion: Motion, sampling: Sampling, lines: int) -> Tensor:
     return line.abs() * (fastest / whole)[:, None] <= lines / 2
 
 
-def _histories(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Tensor]:
+def _windowed(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Tensor]:
     """Histories (trial, peak, 2 half_cells) of windows about peaks, and u of their samples."""
     lines = torch.arange(2 * half_cells * _OVERSAMPLING, device=image.device) - half_cells * _OVERSAMPLING
     row = peaks.line[..., None] + lines
@@ -196,10 +179,10 @@ def _times_at(u: Tensor, k: Tensor, duration_s: float) -> Tensor:
     return time
 
 
-def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:
-    """Robust weighted least squares, (trial, unknown), on phases a sixth of the histories apart.
+def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Robust weighted least squares on phases a sixth of the histories apart.
 
-    And its covariance (trial, unknown, unknown), from the differences between scatterers.
+    The last three fields of `Histories`.
     """
     lag = max(1, history.shape[-1] // 6)
     product = history[..., lag:] * history[..., :-lag].conj()
@@ -210,22 +193,16 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tenso
     total = weight.sum(-1, keepdim=True).clamp_min(1e-300)
     angle = angle - (weight * angle).sum(-1, keepdim=True) / total
     difference = difference - (weight[..., None, :] * difference).sum(-1, keepdim=True) / total[..., None]
-    change, inverse, rest = angle.new_zeros(bases.shape[0], bases.shape[2]), angle.new_zeros(0), angle.new_zeros(0)
+    change, inverse, pull = angle.new_zeros(bases.shape[0], bases.shape[2]), angle.new_zeros(0), angle.new_zeros(0)
     for _ in range(_ROBUST_ROUNDS):
         weighted = difference * weight[..., None, :]
         inverse = inverted(torch.einsum("bpij,bpkj->bik", weighted, difference))[0]
         change = (inverse @ torch.einsum("bpij,bpj->bi", weighted, angle)[..., None])[..., 0]
         residual = angle - torch.einsum("bi,bpij->bpj", change, difference)
-        rest = weighted * residual[..., None, :]
+        pull = weighted * residual[..., None, :]
         scale = 3 * residual.abs().flatten(1).median(-1).values[:, None, None].clamp_min(1e-12)
         weight = weight / (1 + (residual / scale).square())
-    # few scatterers cannot disagree: what the samples of each show counts as well
-    own = lag * inverse @ torch.einsum("bpij,bpkj->bik", rest, rest) @ inverse
-    pull, count = rest.sum(-1), used.sum(-1)
-    free = count / (count - inverse.shape[-1]).clamp_min(_LEAST_FREE)
-    # measured and not derived from the noise, so that errors of the model count: the sandwich
-    # covariance of least squares
-    return change, inverse @ (pull.mT @ pull) @ inverse * free[:, None, None] + own
+    return change, inverse, pull
 
 
 def inverted(normal: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation.motion import Motion, Sampling
+from torchsar.compensate.rotation.motion import Sampling
 from torchsar.compensate.rotation.unknowns import RotationParameters, Unknowns, Variables
-from torchsar.compensate.rotation.verdicts import warp_phase_error
 from torchsar.core import Signal, block_bytes_of, checked_samples, power_of, unit_level
 from torchsar.core.arguments import names_arguments
 from torchsar.focus.image_lines import DopplerLines
@@ -69,6 +68,8 @@ class ImageEntropy:
     reverse. Twice differentiable in x. Candidates are processed in blocks; if derivatives are
     required, the intermediate results of all candidates stay in memory.
 
+    Its attribute `rows` holds the pulses at unit level, shape (trial, pulse, range).
+
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
         objective: Settings.
@@ -97,18 +98,14 @@ class ImageEntropy:
         range_m: Tensor,
     ) -> None:
         data = checked_samples(data, "ImageEntropy", "pulse, range")
-        _check(data, wavelength_m, prf_hz, range_m)
-        self.wavelength_m, self.prf_hz, self.range_m = (
-            wavelength_m,
-            prf_hz,
-            range_m.to(device=data.device, dtype=torch.float64),
-        )
+        self.sampling = Sampling.of("ImageEntropy", data, wavelength_m, prf_hz, range_m)
+        self.range_m = range_m.to(device=data.device, dtype=torch.float64)
         self.objective, yc_m = objective, objective.yc_m
         self.unknowns = Unknowns(
             data.shape[-2] / prf_hz, objective.order, objective.range_term, yc_m is None, objective.variables
         )
         self.trials, self.dtype = data.shape[:-2], data.dtype
-        self._data = _normalised(data.detach()).reshape(-1, *data.shape[-2:])
+        self.rows = _normalised(data.detach()).reshape(-1, *data.shape[-2:])
         known = torch.as_tensor(0.0 if yc_m is None else yc_m, dtype=torch.float64, device=data.device).detach()
         self._yc = known.expand(self.trials).reshape(-1)
 
@@ -135,7 +132,7 @@ class ImageEntropy:
     def __call__(self, x: Tensor) -> Tensor:
         """Compute the entropies (..., candidate) of candidates x (..., candidate, n)."""
         rows, count = x.reshape(-1, x.shape[-1]), x.shape[-2]
-        costs = [self._cost(part, rows[part], count) for part in self._blocks(len(rows), count)]
+        costs = [self._cost(part, rows[part], count) for part in self.blocks(len(rows), count)]
         return torch.cat(costs).reshape(x.shape[:-1])
 
     def single(self, x: Tensor) -> Tensor:
@@ -164,7 +161,7 @@ class ImageEntropy:
         rows = x.detach().reshape(-1, x.shape[-1])
         pairs = [
             _value_and_gradient(lambda part_x, part=part: self._cost(part, part_x, 1), rows[part])
-            for part in self._blocks(len(rows), 1)
+            for part in self.blocks(len(rows), 1)
         ]
         cost, gradient = (torch.cat(parts) for parts in zip(*pairs, strict=True))
         return cost.reshape(x.shape[:-1]), gradient.reshape(x.shape)
@@ -196,7 +193,7 @@ class ImageEntropy:
         Raises:
             ValueError: If `warp_k` does not have order - 1 entries.
         """
-        like = {"dtype": torch.float64, "device": self._data.device}
+        like = {"dtype": torch.float64, "device": self.rows.device}
         omega, k = torch.as_tensor(omega_rad_s, **like), torch.as_tensor(warp_k, **like)
         if k.shape[-1:] != (self.unknowns.order - 1,):
             raise ValueError(
@@ -215,7 +212,7 @@ class ImageEntropy:
         Returns:
             The unknowns, shape (..., n).
         """
-        return x.to(self._data.device).expand(*self.trials, x.shape[-1]).contiguous()
+        return x.to(self.rows.device).expand(*self.trials, x.shape[-1]).contiguous()
 
     def units(self, x: Tensor) -> Tensor:
         """Compute a scale for each unknown: the change that alters phases by about a radian.
@@ -228,8 +225,8 @@ class ImageEntropy:
         Returns:
             The changes, positive, shape (..., n), see `Unknowns.units`.
         """
-        step = float(self.range_m[1] - self.range_m[0]) if len(self.range_m) > 1 else 1.0
-        return self.unknowns.units(x, self.wavelength_m, abs(step) * len(self.range_m), self._data.shape[-2])
+        depth_m = abs(self.sampling.step_m) * len(self.range_m)
+        return self.unknowns.units(x, self.sampling.wavelength_m, depth_m, self.rows.shape[-2])
 
     def uncompensated(self) -> Tensor:
         """Compute the entropy of the image formed as for a uniform rotation.
@@ -239,59 +236,38 @@ class ImageEntropy:
         Returns:
             The entropies in nats, shape (...,).
         """
-        flat = torch.zeros(len(self._data), self.unknowns.order - 1, dtype=torch.float64, device=self._data.device)
         with torch.no_grad():
-            costs = [self._entropy(self._data[part], flat[part]) for part in self._blocks(len(flat), 1)]
-        return torch.cat(costs).reshape(self.trials)
+            return self.single(self.start(0.0, torch.zeros(self.unknowns.order - 1, dtype=torch.float64)))
 
-    def phase_error(self, rotation: RotationParameters) -> Tensor:
-        """Measure how well the relative derivatives of the rotation rate fit the data.
-
-        Bright scatterers of the image show it, not the entropy; see `warp_phase_error`.
-
-        Args:
-            rotation: Rotation of every trial.
-
-        Returns:
-            The phase error in rad of the scatterer farthest from zero Doppler, shape (...,);
-            infinite where fewer than 3 scatterers confirm the rotation.
-        """
-        step = float(self.range_m[1] - self.range_m[0]) if len(self.range_m) > 1 else 1.0
-        pulses, cells = self._data.shape[-2:]
-        sampling = Sampling(self.wavelength_m, self.prf_hz, pulses, cells, float(self.range_m[0]), step)
-        k, yc = rotation.warp_k.reshape(len(self._data), -1), rotation.yc_m.reshape(-1)
-        w = rotation.omega_rad_s.square().reshape(-1)
-        motion = Motion(k, w, w * yc, torch.zeros_like(w))
-        with torch.no_grad():
-            errors = [warp_phase_error(self._data[i], sampling, motion.part(i))[0] for i in self._blocks(len(k), 1)]
-        return torch.cat(errors).reshape(self.trials)
-
-    def _blocks(self, rows: int, count: int) -> Iterator[slice]:
-        """Rows of candidates that fit into the cache together, `count` of them for each trial.
+    def blocks(self, rows: int, count: int = 1) -> Iterator[slice]:
+        """Divide candidates into blocks that fit into the cache.
 
         A block does not extend over trials where there are several candidates.
+
+        Args:
+            rows: Number of candidates.
+            count: Number of them for each trial.
+
+        Yields:
+            The blocks.
         """
-        size = self._data[0].numel() * self._data.element_size() * max(1.0, self.objective.oversampling)
-        height = max(1, int(4 * block_bytes_of(self._data.device) // size))
-        if count == 1:
-            yield from (slice(first, min(first + height, rows)) for first in range(0, rows, height))
-            return
-        for trial in range(0, rows, count):
-            yield from (
-                slice(first, min(first + height, trial + count)) for first in range(trial, trial + count, height)
-            )
+        size = self.rows[0].numel() * self.rows.element_size() * max(1.0, self.objective.oversampling)
+        height = max(1, int(4 * block_bytes_of(self.rows.device) // size))
+        whole = rows if count == 1 else count
+        for begin in range(0, rows, max(1, whole)):
+            yield from (slice(i, min(i + height, begin + whole)) for i in range(begin, begin + whole, height))
 
     def _cost(self, part: slice, x: Tensor, count: int) -> Tensor:
         """Entropies (row,) of a block of vectors (row, n)."""
         own = slice(part.start // count, (part.stop - 1) // count + 1)
         rotation = self.unknowns.turn(x.to(torch.float64), self._yc[own])
-        pulses = self._data[own]
+        pulses = self.rows[own]
         if self.unknowns.range_term:
             pulses = range_phase(
                 pulses,
                 self.range_m,
-                self.wavelength_m,
-                self.prf_hz,
+                self.sampling.wavelength_m,
+                self.sampling.prf_hz,
                 rotation.omega_rad_s,
                 rotation.warp_k,
                 rotation.yc_m,
@@ -302,7 +278,7 @@ class ImageEntropy:
         """Entropy of the image of pulses without their range term."""
         image = self.objective
         lines, transform = DopplerLines(image.oversampling, image.lines), Gridding(image.taps)
-        return _entropy(matched_fourier(pulses, k, self.prf_hz, lines=lines, transform=transform))
+        return _entropy(matched_fourier(pulses, k, self.sampling.prf_hz, lines=lines, transform=transform))
 
 
 def _entropy(image: Tensor) -> Tensor:
@@ -328,20 +304,3 @@ def _normalised(data: Tensor) -> Tensor:
     unit = unit_level(data)
     rms = power_of(unit).mean((-2, -1), keepdim=True).sqrt()
     return unit / torch.where(rms > 0, rms, 1)
-
-
-def _check(data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) -> None:
-    """Raise TypeError or ValueError for invalid input."""
-    if data.shape[-2] < 8:
-        raise ValueError(
-            "ImageEntropy: data must have at least 8 pulses and one range cell, shape (..., pulse, range), got "
-            f"shape {tuple(data.shape)}"
-        )
-    for name, value in (("wavelength_m", wavelength_m), ("prf_hz", prf_hz)):
-        if not value > 0:
-            raise ValueError(f"ImageEntropy: {name} must be positive, got {value}")
-    if range_m.shape != data.shape[-1:]:
-        raise ValueError(
-            f"ImageEntropy: range_m must hold the {data.shape[-1]} coordinates of the range cells (m), got "
-            f"shape {tuple(range_m.shape)}"
-        )

@@ -7,12 +7,14 @@ the rotation from the data.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchsar.core import numbers_on, outer_phasor, phasor_tables, unit_phasor
+from torchsar.core import host_values, numbers_on, outer_phasor, phasor_tables, refuse_non_finite, unit_phasor
 from torchsar.core.warp import warp
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
@@ -20,7 +22,37 @@ from torchsar.focus.transforms import Gridding
 from torchsar.focus.warped_sums import slow_times
 
 SEARCH_EPS = 1e-3  # accuracy of the transform in estimates; images use a better one
-LEAST_PULSES = 8  # least number of pulses, a convention
+_LEAST_PULSES = 8  # least number of pulses, a convention
+
+
+def each(change: Callable[..., Tensor], *objects: Any) -> Any:
+    """Apply a function to the tensors of an object, or of several objects of the same class.
+
+    Args:
+        change: Function of one tensor of each object.
+        objects: Tensors, or dataclasses of tensors and of such dataclasses.
+
+    Returns:
+        An object of that class, with the results.
+    """
+    if isinstance(objects[0], Tensor):
+        return change(*objects)
+    names = [field.name for field in fields(objects[0])]
+    return replace(objects[0], **{name: each(change, *(getattr(x, name) for x in objects)) for name in names})
+
+
+def chosen(keep: Tensor, first: Any, second: Any) -> Any:
+    """Choose, for each trial, between two objects of the same class.
+
+    Args:
+        keep: True where the first is kept, shape (trial,), bool.
+        first: An object whose tensors have the shape (trial, ...).
+        second: The object taken for the other trials.
+
+    Returns:
+        The chosen trials.
+    """
+    return each(lambda x, y: torch.where(keep.reshape(-1, *[1] * (x.ndim - 1)), x, y), first, second)
 
 
 @dataclass(frozen=True)
@@ -42,6 +74,49 @@ class Sampling:
     cells: int
     first_m: float
     step_m: float
+
+    @staticmethod
+    def of(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) -> Sampling:
+        """Describe the sampling of data, and check it.
+
+        Args:
+            name: Name of the caller, for error messages.
+            data: Range-compressed pulses, shape (..., pulse, range).
+            wavelength_m: Wavelength in metres.
+            prf_hz: Pulse repetition frequency in Hz.
+            range_m: Range coordinates of the cells in metres, shape (range,).
+
+        Returns:
+            The sampling.
+
+        Raises:
+            ValueError: If there are fewer than 8 pulses, a number is not positive, or the range
+                axis has another length or is not evenly spaced.
+        """
+        if data.shape[-2] < _LEAST_PULSES:
+            raise ValueError(
+                f"{name} works on samples (..., pulse, range) of at least {_LEAST_PULSES} pulses and "
+                f"one range cell, got the shape {tuple(data.shape)}"
+            )
+        for what, value in (("wavelength_m", wavelength_m), ("prf_hz", prf_hz)):
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name}: {what} must be a positive number, got {value}")
+        if not isinstance(range_m, Tensor) or range_m.shape != data.shape[-1:]:
+            got = f"the shape {tuple(range_m.shape)}" if isinstance(range_m, Tensor) else type(range_m).__name__
+            raise ValueError(
+                f"{name}: range_m must be a tensor of the {data.shape[-1]} coordinates of the range cells (m), got "
+                f"{got}"
+            )
+        refuse_non_finite(range_m, f"{name}: range_m")
+        range_m = range_m.to(torch.float64)
+        steps = torch.diff(range_m) if len(range_m) > 1 else torch.ones_like(range_m)
+        first, step, least, largest = host_values(torch.stack([range_m[0], steps.mean(), *torch.aminmax(steps)]), 0.0)
+        if step == 0 or max(step - least, largest - step) > 1e-6 * abs(step):
+            raise ValueError(
+                f"{name}: range_m must be evenly spaced, got steps of {least:g} to {largest:g} m; resample the data in "
+                "range first"
+            )
+        return Sampling(wavelength_m, prf_hz, data.shape[-2], data.shape[-1], first, step)
 
     @property
     def duration_s(self) -> float:
@@ -161,29 +236,19 @@ class Motion:
         turns = sampling.turns_per_square * (self.w[:, None] * ends + self.offset[:, None]).abs() * whole.square()
         return torch.isfinite(self.k).all(-1) & (turns < sampling.pulses / 4).all(-1)
 
-    def part(self, trials: slice | Tensor) -> Motion:
-        """Select trials.
+    def moved(self, change: Tensor) -> Motion:
+        """Change the rotation.
 
         Args:
-            trials: The trials.
+            change: Changes of k1, k2, ..., of w and, if the centre is estimated, of v, shape
+                (trial, parameter).
 
         Returns:
-            Their rotations.
+            The changed rotation.
         """
-        return Motion(self.k[trials], self.w[trials], self.v[trials], self.centre_m[trials])
-
-    def where(self, keep: Tensor, other: Motion) -> Motion:
-        """Choose, for each trial, between this rotation and another.
-
-        Args:
-            keep: True where this rotation is kept, shape (trial,), bool.
-            other: The rotation taken for the other trials.
-
-        Returns:
-            The chosen rotations. Their `centre_m` is that of this rotation in all trials.
-        """
-        w, v = (torch.where(keep, getattr(self, name), getattr(other, name)) for name in ("w", "v"))
-        return Motion(torch.where(keep[:, None], self.k, other.k), w, v, self.centre_m)
+        order = self.k.shape[-1]
+        k, w, v = change.split([order, 1, change.shape[-1] - order - 1], -1)
+        return Motion(self.k + k, self.w + w[:, 0], self.v + v.sum(-1), self.centre_m)
 
 
 @dataclass(frozen=True)

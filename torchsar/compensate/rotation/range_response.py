@@ -11,7 +11,7 @@ the share of the periodic one is found from the data.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,73 +21,7 @@ from torch import Tensor
 _NEAR = 1e-4
 
 
-@dataclass(frozen=True)
-class RangeResponse:
-    """Range response of each trial.
-
-    Args:
-        share: Share of the periodic response, from 0 to 1, shape (trial,), float64; the rest is
-            that of a sinc.
-        cells: Number of range cells of the window.
-    """
-
-    share: Tensor
-    cells: int
-
-    @staticmethod
-    def of_unknown_share(trials: int, cells: int, device: torch.device) -> RangeResponse:
-        """Make the response to start from, midway between the two kinds.
-
-        Args:
-            trials: Number of trials.
-            cells: Number of range cells of the window.
-            device: Device of the result.
-
-        Returns:
-            The response, with a share of one half.
-        """
-        return RangeResponse(torch.full((trials,), 0.5, dtype=torch.float64, device=device), cells)
-
-    def envelopes(self, row: Tensor) -> Envelopes:
-        """Compute the responses to scatterers in all range cells.
-
-        Args:
-            row: Range of the scatterers in range cells, shape (trial, scatterer), float64.
-
-        Returns:
-            The responses.
-        """
-        open_ended, periodic = _sinc(row, self.cells), _periodic(row, self.cells)
-        share = self.share[:, None, None]
-        value, slope = (x + share * (y - x) for x, y in zip(open_ended, periodic))
-        return Envelopes(value, slope, periodic[0] - open_ended[0])
-
-    def moved(self, change: Tensor) -> RangeResponse:
-        """Change the share of the periodic response, within 0 to 1.
-
-        Args:
-            change: Change of the share, shape (trial,); a change that is not finite is ignored.
-
-        Returns:
-            The changed response.
-        """
-        return RangeResponse((self.share + torch.nan_to_num(change, 0.0, 0.0, 0.0)).clamp(0, 1), self.cells)
-
-    def where(self, keep: Tensor, other: RangeResponse) -> RangeResponse:
-        """Choose, for each trial, between this response and another.
-
-        Args:
-            keep: True where this response is kept, shape (trial,), bool.
-            other: The response taken for the other trials.
-
-        Returns:
-            The chosen responses.
-        """
-        return RangeResponse(torch.where(keep, self.share, other.share), self.cells)
-
-
-@dataclass(frozen=True)
-class Envelopes:
+class Envelopes(NamedTuple):
     """Range responses to scatterers.
 
     Args:
@@ -100,6 +34,23 @@ class Envelopes:
     value: Tensor
     slope: Tensor
     difference: Tensor
+
+
+def envelopes(share: Tensor, row: Tensor, cells: int) -> Envelopes:
+    """Compute the responses to scatterers in all range cells.
+
+    Args:
+        share: Share of the periodic response, from 0 to 1, shape (trial,), float64; the rest is
+            that of a sinc.
+        row: Range of the scatterers in range cells, shape (trial, scatterer), float64.
+        cells: Number of range cells of the window.
+
+    Returns:
+        The responses.
+    """
+    open_ended, periodic = _sinc(row, cells), _periodic(row, cells)
+    value, slope = (x + share[:, None, None] * (y - x) for x, y in zip(open_ended, periodic))
+    return Envelopes(value, slope, periodic[0] - open_ended[0])
 
 
 def _sinc(row: Tensor, cells: int) -> tuple[Tensor, Tensor]:

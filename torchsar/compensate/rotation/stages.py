@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -13,8 +14,9 @@ from torchsar.compensate.pulse_phase.data import find_phases, prepare, refuse_od
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
+from torchsar.compensate.rotation.histories import HALF_CELLS
 from torchsar.compensate.rotation.motion import SEARCH_EPS
-from torchsar.compensate.rotation.recommended import coarse_rotation, phase_fit_rotation, uneven_rotation
+from torchsar.compensate.rotation.recommended import HISTORY_STEPS, coarse_rotation, phase_fit_rotation, uneven_rotation
 from torchsar.compensate.rotation.scatterers import ROUNDS
 from torchsar.compensate.rotation.unknowns import k_name, uniform_rotation
 from torchsar.core import Estimate, Signal, Stage
@@ -35,33 +37,44 @@ class _Rotation(Stage):
     yc_m: the range centre deviation (m) known a priori, or None to estimate it.
     """
 
-    def __init__(self, radar: InverseRadar, order: int, yc_m: float | None) -> None:
+    def __init__(
+        self,
+        radar: InverseRadar,
+        order: int,
+        yc_m: float | None,
+        find: Callable[..., Estimate],
+        assess: bool,
+        **options: Any,
+    ) -> None:
         super().__init__()
         if order < 1:
             raise ValueError(f"order of the rotation must be 1 (uniform rotation) or more, got {order}")
-        self.radar, self.order, self.yc_m = radar, order, yc_m
+        self.radar, self.order, self.yc_m, self.find, self.options = radar, order, yc_m, find, options
+        self.assess = assess
         self.provides = ("omega_rad_s", "warp_k", "yc_m", *(k_name(i) for i in range(1, order)))
         self.neutral = uniform_rotation(radar, self.provides, yc_m)
 
-    def settings(self, signal: Signal, yc_m: Tensor | None) -> dict[str, Any]:
-        """Collect the arguments of the estimating function from signal, radar and stage.
+    def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
+        """Estimate the rotation from a signal of axes (pulse, range).
 
         Args:
-            signal: Range-compressed pulses of axes (pulse, range).
-            yc_m: Connected range centre deviation in metres, or None for that of the stage.
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), known a priori, shape (...,).
 
         Returns:
-            The arguments by name.
+            The `Estimate` of the function that the description of the stage names.
         """
-        range_m = signal.axis("range").values(torch.device("cpu"))  # only their spacing is read, by the host
-        centre = self.yc_m if yc_m is None else yc_m
-        return {
-            "wavelength_m": self.radar.wavelength_m,
-            "prf_hz": 1 / signal.axis("pulse").step,
-            "range_m": range_m,
-            "order": self.order,
-            "yc_m": centre,
-        }
+        return self.find(
+            signal.data,
+            wavelength_m=self.radar.wavelength_m,
+            prf_hz=1 / signal.axis("pulse").step,
+            range_m=signal.axis("range").values(torch.device("cpu")),  # only their spacing is read, by the host
+            order=self.order,
+            yc_m=self.yc_m if yc_m is None else yc_m,
+            assess=self.assess,
+            **self.options,
+        )
 
 
 class UnevenRotation(_Rotation):
@@ -79,6 +92,7 @@ class UnevenRotation(_Rotation):
         scatterers: Largest number of scatterers that are fitted, by default as in
             `uneven_rotation`.
         rounds: Largest number of maximum-likelihood steps.
+        assess: False leaves out the assessment.
 
     Raises:
         ValueError: If the order is below 1.
@@ -91,24 +105,9 @@ class UnevenRotation(_Rotation):
         yc_m: float | None = None,
         scatterers: int | None = None,
         rounds: int = ROUNDS,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, order, yc_m)
-        self.scatterers, self.rounds = scatterers, rounds
-
-    def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
-        """Estimate the rotation from a signal of axes (pulse, range).
-
-        Args:
-            signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-                rotation centre), known a priori, shape (...,).
-
-        Returns:
-            The `Estimate` that the function `uneven_rotation` returns.
-        """
-        return uneven_rotation(
-            signal.data, **self.settings(signal, yc_m), scatterers=self.scatterers, rounds=self.rounds
-        )
+        super().__init__(radar, order, yc_m, uneven_rotation, scatterers=scatterers, rounds=rounds, assess=assess)
 
 
 class CoarseRotation(_Rotation):
@@ -120,24 +119,14 @@ class CoarseRotation(_Rotation):
         radar: Radar parameters.
         order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
             rotation.
+        assess: False leaves out the assessment.
 
     Raises:
         ValueError: If the order is below 1.
     """
 
-    def __init__(self, radar: InverseRadar, order: int = 3) -> None:
-        super().__init__(radar, order, None)
-
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate k1 and k2, the relative derivatives of the rotation rate.
-
-        Args:
-            signal: Range-compressed pulses of axes (pulse, range).
-
-        Returns:
-            The `Estimate` that the function `coarse_rotation` returns.
-        """
-        return coarse_rotation(signal.data, **self.settings(signal, None))
+    def __init__(self, radar: InverseRadar, order: int = 3, assess: bool = True) -> None:
+        super().__init__(radar, order, None, coarse_rotation, assess=assess)
 
 
 class PhaseFitRotation(_Rotation):
@@ -151,31 +140,22 @@ class PhaseFitRotation(_Rotation):
             rotation centre), if known a priori; None estimates it.
         steps: Number of times that the least-squares fit to the phase histories is repeated.
         half_cells: Half width of the windows about scatterers in Doppler cells.
+        assess: False leaves out the assessment.
 
     Raises:
         ValueError: If the order is below 1.
     """
 
     def __init__(
-        self, radar: InverseRadar, order: int = 3, yc_m: float | None = None, steps: int = 4, half_cells: int = 24
+        self,
+        radar: InverseRadar,
+        order: int = 3,
+        yc_m: float | None = None,
+        steps: int = HISTORY_STEPS,
+        half_cells: int = HALF_CELLS,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, order, yc_m)
-        self.steps, self.half_cells = steps, half_cells
-
-    def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
-        """Estimate the rotation from a signal of axes (pulse, range).
-
-        Args:
-            signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
-                rotation centre), known a priori, shape (...,).
-
-        Returns:
-            The `Estimate` that the function `phase_fit_rotation` returns.
-        """
-        return phase_fit_rotation(
-            signal.data, **self.settings(signal, yc_m), steps=self.steps, half_cells=self.half_cells
-        )
+        super().__init__(radar, order, yc_m, phase_fit_rotation, steps=steps, half_cells=half_cells, assess=assess)
 
 
 class RotationAutofocus(Stage):
@@ -193,14 +173,15 @@ class RotationAutofocus(Stage):
             without a rotation.
         polish: Largest number of further iterations, which compare each pulse with a Wiener
             estimate of the scene.
+        assess: False leaves out the assessment.
     """
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
 
-    def __init__(self, radar: InverseRadar, search: int = 60, polish: int = 20) -> None:
+    def __init__(self, radar: InverseRadar, search: int = 60, polish: int = 20, assess: bool = True) -> None:
         super().__init__()
-        self.radar, self.search, self.polish = radar, search, polish
+        self.radar, self.search, self.polish, self.assess = radar, search, polish, assess
 
     def forward(
         self,
@@ -230,8 +211,9 @@ class RotationAutofocus(Stage):
             TypeError: If the data are not complex or the start is not a tensor.
             ValueError: As from the two functions.
         """
+        options = {"search": self.search, "polish": self.polish, "assess": self.assess}
         if warp_k is None:
-            return autofocus(signal.data, start=phase_rad, search=self.search, polish=self.polish)
+            return autofocus(signal.data, start=phase_rad, **options)
         prf_hz, data = 1 / signal.axis("pulse").step, signal.data
         if omega_rad_s is not None:
             data = range_phase(
@@ -244,11 +226,17 @@ class RotationAutofocus(Stage):
                 0.0 if yc_m is None else yc_m,
             )
         k = warp_k.expand(*signal.trials, warp_k.shape[-1]).reshape(-1, warp_k.shape[-1])
-        return rotating_autofocus(data, prf_hz, k, phase_rad, self.search, self.polish)
+        return rotating_autofocus(data, prf_hz, k, phase_rad, **options)
 
 
 def rotating_autofocus(
-    data: Tensor, prf_hz: float, warp_k: Tensor, start: Tensor | None = None, search: int = 60, polish: int = 20
+    data: Tensor,
+    prf_hz: float,
+    warp_k: Tensor,
+    start: Tensor | None = None,
+    search: int = 60,
+    polish: int = 20,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the phase error of each pulse of a target whose non-uniform rotation is known.
 
@@ -267,12 +255,13 @@ def rotating_autofocus(
         search: Largest number of fixed-point iterations that minimise the image entropy.
         polish: Largest number of further iterations, which compare each pulse with a Wiener
             estimate of the scene.
+        assess: False leaves out the assessment.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation, quality, `ok`
-        and info as from `autofocus`: `ok` is False unless the image is 1.5 times as sharp as
-        autofocus can make pure noise, more than one range cell contributes to the sharpness, and
-        the Strehl ratio predicted from the standard deviation exceeds 0.8.
+        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation, quality and
+        info as from `autofocus`. Outcomes: EMPTY, SINGULAR, NOISE if the image is less than 1.5
+        times as sharp as autofocus makes noise, and INEXACT if the Strehl ratio predicted from the
+        standard deviation is below 0.8.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -300,4 +289,4 @@ def rotating_autofocus(
 
     with torch.no_grad():
         begin = starting_phase(start, pulses, "rotating_autofocus")
-        return conclude(pulses, *find_phases(pulses, find, begin, whole=True), True, continued, through)
+        return conclude(pulses, *find_phases(pulses, find, begin, whole=True), assess, continued, through)

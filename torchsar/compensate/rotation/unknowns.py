@@ -216,6 +216,22 @@ def k_name(i: int) -> str:
     return f"k{i}_per_s{i if i > 1 else ''}"
 
 
+def values_of(omega_rad_s: Tensor, warp_k: Tensor, yc_m: Tensor) -> dict[str, Tensor]:
+    """Name the parameters of a rotation as an estimate does.
+
+    Args:
+        omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,).
+        warp_k: Relative derivatives k1, k2, ... of the rotation rate in 1/s, 1/s^2, ..., shape
+            (..., order - 1).
+        yc_m: Range centre deviation in metres, shape (...,).
+
+    Returns:
+        `omega_rad_s`, `yc_m`, `warp_k`, and each entry of `warp_k` as `k1_per_s`, `k2_per_s2`, ...
+    """
+    named = {k_name(i): k for i, k in enumerate(warp_k.unbind(-1), 1)}
+    return {"omega_rad_s": omega_rad_s, "yc_m": yc_m, "warp_k": warp_k, **named}
+
+
 def uniform_rotation(radar: InverseRadar, names: Iterable[str], yc_m: Tensor | float | None) -> Mapping[str, Any]:
     """Return the rotation that is assumed where it cannot be estimated.
 

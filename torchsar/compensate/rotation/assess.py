@@ -1,0 +1,238 @@
+"""Assessment of an estimated rotation by the scatterers of the image.
+
+The entropy of an image does not show whether a rotation is right: noise has a sharpest image as
+well. Five questions are asked.
+
+- Does anything in the image rise above the noise (`Outcome.NOISE`), and are there at least three
+scatterers that show the rotation (`Outcome.TOO_FEW`)?
+- Are the scatterers seen during the whole aperture, and do they explain half of the energy
+(`Outcome.MISFIT`)?
+- Does any scatterer ask for another rotation: do the phase histories of bright scatterers agree
+with it (`Outcome.PARTS_DISAGREE`)?
+- Has the fit converged (`Outcome.NOT_CONVERGED`)?
+- How far do the scatterers differ? Their differences, and the noise, give the standard deviations
+(`Outcome.INEXACT`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.rotation.couplings import Neighbours
+from torchsar.compensate.rotation.histories import Histories, histories_of, refined_by_histories
+from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
+from torchsar.compensate.rotation.peaks import threshold
+from torchsar.compensate.rotation.scatterers import LEAST_EXPLAINED, Fit, Scatterers, Step, explained_share
+from torchsar.compensate.rotation.unknowns import k_name
+from torchsar.core import Outcome, worst
+from torchsar.metrics import entropy
+
+# largest phase error, in rad rms, of a scatterer at the edge of the target: it then still has a
+# Strehl ratio of 0.8, the convention of Marechal
+MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8))
+_LEAST_SCATTERERS = 3  # fewer do not determine the rotation reliably, a convention
+_CLEAR = 1.3  # power over the detection threshold that noise alone exceeds in one of 1000 images
+# least power of the scatterers in a quarter of the aperture over that in the quarter of most power:
+# noise at the detection threshold gives 0.25
+_LEAST_LIT = 0.35
+_LEAST_FREE = 0.1  # degrees of freedom of a fit that few scatterers could not contradict
+_LEAST_ORDER = 3  # least order of the rotation with which another is compared, that of the paper
+_REFINED = 2  # refinements of a rotation to be judged: enough for an image that is still blurred
+# relative error of the rate up to which it scales images, a convention, and the standard deviations
+# that it must exceed: a rate that is found too large also looks too accurate
+_RATE_TOLERANCE, _SURE = 0.1, 2.7
+# Doppler and range cells over which scatterers share errors of the model, found by trial: those of
+# a few scatterers side by side in Doppler are large, with opposite signs
+_SHARED_LINES, _SHARED_CELLS = 8.0, 2.0
+# scatterers that outweigh the variance that the noise explains: a variance that a few of them show
+# is uncertain by a factor, found by trial
+_FEW = 2.0
+_LEAST_SHARES = 1.3  # independent scatterers that show the rate; one alone may be a peak of the noise
+
+
+class Judged(NamedTuple):
+    """Assessment of estimated rotations.
+
+    Args:
+        outcome: Codes of `Outcome`, shape (trial,).
+        quality: Quality from 0 to 1, shape (trial,).
+        std: Standard deviations by the name of the value.
+        info: Further figures by name.
+    """
+
+    outcome: Tensor
+    quality: Tensor
+    std: Mapping[str, Tensor]
+    info: Mapping[str, Tensor]
+
+
+def judged_motion(rows: Tensor, sampling: Sampling, motion: Motion) -> Judged:
+    """Assess the relative derivatives of the rotation rate of a rotation.
+
+    The rotation is refined by the histories of bright scatterers, and compared with the result. The
+    phase error that is expected of the scatterer farthest from zero Doppler follows from the change
+    and its covariance. A rotation of a lower order is compared
+    with one of third order, since its own order cannot show what it leaves out.
+
+    Args:
+        rows: Range-compressed pulses, shape (trial, pulse, range), complex.
+        sampling: Sampling of the data.
+        motion: Rotation to be judged.
+
+    Returns:
+        The assessment. Its quality is the relative decrease of exp(entropy) of the image due to the
+        compensation; info holds `phase_error_rad`, `scatterers` and the entropies.
+    """
+    third = replace(motion, k=torch.nn.functional.pad(motion.k, (0, max(0, _LEAST_ORDER - 1 - motion.k.shape[-1]))))
+    refined = third
+    for _ in range(_REFINED):
+        refined = refined_by_histories(rows, sampling, refined)
+    found = histories_of(rows, sampling, refined)
+    error, reasons = _questioned(sampling, third, refined, found)
+    entropies, quality = _entropies(rows, sampling, motion)
+    info = {**entropies, "phase_error_rad": error, "scatterers": found.used.sum(-1)}
+    outcome = worst(
+        *reasons,
+        (Outcome.PARTS_DISAGREE, error >= MOST_PHASE_ERROR_RAD),
+        (Outcome.NOISE, found.level < _CLEAR),
+        _empty(rows),
+    )
+    return Judged(outcome, quality, {}, info)
+
+
+def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit) -> Judged:
+    """Assess a joint fit of a rotation and its scatterers.
+
+    The step that the fit would take next is computed. Its curvature and the noise give a covariance
+    (Fisher information); the differences between what the scatterers ask for give another one. Both
+    are averaged, the second with the weight of the number of independent scatterers. Scatterers
+    that are not found disturb the others: standard deviations are divided by the share of the
+    energy that is accounted for.
+
+    Args:
+        rows: Range-compressed pulses, shape (trial, pulse, range), complex.
+        sampling: Sampling of the data.
+        fit: The fit.
+
+    Returns:
+        The assessment. Its quality is the share of the energy above the noise that the scatterers
+        explain.
+    """
+    found, motion, order = fit.scatterers, fit.motion, fit.motion.k.shape[-1]
+    explained, accounted = explained_share(rows, fit)
+    near = replace(Neighbours.find(found.amplitude, found.cell), shape=found.cell.shape)
+    reduced = Step.of(rows, sampling, fit, near, found.amplitude.shape[-1])[1].reduced(robust=True)
+    change, inverse, lost = reduced.solved()
+    tiny = torch.finfo(torch.float64).tiny
+    covariance = inverse / 2 * fit.noise[:, None, None]
+    predicted = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(tiny)
+    # shares of the scatterers in what is known about each parameter, and what each asks for
+    alike, power = _alike(found), found.amplitude.abs().square()
+    shares = torch.einsum("bpij,bin,bjn->bpn", reduced.curvature, inverse, inverse)
+    shares = shares / shares.sum(1, keepdim=True).clamp_min(tiny)
+    own = (reduced.pull - torch.einsum("bpij,bj->bpi", reduced.curvature, change)) @ inverse
+    seen = (own * (alike @ own)).sum(1) / predicted
+    number = 1 / (shares * (alike @ shares)).sum(1).clamp_min(tiny)
+    wider = (number * seen + _FEW + number.clamp_max(predicted.shape[-1])) / (
+        number + _FEW
+    ) + change.square() / predicted
+    wider = wider.sqrt() / accounted.clamp_min(1e-6)[:, None]
+    covariance = covariance * wider[:, :, None] * wider[:, None] + torch.diag_embed(torch.where(lost, math.inf, 0.0))
+    std = _standard_deviations(motion, covariance, fit.free_centre)
+    step = (fit.change.abs() / predicted.sqrt()).amax(-1)
+    # a step below three deviations, or that changes phases by less than 0.01 rad, is small
+    moving = (step > 3) & (step * (fit.noise / (2 * power.sum(-1) * sampling.pulses).clamp_min(tiny)).sqrt() > 0.01)
+    level = power.amax(-1) * sampling.pulses / (fit.noise * threshold(2 * rows[0].numel())).clamp_min(tiny)
+    error, reasons = _questioned(sampling, motion, motion, histories_of(rows, sampling, motion))
+    outcome = worst(
+        *reasons,
+        (Outcome.INEXACT, (_SURE * std["omega_rad_s"] >= _RATE_TOLERANCE * motion.omega_rad_s) | (motion.w <= 0)),
+        # histories are less accurate than the fit
+        (Outcome.PARTS_DISAGREE, error >= 2 * MOST_PHASE_ERROR_RAD),
+        (Outcome.MISFIT, explained < LEAST_EXPLAINED),
+        (Outcome.NOT_CONVERGED, moving),
+        (Outcome.TOO_FEW, (found.count < _LEAST_SCATTERERS) | (number[:, order] < _LEAST_SHARES)),
+        (Outcome.NOISE, level < _CLEAR),
+        _empty(rows),
+    )
+    return Judged(outcome, explained, std, _entropies(rows, sampling, motion)[0])
+
+
+def _empty(rows: Tensor) -> tuple[Outcome, Tensor]:
+    """Trials without samples other than zero."""
+    return Outcome.EMPTY, (rows == 0).flatten(1).all(-1)
+
+
+def _questioned(
+    sampling: Sampling, judged: Motion, refined: Motion, found: Histories
+) -> tuple[Tensor, list[tuple[Outcome, Tensor]]]:
+    """Phase error in rad, rms over the aperture, of a scatterer at the edge, (trial,); and doubts.
+
+    It is expected from the difference of two rotations and the covariance of that difference.
+    Constant and linear phases only displace a scatterer and are left out.
+    """
+    count, order = found.used.sum(-1), judged.k.shape[-1]
+    lag = found.pull.shape[-1] // 5  # samples of a history that share errors
+    # few scatterers cannot disagree: what the samples of each show counts as well
+    own = lag * torch.einsum("bpij,bpkj->bik", found.pull, found.pull)
+    pull = found.pull.sum(-1)
+    free = count / (count - found.inverse.shape[-1]).clamp_min(_LEAST_FREE)
+    covariance = found.inverse @ (pull.mT @ pull * free[:, None, None] + own) @ found.inverse
+    edge = 2 * math.pi * torch.where(found.used, found.cells.abs(), 0).amax(-1)
+    warped = Warped.of(judged.k, sampling.times(judged.k.device), sampling.duration_s)
+    line = torch.stack([torch.ones_like(warped.u), warped.u - warped.u.mean(-1, keepdim=True)], 1)
+    line = line / line.square().sum(-1, keepdim=True).sqrt()
+    curves = warped.slopes - (warped.slopes @ line.mT) @ line
+    size, change = curves @ curves.mT / sampling.pulses, refined.k - judged.k + found.change[:, :order]
+    moved = torch.einsum("bi,bij,bj->b", change, size, change).clamp_min(0)
+    unsure = (size * covariance[:, :order, :order]).sum((-2, -1)).clamp_min(0)
+    few = (count < _LEAST_SCATTERERS) | (edge <= 2 * math.pi)
+    dark = found.least_lit < _LEAST_LIT
+    error = torch.nan_to_num(edge * (moved + unsure).sqrt(), math.inf, math.inf)
+    return torch.where(few | dark, math.inf, error), [(Outcome.MISFIT, dark), (Outcome.TOO_FEW, few)]
+
+
+def _alike(found: Scatterers) -> Tensor:
+    """How far the errors of scatterers depend on each other, (trial, scatterer, scatterer), 0..1.
+
+    Scatterers a few resolution cells apart share what the model does not describe.
+    """
+    lines, rows = (
+        ((x[:, :, None] - x[:, None]) / reach).square()
+        for x, reach in ((found.cell, _SHARED_LINES), (found.row, _SHARED_CELLS))
+    )
+    used = (found.amplitude != 0).double()
+    return torch.exp(-(lines + rows) / 2) * used[:, :, None] * used[:, None]
+
+
+def _entropies(rows: Tensor, sampling: Sampling, motion: Motion) -> tuple[dict[str, Tensor], Tensor]:
+    """Entropies of the image with and without compensation, and the decrease of exp(entropy)."""
+    after, before = entropy(image_of(rows, sampling, motion)), entropy(torch.fft.fft(rows, 2 * rows.shape[-2], dim=-2))
+    named = {"entropy_nats": after, "uncompensated_entropy_nats": before}
+    return named, (1 - torch.exp((after - before).double())).clamp(0, 1)
+
+
+def _standard_deviations(motion: Motion, covariance: Tensor, free_centre: bool) -> dict[str, Tensor]:
+    """Standard deviations of the values, from the covariance of (k, w, v).
+
+    They are infinite where the data do not determine a value.
+    """
+    order, w = motion.k.shape[-1], torch.where(motion.w > 0, motion.w, 0)
+    k, ww = covariance.diagonal(dim1=-2, dim2=-1)[:, :order].clamp_min(0).sqrt(), covariance[:, order, order]
+    yc, moved = torch.zeros_like(w), motion.yc_m - motion.centre_m
+    if free_centre:
+        yc = covariance[:, -1, -1] - 2 * moved * covariance[:, order, -1] + moved.square() * ww
+        yc = yc.clamp_min(0).sqrt() / w
+    named = {
+        "omega_rad_s": ww.clamp_min(0).sqrt() / (2 * w.sqrt()),
+        "warp_k": k,
+        **{k_name(i + 1): column for i, column in enumerate(k.unbind(-1))},
+        "yc_m": yc,
+    }
+    return {name: torch.where(torch.isnan(value), math.inf, value) for name, value in named.items()}
