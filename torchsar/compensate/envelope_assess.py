@@ -24,7 +24,8 @@ GOOD_CELLS = 0.5
 # choice: polynomials in noise have 0.6 of it, single pulses nearly all
 _RANDOM = 0.25
 _LEAST_RANGE_CELLS = 4
-# usual differences of the halves by which those of a pulse are far, and largest share of such pulses
+# usual differences of the halves by which those of a pulse are far, and largest share of such
+# pulses
 _FAR, _MOST_FAR = 4.0, 0.05
 # error of single pulses without noise, by the parabola through samples a quarter of a cell apart
 _INTERPOLATION_CELLS = 1e-3
@@ -60,7 +61,7 @@ def deviation(
     if std is not None:
         agree = (apart.square().sum(-1) / count).sqrt() < GOOD_CELLS
         return std, agree & (std < GOOD_CELLS / 2)
-    # a pulse whose halves differ by far is aligned at a wrong maximum by one of them, rarely by both
+    # a pulse whose halves differ by far is aligned at a wrong maximum by one of them
     usual = _FAR * robust_std(apart.abs(), present)
     agree = (apart.abs() > usual).sum(-1) <= _MOST_FAR * count
     envelopes = Envelopes.of(lines)
