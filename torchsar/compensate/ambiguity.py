@@ -54,6 +54,9 @@ from torchsar.core import (
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
+# Probability above which the most probable ambiguity is taken, by choice. Otherwise it is that of
+# the nominal pointing.
+SURE = 0.9
 _BLOCKS = 8  # independent parts of the data; more give more degrees of freedom, each of less contrast
 
 
@@ -283,11 +286,12 @@ class DopplerCentroid(Stage):
     """Absolute Doppler centroid with its ambiguity and the squint angle; the recommended estimator.
 
     The baseband centroid comes from the phase increment between adjacent lines. The ambiguity is
-    found without prior knowledge, see `ambiguity_evidence`. Targets whose apertures are cut by the
-    ends of the record bias the centroid. If the dwell of the beam is known (`radar.integration_s`)
-    and the record is at least 1.15 dwells long, the centroid is therefore refined with targets
-    whose whole dwell lies in the record, see `complete_aperture_centroid`. The signal is left
-    unchanged.
+    found without prior knowledge, see `ambiguity_evidence`. Where the data leave it open, it is
+    that of the centroid nearest to `pointing_doppler_hz` of the radar, if that is not None. Targets
+    whose apertures are cut by the ends of the record bias the centroid. If the dwell of the beam is
+    known (`radar.integration_s`) and the record is at least 1.15 dwells long, the centroid is
+    therefore refined with targets whose whole dwell lies in the record, see
+    `complete_aperture_centroid`. The signal is left unchanged.
 
     Provides `doppler_hz` (absolute, positive when closing), `doppler_baseband_hz`, `ambiguity`
     (whole number of PRFs, as float64) and `squint_deg` (positive ahead, for the nominal velocity).
@@ -365,13 +369,17 @@ class DopplerCentroid(Stage):
         evidence = ambiguity_evidence(raw, radar, base, spectrum, self.reach)
         turns = candidate_turns(self.reach, raw.device)
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
-        first = base + prf * turns[joint.argmax(-1)]
+        best, nominal = turns[joint.argmax(-1)], radar.pointing_doppler_hz
+        if nominal is not None:
+            sure = torch.softmax(joint, -1).amax(-1) > SURE
+            best = torch.where(sure, best, torch.round((nominal - base) / prf))
+        first = base + prf * best
         refined, std = complete_aperture_centroid(raw, radar, first, self.reference)
         found = Estimate(self._values(refined), quality=torch.ones_like(first), info={**evidence, "candidates": turns})
         if not self.assess:
             return found
         lines = doppler_assess.Increments.of(raw, products, power, prf, *swept_band(radar, n))
-        return doppler_assess.absolute(found, lines, base, std, joint)
+        return doppler_assess.absolute(found, lines, base, std, joint, SURE)
 
     def _values(self, doppler_hz: Tensor) -> dict[str, Tensor]:
         """All values that an absolute Doppler centroid in Hz determines."""

@@ -21,6 +21,9 @@ from torchsar.metrics.bounds import tone_frequency_bound_hz
 # Largest standard deviation of an estimate that is ok, in PRF. Noise alone has a predicted standard
 # deviation about ten times as large, since the sum of its products is no larger than their scatter.
 MOST_STD = 0.015
+# Standard deviation from which on the centroid of incoherent lines is that of noise, in PRF, by
+# choice: a third of that of random frequencies.
+_NOISE_STD = 0.1
 # Least extent of the energy along the record, as a share of its length: targets seen for less are
 # cut by the end of the record, or nearly as short as their own drift of Doppler.
 _LEAST_EXTENT = 0.3
@@ -38,8 +41,6 @@ _REST_CYCLES = 2.5e-4
 # or speckle nothing shows which point the beam centre crosses at the given time.
 _LEAST_LEAD = 4.0
 _POINT_CELLS = 4  # resolution cells to each side of a point that belong to its response
-# Probability above which the ambiguity is taken for known, by choice.
-_SURE = 0.9
 
 
 class Increments(NamedTuple):
@@ -233,7 +234,7 @@ def over_range(
 
 
 def absolute(
-    found: Estimate, lines: Increments, base_hz: Tensor, refined_std_hz: Tensor, log_likelihood: Tensor
+    found: Estimate, lines: Increments, base_hz: Tensor, refined_std_hz: Tensor, log_likelihood: Tensor, sure: float
 ) -> Estimate:
     """Assess an absolute centroid; see `DopplerCentroid`.
 
@@ -244,6 +245,7 @@ def absolute(
         refined_std_hz: Standard deviation in Hz by the targets whose whole dwell lies in the
             record, shape (...,); infinite where there are none.
         log_likelihood: Of the candidates for the ambiguity, shape (..., candidate).
+        sure: Probability above which the ambiguity is known.
     """
     plain = baseband(replace(found, value={"doppler_baseband_hz": base_hz}), lines)
     turned = cis((found["doppler_hz"] - base_hz) / lines.scale)
@@ -252,17 +254,18 @@ def absolute(
     probability = torch.softmax(log_likelihood, -1).amax(-1)
     cut = plain.info["cut_hz"].abs() >= lines.scale * lines.half_band_rad / 4
     outcome = worst(
-        (Outcome.INEXACT, std >= 2 * math.pi * lines.scale * MOST_STD),
+        (Outcome.INEXACT, ~lines.coherent | (std >= 2 * math.pi * lines.scale * MOST_STD)),
         (Outcome.MISFIT, cut),
-        (Outcome.AMBIGUOUS, probability <= _SURE),
+        (Outcome.AMBIGUOUS, probability <= sure),
+        (Outcome.NOISE, ~lines.coherent & (std >= 2 * math.pi * lines.scale * _NOISE_STD)),
+        (Outcome.EMPTY, plain.outcome == Outcome.EMPTY),
     )
-    failed = plain.outcome * plain.failed
     best = log_likelihood.topk(min(2, log_likelihood.shape[-1])).values
     return replace(
         found,
         std={"doppler_hz": std, "doppler_baseband_hz": std},
         quality=probability,
-        outcome=torch.maximum(outcome, failed),
+        outcome=outcome,
         info={**plain.info, "margin": best[..., 0] - best[..., -1], "coherence": plain.quality},
     )
 
