@@ -95,15 +95,15 @@ class Increments(NamedTuple):
         half_band = half_band.clamp(1e-3, 0.95 * math.pi)
         dwell = pairs / 2 if rate_hz_s is None else half_band * prf_hz**2 / (math.pi * rate_hz_s)
         per_pair = cut_lines(half_band, dwell) * (products.shape[-2] / pairs)
-        ends = per_pair[..., None, None] * products[..., [0, -1], :]
+        ends = per_pair[..., None, None] * torch.stack([products[..., 0, :], products[..., -1, :]], -2)
         return Increments(products, power, half_band, ends, coherent, prf_hz / (2 * math.pi))
 
     def cut(self, turn: Tensor) -> Tensor:
         """What cut apertures add to the sum of the phase increments, (..., 2, b); turn: phasor of
         the negative phase increment, shape (...,).
         """
-        ends = (self.ends * turn[..., None, None]).real
-        return ends * ends.new_tensor([-1.0, 1.0])[:, None]
+        first, last = (self.ends * turn[..., None, None]).real.unbind(-2)
+        return torch.stack([-first, last], -2)
 
     def outcome(self, turn: Tensor, scatter: Tensor, shift: Tensor) -> Tensor:
         """Outcome (...,) for a standard deviation and a shift by cut apertures in rad."""

@@ -2,7 +2,7 @@
 
 The speckle and the noise of the lower and the upper half of the band are independent. A half has
 cells twice as wide and half as many of them, so that the mean of both errs twice as much as the
-whole band, and their difference four times as much. Shifts of single pulses that are not the
+whole band, and their difference four to six times as much. Shifts of single pulses that are not the
 likeliest ones also err by their distance from these.
 """
 
@@ -21,9 +21,12 @@ from torchsar.core import Estimate, Outcome, worst
 # standard deviation of a shift in cells from which on an alignment is not ok: a convention
 GOOD_CELLS = 0.5
 # share of the deviation of random positions in the window from which on nothing was found, by
-# choice: polynomials in noise have 0.6 of it, single pulses nearly all
-_RANDOM = 0.25
+# choice: polynomials in noise have 0.6 of it, single pulses by half of the band 0.28
+_RANDOM = 0.15
 _LEAST_RANGE_CELLS = 4
+# difference of the halves over the error of the whole band: 4 by the number and the width of the
+# cells, 4.5 to 6.5 in speckle and among points
+_APART = 5.0
 # usual differences of the halves by which those of a pulse are far, and largest share of such
 # pulses
 _FAR, _MOST_FAR = 4.0, 0.05
@@ -56,7 +59,7 @@ def deviation(
     lower, upper = (find(Envelopes.of(end))[0] * (n / half) for end in ends)
     phasor = torch.where(present, torch.polar(torch.ones_like(lower), 2 * math.pi / n * (lower - upper)), 0)
     apart = wrapped(lower - upper - torch.angle(phasor.sum(-1, keepdim=True)) * (n / (2 * math.pi)), n)
-    apart = torch.where(present, apart, 0) / 4
+    apart = torch.where(present, apart, 0) / _APART
     count = (present.sum(-1) - 1).clamp_min(1)
     if std is not None:
         agree = (apart.square().sum(-1) / count).sqrt() < GOOD_CELLS

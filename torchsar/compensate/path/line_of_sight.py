@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsar.compensate.path import assess as assessment
 from torchsar.compensate.path.axes import three_axes
-from torchsar.compensate.path.ground import for_each, ground_image, trials_of
+from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, trials_of
 from torchsar.compensate.path.search import Search, found_from_starts
 from torchsar.core import Estimate, Outcome, checked_samples
 from torchsar.metrics import entropy
@@ -127,7 +127,7 @@ def path_autofocus(
         some = rows[present]
         some = some / some.abs().amax()
         search = Search(some, frequency_hz, coarse, present)
-        results = found_from_starts(search, imaging(), rounds)
+        results = found_from_starts(search, imaging(FINE_STEP), rounds)
         best = results.best
         if best.noise < _CLEAR * some.abs().square().double().mean():
             last = three_axes(some, imaging(_FINEST_STEP), best.motion_m, present, _LAST_ROUNDS, exact=True)
