@@ -252,10 +252,12 @@ def absolute(
     moved = lines.scale * torch.atan2(turned.imag, turned.real)
     std = torch.minimum(refined_std_hz, torch.hypot(plain.std["doppler_baseband_hz"], moved))
     probability = torch.softmax(log_likelihood, -1).amax(-1)
-    cut = plain.info["cut_hz"].abs() >= lines.scale * lines.half_band_rad / 4
+    shift = plain.info["cut_hz"].abs()
+    scatter = (plain.std["doppler_baseband_hz"].square() - shift.square()).clamp_min(0).sqrt()
+    inexact = torch.minimum(refined_std_hz, scatter) >= 2 * math.pi * lines.scale * MOST_STD
     outcome = worst(
-        (Outcome.INEXACT, ~lines.coherent | (std >= 2 * math.pi * lines.scale * MOST_STD)),
-        (Outcome.MISFIT, cut),
+        (Outcome.INEXACT, ~lines.coherent | inexact),
+        (Outcome.MISFIT, shift >= lines.scale * lines.half_band_rad / 4),
         (Outcome.AMBIGUOUS, probability <= sure),
         (Outcome.NOISE, ~lines.coherent & (std >= 2 * math.pi * lines.scale * _NOISE_STD)),
         (Outcome.EMPTY, plain.outcome == Outcome.EMPTY),
