@@ -51,8 +51,8 @@ class Increments(NamedTuple):
         power: Mean power of the same pairs of lines, shape (..., a, b).
         half_band_rad: Half of the band that a target sweeps in the beam, as a phase increment in
             rad, shape (...,).
-        ends: What the mean product of a pair of lines in the first and in the last block adds to
-            the sum of the phase increments, see `cut_lines`, shape (..., 2, b), complex128.
+        ends: What the mean product of a pair of lines at the first and at the last line adds to the
+            sum of the phase increments, see `cut_lines`, shape (..., 2, b), complex128.
         coherent: True where the products of adjacent lines, or the changes of these products, add
             up to more than in noise, shape (...,).
         scale: Frequency of a phase increment of 1 rad, in Hz.
@@ -82,6 +82,7 @@ class Increments(NamedTuple):
                 the band is measured from the products of lines two apart: cos b over their ratio.
         """
         x = unit_level(x)
+        x = x / _positive(x.abs().amax((-2, -1), keepdim=True))  # as in the products
         step = torch.linalg.vecdot(x[..., :-1, :], x[..., 1:, :]).to(torch.complex128)
         coherent = _adds_up(step) | _adds_up(step[..., :-1].conj() * step[..., 1:])
         pairs = x.shape[-2] - 1
@@ -94,8 +95,11 @@ class Increments(NamedTuple):
             half_band = torch.full_like(step[..., 0].real, math.pi * rate_hz_s * dwell_s / prf_hz)
         half_band = half_band.clamp(1e-3, 0.95 * math.pi)
         dwell = pairs / 2 if rate_hz_s is None else half_band * prf_hz**2 / (math.pi * rate_hz_s)
-        per_pair = cut_lines(half_band, dwell) * (products.shape[-2] / pairs)
-        ends = per_pair[..., None, None] * torch.stack([products[..., 0, :], products[..., -1, :]], -2)
+        last = max(1, pairs // (2 * products.shape[-2]))  # half of a block
+        parts = [x[..., : last + 1, :], x[..., -last - 1 :, :]]
+        mean = [(part[..., :-1, :].conj() * part[..., 1:, :]).sum(-2) / last for part in parts]
+        ends = torch.stack(mean, -2).to(torch.complex128).tensor_split(products.shape[-1], -1)
+        ends = torch.stack([some.sum(-1) for some in ends], -1) * cut_lines(half_band, dwell)[..., None, None]
         return Increments(products, power, half_band, ends, coherent, prf_hz / (2 * math.pi))
 
     def cut(self, turn: Tensor) -> Tensor:
