@@ -25,11 +25,8 @@ from torchsar.compensate import (
     SharpestPhase,
     TargetAutofocus,
     align_envelopes,
-    align_mean,
-    align_running,
     maximum_contrast,
     pulse_gain,
-    refine_alignment,
 )
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_turntable
@@ -285,10 +282,9 @@ def entries() -> list[Entry]:
     shifts = [Quantity("shift_cells", 0.5, shift_error, 0.02)]
     aligners = {
         "align_envelopes": align_envelopes,
-        "align_envelopes:single": partial(align_envelopes, degree=None),
-        "align_mean": align_mean,
-        "align_running": align_running,
-        "refine_alignment": lambda x: refine_alignment(x, align_envelopes(x)["shift_cells"]),
+        "align_envelopes:single": partial(align_envelopes, method="single"),
+        "align_envelopes:amplitude": partial(align_envelopes, method="amplitude"),
+        "align_envelopes:running": partial(align_envelopes, method="running"),
         "AlignEnvelopes": lambda x: _in_cells(x),
     }
     return [

@@ -14,15 +14,17 @@ from torchsar.compensate import (
     EnergyCentre,
     PhaseIncrement,
     RangeDependentCentroid,
+    doppler_assess,
     energy_centre,
     lag_products,
     phase_increment,
     point_doppler,
+    velocity_assess,
     velocity_objective,
 )
 from torchsar.compensate.aperture import _noise_variance
 from torchsar.compensate.group import BeamSpectrum
-from torchsar.core import Chain, Draws, Recording, Signal, use
+from torchsar.core import Chain, Draws, Outcome, Recording, Signal, use
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
@@ -382,20 +384,6 @@ def test_independent_lines_have_no_centroid_whatever_the_range_cells_share(estim
     assert bool(estimate(sum(bright.roll(k, -2) for k in range(6)), PRF).ok.all())
 
 
-def test_the_deviation_over_range_includes_the_few_targets_that_are_cut() -> None:
-    """A chirp fills several blocks, whose residuals agree: errors of 7 deviations."""
-    radar, generator = replace(AIRCRAFT, prf_hz=200.0), torch.Generator().manual_seed(3)
-    middle, row = (x * (torch.rand(240, 3, 1, generator=generator) - 0.5) for x in (2.6, 25.0))
-    t, u = (torch.arange(384) - 192) / radar.prf_hz - middle, torch.arange(96) - 48 - row
-    along = torch.polar((t.abs() < 0.5).float(), math.pi * 77 * t.square())
-    x = torch.einsum("tkp,tkr->tpr", along, torch.polar((u.abs() < 12.5).float(), 0.1 * u.square()))
-    x = x + 0.1 * torch.randn(x.shape, generator=generator, dtype=x.dtype)
-    found = RangeDependentCentroid(radar)(Signal(x, radar.raw_axes(384, 96)))
-    error, std = found["doppler_baseband_hz"][found.ok].abs(), found.std["doppler_baseband_hz"][found.ok]
-    assert len(error) > 120 and bool((error < 4 * std + 0.5).all())
-    assert 0.7 < float((error.square().mean() / std.square().mean()).sqrt()) < 1.43
-
-
 def test_faint_range_cells_do_not_bend_the_centroid_over_range() -> None:
     """Without noise, the sidelobes of the pulses are as coherent as the targets."""
     rms = []
@@ -423,6 +411,38 @@ def test_a_wide_search_with_an_unknown_dwell_takes_few_images() -> None:
     assert found.info["grid_velocity_m_s"].shape[0] <= 33 and float(found.info["grid_velocity_m_s"].min()) >= 60
     assert bool(found.ok.all())
     torch.testing.assert_close(found["velocity_m_s"], torch.full_like(doppler, 121.5), atol=0.2, rtol=0)
+
+
+@pytest.mark.parametrize("kind", [PhaseIncrement, EnergyCentre, RangeDependentCentroid, DopplerCentroid])
+def test_outcomes_of_centroids_and_values_without_assessment(kind, monkeypatch: pytest.MonkeyPatch) -> None:
+    signal, _ = aircraft(RandomPoints(24, 230.0, 150.0, spread_db=6.0), trials=1)
+    noise = Draws(3, trials=range(1)).normal("alone", (768, 192), torch.complex64)
+    cut, _ = aircraft(RandomPoints(24, 20.0, 150.0, azimuth_m=125.0), trials=1)
+    data = torch.cat([signal.data, noise, 0 * noise, cut.data])
+    found = kind(AIRCRAFT)(signal.with_data(data))
+    assert found.outcome[:3].tolist() == [Outcome.OK, Outcome.NOISE, Outcome.EMPTY]
+    assert found.outcome[3] == Outcome.MISFIT
+    for part in ("Increments", "baseband", "over_range", "absolute"):
+        monkeypatch.delattr(doppler_assess, part)
+    alone = kind(AIRCRAFT, assess=False)(signal.with_data(data))
+    assert bool((alone.outcome == Outcome.NOT_ASSESSED).all()) and not alone.std
+    for name, value in found.value.items():
+        torch.testing.assert_close(alone[name], value, rtol=0, atol=0)
+
+
+def test_outcomes_of_velocities_and_values_without_assessment(monkeypatch: pytest.MonkeyPatch) -> None:
+    signal, doppler = aircraft(RandomPoints(24, 230.0, 150.0, spread_db=6.0), trials=2)
+    noise = Draws(3, trials=range(1)).normal("alone", (768, 192), torch.complex64)
+    far = StripmapWorld(RandomPoints(24, 230.0, 150.0), Dwell(1.0), velocity_m_s=160.0, doppler_hz=0.0, snr_db=20.0)
+    beyond = simulate(AIRCRAFT, far, 768, 192, Draws(15, trials=range(1)))[0].signal.data
+    data = torch.cat([signal.data[:1], noise, 0 * noise, beyond])
+    doppler = torch.cat([doppler[:1], torch.zeros(3, dtype=torch.float64)])
+    found = EffectiveVelocity(OmegaK(AIRCRAFT), 25.0)(signal.with_data(data), doppler)
+    assert found.outcome[:3].tolist() == [Outcome.OK, Outcome.NOISE, Outcome.EMPTY] and not bool(found.ok[3])
+    monkeypatch.delattr(velocity_assess, "assessed")
+    alone = EffectiveVelocity(OmegaK(AIRCRAFT), 25.0, assess=False)(signal.with_data(data), doppler)
+    assert bool((alone.outcome == Outcome.NOT_ASSESSED).all()) and not alone.std
+    torch.testing.assert_close(alone["velocity_m_s"], found["velocity_m_s"], rtol=0, atol=0)
 
 
 def test_invalid_arguments_are_rejected() -> None:

@@ -13,15 +13,13 @@ from torchsar.compensate import (
     AlignEnvelopes,
     ShiftRange,
     align_envelopes,
-    align_mean,
-    align_running,
     correct_pulse_phase,
     drift_cells,
-    refine_alignment,
+    envelope_assess,
     shift_range,
 )
 from torchsar.compensate.envelope_fit import Envelopes, robust_fit
-from torchsar.core import Axis, Chain, Draws, Signal, use
+from torchsar.core import Axis, Chain, Draws, Outcome, Signal, use
 from torchsar.echo import simulate_turntable
 from torchsar.focus import CompressDechirped, azimuth_transform
 from torchsar.metrics import entropy
@@ -30,12 +28,7 @@ from torchsar.scene import Aircraft, Dechirped, Polynomial, Sinusoid, TurntableW
 
 DOUBLE = torch.complex128
 LADAR = InverseRadar(LIGHT_M_S / 1.55e-6, 150e9, 2000.0, 0.005, 100e-6, 20e3)
-SINGLE = {
-    "running": align_running,
-    "mean": align_mean,
-    "mean of |s|": partial(align_mean, match="amplitude"),
-    "not smoothed": partial(align_envelopes, degree=None),
-}
+SINGLE = {name: partial(align_envelopes, method=name) for name in ("running", "single", "amplitude")}
 METHODS = {**SINGLE, "degree 2": align_envelopes, "two tones": partial(align_envelopes, tones=2)}
 
 
@@ -179,7 +172,7 @@ def test_noise_free_data_are_not_degraded() -> None:
 
     assert abs(cost(align_envelopes)) < 0.01
     assert cost(partial(align_envelopes, tones=2)) < 0.01
-    assert 0 < cost(align_mean) < 0.04 < cost(SINGLE["mean of |s|"])
+    assert 0 < cost(SINGLE["single"]) < 0.04 < cost(SINGLE["amplitude"])
 
 
 @pytest.mark.parametrize("snr_db", [None, 0.0, -10.0])
@@ -246,9 +239,7 @@ def test_empty_data_give_finite_values(method) -> None:
         )
 
 
-@pytest.mark.parametrize(
-    "method", [*METHODS.values(), lambda x: refine_alignment(x, torch.zeros(5))], ids=[*METHODS, "refine"]
-)
+@pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
 def test_invalid_data_are_rejected(method) -> None:
     x = circular(2, 5, 16)
     x[1, 3, 4] = float("nan")
@@ -261,18 +252,16 @@ def test_invalid_data_are_rejected(method) -> None:
 @pytest.mark.parametrize(
     "call",
     [
-        partial(align_running, memory_pulses=0.5),
-        partial(align_mean, match="power"),  # pyright: ignore[reportArgumentType]
-        partial(align_mean, iterations=0),
+        partial(align_envelopes, method="power"),
         partial(align_envelopes, degree=-1),
-        partial(align_envelopes, degree=None, tones=1),
+        partial(align_envelopes, method="single", tones=1),
         partial(align_envelopes, blocks=0),
         partial(align_envelopes, degree=2.5),  # pyright: ignore[reportArgumentType]
-        lambda x: refine_alignment(x, torch.zeros(5), degree=0),
+        partial(align_envelopes, degree=None),  # pyright: ignore[reportArgumentType]
     ],
 )
 def test_invalid_settings_are_rejected(call) -> None:
-    with pytest.raises(ValueError, match=r"^(align|refine)_\w+"):
+    with pytest.raises(ValueError, match=r"^align_envelopes"):
         call(circular(5, 16))
 
 
@@ -285,14 +274,6 @@ def test_robust_fit_ignores_outliers() -> None:
     torch.testing.assert_close(
         robust_fit(values, basis, torch.ones(2, 40, dtype=torch.float64)), true, atol=1e-6, rtol=0
     )
-
-
-def test_refinement_by_the_image_finds_a_curved_shift_history() -> None:
-    x, _ = aircraft(None, 2, 120)
-    u = unit_time(120)
-    wrong = 0.5 * (1.5 * u**2 - 0.5) * torch.tensor([[1.0], [-0.6]], dtype=torch.float64)
-    refined = refine_alignment(x, wrong, rounds=1, steps=8)
-    assert float(rms(off(refined["shift_cells"], torch.zeros(2, 120))).max()) < 0.5 * float(rms(wrong).min())
 
 
 def test_stages_align_a_target_with_a_tracking_error() -> None:
@@ -345,7 +326,7 @@ def test_stages_work_in_metres() -> None:
     )
 
 
-@pytest.mark.parametrize("settings", [{}, {"tones": 2}, {"degree": None}])
+@pytest.mark.parametrize("settings", [{}, {"tones": 2}, {"method": "single"}])
 def test_no_trials_give_no_shifts(settings: dict) -> None:
     found = align_envelopes(torch.zeros(0, 5, 16, dtype=torch.complex64), **settings)
     assert found["shift_cells"].shape == (0, 5) and found.ok.shape == (0,)
@@ -371,42 +352,25 @@ def points(rows: Tensor, snr_db: float, size: float = 2.0, n: int = 96) -> tuple
 
 
 @pytest.mark.parametrize("count, snr_db", [(12, 0.0), (12, 40.0), (160, 20.0), (160, 40.0)])
-@pytest.mark.parametrize("method", [align_running, align_mean])
-def test_deviation_of_single_shifts(method, count: int, snr_db: float) -> None:
+def test_deviation_of_single_shifts(count: int, snr_db: float) -> None:
     """It holds for separate points as for speckle, at any SNR."""
     x, shift = points(24 + 48 * torch.rand(10, count, generator=torch.Generator().manual_seed(5)).double(), snr_db)
-    found = method(x)
+    found = align_envelopes(x, method="single")
     error = rms(off(found["shift_cells"], shift, 96) - off(found["shift_cells"], shift, 96).mean(-1, keepdim=True))
     ok = found.ok
     ratio = float(rms(error[ok]) / rms(found.std["shift_cells"][ok, 0]))
     assert float(ok.double().mean()) >= 0.6 and 0.7 < ratio < 1.5, ratio
 
 
-@pytest.mark.parametrize("spacing", [6, 12])
-def test_deviation_of_single_shifts_of_rows_at_even_spacing(spacing: int) -> None:
-    """The errors of such rows cancel in pairs: twice as much was predicted."""
-    rows = 8 + spacing * torch.randint(80 // spacing, (20, 24), generator=torch.Generator().manual_seed(4)).double()
-    x, shift = points(rows, 40.0)
-    found = align_mean(x)
-    error = off(found["shift_cells"], shift, 96)
-    ok, error = found.ok, rms(error - error.mean(-1, keepdim=True))
-    ratio = float(rms(error[ok]) / rms(found.std["shift_cells"][ok, 0]))
-    assert int(ok.sum()) >= 8 and 0.7 < ratio < 1.5, ratio
-
-
-@pytest.mark.parametrize("seed", [100, 103])
-def test_a_wrong_maximum_of_rows_at_even_spacing_is_noticed(seed: int) -> None:
-    """Their likelihood has maxima at the spacing, and a faded row makes a wrong one the highest."""
-    rows = 16 + 8 * torch.randint(8, (40, 20), generator=torch.Generator().manual_seed(seed)).double()
-    x, shift = points(rows, 12.0)
-    found = align_mean(x)
-    wrong = off(found["shift_cells"], shift, 96).abs().amax(-1) > 1
-    assert bool(wrong.any()) and not bool((found.ok & wrong).any()) and bool(found.ok.any())
-
-
-def test_the_envelopes_confirm_a_refined_alignment_of_a_homogeneous_target() -> None:
-    """The entropy of such a target does not show shifts."""
-    rows = 24 * torch.rand(1, 200, generator=torch.Generator().manual_seed(1)).double()
-    x, shift = points(rows, 20.0, 1.0, 32)
-    found = refine_alignment(x, shift + 0.2 * unit_time(96) ** 2, rounds=1, steps=3)
-    assert found.ok.all() and float(rms(off(found["shift_cells"], shift, 32))[0]) < 0.2
+@pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
+def test_outcomes_and_values_without_assessment(method, monkeypatch: pytest.MonkeyPatch) -> None:
+    good = aircraft(10.0, 1, 60)[0]
+    x = torch.cat([good, circular(1, 60, 256), 0 * good, good])
+    x[3, 1:] = 0
+    found = method(x)
+    assert found.outcome.tolist() == [Outcome.OK, Outcome.NOISE, Outcome.EMPTY, Outcome.TOO_FEW]
+    for part in ("deviation", "assessed"):
+        monkeypatch.delattr(envelope_assess, part)
+    alone = method(x, assess=False)
+    assert bool((alone.outcome == Outcome.NOT_ASSESSED).all()) and not alone.std
+    assert torch.equal(alone["shift_cells"], found["shift_cells"])

@@ -11,12 +11,13 @@ import pytest
 import torch
 
 from torchsar.compensate import CorrectPath, PathAutofocus, PathPhase, path_autofocus, path_phase
-from torchsar.compensate.path import line_of_sight
+from torchsar.compensate.path import assess
 from torchsar.compensate.path.axes import Found
 from torchsar.compensate.path.envelopes import drift_m, moved
 from torchsar.compensate.path.fringes import rough_near, roughness, smooth_near, smoothest
 from torchsar.compensate.path.ground import ground_image
-from torchsar.core import Draws, Recording, unit_phasor
+from torchsar.compensate.path.search import Starts
+from torchsar.core import Draws, Estimate, Outcome, Recording, unit_phasor
 from torchsar.echo import simulate_path
 from torchsar.focus import ImageGrid, TileImage, TileOperator, TilePlan
 from torchsar.metrics import phase_rmse, registered_error_db
@@ -170,7 +171,10 @@ def test_noise_and_too_few_pulses_are_not_ok() -> None:
     noise = torch.randn(2, 24, CELLS, dtype=torch.complex64, generator=torch.Generator().manual_seed(2))
     noise[1, 5:] = 0
     found = path_autofocus(noise, frequency, antennas, rounds=1)
-    assert found.ok.tolist() == [False, False]
+    assert found.outcome.tolist() == [Outcome.NOISE, Outcome.TOO_FEW]
+    alone = path_autofocus(noise, frequency, antennas, rounds=1, assess=False)
+    assert bool((alone.outcome == Outcome.NOT_ASSESSED).all()) and not alone.std
+    assert torch.equal(alone["offset_m"], found["offset_m"])
     assert all(bool(torch.isfinite(x).all()) for x in (*found.value.values(), *found.std.values(), found.quality))
     with pytest.raises(ValueError, match="extent_m must be positive and finite, got -1"):
         path_autofocus(noise, frequency, antennas, extent_m=-1.0)
@@ -223,7 +227,7 @@ def test_an_envelope_that_drifts_against_the_phases_is_found() -> None:
 
 def test_a_start_that_explains_the_samples_worse_widens_the_doubt_and_not_the_deviation() -> None:
     present = torch.ones(PULSES, dtype=torch.bool)
-    search = SimpleNamespace(fringe_m=0.0156, present=present)
+    search: Any = SimpleNamespace(fringe_m=0.0156, present=present, rows=torch.ones(PULSES, CELLS))
 
     def found(noise: float, error_m: float, sharp: float) -> Found:
         line = error_m * torch.randn(PULSES, dtype=F64, generator=torch.Generator().manual_seed(3))
@@ -234,14 +238,12 @@ def test_a_start_that_explains_the_samples_worse_widens_the_doubt_and_not_the_de
         return Found(motion, motion, torch.full_like(line, 3e-5), image, value, value * 0)
 
     best, near, far, lost = found(1, 0, 0.1), found(1.02, 2e-5, 0.2), found(1.3, 3e-4, 0.3), found(10, 3e-4, 0.4)
-    cases = (
-        ([far, near], 3.3e-5, 3.3e-5, False),
-        ([near], 3.3e-5, 3.3e-5, False),
-        ([far], 1.7e-4, 2e-4, True),
-        ([far, lost], 4e-5, 2e-4, True),
-    )
-    sharpest: Any = line_of_sight._sharpest
-    for others, std_m, doubt_m, only in cases:
-        kept, *spread, alone = sharpest([*others, best], search)
-        assert kept is best and alone is only
-        assert [float(x.square().mean().sqrt()) for x in spread] == pytest.approx([std_m, doubt_m], rel=0.2)
+    cases = (([far, near], 3.3e-5, 3.3e-5), ([near], 3.3e-5, 3.3e-5), ([far], 1.7e-4, 2e-4), ([far, lost], 4e-5, 2e-4))
+    for others, std_m, doubt_m in cases:
+        starts = Starts.of([*others, best], search, best.noise)
+        assert starts.best is best
+        known = Estimate({"line_of_sight_m": best.line_of_sight_m}, quality=best.noise)
+        judged = assess.of_path(known, starts, search)
+        doubt = (best.std_m.square().mean() + starts.square_m2.amin() / 2).sqrt()
+        assert float(judged.std["line_of_sight_m"].square().mean().sqrt()) == pytest.approx(std_m, rel=0.2)
+        assert float(doubt) == pytest.approx(doubt_m, rel=0.2)

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from torchsar.compensate import PointDoppler, doppler_at, peak_time_s
-from torchsar.core import Draws, Signal
+from torchsar.compensate import PointDoppler, doppler_assess, doppler_at, peak_time_s
+from torchsar.core import Draws, Outcome, Signal
 from torchsar.echo import simulate, target_energy
 from torchsar.focus import OmegaK
 from torchsar.metrics import reference_doppler_std_hz, tone_frequency_bound_hz
@@ -52,21 +52,25 @@ def test_a_weak_point_has_the_std_of_its_bound() -> None:
     assert found.ok.all() and std == pytest.approx(float(tone_frequency_bound_hz(q, 0.1)), rel=0.1)
 
 
-def test_noise_alone_is_not_ok() -> None:
+def test_noise_alone_is_not_ok(monkeypatch: pytest.MonkeyPatch) -> None:
     noise = Draws(4, trials=range(20)).normal("n", (512, 192), torch.complex64)
     found = PointDoppler(RADAR)(Signal(noise, RADAR.image_axes(RADAR.raw_axes(512, 192))))
-    assert int(found.ok.sum()) == 0
+    assert bool((found.outcome == Outcome.NOISE).all())
     silent = PointDoppler(RADAR)(
         Signal(torch.zeros(2, 64, 64, dtype=torch.complex64), RADAR.image_axes(RADAR.raw_axes(64, 64)))
     )
-    assert not bool(silent.ok.any()) and bool(torch.isfinite(silent["doppler_hz"]).all())
+    assert bool((silent.outcome == Outcome.EMPTY).all()) and bool(torch.isfinite(silent["doppler_hz"]).all())
+    monkeypatch.delattr(doppler_assess, "of_point")
+    alone = PointDoppler(RADAR, assess=False)(Signal(noise, RADAR.image_axes(RADAR.raw_axes(512, 192))))
+    assert not alone.std and bool((alone.outcome == Outcome.NOT_ASSESSED).all())
+    assert torch.equal(alone["doppler_hz"], found["doppler_hz"])
 
 
 @pytest.mark.parametrize("scene", [Speckle(600, 900.0, 60.0), RandomPoints(3, 60.0, 400.0)])
 def test_a_point_that_does_not_stand_out_is_not_ok(scene: Scene) -> None:
     world = StripmapWorld(scene, Dwell(0.3), doppler_hz=652.0, snr_db=10.0)
     image = OmegaK(RADAR)(simulate(RADAR, world, 512, 192, Draws(6, trials=range(6)))[0].signal)
-    assert not bool(PointDoppler(RADAR)(image).ok.any())
+    assert bool((PointDoppler(RADAR)(image).outcome == Outcome.AMBIGUOUS).all())
 
 
 def test_doppler_at_inverts_the_image_position() -> None:

@@ -13,6 +13,7 @@ from torchsar.compensate import CorrectPath, StripAutofocus, strip_autofocus
 from torchsar.compensate.path.curve import Curve
 from torchsar.compensate.path.motion import cosines
 from torchsar.compensate.path.scatterers import Echoes, prominent_places
+from torchsar.core import Outcome
 from torchsar.focus import ImageGrid, ProcessedBeam, TileImage
 from torchsar.metrics import phase_rmse, registered_error_db
 from torchsar.radar import StraightTrack, frequency_samples
@@ -84,6 +85,14 @@ def test_bad_strips_are_refused(changed: dict[str, float], sentence: str) -> Non
         strip_autofocus(
             recording.signal.data, recording.aux["frequency_hz"], path_of(recording), **{**STRIP, **changed}
         )
+
+
+def test_values_without_assessment_are_those_with_it() -> None:
+    recording, _ = strips(seed=5)
+    known = {name: recording.aux[name] for name in KNOWN}
+    found, alone = (StripAutofocus(**STRIP, assess=assess)(recording.signal, **known) for assess in (True, False))
+    assert found.outcome.tolist() == [Outcome.OK] and alone.outcome.tolist() == [Outcome.NOT_ASSESSED]
+    assert not alone.std and torch.equal(alone["offset_m"], found["offset_m"])
 
 
 def test_a_curve_is_that_of_dense_least_squares() -> None:

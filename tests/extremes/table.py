@@ -325,9 +325,6 @@ FUNCTIONS = [
     ),
     # compensate
     _entry("compensate.align_envelopes", "raw", compensate.align_envelopes),
-    _entry("compensate.align_mean", "raw", compensate.align_mean),
-    _entry("compensate.align_running", "raw", compensate.align_running),
-    _entry("compensate.refine_alignment", "raw", lambda x: compensate.refine_alignment(x, ramp(x.shape[-2], 0.01))),
     _entry("compensate.shift_range", "raw", lambda x: compensate.shift_range(x, ramp(x.shape[-2]))),
     _entry("compensate.pulse_gain", "raw", compensate.pulse_gain),
     _entry("compensate.equalise_pulses", "raw", lambda x: compensate.equalise_pulses(x, 1 + ramp(x.shape[-2]))),
@@ -427,9 +424,7 @@ FUNCTIONS = [
     _entry(
         "compensate.complete_aperture_centroid",
         "raw",
-        lambda x: compensate.complete_aperture_centroid(
-            x, RADAR, torch.full(x.shape[:-2], 5.0, dtype=F64), torch.ones(x.shape[:-2], dtype=F64), None
-        ),
+        lambda x: compensate.complete_aperture_centroid(x, RADAR, torch.full(x.shape[:-2], 5.0, dtype=F64), None),
     ),
     _entry(
         "compensate.minimum_entropy_velocity",
@@ -442,7 +437,6 @@ FUNCTIONS = [
             parabola_minimum,
             0.1,
         ),
-        {"most_m_s": None},  # a width by differences of entropies, rounded in single precision
     ),
     _entry(
         "compensate.velocity_objective",

@@ -206,7 +206,7 @@ RANGE_FREE = (
     *("Autofocus:autofocus", "PhasePolish:phase_polish", "SharpestPhase", "TargetAutofocus", "AlignEnvelopes"),
     *("PulseGain", "EstimateImbalance:estimate_imbalance", "PilotJitter:pilot_jitter", "BlindJitter:blind_jitter"),
     *("EstimateBalance:estimate_balance", "WalkAmbiguity:walk_ambiguity", "compensate.align_envelopes"),
-    *("compensate.align_mean", "compensate.align_running", "compensate.refine_alignment", "compensate.pulse_gain"),
+    "compensate.pulse_gain",
     *("compensate.autofocus", "compensate.sca", "compensate.pga", "compensate.pga_sca", "compensate.link_phases"),
     *("compensate.entropy_fixed_point", "compensate.maximum_contrast", "compensate.minimum_entropy"),
     *("compensate.sharpest_phase", "compensate.phase_polish", "compensate.line_doppler", "metrics.entropy"),

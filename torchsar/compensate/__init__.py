@@ -17,10 +17,7 @@ from torchsar.compensate.envelope import (
     AlignEnvelopes,
     ShiftRange,
     align_envelopes,
-    align_mean,
-    align_running,
     drift_cells,
-    refine_alignment,
     shift_range,
 )
 from torchsar.compensate.path import (
@@ -108,7 +105,6 @@ from torchsar.compensate.rotation import (
 )
 from torchsar.compensate.velocity import (
     EffectiveVelocity,
-    VelocityMinimum,
     minimum_entropy_velocity,
     velocity_objective,
 )
@@ -160,10 +156,7 @@ __all__ = [
     "StripAutofocus",
     "TargetAutofocus",
     "UnevenRotation",
-    "VelocityMinimum",
     "align_envelopes",
-    "align_mean",
-    "align_running",
     "ambiguity_evidence",
     "autofocus",
     "chirplet_clean",
@@ -204,7 +197,6 @@ __all__ = [
     "pulse_gain",
     "radial_motion",
     "range_error",
-    "refine_alignment",
     "rotating_autofocus",
     "sca",
     "search_rotation",

@@ -25,8 +25,9 @@ import math
 import torch
 from torch import Tensor
 
+from torchsar.compensate import doppler_assess
 from torchsar.compensate.aperture import complete_aperture_centroid
-from torchsar.compensate.doppler import MOST_STD, phase_increment, swept_band, wrap_hz
+from torchsar.compensate.doppler import combine_blocks, lag_products, nominal_doppler, swept_band, wrap_hz
 from torchsar.compensate.group import (
     RangeGroup,
     aperture_s,
@@ -41,7 +42,6 @@ from torchsar.compensate.group import (
 )
 from torchsar.core import (
     Estimate,
-    Outcome,
     Signal,
     Stage,
     checked_samples,
@@ -54,6 +54,9 @@ from torchsar.core import (
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
+# Probability above which the most probable ambiguity is taken, by choice. Otherwise it is that of
+# the nominal pointing.
+SURE = 0.9
 _BLOCKS = 8  # independent parts of the data; more give more degrees of freedom, each of less contrast
 
 
@@ -279,45 +282,20 @@ def possible_reach(radar: StripmapRadar, reach: int) -> int:
     return max(0, min(reach, math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)))
 
 
-@torch.no_grad()
-def coherent_lines(raw: Tensor) -> Tensor:
-    """Test whether the phases of the lines follow from one line to the next.
-
-    The phase increments between adjacent lines, or their changes, must add up to more than random
-    phases would. Lines with random phases pass in about 2 of 1,000 trials.
-
-    Args:
-        raw: Lines, shape (..., pulse, range), complex.
-
-    Returns:
-        True where they do, shape (...,), bool.
-    """
-    x = unit_level(raw)
-    step = torch.linalg.vecdot(x[..., :-1, :], x[..., 1:, :]).to(torch.complex128)
-    change = step[..., :-1].conj() * step[..., 1:]
-
-    def adds_up(z: Tensor) -> Tensor:
-        # for random phases the ratio of both sides is exceeded with probability exp(-7)
-        return z.sum(-1).abs().square() > 7 * z.abs().square().sum(-1)
-
-    return adds_up(step) | adds_up(change)
-
-
 class DopplerCentroid(Stage):
     """Absolute Doppler centroid with its ambiguity and the squint angle; the recommended estimator.
 
     The baseband centroid comes from the phase increment between adjacent lines. The ambiguity is
-    found without prior knowledge, see `ambiguity_evidence`. Targets whose apertures are cut by the
-    ends of the record bias the centroid. If the dwell of the beam is known (`radar.integration_s`)
-    and the record is at least 1.15 dwells long, the centroid is therefore refined with targets
-    whose whole dwell lies in the record, see `complete_aperture_centroid`. The signal is left
-    unchanged.
+    found without prior knowledge, see `ambiguity_evidence`. Where the data leave it open, it is
+    that of the centroid nearest to `pointing_doppler_hz` of the radar, if that is not None. Targets
+    whose apertures are cut by the ends of the record bias the centroid. If the dwell of the beam is
+    known (`radar.integration_s`) and the record is at least 1.15 dwells long, the centroid is
+    therefore refined with targets whose whole dwell lies in the record, see
+    `complete_aperture_centroid`. The signal is left unchanged.
 
     Provides `doppler_hz` (absolute, positive when closing), `doppler_baseband_hz`, `ambiguity`
     (whole number of PRFs, as float64) and `squint_deg` (positive ahead, for the nominal velocity).
-    In trials that are not ok, the neutral values are those of the centroid with the estimated
-    baseband value that is nearest to `pointing_doppler_hz` of the radar (or 0 if that is None); if
-    the baseband value is not reliable either, those of `pointing_doppler_hz` itself.
+    The neutral values are those of `pointing_doppler_hz` of the radar, or of 0 if that is None.
 
     Args:
         radar: Radar parameters.
@@ -325,6 +303,7 @@ class DopplerCentroid(Stage):
             range-compressed data.
         reach: Largest ambiguity that is searched, in PRFs.
         blocks: Number of blocks along pulses and along range for the baseband centroid.
+        assess: Whether to add standard deviations, the quality and the outcome.
 
     Raises:
         ValueError: If the range reference is unknown or `reach` is below one.
@@ -336,7 +315,12 @@ class DopplerCentroid(Stage):
     provides = ("doppler_hz", "doppler_baseband_hz", "ambiguity", "squint_deg")
 
     def __init__(
-        self, radar: StripmapRadar, reference: str | None = "matched", reach: int = 12, blocks: tuple[int, int] = (8, 8)
+        self,
+        radar: StripmapRadar,
+        reference: str | None = "matched",
+        reach: int = 12,
+        blocks: tuple[int, int] = (8, 8),
+        assess: bool = True,
     ) -> None:
         super().__init__()
         if reference is not None and reference not in REFERENCES:
@@ -346,25 +330,10 @@ class DopplerCentroid(Stage):
             )
         if reach < 1:
             raise ValueError(f"reach must be 1 or more (largest Doppler ambiguity to search, in PRFs), got {reach}")
-        self.radar, self.reference, self.reach, self.blocks = radar, reference, possible_reach(radar, reach), blocks
-        nominal = torch.tensor(radar.pointing_doppler_hz or 0.0, dtype=torch.float64)
+        self.radar, self.reference, self.reach = radar, reference, possible_reach(radar, reach)
+        self.blocks, self.assess = blocks, assess
+        nominal = torch.tensor(nominal_doppler(radar)["doppler_hz"], dtype=torch.float64)
         self.neutral = {name: float(value) for name, value in self._values(nominal).items()}
-
-    def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
-        """Compute the range reference spectrum for lines of n samples.
-
-        Args:
-            n: Number of range samples.
-            device: Device of the result.
-
-        Returns:
-            The spectrum, shape (n,), complex; None for range-compressed data.
-        """
-        return (
-            None
-            if self.reference is None
-            else REFERENCES[self.reference](self.radar.pulse, n, self.radar.sampling_hz, device)
-        )
 
     @torch.no_grad()
     def forward(self, signal: Signal) -> Estimate:
@@ -374,61 +343,43 @@ class DopplerCentroid(Stage):
             signal: Lines, shape (..., pulse, range), complex.
 
         Returns:
-            `doppler_hz` (absolute) and `doppler_baseband_hz`, with their standard deviations in Hz,
-            `ambiguity` (whole number of PRFs) and `squint_deg`, shape (...,) each. `quality` is the
-            probability that the ambiguity is right. `ok` is False where that probability is 0.9 or
-            less, where the baseband centroid is unreliable, where the apertures that the ends of
-            the record cut shift it by an eighth of the band of the beam or more, or where the
-            phases of the lines are random (`coherent_lines`). A smooth phase error of the lines
-            shifts the centroid and cannot be distinguished from motion. `info` holds
+            `doppler_hz` (absolute) and `doppler_baseband_hz` in Hz, `ambiguity` (whole number of
+            PRFs) and `squint_deg`, shape (...,) each. A smooth phase error of the lines shifts the
+            centroid and cannot be distinguished from motion. `info` holds
 
-            - "block_hz" and "block_power", see `baseband_estimate`;
             - "looks", "lines", "entropy", "line_doppler_hz" and "line_doppler_std_hz", see
               `ambiguity_evidence`;
-            - "candidates": the candidates for the ambiguity in PRFs, shape (candidate,);
-            - "margin": summed log-likelihood of the best candidate minus that of the second-best;
-            - "coherence": coherence of adjacent lines, 0..1.
+            - "candidates": the candidates for the ambiguity in PRFs, shape (candidate,).
+
+            The assessment adds standard deviations of both centroids, the probability that the
+            ambiguity is right as `quality`, and to `info` "cut_hz" (see `phase_increment`),
+            "margin" (log-likelihood of the best candidate minus that of the second-best) and
+            "coherence" (of adjacent lines, 0..1). The outcome is EMPTY or NOISE where the phases of
+            the lines are random, AMBIGUOUS where the probability is 0.9 or less, MISFIT where the
+            apertures that the ends of the record cut shift the centroid by an eighth of the band of
+            the beam or more, and INEXACT from a standard deviation of 1.5 % of the PRF on.
         """
         raw, radar = signal.data, self.radar
-        rate, dwell = swept_band(radar, raw.shape[-1])
-        first = phase_increment(raw, radar.prf_hz, self.blocks, rate_hz_s=rate, dwell_s=dwell)
-        base, coarse_std = first["doppler_baseband_hz"], first.std["doppler_baseband_hz"]
-        evidence = ambiguity_evidence(raw, radar, base, self.spectrum(raw.shape[-1], raw.device), self.reach)
+        n, prf = raw.shape[-1], radar.prf_hz
+        products, power = lag_products(raw, self.blocks)
+        base = wrap_hz(prf / (2 * math.pi) * combine_blocks(products), prf)
+        spectrum = None
+        if self.reference is not None:
+            spectrum = REFERENCES[self.reference](radar.pulse, n, radar.sampling_hz, raw.device)
+        evidence = ambiguity_evidence(raw, radar, base, spectrum, self.reach)
         turns = candidate_turns(self.reach, raw.device)
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
-        ranked = joint.sort(-1, descending=True)
-        absolute = base + radar.prf_hz * turns[ranked.indices[..., 0]]
-        absolute, std = complete_aperture_centroid(raw, radar, absolute, coarse_std, self.reference)
-        refined = (std < coarse_std) & (std < MOST_STD * radar.prf_hz)
-        if dwell is not None:
-            # where almost all targets are cut, what seems to be a whole one is a part of another
-            refined = refined & (first.info["cut_hz"].abs() < rate * dwell / 8)
-        reliable = (first.ok | refined) & coherent_lines(raw)
-        probability = torch.softmax(joint, -1).amax(-1)
-        info = {
-            **first.info,
-            **evidence,
-            "candidates": turns,
-            "margin": ranked.values[..., 0] - ranked.values[..., 1],
-            "coherence": first.quality,
-        }
-        return Estimate(
-            self._values(absolute),
-            {"doppler_hz": std, "doppler_baseband_hz": std},
-            probability,
-            Outcome.of(reliable & (probability > 0.9), Outcome.NOISE),
-            info=info,
-            neutral=self._values(self._nearest(base, absolute, reliable)),
-        )
-
-    def _nearest(self, base: Tensor, absolute: Tensor, reliable: Tensor) -> Tensor:
-        """The centroid nearest to the nominal Doppler, which is assumed where the ambiguity is not
-        known; the nominal Doppler itself where the baseband centroid is not reliable either.
-        """
-        nominal, prf = self.radar.pointing_doppler_hz or 0.0, self.radar.prf_hz
-        near = nominal + wrap_hz(base - nominal, prf)
-        near = torch.where((absolute - near).abs() < prf / 2, absolute, near)
-        return torch.where(reliable, near, nominal)
+        best, nominal = turns[joint.argmax(-1)], radar.pointing_doppler_hz
+        if nominal is not None:
+            sure = torch.softmax(joint, -1).amax(-1) > SURE
+            best = torch.where(sure, best, torch.round((nominal - base) / prf))
+        first = base + prf * best
+        refined, std = complete_aperture_centroid(raw, radar, first, self.reference)
+        found = Estimate(self._values(refined), quality=torch.ones_like(first), info={**evidence, "candidates": turns})
+        if not self.assess:
+            return found
+        lines = doppler_assess.Increments.of(raw, products, power, prf, *swept_band(radar, n))
+        return doppler_assess.absolute(found, lines, base, std, joint, SURE)
 
     def _values(self, doppler_hz: Tensor) -> dict[str, Tensor]:
         """All values that an absolute Doppler centroid in Hz determines."""

@@ -36,45 +36,43 @@ _GUARD = 0.02  # share of the dwell by which it is widened at each end, found by
 
 
 def complete_aperture_centroid(
-    raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, std_hz: Tensor, reference: str | None, rounds: int = 2
+    raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, reference: str | None, rounds: int = 2
 ) -> tuple[Tensor, Tensor]:
     """Refine an absolute Doppler centroid with targets whose whole dwell lies within the record.
 
     Targets whose apertures are cut by the ends of the record would bias the centroid. The image
-    lines that show them are excluded. `doppler_hz` and `std_hz` are returned unchanged if the dwell
-    of the beam is not known (`radar.integration_s` is None), or if the record is shorter than 1.15
-    dwells.
+    lines that show them are excluded.
 
     Args:
         raw: Lines, shape (..., pulse, range), complex.
         radar: Radar parameters.
         doppler_hz: Absolute centroid in Hz, shape (...,), positive when closing.
-        std_hz: Its predicted standard deviation in Hz, shape (...,).
         reference: Name of the range reference in `torchsar.focus.reference`; None if `raw` is
             already range-compressed.
         rounds: Number of rounds, each of which forms the image anew with the current centroid.
 
     Returns:
-        The refined centroid and its standard deviation in Hz, shape (...,) each. Where the new
-        standard deviation is 1.5 times `std_hz` or more, or the targets migrate out of the swath in
-        more than half of the range cells, `doppler_hz` and `std_hz` are returned instead.
+        The refined centroid and its standard deviation in Hz, shape (...,) each. There are no such
+        targets, so that `doppler_hz` and infinity are returned, if the dwell of the beam is not
+        known (`radar.integration_s` is None), if the record is shorter than 1.15 dwells, and in
+        trials where the targets migrate out of the swath in more than half of the range cells or
+        less than a tenth of the energy is that of such targets.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples or a sample is not finite.
     """
     raw = checked_samples(raw, "complete_aperture_centroid", "pulse, range")
+    std = torch.full_like(doppler_hz, math.inf)
     if radar.integration_s is None:
-        return doppler_hz, std_hz
+        return doppler_hz, std
     dwell = math.ceil((1 + 2 * _GUARD) * radar.integration_s * radar.prf_hz)
     if raw.shape[-2] < 1.1 * dwell:
-        return doppler_hz, std_hz
-    raw, value, std = unit_level(raw), doppler_hz, std_hz
+        return doppler_hz, std
+    raw, value = unit_level(raw), doppler_hz
     for _ in range(rounds):
-        found, found_std = _refined(raw, radar, value, dwell, reference)
-        # targets that are not cut are preferred when both are about as sure
-        better = found_std < 1.5 * std_hz
-        value, std = torch.where(better, found, doppler_hz), torch.where(better, found_std, std_hz)
+        found, std = _refined(raw, radar, value, dwell, reference)
+        value = torch.where(std.isfinite(), found, doppler_hz)
     return value, std
 
 
@@ -87,27 +85,23 @@ def _refined(
     rate = torch.cat([torch.full(p.shape[-1:], r, dtype=torch.float64, device=raw.device) for p, _, r in parts])
     power = torch.cat([q for _, q, _ in parts], -1)
     weight = _above_noise(products, power)
-    products, noise = products * weight, weight.square() * _noise_variance(power, radar)
-    energy = products.abs().sum((-2, -1))
+    products = products * weight
     tile = raw.shape[-2] / products.shape[-2]
     line = (torch.arange(products.shape[-2], dtype=torch.float64, device=raw.device) + 0.5) * tile
     total, scale = doppler_hz, radar.prf_hz / (2 * math.pi)
-    half_way = math.pi / 2 * parts[0][2] * dwell / radar.prf_hz**2  # rad, between centre and edge of the beam
-    std = torch.full_like(doppler_hz, math.inf)
+    whole, phase = torch.ones_like(power), torch.zeros_like(total)
     for _ in range(8):
         # in a frame with an error d, targets appear late by d / rate
         shift = (total - doppler_hz)[..., None, None] / rate * radar.prf_hz
         whole = _whole(line[:, None] - shift, raw.shape[-2], dwell)
-        chosen = products * whole
-        phase = torch.angle(chosen.sum((-2, -1)))
-        delta = wrap_hz(scale * phase - total, radar.prf_hz)
-        enough = chosen.sum((-2, -1)).abs() > 0
-        total = torch.where(enough, total + delta, total)
-        kept = chosen.abs().sum((-2, -1))
-        leak = _LEAK * half_way * (energy - kept).clamp_min(0)
-        noisy = (noise * whole.square()).sum((-2, -1))
-        std = torch.where(kept > _LEAST_SHARE * energy, scale * _std_rad(chosen, noisy, phase, leak), math.inf)
-    return total, std
+        chosen = (products * whole).sum((-2, -1))
+        phase = torch.angle(chosen)
+        total = torch.where(chosen.abs() > 0, total + wrap_hz(scale * phase - total, radar.prf_hz), total)
+    kept, energy = (products * whole).abs().sum((-2, -1)), products.abs().sum((-2, -1))
+    half_way = math.pi / 2 * parts[0][2] * dwell / radar.prf_hz**2  # rad, between centre and edge of the beam
+    noise = ((weight * whole).square() * _noise_variance(power, radar)).sum((-2, -1))
+    std = scale * _std_rad(products * whole, noise, phase, _LEAK * half_way * (energy - kept))
+    return total, torch.where(kept > _LEAST_SHARE * energy, std, math.inf)
 
 
 def _whole(crossing: Tensor, lines: int, dwell: int) -> Tensor:

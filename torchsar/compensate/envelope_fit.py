@@ -24,10 +24,6 @@ _FLOOR = 1e-2
 # Sidelobes of all cells, beyond this distance in cells and times this factor, are the least power
 # too: they repeat the speckle of the cells that they come from. Found by trial, on 1 to 200 points.
 _SIDELOBE_CELLS, _SIDELOBES = 1.5, 1.5
-# Range cells over which errors of the shift may depend on each other; least share of the variance
-# that is left after the shift was fitted.
-_NEAR_CELLS, _LEAST_LEFT = 8, 0.2
-_PAIRED = 256  # most pulses whose products with each other are formed
 # cycles in the window of the finest features used for the mean drift, found by trial: finer
 # features agree only close to the right drift, coarser ones measure it less well
 _COARSE = 16
@@ -294,119 +290,6 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
     return shift, robust_std(residual, count > 0).squeeze(-1) * ((degree + 1) / (count > 0).sum(-1).clamp_min(1)).sqrt()
 
 
-def expected_outliers(pulses: Envelopes, shift: Tensor) -> Tensor:
-    """Predict how many pulses are aligned at a wrong maximum of their likelihood.
-
-    It is the sum over pulses of the probability that the shift of the pulse is wrong by more than a
-    cell, given the mean envelope. The log-likelihood takes the power of every cell for independent
-    and exponential. It is divided by the factor by which the powers of the pulses, in units of the
-    mean envelope and summed over the cells, vary more than such powers would.
-
-    Args:
-        pulses: Envelopes.
-        shift: Shifts in cells, shape (trial, pulse).
-
-    Returns:
-        The expected number, shape (trial,), float64.
-    """
-    moved = pulses.moved(shift)
-    mean = moved.sum(-2, keepdim=True) / pulses.count
-    # two samples per cell, of which one is independent
-    power = pulses.on_grid(moved) / pulses.floored(pulses.on_grid(mean))
-    total = power.sum(-1, keepdim=True, dtype=torch.float64) / _HALF
-    apart = torch.where(pulses.present[..., None], total - total.sum(-2, keepdim=True) / pulses.count, 0)
-    dispersion = apart.square().sum(-2, keepdim=True) / (pulses.count - 1).clamp_min(1) / pulses.n
-    gain = pulses.on_grid(moved * pulses.likelihood(mean, sidelobes=False).conj(), _QUARTER)
-    gain = gain.to(torch.float64) / _HALF / dispersion.clamp_min(1)
-    at = wrapped(torch.arange(gain.shape[-1], dtype=torch.float64, device=gain.device) / _QUARTER, pulses.n)
-    wrong = (torch.softmax(gain, -1) * (at.abs() > 1)).sum(-1)
-    return torch.where(pulses.present, wrong, 0).sum(-1)
-
-
-def single_std(pulses: Envelopes, aligned: Tensor) -> Tensor:
-    """Predict the standard deviation of the shifts of single pulses that `refined_shifts` finds.
-
-    A shift is the slope of the log-likelihood over its curvature. The terms of a range cell in both
-    change from pulse to pulse; the slope less the curvature times the mean shift is the error. Its
-    variance is estimated in two ways, each of which may be too large, and the smaller is taken:
-
-    - from the scatter of the terms between the pulses, with the covariances of terms up to 8 cells
-      apart, and half of those 12 cells apart. (The slope itself is zero at the shift found, which
-      takes away the share of its variance that is added again.) The errors of distant cells are
-      taken for independent, but those of separate rows at even spacing cancel in pairs.
-    - as the mean square of the same sum over the products of two different pulses in place of the
-      power of one, which is the variance for complex amplitudes of normal distribution. The
-      amplitudes of single scatterers do not change.
-
-    The mean envelope is that of the other pulses, whose speckle does not follow the pulse.
-
-    Args:
-        pulses: Envelopes.
-        aligned: Pulses with their shifts removed, shape (trial, pulse, range), complex.
-
-    Returns:
-        The standard deviation in cells, shape (trial,), float64; infinite without curvature.
-    """
-    x = _interpolated(unit_level(aligned, 1).to(torch.complex128), _QUARTER)
-    x = x / _positive(x.abs().square().mean(-1, keepdim=True)).sqrt()
-    power = x.abs().square()
-    count, total = pulses.count.to(torch.float64), power.sum(-2, keepdim=True)
-    slope, bend = _derivatives(-1 / pulses.floored((total - power) / (count - 1).clamp_min(1)))
-    curvature = (power * bend).sum(-2, keepdim=True) / count
-    whole = curvature.sum(-1, keepdim=True)
-    term = power * (slope - bend * _ratio((power * slope).sum((-2, -1), keepdim=True) / count, whole))
-    term = torch.where(pulses.present[..., None], term - term.sum(-2, keepdim=True) / count, 0)
-    share = _ratio(curvature, whole)
-    variance, taken = torch.zeros_like(whole), torch.zeros_like(whole)
-    for cells, sign in ((_NEAR_CELLS, -1), (2 * _NEAR_CELLS, 2)):
-        of_share = _running_sums(share, cells * _QUARTER)
-        rest = _running_sums(term, cells * _QUARTER) - of_share * term.sum(-1, keepdim=True)
-        scale = sign / (cells * _QUARTER)
-        variance = variance + scale * rest.square().sum((-2, -1), keepdim=True) / count
-        taken = taken + scale * of_share.square().sum(-1, keepdim=True)
-    variance = variance.clamp_min(0) / (1 - taken).clamp_min(_LEAST_LEFT)
-    variance = torch.minimum(variance, _normal_variance(pulses, x))
-    return torch.where(whole > 0, variance.sqrt() / _positive(whole), torch.inf)[:, 0, 0]
-
-
-def _normal_variance(pulses: Envelopes, x: Tensor) -> Tensor:
-    """Variance (trial, 1, 1) of the error of the slope for amplitudes of normal distribution.
-
-    x: Aligned pulses of unit power, four samples per cell, (trial, pulse, sample).
-    """
-    mean = x.abs().square().sum(-2, keepdim=True) / pulses.count
-    slope, bend = _derivatives(-1 / pulses.floored(mean))
-    weight = slope - bend * _ratio((mean * slope).sum(-1, keepdim=True), (mean * bend).sum(-1, keepdim=True))
-    some = x[:, :: -(-x.shape[-2] // _PAIRED)]
-    square = ((some.conj() * weight) @ some.mT).abs().square()
-    pairs = square.sum((-2, -1)) - square.diagonal(dim1=-2, dim2=-1).sum(-1)
-    count = (some != 0).any(-1).sum(-1).to(torch.float64)
-    return torch.where(count > 1, pairs / (count * (count - 1)).clamp_min(1), torch.inf)[:, None, None]
-
-
-def _derivatives(weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Slope and negative curvature, per cell, of samples on a circle, four samples per cell."""
-    before, after = weight.roll(1, -1), weight.roll(-1, -1)
-    return (after - before) * (_QUARTER / 2), (2 * weight - before - after) * _QUARTER**2
-
-
-def _ratio(a: Tensor, b: Tensor) -> Tensor:
-    """a / b, zero where b is not positive."""
-    return a / torch.where(b > 0, b, torch.inf)
-
-
-def _positive(value: Tensor) -> Tensor:
-    """The values, and 1 where they are not positive."""
-    return torch.where(value > 0, value, 1)
-
-
-def _running_sums(terms: Tensor, length: int) -> Tensor:
-    """Sums over `length` neighbours on a circle, (..., sample)."""
-    length = min(length, terms.shape[-1])
-    sums = torch.nn.functional.pad(torch.cat([terms, terms[..., : length - 1]], -1).cumsum(-1), (1, 0))
-    return sums[..., length:] - sums[..., :-length]
-
-
 def mean_drift(pulses: Envelopes) -> Tensor:
     """Find the mean drift of the envelopes: the straight line along which they add up best.
 
@@ -589,22 +472,6 @@ def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     power[:, :8] = 0  # less than one period in the aperture is left to the polynomial
     top, at = power.max(-1)
     return at / (8 * k), top > (math.log(k) + _STANDS_OUT) * power.mean(-1)
-
-
-def about_circular_mean(shift: Tensor, present: Tensor, n: int) -> Tensor:
-    """Subtract from circular shifts their circular mean, in a window of n cells.
-
-    Args:
-        shift: Shifts in cells, shape (trial, pulse).
-        present: False for pulses without samples, shape (trial, pulse), bool.
-        n: Number of cells of the window.
-
-    Returns:
-        The shifts in cells, in -n/2..n/2, shape (trial, pulse); zero for pulses that are not
-        present.
-    """
-    phasor = torch.where(present, torch.polar(torch.ones_like(shift), 2 * math.pi / n * shift), 0)
-    return torch.where(present, wrapped(shift - torch.angle(phasor.sum(-1, keepdim=True)) * (n / (2 * math.pi)), n), 0)
 
 
 def centred(shift: Tensor, present: Tensor) -> Tensor:

@@ -383,3 +383,9 @@ def jackknife_std(left_out: Tensor) -> Tensor:
     """
     n = left_out.shape[-1]
     return math.sqrt((n - 1) / n) * torch.linalg.vector_norm(left_out - left_out.mean(-1, keepdim=True), dim=-1)
+
+
+def quotient(value: Tensor, curvature: Tensor) -> Tensor:
+    """Return the quotient, 1e6 at most and where the curvature is not positive."""
+    good = curvature > 0
+    return torch.where(good, value / torch.where(good, curvature, 1), 1e6).clamp_max(1e6)

@@ -18,18 +18,11 @@ import math
 import torch
 from torch import Tensor
 
+from torchsar.compensate import doppler_assess
 from torchsar.compensate.doppler import nominal_doppler, point_doppler, wrap_hz
-from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, cis, power_of, settle, unit_level
-from torchsar.metrics.bounds import tone_frequency_bound_hz
+from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, power_of, settle, unit_level
 from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import StripmapRadar
-
-# What remains without noise, from the interpolation of the response, in cycles per dwell.
-_REST_CYCLES = 2.5e-4
-# Power of the brightest point over that of any other, beyond the peaks of noise. Among equal points
-# or speckle nothing shows which point the beam centre crosses at the given time.
-_LEAST_LEAD = 4.0
-_POINT_CELLS = 4  # resolution cells to each side of a point that belong to its response
 
 
 def doppler_at(
@@ -101,11 +94,11 @@ def peak_time_s(
     """
     image = checked_samples(image, "peak_time_s", "azimuth, range")
     rate = torch.as_tensor(rate_hz_s, dtype=torch.float64, device=image.device)
-    tone, _ = _history(image, prf_hz, sample, rate, seen_s, doppler_hz, start_s)
+    tone, _ = point_history(image, prf_hz, sample, rate, seen_s, doppler_hz, start_s)
     return start_s + (point_doppler(tone, prf_hz, centre_hz=doppler_hz) - doppler_hz) / rate
 
 
-def _history(
+def point_history(
     image: Tensor,
     prf_hz: float,
     sample: Tensor,
@@ -114,8 +107,8 @@ def _history(
     doppler_hz: Tensor,
     start_s: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Azimuth history of a point without its Doppler rate, (..., azimuth), zero where it was not
-    observed; and the phasor of its Doppler. The arguments are those of `peak_time_s`.
+    """Return the azimuth history of a point without its Doppler rate, (..., azimuth), zero where it
+    was not observed; and the phasor of its Doppler. The arguments are those of `peak_time_s`.
     """
     n = image.shape[-2]
     columns = image.shape[-1]
@@ -142,31 +135,6 @@ def _history(
     return tone, cis(2 * math.pi * torch.remainder(doppler_hz[..., None] * since, 1))
 
 
-def _rival(power: Tensor, line: Tensor, sample: Tensor, lines: Tensor, samples: float) -> Tensor:
-    """Largest power (...,) of an image (..., azimuth, range) apart from lines and samples about a
-    point; the image is circular in azimuth.
-    """
-    n = power.shape[-2]
-    apart = (torch.arange(n, device=power.device) - line[..., None]).abs()
-    rows = torch.minimum(apart, n - apart) <= lines[..., None]
-    columns = (torch.arange(power.shape[-1], device=power.device) - sample[..., None]).abs() <= samples
-    return power.masked_fill(rows[..., :, None] & columns[..., None, :], 0).amax((-2, -1))
-
-
-def _tail(power: Tensor, floor: Tensor) -> Tensor:
-    """Mean power (...,) of circular noise whose highest peaks are those of an image (..., azimuth,
-    range) of noise and a few bright points, at least its mean power `floor` (...,).
-
-    The power of circular noise has an exponential distribution: 99 of 100 samples do not exceed the
-    median by more than the mean times ln 50. In noise with a longer tail, such as that of real
-    samples, they do.
-    """
-    ordered = power.flatten(-2)
-    few = ordered.shape[-1] // 100
-    high = ordered.kthvalue(ordered.shape[-1] - few, -1).values.double() - ordered.median(-1).values.double()
-    return torch.maximum(floor, high / math.log(50))
-
-
 class PointDoppler(Stage):
     """Doppler centroid of the beam from the brightest point of an image.
 
@@ -184,6 +152,7 @@ class PointDoppler(Stage):
         radar: Radar parameters.
         crossing_s: Slow time in seconds at which the beam centre crosses the point; by default that
             of the middle line.
+        assess: Whether to add standard deviations, the quality and the outcome.
 
     Reference:
         Tsvetkov 2017, text after Fig. 5.
@@ -192,9 +161,10 @@ class PointDoppler(Stage):
     works_on = ("azimuth", "range")
     provides = ("doppler_hz", "doppler_baseband_hz")
 
-    def __init__(self, radar: StripmapRadar, crossing_s: float | None = None) -> None:
+    def __init__(self, radar: StripmapRadar, crossing_s: float | None = None, assess: bool = True) -> None:
         super().__init__()
-        self.radar, self.crossing_s, self.neutral = radar, crossing_s, nominal_doppler(radar)
+        self.radar, self.crossing_s, self.assess = radar, crossing_s, assess
+        self.neutral = nominal_doppler(radar)
 
     @torch.no_grad()
     def forward(self, signal: Signal, frame_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Estimate:
@@ -208,13 +178,14 @@ class PointDoppler(Stage):
                 nominal one.
 
         Returns:
-            `doppler_hz` and `doppler_baseband_hz` in Hz, shape (...,), positive when closing. Their
-            standard deviation is the Cramer-Rao bound of a tone. It uses the measured SNR q after
-            compression (info["q"], a power ratio) and the part of the dwell that lies in the
-            record, and holds if radar.integration_s is the true dwell. `quality` is
-            1 - 1 / (1 + q). `ok` is False where the time at which the beam centre crosses the point
-            lies outside the record, where noise alone would have as high a peak in more than one of
-            22,000 images, or where another point has more than a quarter of the power.
+            `doppler_hz` and `doppler_baseband_hz` in Hz, shape (...,), positive when closing.
+            The assessment adds their standard deviation, the Cramer-Rao bound of a tone. It uses
+            the measured SNR q after compression (info["q"], a power ratio) and the part of the
+            dwell that lies in the record, and holds if radar.integration_s is the true dwell.
+            `quality` is 1 - 1 / (1 + q). The outcome is EMPTY, or NOISE where noise alone would
+            have as high a peak in more than one of 22,000 images; MISFIT where the time at which
+            the beam centre crosses the point lies outside the record; and AMBIGUOUS where another
+            point has more than a quarter of the power.
 
         Raises:
             ValueError: If neither `frame_hz` nor radar.pointing_doppler_hz gives the frame Doppler.
@@ -227,16 +198,15 @@ class PointDoppler(Stage):
                 "PointDoppler: frame_hz, the Doppler (Hz) that the image was focused with, is not known; "
                 "connect it with torchsar.use, or set radar.pointing_doppler_hz"
             )
-        power = power_of(image)
-        peak, width = power.flatten(-2).argmax(-1), power.shape[-1]
-        line, sample = peak // width, peak % width
-        found = impulse_response(
+        at, width = power_of(image).flatten(-2).argmax(-1), image.shape[-1]
+        line, sample = at // width, at % width
+        response = impulse_response(
             signal,
             (azimuth.start + azimuth.step * line.double(), slant.start + slant.step * sample.double()),
             search_m=azimuth.step,
         )
         velocity = radar.velocity_m_s if velocity_m_s is None else velocity_m_s
-        position, cos = found["position_range_m"], torch.sqrt(1 - radar.sin_squint(frame, velocity).square())
+        position, cos = response["position_range_m"], torch.sqrt(1 - radar.sin_squint(frame, velocity).square())
         rate = (
             radar.azimuth_rate_hz_s(position, velocity) * cos.square()
         )  # of a point at this slant range in the direction of the frame
@@ -248,7 +218,7 @@ class PointDoppler(Stage):
         )
         dwell = radar.aperture_s(slant.start)
         seen = max(-dwell / 2, -crossing), min(dwell / 2, record - crossing)
-        at_s = (found["position_azimuth_m"] - azimuth.start) / radar.velocity_m_s
+        at_s = (response["position_azimuth_m"] - azimuth.start) / radar.velocity_m_s
         # an image is circular in azimuth: the peak may lie beyond its end
         at_s = crossing + wrap_hz(at_s - crossing, record)
         value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
@@ -256,30 +226,11 @@ class PointDoppler(Stage):
             at_s = peak_time_s(image, radar.prf_hz, slant.index_of(position), rate, seen, value, at_s)
             value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
         value, finite = settle(value, 0.0)
-        # noise power has an exponential distribution, whose mean is the median / ln 2
-        floor = power.flatten(-2).median(-1).values.double() / math.log(2)
+        found = Estimate({"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)})
+        if not self.assess:
+            return found
+        sees = finite & torch.full_like(finite, 0 <= crossing <= record)
         visible = max(seen[1] - seen[0], 1 / radar.prf_hz)
-        strongest_noise = math.log(azimuth.n * slant.n) + 10
-        rival = _rival(
-            power,
-            line,
-            sample,
-            _POINT_CELLS * radar.prf_hz / (rate * visible),
-            _POINT_CELLS * radar.range_resolution_m / slant.step,
-        )
-        above = found["peak"].abs().square() > strongest_noise * _tail(power, floor)
-        leads = found["peak"].abs().square() > _LEAST_LEAD * (rival.double() - strongest_noise * floor)
-        # The peak is the highest of many samples with noise of the whole PRF; the sum of the
-        # history has that of its own band. Noise alone gives it a power of 1.
-        tone, phasor = _history(image, radar.prf_hz, slant.index_of(position), rate, seen, value, at_s)
-        lit = (tone != 0).sum(-1).clamp_min(1)
-        power_sum = (tone * phasor.conj()).sum(-1).abs().square()
-        q = (power_sum / (lit * torch.where(floor > 0, floor, 1)) - 1).clamp_min(0)
-        std = torch.hypot(tone_frequency_bound_hz(q.clamp_min(1e-12), visible), q.new_tensor(_REST_CYCLES / visible))
-        return Estimate(
-            {"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)},
-            {"doppler_hz": std, "doppler_baseband_hz": std},
-            1 - 1 / (1 + q),
-            Outcome.of(finite & (floor > 0) & (0 <= crossing <= record) & above & leads, Outcome.NOISE),
-            info={"q": q},
-        )
+        cell = radar.prf_hz / (rate * visible), radar.range_resolution_m / slant.step
+        history = point_history(image, radar.prf_hz, slant.index_of(position), rate, seen, value, at_s)
+        return doppler_assess.of_point(found, image, (line, sample), cell, history, visible, sees)

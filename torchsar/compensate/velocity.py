@@ -15,6 +15,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from torchsar.compensate import velocity_assess
 from torchsar.compensate.group import (
     BeamSpectrum,
     RangeGroup,
@@ -26,16 +27,14 @@ from torchsar.compensate.group import (
     compress,
     entropy_parts,
     pick_group,
+    quotient,
 )
 from torchsar.core import (
     Estimate,
-    Outcome,
     Signal,
     Stage,
     checked_samples,
     fft_lines,
-    host_value,
-    per_trial,
     settle,
     take,
     unit_level,
@@ -45,23 +44,6 @@ from torchsar.radar import StripmapRadar
 
 Refine = Callable[..., tuple[Tensor, Tensor]]
 
-# Variance of the entropy of n independent pixels of pure noise, times n: with the exponential
-# distribution of their intensity, 0.290.
-_NOISE_ENTROPY = 0.29
-# Depth of a significant minimum in standard deviations of noise. On noise and on clutter that fills
-# the Doppler band evenly the depth is below 5; 20 dB above the noise it is above 100.
-_LEAST_DEPTH = 8.0
-# Distances from the minimum at which its depth is measured, in steps of the grid. The second pair
-# counts where the minimum reaches to the first, because the targets are seen for a short time.
-_DISTANCES = (2.0, 8.0)
-# Error that remains without noise: the spectrum of a short chirp is not that of the stationary
-# phase. It is a share of width^2 / velocity, or of the same with the step of the grid as the width.
-# Measured at time-bandwidth products of 19 to 374.
-_REST, _REST_STEP = 0.45, 0.11
-# Largest standard deviation of an estimate that is ok, over the width of the minimum: an eighth
-# of a cycle of phase at the ends of the aperture.
-_MOST_WIDTHS = 0.27
-_COMBS = 4  # interleaved sets of Doppler rows, of independent noise, for the standard deviation
 _PARTS = 8  # parts of the image along azimuth, for the standard deviation
 # The refinement stops at this share of the step of the grid, a sixth of the half width of the last
 # parabola. With half of that half width, estimates in speckle were displaced by 0.02 m/s.
@@ -111,19 +93,15 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
     lines = checked_samples(group.data, "velocity_objective", "pulse, range")
     group = RangeGroup(unit_level(lines), group.start, group.radar)
     spectrum = beam_spectrum(group, doppler_hz)
-    weight, _, _ = _nominal(spectrum, doppler_hz, dwell_s)
-    return _objective(spectrum, doppler_hz, weight)
+    return _objective(spectrum, doppler_hz, _nominal(spectrum, doppler_hz, dwell_s)[1])
 
 
 @torch.no_grad()
-def _nominal(spectrum: BeamSpectrum, doppler_hz: Tensor, dwell_s: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights of the blocks (..., block), entropy (...,), and the standard deviation (...,) that it
-    has if the image is noise, from the image of the nominal velocity.
-    """
+def _nominal(spectrum: BeamSpectrum, doppler_hz: Tensor, dwell_s: float) -> tuple[Tensor, Tensor]:
+    """Image of the nominal velocity, and the weights of the blocks (..., block)."""
     radar = spectrum.group.radar
     image = spectrum.image(doppler_hz, radar.velocity_m_s)
-    weight = block_weights(image, radar, doppler_hz, dwell_s)
-    return weight, (block_entropy(image) * weight).sum(-1), _noise_std(image, weight)
+    return image, block_weights(image, radar, doppler_hz, dwell_s)
 
 
 def _objective(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Callable[[Tensor], Tensor]:
@@ -135,7 +113,7 @@ def _objective(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Ca
     return blocks
 
 
-class _Parts(NamedTuple):
+class Parts(NamedTuple):
     """Entropies of parts of an image, each times the weight of its block.
 
     The image has twice as many azimuth samples as the spectrum has rows. The entropy of an image of
@@ -143,32 +121,49 @@ class _Parts(NamedTuple):
     wrong velocity moves targets.
 
     Args:
+        rows: Range-Doppler spectrum of the image, (..., row, range).
         summands: What parts along azimuth add to the entropies of the blocks, (..., block, part).
         shares: Their shares of the energy, (..., block, part).
-        combs: Entropies of the images of interleaved sets of Doppler rows, (..., comb).
-        whole: Function that returns the entropy of the image of as many azimuth samples as rows,
-            (...,).
     """
 
+    rows: Tensor
     summands: Tensor
     shares: Tensor
-    combs: Tensor
-    whole: Callable[[], Tensor]
 
 
-def _parts(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, velocity_m_s: Tensor) -> _Parts:
+def _parts(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, velocity_m_s: Tensor) -> Parts:
     """Entropies of the parts of the image that belongs to a velocity (...,)."""
     rows = spectrum.rows(doppler_hz, velocity_m_s)
-    count = rows.shape[-2]
-    image = fft_lines(rows, inverse=True, n=2 * count)
-    entropy, share = entropy_parts(image, _PARTS)
+    entropy, share = entropy_parts(fft_lines(rows, inverse=True, n=2 * rows.shape[-2]), _PARTS)
+    return Parts(rows, entropy * weight[..., None], share * weight[..., None])
 
-    def whole() -> Tensor:
-        return (block_entropy(image[..., ::2, :]) * weight).sum(-1)
 
-    sets = [rows[..., first::_COMBS, :] for first in range(min(_COMBS, count))]
-    combs = [(block_entropy(fft_lines(part, inverse=True)) * weight).sum(-1) for part in sets]
-    return _Parts(entropy * weight[..., None], share * weight[..., None], torch.stack(combs, -1), whole)
+class Minimum(NamedTuple):
+    """What the assessment of a velocity depends on.
+
+    Args:
+        velocity_m_s: The velocity, (...,).
+        beside: Parts of the images a tenth of a step below, near and above it.
+        half_m_s: That tenth of a step.
+        slope: Slopes of the summands over the velocity, (..., block, part).
+        curvature: Curvature of the entropy, (...,).
+        objective: Entropy of the image as a function of the velocity (...,).
+        nominal: Image of the nominal velocity.
+        weight: Weights of the blocks, (..., block).
+        inside: Whether the best velocity of the first grid is not at an end, (...,).
+        step_m_s: Step of the grid, see `grid_step_m_s`.
+    """
+
+    velocity_m_s: Tensor
+    beside: tuple[Parts, Parts, Parts]
+    half_m_s: float
+    slope: Tensor
+    curvature: Tensor
+    objective: Callable[[Tensor], Tensor]
+    nominal: Tensor
+    weight: Tensor
+    inside: Tensor
+    step_m_s: float
 
 
 def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float:
@@ -189,30 +184,16 @@ def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float
     return 2 * radar.wavelength_m * range_m / (radar.velocity_m_s * dwell_s**2)
 
 
-class VelocityMinimum(NamedTuple):
-    """Velocity of least entropy.
-
-    Args:
-        velocity_m_s: The velocity in m/s, shape (...,).
-        std_m_s: Its predicted standard deviation in m/s, shape (...,).
-        most_m_s: Standard deviation in m/s with which an eighth of a cycle of phase remains at the
-            ends of the aperture, shape (...,).
-        clear: Whether the minimum is that of a focused image, bool (...,).
-        grid_m_s: Velocities of the grid search in m/s, shape (grid,).
-        grid_entropy: Their entropies in nats, shape (..., grid).
-    """
-
-    velocity_m_s: Tensor
-    std_m_s: Tensor
-    most_m_s: Tensor
-    clear: Tensor
-    grid_m_s: Tensor
-    grid_entropy: Tensor
-
-
 def minimum_entropy_velocity(
-    group: RangeGroup, doppler_hz: Tensor, dwell_s: float, reach_m_s: float, refine: Refine, tolerance_m_s: float
-) -> VelocityMinimum:
+    group: RangeGroup,
+    doppler_hz: Tensor,
+    dwell_s: float,
+    reach_m_s: float,
+    refine: Refine,
+    tolerance_m_s: float,
+    *,
+    assess: bool = True,
+) -> Estimate:
     """Find the velocity of least entropy: a grid search, a refinement, and a parabola.
 
     The grid has steps of `grid_step_m_s`. Where that would be more than 33 velocities, only the
@@ -224,17 +205,6 @@ def minimum_entropy_velocity(
     larger. The result is the vertex of a parabola through entropies of images with twice as many
     azimuth samples, a tenth of a step to either side.
 
-    The depth of the minimum is measured against velocities 2 steps away, or 8 steps where that
-    shows a minimum of more than half this distance. Its width is that of a parabola with this depth
-    and with the curvature at the minimum. Neither depends on `reach_m_s`.
-
-    The standard deviation has three parts. The first follows from the parts of the image, blocks of
-    range cells times eight parts along azimuth: the slopes of their entropies at the minimum,
-    divided by the curvature of the whole entropy. The second follows in the same way from four
-    interleaved sets of Doppler rows, whose noise is independent also where one target dominates;
-    the larger of both counts. The third is what remains without noise, 0.45 width^2 / velocity
-    or 0.11 step^2 / velocity, whichever is larger.
-
     Args:
         group: Group of range cells.
         doppler_hz: Absolute Doppler centroid in Hz, shape (...,), positive when closing.
@@ -243,15 +213,12 @@ def minimum_entropy_velocity(
             half the nominal velocity is searched.
         refine: `parabola_minimum` or `gradient_minimum` of `torchsar.optim.scalar`.
         tolerance_m_s: Tolerance of the refinement in m/s.
+        assess: Whether to add the standard deviation, the quality and the outcome.
 
     Returns:
-        The minimum. It is clear where it is not at an end of the searched interval, its depth is 8
-        standard deviations of the entropy of noise or more (noise that has the powers and
-        correlations of the range cells), and the record is not shorter than the
-        dwell of the beam, if that is known: in a shorter record every target is cut, differently,
-        and the standard deviation does not hold. `most_m_s` is an eighth of
-        `grid_step_m_s` or, if the dwell of the beam is not known (`integration_s` of the radar), of
-        the step that belongs to the width of the minimum.
+        `velocity_m_s` of shape (...,). `info` holds "grid_velocity_m_s", the velocities of the
+        first grid search, shape (grid,), and "grid_entropy", their entropies in nats, shape (...,
+        grid). The assessment, with its outcomes, is that of `EffectiveVelocity`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -260,44 +227,38 @@ def minimum_entropy_velocity(
     lines = checked_samples(group.data, "minimum_entropy_velocity", "pulse, range", empty=False)
     group = RangeGroup(unit_level(lines), group.start, group.radar)
     spectrum, nominal = beam_spectrum(group, doppler_hz), group.radar.velocity_m_s
-    weight, cost, noise_std = _nominal(spectrum, doppler_hz, dwell_s)
+    image, weight = _nominal(spectrum, doppler_hz, dwell_s)
     blocks = _objective(spectrum, doppler_hz, weight)
 
-    def whole(velocity_m_s: Tensor) -> Tensor:
+    def objective(velocity_m_s: Tensor) -> Tensor:
         return blocks(velocity_m_s).sum(-1)
 
-    full_step = grid_step_m_s(group.radar, float(group.radar.near_range_m), dwell_s)
+    step = grid_step_m_s(group.radar, float(group.radar.near_range_m), dwell_s)
     start = torch.full(doppler_hz.shape, nominal, dtype=torch.float64, device=doppler_hz.device)
-    reach = min(reach_m_s, nominal / 2)
-    grid = _search(spectrum, doppler_hz, weight, start, cost, reach, full_step)
-    tolerance = max(tolerance_m_s, full_step / _STEP_SHARE)
-    value = grid.vertex_m_s
+    reach, known = min(reach_m_s, nominal / 2), (block_entropy(image) * weight).sum(-1)
+    grid = _search(spectrum, doppler_hz, weight, start, known, reach, step)
+    value, tolerance = grid.vertex_m_s, max(tolerance_m_s, step / _STEP_SHARE)
     if grid.near_m_s > tolerance:
-        value, _ = refine(whole, value, grid.near_m_s, tolerance)
+        value, _ = refine(objective, value, grid.near_m_s, tolerance)
     value, _ = settle(value, nominal)
     with torch.no_grad():
-        half = min(full_step, nominal / 2) / 10
+        half = min(step, nominal / 2) / 10
         low, middle, high = (_parts(spectrum, doppler_hz, weight, value + side * half) for side in (-1, 0, 1))
         curvature = (low.summands - 2 * middle.summands + high.summands).sum((-2, -1)) / half**2
         # without the energy that moves from one part to another, which changes no entropy by itself
         level = middle.summands.sum(-1, keepdim=True) / middle.shares.sum(-1, keepdim=True).clamp_min(1e-300)
         slope = (high.summands - low.summands - level * (high.shares - low.shares)) / (2 * half)
         # the step to the vertex of the parabola, at most to its ends
-        value = value - (_over(slope.sum((-2, -1)), curvature)).clamp(-half, half)
-        depth, width = _depth(whole, value, middle.whole(), curvature, min(full_step, nominal / 18))
-        scatter = torch.maximum(
-            _over(slope.flatten(-2).square().sum(-1).sqrt(), curvature),
-            _comb_std(low.combs, middle.combs, high.combs, half),
+        value = value - quotient(slope.sum((-2, -1)), curvature).clamp(-half, half)
+        points = nominal + torch.linspace(-reach, reach, grid.costs.shape[-1], dtype=torch.float64, device=start.device)
+        found = Estimate({"velocity_m_s": value}, info={"grid_velocity_m_s": points, "grid_entropy": grid.costs})
+        if not assess:
+            return found
+        minimum = Minimum(
+            *(value, (low, middle, high), half, slope, curvature),
+            *(objective, image, weight, grid.inside, step),
         )
-        rest = (_REST * width.square()).clamp_min(_REST_STEP * full_step**2) / nominal
-        std = torch.hypot(scatter, rest).clamp_max(1e6)
-        known = group.radar.integration_s
-        most = _MOST_WIDTHS * width if known is None else full_step / 8
-        clear = grid.inside & (curvature > 0) & (depth > _LEAST_DEPTH * noise_std)
-        if known is not None and lines.shape[-2] < known * group.radar.prf_hz:
-            clear = torch.zeros_like(clear)
-    points = nominal + torch.linspace(-reach, reach, grid.costs.shape[-1], dtype=torch.float64, device=start.device)
-    return VelocityMinimum(value, std, per_trial(most, 0, std).expand(std.shape), clear, points, grid.costs)
+        return velocity_assess.assessed(found, minimum, group)
 
 
 class _Grid(NamedTuple):
@@ -358,61 +319,6 @@ def _middle_rows(spectrum: BeamSpectrum, share: float) -> BeamSpectrum:
     return replace(spectrum, data=spectrum.data[..., part, :], doppler_hz=spectrum.doppler_hz[..., part])
 
 
-def _depth(
-    cost: Callable[[Tensor], Tensor], value: Tensor, least: Tensor, curvature: Tensor, step: float
-) -> tuple[Tensor, Tensor]:
-    """Depth of the minimum in nats and its width in m/s, (...,) each.
-
-    least: Entropy at the minimum, (...,).
-    """
-    near, far = _DISTANCES
-
-    def measured(distance: float) -> tuple[Tensor, Tensor]:
-        beside = 0.5 * (cost(value - distance * step) + cost(value + distance * step)) - least
-        return beside, _over(2 * beside.clamp_min(0), curvature).sqrt()
-
-    depth, width = measured(near)
-    wide = width > near * step / 2
-    if not host_value(wide.any(), True):
-        return depth, width
-    far_depth, far_width = measured(far)
-    return torch.where(wide, far_depth, depth), torch.where(wide, far_width, width)
-
-
-def _over(value: Tensor, curvature: Tensor) -> Tensor:
-    """Quotient, 1e6 at most and where the curvature is not positive."""
-    good = curvature > 0
-    return torch.where(good, value / torch.where(good, curvature, 1), 1e6).clamp_max(1e6)
-
-
-def _noise_std(image: Tensor, weight: Tensor) -> Tensor:
-    """Standard deviation (...,) in nats of the weighted entropy of an image (..., azimuth, range)
-    of noise that has the powers and the correlations of the image's range cells.
-
-    Cells of equal power without correlation have the variance 0.29 / number of pixels. In general,
-    the squared elements of the covariance between cells take the place of 1 / number of cells.
-    """
-    n, parts = image.shape[-2], image.tensor_split(weight.shape[-1], -1)
-    norms = [torch.linalg.vector_norm(part, dim=(-2, -1)).clamp_min(1e-30) for part in parts]
-    scale = weight.sqrt() / torch.stack(norms, -1)
-    scaled = [part * share[..., None, None] for part, share in zip(parts, scale.to(norms[0]).unbind(-1), strict=True)]
-    lines = torch.cat(scaled, -1)
-    squares = torch.linalg.vector_norm(lines.mH @ lines, dim=(-2, -1)).square().to(torch.float64)
-    # less what independent cells contribute because the number of pixels is finite
-    return (_NOISE_ENTROPY / n * (squares - 1 / n).clamp_min(1 / image.shape[-1])).sqrt()
-
-
-def _comb_std(low: Tensor, middle: Tensor, high: Tensor, half: float) -> Tensor:
-    """Standard deviation (...,) in m/s from the slopes of interleaved sets of Doppler rows.
-
-    low, middle, high: Entropies of the sets (..., comb) at three velocities, `half` m/s apart.
-    """
-    if middle.shape[-1] < _COMBS:
-        return torch.full_like(middle[..., 0], 1e6)
-    curvature = (low - 2 * middle + high).mean(-1) / half**2
-    return _over(((high - low) / (2 * half)).std(-1) / math.sqrt(_COMBS), curvature)
-
-
 class EffectiveVelocity(Stage):
     """Effective velocity of least image entropy.
 
@@ -426,6 +332,7 @@ class EffectiveVelocity(Stage):
         lines: Number of range cells that are used, at least 16.
         refine: `parabola_minimum` or `gradient_minimum` of `torchsar.optim.scalar`.
         tolerance_m_s: Tolerance of the refinement in m/s.
+        assess: Whether to add the standard deviation, the quality and the outcome.
 
     Raises:
         ValueError: If `reach_m_s` or `tolerance_m_s` is not positive, or `lines` is below 16.
@@ -444,6 +351,7 @@ class EffectiveVelocity(Stage):
         lines: int = 512,
         refine: Refine = parabola_minimum,
         tolerance_m_s: float = 0.01,
+        assess: bool = True,
     ) -> None:
         super().__init__()
         if not (reach_m_s > 0 and tolerance_m_s > 0 and lines >= 16):
@@ -454,7 +362,8 @@ class EffectiveVelocity(Stage):
         # in a list, so that torch does not register the focuser of the chain as a submodule twice
         self._focuser = [focuser]
         self.neutral = {"velocity_m_s": focuser.radar.velocity_m_s}
-        self.reach_m_s, self.lines, self.refine, self.tolerance_m_s = reach_m_s, lines, refine, tolerance_m_s
+        self.reach_m_s, self.lines, self.assess = reach_m_s, lines, assess
+        self.refine, self.tolerance_m_s = refine, tolerance_m_s
 
     def group(self, raw: Tensor) -> tuple[RangeGroup, float]:
         """Cut out the group of range cells that the estimate uses.
@@ -484,29 +393,25 @@ class EffectiveVelocity(Stage):
                 default `pointing_doppler_hz` of the radar, or 0 if that is None.
 
         Returns:
-            `velocity_m_s` of shape (...,) with its standard deviation in m/s. quality falls
-            exponentially with the standard deviation, to 1/e where an eighth of a cycle of phase
-            remains at the ends of the aperture (an eighth of `grid_step_m_s`). `ok` is False where
-            the standard deviation is larger, where the entropy is least at an end of the searched
-            interval, where its minimum is not deep enough for a focused image, and where the record
-            is shorter than the dwell of the beam: see `minimum_entropy_velocity`. Clutter that
-            fills the Doppler band evenly has no image that is sharper than others, so that `ok` is
-            False. info: grid_velocity_m_s, the velocities of the first grid search, shape (grid,);
-            grid_entropy, their entropies in nats, shape (..., grid); and group_start, the first
-            range sample of the group of range cells used, shape (...,).
+            `velocity_m_s` of shape (...,) in m/s. `info` holds "grid_velocity_m_s", the velocities
+            of the first grid search, shape (grid,); "grid_entropy", their entropies in nats, shape
+            (..., grid); and "group_start", the first range sample of the group of range cells used,
+            shape (...,).
+            The assessment adds a standard deviation, and a quality that falls exponentially with
+            it, to 1/e where an eighth of a cycle of phase remains at the ends of the aperture (an
+            eighth of `grid_step_m_s`; where the dwell of the beam is not known, of the step that
+            belongs to the width of the minimum). The outcome is EMPTY or NOISE where no minimum is
+            deep enough for a focused image, as with clutter that fills the Doppler band evenly;
+            OUTSIDE_SEARCH where the entropy is least at an end of the searched interval; MISFIT
+            where the record is shorter than the dwell of the beam, so that every target is cut; and
+            INEXACT where the standard deviation exceeds that eighth.
         """
         raw = signal.data.detach()
         group, dwell = self.group(raw)
-        found = minimum_entropy_velocity(
-            group, self._doppler(raw, doppler_hz), dwell, self.reach_m_s, self.refine, self.tolerance_m_s
-        )
-        return Estimate(
-            {"velocity_m_s": found.velocity_m_s},
-            {"velocity_m_s": found.std_m_s},
-            torch.exp(-found.std_m_s / found.most_m_s.clamp_min(1e-12)),
-            Outcome.of(found.clear & (found.std_m_s < found.most_m_s), Outcome.NOISE),
-            info={"grid_velocity_m_s": found.grid_m_s, "grid_entropy": found.grid_entropy, "group_start": group.start},
-        )
+        doppler = self._doppler(raw, doppler_hz)
+        settings = self.reach_m_s, self.refine, self.tolerance_m_s
+        found = minimum_entropy_velocity(group, doppler, dwell, *settings, assess=self.assess)
+        return replace(found, info={**found.info, "group_start": group.start})
 
     @torch.no_grad()
     def entropy(self, signal: Signal, velocity_m_s: Tensor, doppler_hz: Tensor | None = None) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import without_line
-from torchsar.core import Estimate, Outcome
+from torchsar.core import Estimate
 from torchsar.focus import ImageGrid, TileOperator, TilePlan
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.spotlight import frequency_step_hz
@@ -67,13 +67,11 @@ def for_each(
     def joined(parts: list[Tensor]) -> Tensor:
         return torch.stack(parts).reshape((*trials, *parts[0].shape))
 
-    return Estimate(
-        {key: joined([one.value[key] for one in found]) for key in found[0].value},
-        {key: joined([one.std[key] for one in found]) for key in found[0].std},
-        joined([one.quality for one in found]),
-        Outcome.of(joined([one.ok for one in found]), Outcome.NOISE),
-        info={key: joined([one.info[key] for one in found]) for key in found[0].info},
-    )
+    def table(name: str) -> dict[str, Tensor]:
+        return {key: joined([getattr(one, name)[key] for one in found]) for key in getattr(found[0], name)}
+
+    quality, outcome = (joined([getattr(one, name) for one in found]) for name in ("quality", "outcome"))
+    return Estimate(table("value"), table("std"), quality, outcome, table("info"))
 
 
 def line_free(range_m: Tensor, present: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from numbers import Integral
@@ -11,43 +10,17 @@ from numbers import Integral
 import torch
 from torch import Tensor
 
-from torchsar.compensate.path.axes import Found, three_axes
-from torchsar.compensate.path.envelopes import moved
-from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, placed, trials_of
-from torchsar.compensate.path.search import Search
-from torchsar.compensate.pulse_phase.assess import LEAST_STREHL
-from torchsar.compensate.pulse_phase.sharpness import sharpness_beyond_speckle, sharpness_of_noise
+from torchsar.compensate.path import assess as assessment
+from torchsar.compensate.path.axes import three_axes
+from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, trials_of
+from torchsar.compensate.path.search import Search, found_from_starts
 from torchsar.core import Estimate, Outcome, checked_samples
-from torchsar.focus import TileOperator
-from torchsar.metrics import entropy, residual_phase
+from torchsar.metrics import entropy
 from torchsar.radar import AntennaPath
 from torchsar.radar.antenna_path import refuse_unusable
 
-# share of the band in step 1, in which range cells are four times as long
-_FIRST_BAND = 0.25
-# share of the band with which step 1 begins in the third start
-_OTHER_BAND = 0.5
 # fewest pulses
 _LEAST_PULSES = 8
-# factor by which the sharpness must exceed that of noise: more than for the phases of pulses, 1.5,
-# because envelopes and three axes are free too
-_MARGIN = 2.0
-# factor by which the sharpness of a start must exceed that of noise to be refined in more than one
-# round: in 43 scenes it was 0.5 to 1.3 times that of noise for noise and at -10 dB, 1.0 to 2.9
-# times for clutter, whose errors are not found, and 3.7 to 11 times where errors were found
-_HOPE = 1.25
-# number of standard deviations that may not lower the Strehl ratio below its limit, by choice: the
-# difference of two starts is itself uncertain
-_SPREAD = 1.5
-# factor by which another start may leave more of the samples than the sharpest image and still
-# count as a second opinion on it, by trial: those whose results were as good left up to 1.05 times
-# as much, those that had not come as far 1.1 to 1.35 times
-_AS_WELL = 1.1
-# largest share of the pulses whose fringes the last round may have changed, and factor by which the
-# sharpest image may leave more of the samples than that of another start, by trial: 3 % and 1.1
-# where the result was right, 19 % and 3 in a wrong minimum that all starts had in common; and share
-# of the power that a fit may leave without noise: fits of right results left up to 0.2 % at 40 dB
-_RESTLESS, _WORSE, _UNFIT = 0.1, 1.5, 0.003
 # noise as a share of the mean power of the samples below which the last rounds take finer cells,
 # their spacing in resolution cells, and most rounds, by trial: at 20 dB and errors of 5 cm the
 # error of the line of sight fell from 1.66 to 1.50 bounds, at 10 dB it did not change
@@ -62,6 +35,7 @@ def path_autofocus(
     extent_m: float | None = None,
     height_m: float = 0.0,
     rounds: int = 6,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the error of the recorded path at each pulse, along and across the line of sight.
 
@@ -108,22 +82,25 @@ def path_autofocus(
         rounds: Largest number of rounds of the joint estimate in step 4, at least 1; there is only
             one where the image before is no sharper than that of noise.
 
+        assess: Whether to add the standard deviation, the quality and the outcome.
+
     Returns:
         `line_of_sight_m` of shape (..., pulse), float64: half the path over the middle of the scene
         in metres, recorded minus true; and `offset_m` of shape (..., pulse, 3): the error of the
-        positions in metres, recorded minus true, of both antennas alike, for `CorrectPath`. The
-        standard deviation, of `line_of_sight_m` only, is that modulo half a wavelength; it follows
-        from what the estimated scene and motion leave of the samples, and from the difference from
-        the result of another start, weighed by how well that explains the samples. `quality` is the
-        Strehl ratio predicted from it with half of the power of that difference, however well the
-        other explains the samples, times the share of the sharpness that noise does not explain.
-        Sharpness is the amount by which the image entropy lies below that of speckle. `ok` is False
-        unless the image is twice as sharp as autofocus can make pure noise, more than one range
-        cell contributes to the sharpness, the same Strehl ratio for 1.5 standard deviations exceeds
-        0.8, the fringes have settled, and no start explains the samples better by far; it does not
-        say whether fringes are right. It is False for fewer than 8 pulses with samples.
-        `info` holds "roughness" (see `roughness`: about 1 if the fringes come from single
-        envelopes, less for smooth motions) and "entropy_nats" of the image, shape (...,).
+        positions in metres, recorded minus true, of both antennas alike, for `CorrectPath`. `info`
+        holds "roughness" (see `roughness`: about 1 if the fringes come from single envelopes, less
+        for smooth motions) and "entropy_nats" of the image, shape (...,).
+        The assessment adds the standard deviation of `line_of_sight_m` modulo half a wavelength; it
+        follows from what the estimated scene and motion leave of the samples, and from the
+        difference from the result of another start, weighed by how well that explains the samples.
+        `quality` is the Strehl ratio predicted from it with half of the power of that difference,
+        however well the other explains the samples, times the share of the sharpness that noise
+        does not explain. Sharpness is the amount by which the image entropy lies below that of
+        speckle. The outcome does not say whether fringes are right. It is EMPTY without samples;
+        NOISE where the image is not twice as sharp as autofocus can make pure noise; TOO_FEW for
+        fewer than 8 pulses with samples; NOT_CONVERGED where the fringes have not settled;
+        AMBIGUOUS where another start explains the samples better by far; and INEXACT where the same
+        Strehl ratio for 1.5 standard deviations is below 0.8.
 
     Raises:
         TypeError: If the profiles are not complex, or frequencies are not float64.
@@ -145,11 +122,21 @@ def path_autofocus(
         seen = one if few or bool(present.all()) else _only(one, present)
         coarse = ground_image(frequency_hz, seen, height_m, extent_m)
         if few:
-            return _nothing(rows)
+            return _nothing(rows, present, assess)
         imaging = partial(ground_image, frequency_hz, seen, height_m, extent_m)
         some = rows[present]
         some = some / some.abs().amax()
-        return _spread(_judged(Search(some, frequency_hz, coarse, present), imaging, rounds), present)
+        search = Search(some, frequency_hz, coarse, present)
+        results = found_from_starts(search, imaging(FINE_STEP), rounds)
+        best = results.best
+        if best.noise < _CLEAR * some.abs().square().double().mean():
+            last = three_axes(some, imaging(_FINEST_STEP), best.motion_m, present, _LAST_ROUNDS, exact=True)
+            if last.noise <= best.noise and last.restless <= assessment.RESTLESS:
+                best = replace(best, motion_m=last.motion_m, offset_m=last.offset_m)
+        value = {"line_of_sight_m": best.line_of_sight_m, "offset_m": best.offset_m}
+        info = {"roughness": results.roughness, "entropy_nats": entropy(best.image).double()}
+        found = Estimate(value, quality=torch.ones_like(best.noise), info=info)
+        return _spread(assessment.of_path(found, results, search) if assess else found, present)
 
     return for_each(find, profiles, antennas, trials)
 
@@ -160,13 +147,16 @@ def _only(antennas: AntennaPath, present: Tensor) -> AntennaPath:
     return AntennaPath(antennas.transmitter_m[present], receiver, antennas.reference_m[present])
 
 
-def _nothing(rows: Tensor) -> Estimate:
+def _nothing(rows: Tensor, present: Tensor, assess: bool) -> Estimate:
     """The estimate of a trial with too few pulses."""
     zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
     none = zero.new_zeros(())
-    info = {"roughness": none + 1, "entropy_nats": none}
     value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
-    return Estimate(value, {"line_of_sight_m": zero + 1}, none, Outcome.of(none > 0, Outcome.NOISE), info=info)
+    found = Estimate(value, quality=none + 1, info={"roughness": none + 1, "entropy_nats": none})
+    if not assess:
+        return found
+    outcome = (Outcome.TOO_FEW if bool(present.any()) else Outcome.EMPTY).like(none)
+    return replace(found, std={"line_of_sight_m": zero + 1}, quality=none, outcome=outcome)
 
 
 def _spread(found: Estimate, present: Tensor) -> Estimate:
@@ -180,82 +170,5 @@ def _spread(found: Estimate, present: Tensor) -> Estimate:
         part = share.reshape(-1, *(1,) * (x.ndim - 1))
         return x[high - 1] * (1 - part) + x[high] * part
 
-    value = {name: of(x) for name, x in found.value.items()}
-    return Estimate(
-        value, {name: of(x) for name, x in found.std.items()}, found.quality, found.outcome, info=found.info
-    )
-
-
-def _judged(search: Search, imaging: Callable[[float], TileOperator], rounds: int) -> Estimate:
-    """The estimate of the sharpest image from two or three starts, and its verdict.
-
-    imaging: Image formation with a spacing of pixels in resolution cells.
-    """
-    fine = imaging(FINE_STEP)
-
-    def refined(range_m: Tensor) -> Found:
-        range_m = search.polished(range_m, fine)
-        sharp, noise = _sharpness(fine.image(moved(search.rows, search.frequency_hz, range_m)[None])[0])
-        return three_axes(search.rows, fine, range_m, search.present, rounds if sharp > _HOPE * noise else 1)
-
-    def strehl(std_m: Tensor) -> Tensor:
-        return torch.exp(-(std_m * (2 * math.pi / search.fringe_m)).square().mean())
-
-    range_m, rough = search.by_envelopes(_FIRST_BAND)
-    results = [refined(range_m), refined(search.by_phases())]
-    found, std_m, doubt_m, alone = _sharpest(results, search)
-    if alone or strehl(_SPREAD * doubt_m) <= LEAST_STREHL:
-        results.append(refined(search.by_envelopes(_OTHER_BAND)[0]))
-        found, std_m, doubt_m, _ = _sharpest(results, search)
-    sharp, noise = _sharpness(found.image)
-    quality = strehl(doubt_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
-    least = torch.stack([one.noise for one in results]).amin()
-    least = _WORSE * least + _UNFIT * search.rows.abs().square().double().mean()
-    sure = [
-        sharp > _MARGIN * noise,
-        strehl(_SPREAD * doubt_m) > LEAST_STREHL,
-        found.restless <= _RESTLESS,
-        found.noise <= least,
-    ]
-    ok = torch.stack(sure).all()
-    if ok and found.noise < _CLEAR * search.rows.abs().square().double().mean():
-        finest = imaging(_FINEST_STEP)
-        last = three_axes(search.rows, finest, found.motion_m, search.present, _LAST_ROUNDS, exact=True)
-        if last.noise <= found.noise and last.restless <= _RESTLESS:
-            found = replace(found, motion_m=last.motion_m, offset_m=last.offset_m)
-    value = {"line_of_sight_m": found.line_of_sight_m, "offset_m": found.offset_m}
-    info = {"roughness": rough, "entropy_nats": entropy(found.image).double()}
-    return Estimate(value, {"line_of_sight_m": std_m}, quality, Outcome.of(ok, Outcome.NOISE), info=info)
-
-
-def _sharpness(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Sharpness of an image (azimuth, range), and that of noise."""
-    sharp, effective = sharpness_beyond_speckle(image.mT)
-    return sharp, sharpness_of_noise((effective * FINE_STEP).clamp_min(1))
-
-
-def _sharpest(found: list[Found], search: Search) -> tuple[Found, Tensor, Tensor, bool]:
-    """The result of the sharpest image, two standard deviations of its line of sight (m), and
-    whether it stands alone: no other result explains the samples as well.
-
-    Both contain a part of the difference from another result, of the nearest of those that explain
-    the samples as well if there are any. All have the errors by noise in common; what differs comes
-    from the search. The first takes the errors of each to be in proportion to what it leaves of the
-    samples: half the power of the difference comes from one that is as good, little from one that
-    is lost. The second, by which a result is doubted, takes half the power in any case: a wrong
-    motion can explain the samples as well as the true one, with more scatterers, and it stands
-    alone then.
-    """
-    best, *others = sorted(found, key=lambda one: float(entropy(one.image)))
-    as_well = [one for one in others if one.noise <= _AS_WELL * best.noise]
-    radians, present = 2 * math.pi / search.fringe_m, search.present
-
-    def phase(one: Found) -> Tensor:
-        return radians * placed(one.line_of_sight_m, present)
-
-    compared = as_well or others
-    apart = [residual_phase(phase(best), phase(other), present)[present] / radians for other in compared]
-    square = torch.stack([x.square().mean() for x in apart])
-    share = torch.stack([1 / (1 + (other.noise / best.noise).square()) for other in compared])
-    std, doubt = ((best.std_m.square() + (square * part).amin()).sqrt() for part in (share, 0.5))
-    return best, std, doubt, not as_well
+    value, std = ({name: of(x) for name, x in table.items()} for table in (found.value, found.std))
+    return replace(found, value=value, std=std)

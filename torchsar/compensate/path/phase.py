@@ -19,6 +19,7 @@ def path_phase(
     height_m: float = 0.0,
     search: int = 120,
     polish: int = 20,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the phase of each pulse that sharpens the image of a spotlight scene on any path.
 
@@ -35,10 +36,11 @@ def path_phase(
         search: Largest number of iterations of the entropy fixed point, approximately.
         polish: Largest number of further iterations, which compare each pulse with a Wiener
             estimate of the scene.
+        assess: Whether to add the standard deviation, the quality and the outcome.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation, `quality` and
-        `ok` as for `autofocus`. They describe errors of one phase per pulse: errors of the path
+        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation, quality and
+        outcome as for `autofocus`. They describe errors of one phase per pulse: errors of the path
         that move envelopes by a range cell or act differently across the scene are not part of
         them.
 
@@ -50,11 +52,11 @@ def path_phase(
     profiles = checked_samples(profiles, "path_phase", "pulse, range")
     refuse_unusable(frequency_hz=frequency_hz)
     trials = trials_of("path_phase", profiles, frequency_hz, antennas)
-    if antennas.trials.numel() == 1:
-        one = antennas.of_trial((0,) * len(antennas.trials))
-        return autofocus(profiles, search=search, polish=polish, imaging=ground_image(frequency_hz, one, height_m))
 
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
-        return autofocus(rows, search=search, polish=polish, imaging=ground_image(frequency_hz, one, height_m))
+        imaging = ground_image(frequency_hz, one, height_m)
+        return autofocus(rows, search=search, polish=polish, imaging=imaging, assess=assess)
 
+    if antennas.trials.numel() == 1:
+        return find(profiles, antennas.of_trial((0,) * len(antennas.trials)))
     return for_each(find, profiles, antennas, trials)

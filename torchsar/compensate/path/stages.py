@@ -9,7 +9,7 @@ from torch import Tensor
 from torchsar.compensate.path.line_of_sight import path_autofocus
 from torchsar.compensate.path.phase import path_phase
 from torchsar.compensate.path.strip import strip_autofocus
-from torchsar.core import Estimate, Outcome, Signal, Stage
+from torchsar.core import Estimate, Signal, Stage
 from torchsar.radar import AntennaPath
 
 
@@ -55,14 +55,15 @@ class PathPhase(_PathEstimator):
         search: Largest number of iterations of the entropy fixed point, approximately.
         polish: Largest number of further iterations, which compare each pulse with a Wiener
             estimate of the scene.
+        assess: Whether to add the standard deviation, the quality and the outcome.
     """
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
     find = staticmethod(path_phase)
 
-    def __init__(self, height_m: float = 0.0, search: int = 120, polish: int = 20) -> None:
-        super().__init__(height_m=height_m, search=search, polish=polish)
+    def __init__(self, height_m: float = 0.0, search: int = 120, polish: int = 20, assess: bool = True) -> None:
+        super().__init__(height_m=height_m, search=search, polish=polish, assess=assess)
 
 
 class PathAutofocus(_PathEstimator):
@@ -75,14 +76,17 @@ class PathAutofocus(_PathEstimator):
             unambiguous ground.
         height_m: Height z of the imaged plane in metres.
         rounds: Largest number of rounds of the last step, at least 1.
+        assess: Whether to add the standard deviation, the quality and the outcome.
     """
 
     provides = ("line_of_sight_m", "offset_m")
     neutral = {"line_of_sight_m": 0.0, "offset_m": 0.0}
     find = staticmethod(path_autofocus)
 
-    def __init__(self, extent_m: float | None = None, height_m: float = 0.0, rounds: int = 6) -> None:
-        super().__init__(extent_m=extent_m, height_m=height_m, rounds=rounds)
+    def __init__(
+        self, extent_m: float | None = None, height_m: float = 0.0, rounds: int = 6, assess: bool = True
+    ) -> None:
+        super().__init__(extent_m=extent_m, height_m=height_m, rounds=rounds, assess=assess)
 
 
 class StripAutofocus(_PathEstimator):
@@ -96,6 +100,7 @@ class StripAutofocus(_PathEstimator):
         range_axis_rad: Direction of the range axis in rad, from ground coordinate x towards y.
         height_m: Height z of the imaged plane in metres.
         squint_deg: Angle of the middle of the beam ahead of broadside in degrees.
+        assess: Whether to add the standard deviation, the quality and the outcome.
     """
 
     provides = ("line_of_sight_m", "offset_m")
@@ -111,6 +116,7 @@ class StripAutofocus(_PathEstimator):
         range_axis_rad: float = 0.0,
         height_m: float = 0.0,
         squint_deg: float = 0.0,
+        assess: bool = True,
     ) -> None:
         super().__init__(
             azimuth_m=azimuth_m,
@@ -120,6 +126,7 @@ class StripAutofocus(_PathEstimator):
             range_axis_rad=range_axis_rad,
             height_m=height_m,
             squint_deg=squint_deg,
+            assess=assess,
         )
 
 
@@ -149,9 +156,8 @@ class CorrectPath(Stage):
 
         Returns:
             `Estimate` of `transmitter_m`, and of `receiver_m` if there is one, float64 (..., pulse,
-            3). It is always `ok`; a chain replaces an offset that is not `ok` by zero.
+            3), not assessed; a chain replaces an offset whose estimate failed by zero.
         """
         places = {"transmitter_m": transmitter_m, "receiver_m": receiver_m}
         value = {name: place - offset_m for name, place in places.items() if place is not None}
-        sure = signal.data.real.new_ones(value["transmitter_m"].shape[:-2])
-        return Estimate(value, quality=sure, outcome=Outcome.of(sure > 0, Outcome.NOISE))
+        return Estimate(value, quality=signal.data.real.new_ones(value["transmitter_m"].shape[:-2]))

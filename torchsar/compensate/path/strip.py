@@ -9,6 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from torchsar.compensate.path import assess as assessment
 from torchsar.compensate.path.curve import Curve, Solution
 from torchsar.compensate.path.ground import for_each, trials_of
 from torchsar.compensate.path.motion import cosines, expected_power
@@ -41,10 +42,6 @@ _LAG, _MEAN, _SMOOTH = 1 / 64, 1 / 64, 1 / 8
 _PLACED, _PLACED_IN_NOISE = 0.07, 0.7
 # least share of its mean amplitude at which an echo counts, by choice
 _FADED = 0.2
-# fewest scatterers, and least share of the pulses that see one, by choice
-_LEAST_SCATTERERS, _LEAST_SEEN = 3, 0.95
-# number of standard deviations that may not lower the Strehl ratio below its limit, by choice
-_SPREAD = 1.5
 
 
 def strip_autofocus(
@@ -59,6 +56,7 @@ def strip_autofocus(
     range_axis_rad: float = 0.0,
     height_m: float = 0.0,
     squint_deg: float = 0.0,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the slow errors of the recorded path of a strip.
 
@@ -96,16 +94,20 @@ def strip_autofocus(
         height_m: Height z of the imaged plane in metres.
         squint_deg: Angle of the middle of the beam ahead of broadside in degrees.
 
+        assess: Whether to add the standard deviation, the quality and the outcome.
+
     Returns:
         `line_of_sight_m` of shape (..., pulse), float64: half the path over the middle of the strip
         abeam of the antenna in metres, recorded minus true; and `offset_m` of shape (..., pulse,
         3): the error of the positions in metres, recorded minus true, of both antennas alike, for
-        `CorrectPath`. The standard deviation, of `line_of_sight_m` only, follows from the noise of
-        the phases and the prior, without constant and linear terms over the pulses that see the
-        strip. `quality` is the Strehl ratio predicted from it. `ok` is False unless there are 3
-        prominent scatterers, 95 % of these pulses see one of them, the Strehl ratio for 1.5
-        standard deviations exceeds 0.8, and the last round changed the motion by less than a
-        standard deviation. `info` holds "scatterers", their number, shape (...,).
+        `CorrectPath`. `info` holds "scatterers", their number, shape (...,).
+        The assessment adds the standard deviation of `line_of_sight_m`, which follows from the
+        noise of the phases and the prior, without constant and linear terms over the pulses that
+        see the strip; `quality` is the Strehl ratio predicted from it. The outcome is NOISE where
+        no scatterer exceeds clutter; TOO_FEW for fewer than 3 prominent scatterers, or fewer than
+        95 % of these pulses that see one; NOT_CONVERGED where the last round changed the motion by
+        a standard deviation; and INEXACT where the Strehl ratio for 1.5 standard deviations is
+        below 0.8.
 
     Raises:
         TypeError: If the profiles are not complex, or frequencies are not float64.
@@ -127,13 +129,13 @@ def strip_autofocus(
 
     @torch.no_grad()
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
-        return _judged(_Strip.of(rows, frequency_hz, one, beam, axes, middle, (azimuth_m, range_m)))
+        return _found(Strip.of(rows, frequency_hz, one, beam, axes, middle, (azimuth_m, range_m)), assess)
 
     return for_each(find, profiles, antennas, trials)
 
 
 @dataclass(frozen=True, eq=False)
-class _Strip:
+class Strip:
     """One trial.
 
     axes: along the line of sight abeam, scaled so that a unit changes half the path by one, and
@@ -162,7 +164,7 @@ class _Strip:
         ground: Tensor,
         middle_m: Tensor,
         extent_m: tuple[float, float],
-    ) -> _Strip:
+    ) -> Strip:
         place, pulses = antennas.places[-1], antennas.pulses
         track = StraightTrack.fitted(place)
         points = track.abeam_m(place, middle_m)
@@ -197,7 +199,7 @@ class _Strip:
         per = max(1, int(seen[0, 1] - seen[0, 0]))
         count = max(1, min(pulses - 2, _COSINES, math.ceil(_BENDS * pulses / per)))
         weights = window_weights("hann", len(frequency_hz), rows.device)
-        return _Strip(
+        return Strip(
             frequency_samples(rows),
             frequency_hz,
             weights / weights.sum(),
@@ -228,6 +230,10 @@ class _Strip:
         moved = None if receiver is None else receiver - self.offset_m
         return AntennaPath(recorded.transmitter_m - self.offset_m, moved, recorded.reference_m)
 
+    def changed_m2(self, after: Strip) -> Tensor:
+        """Mean square by which another round has changed the line of sight."""
+        return self.line_free((after.motion_m - self.motion_m)[:, 0])[self.judged].square().mean()
+
     def line_free(self, range_m: Tensor) -> Tensor:
         """Ranges (pulse,) without constant and linear terms over the judged pulses."""
         return without_line(range_m, self.judged)
@@ -240,7 +246,7 @@ class _Strip:
         plan = TilePlan(self.frequency_hz, *places, self.grid, _ERROR_DB, lit)
         image = plan.image(self.history * self.weights.to(self.history.real.dtype))
         found = prominent_places(image, self.grid, self.cells, most)
-        if len(found) < _LEAST_SCATTERERS:
+        if len(found) < assessment.LEAST_SCATTERERS:
             return None
         echoes = Echoes.of(self.history, self.frequency_hz, self.weights, antennas, found, lit)
         lever = echoes.wave * (echoes.slope[..., None, :] * self.axes[echoes.pulses]).sum(-1)
@@ -254,7 +260,7 @@ class _Strip:
         own = torch.cat([torch.ones_like(moved[..., :1]), echoes.wave * moved], -1)
         return echoes, Curve(self.basis, echoes.pulses, lever, own)
 
-    def with_increments(self) -> _Strip | None:
+    def with_increments(self) -> Strip | None:
         """The strip with the motion that the increments of the phases show."""
         found = self.echoes(_FIRST_SCATTERERS)
         if found is None:
@@ -280,7 +286,7 @@ class _Strip:
         along = self.basis @ of_steps.solved(turn.angle(), weight, power, free).coefficient[0]
         return replace(self, motion_m=self.motion_m + torch.nn.functional.pad(along[:, None], (0, 1)))
 
-    def fitted(self, power: Tensor) -> tuple[_Strip, Solution, Tensor, Echoes] | None:
+    def fitted(self, power: Tensor) -> tuple[Strip, Solution, Tensor, Echoes] | None:
         """The strip with the most probable motion, its solution, and the power of its cosines."""
         found = self.echoes(_SCATTERERS)
         if found is None:
@@ -317,55 +323,64 @@ class _Strip:
         return replace(self, motion_m=curve.motion_m(solution.coefficient)), solution, power, echoes
 
 
-def _judged(strip: _Strip) -> Estimate:
-    """The estimate of one trial, and its verdict."""
+@dataclass(frozen=True, eq=False)
+class StripFit:
+    """The last round of a fit.
+
+    Args:
+        strip: The strip with the motion found.
+        echoes: Echoes of the scatterers.
+        std_m: Standard deviation of the line of sight in metres, float64 (pulse,).
+        change_m2: Mean square by which the round changed the line of sight.
+    """
+
+    strip: Strip
+    echoes: Echoes
+    std_m: Tensor
+    change_m2: Tensor
+
+
+def _found(strip: Strip, assess: bool) -> Estimate:
+    """The estimate of one trial."""
     for _ in range(_SEARCHES):
         after = strip.with_increments()
         if after is None:
-            return _nothing(strip)
-        change, strip = after.motion_m - strip.motion_m, after
-        if strip.line_free(change[:, 0])[strip.judged].square().mean().sqrt() < _NEAR * strip.fringe_m:
+            return _nothing(strip, assess)
+        change, strip = strip.changed_m2(after), after
+        if change.sqrt() < _NEAR * strip.fringe_m:
             break
     # increments show slow errors best: their spectrum would forbid fast ones
     size = strip.line_free(strip.motion_m[:, 0])[strip.judged].square().mean()
     power = torch.full_like(strip.basis[:2], float(size) * strip.basis.shape[0] / strip.basis.shape[1])
-    change = spread = torch.full_like(size, math.inf)
+    fit = None
     for _ in range(_FITS):
-        found = strip.fitted(power)
-        if found is None:
-            return _nothing(strip)
-        before, (strip, solution, power, echoes) = strip, found
-        std_m = _std_m(strip, solution)
-        change = strip.line_free((strip.motion_m - before.motion_m)[:, 0])[strip.judged].square().mean()
-        spread = std_m[strip.judged].square().mean()
-        if change < _SETTLED**2 * spread:
+        fitted = strip.fitted(power)
+        if fitted is None:
+            return _nothing(strip, assess)
+        after, solution, power, echoes = fitted
+        fit, strip = StripFit(after, echoes, _std_m(after, solution), strip.changed_m2(after)), after
+        if fit.change_m2 < _SETTLED**2 * fit.std_m[strip.judged].square().mean():
             break
-    seen = torch.zeros_like(strip.judged)
-    seen[echoes.pulses[echoes.seen]] = True
-
-    def strehl(number: float) -> Tensor:
-        return torch.exp(-spread * (number * 2 * math.pi / strip.fringe_m) ** 2)
-
-    covered = seen[strip.judged].double().mean() >= _LEAST_SEEN
-    ok = covered & (strehl(_SPREAD) > LEAST_STREHL) & (change < spread)
+    assert fit is not None
     value = {"line_of_sight_m": strip.line_free(strip.motion_m[:, 0]), "offset_m": strip.offset_m}
-    count = spread.new_tensor(float(len(echoes.seen)))
-    return Estimate(
-        value, {"line_of_sight_m": std_m}, strehl(1.0), Outcome.of(ok, Outcome.NOISE), info={"scatterers": count}
-    )
+    count = size.new_tensor(float(len(fit.echoes.seen)))
+    found = Estimate(value, quality=torch.ones_like(count), info={"scatterers": count})
+    return assessment.of_strip(found, fit) if assess else found
 
 
-def _nothing(strip: _Strip) -> Estimate:
+def _nothing(strip: Strip, assess: bool) -> Estimate:
     """The estimate where there are too few scatterers."""
     zero = torch.zeros(len(strip.judged), dtype=torch.float64, device=strip.judged.device)
     none = zero.new_zeros(())
     value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
-    return Estimate(
-        value, {"line_of_sight_m": zero + 1}, none, Outcome.of(none > 0, Outcome.NOISE), info={"scatterers": none}
-    )
+    found = Estimate(value, quality=none + 1, info={"scatterers": none})
+    if not assess:
+        return found
+    outcome = (Outcome.NOISE if bool((strip.history != 0).any()) else Outcome.EMPTY).like(none)
+    return replace(found, std={"line_of_sight_m": zero + 1}, quality=none, outcome=outcome)
 
 
-def _std_m(strip: _Strip, solution: Solution) -> Tensor:
+def _std_m(strip: Strip, solution: Solution) -> Tensor:
     """Standard deviation of the line of sight, (pulse,), without a line over the judged pulses."""
     count = strip.basis.shape[1]
     free = torch.stack([strip.line_free(cosine) for cosine in strip.basis.mT], -1)

@@ -1,0 +1,95 @@
+"""Whether range shifts of envelopes can be trusted: their deviation from two halves of the band.
+
+The speckle and the noise of the lower and the upper half of the band are independent. A half has
+cells twice as wide and half as many of them, so that the mean of both errs twice as much as the
+whole band, and their difference four to six times as much. Shifts of single pulses that are not the
+likeliest ones also err by their distance from these.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.envelope_fit import Course, Envelopes, refined_shifts, robust_std, single_shifts, wrapped
+from torchsar.core import Estimate, Outcome, worst
+
+# standard deviation of a shift in cells from which on an alignment is not ok: a convention
+GOOD_CELLS = 0.5
+# share of the deviation of random positions in the window from which on nothing was found, by
+# choice: polynomials in noise have 0.6 of it, single pulses by half of the band 0.28
+_RANDOM = 0.15
+_LEAST_RANGE_CELLS = 4
+# difference of the halves over the error of the whole band: 4 by the number and the width of the
+# cells, 4.5 to 6.5 in speckle and among points
+_APART = 5.0
+# usual differences of the halves by which those of a pulse are far, and largest share of such
+# pulses
+_FAR, _MOST_FAR = 4.0, 0.05
+# error of single pulses without noise, by the parabola through samples a quarter of a cell apart
+_INTERPOLATION_CELLS = 1e-3
+
+
+def deviation(
+    lines: Tensor, shift: Tensor, std: Tensor | None, find: Callable[[Envelopes], Course]
+) -> tuple[Tensor, Tensor]:
+    """Predict the deviation of shifts, by estimates from two halves of the band.
+
+    Args:
+        lines: Pulses, shape (trial, pulse, range), complex.
+        shift: Their shifts in cells, shape (trial, pulse).
+        std: Standard deviation of a polynomial by the scatter of its blocks, shape (trial,); None
+            for the shifts of single pulses.
+        find: The estimator, which returns shifts of envelopes.
+
+    Returns:
+        The standard deviation in cells, shape (trial,), and whether the halves confirm the shifts,
+        of all but a twentieth of single pulses, bool, shape (trial,).
+    """
+    n = lines.shape[-1]
+    if n < _LEAST_RANGE_CELLS:
+        return shift.new_full(shift.shape[:1], n / math.sqrt(12)), torch.ones_like(shift[:, 0], dtype=torch.bool)
+    half, present = n // 2, (lines != 0).any(-1)
+    spectrum = torch.fft.fftshift(torch.fft.fft(lines), dim=-1)
+    ends = (torch.fft.ifft(torch.fft.ifftshift(part, dim=-1)) for part in (spectrum[..., :half], spectrum[..., -half:]))
+    lower, upper = (find(Envelopes.of(end))[0] * (n / half) for end in ends)
+    phasor = torch.where(present, torch.polar(torch.ones_like(lower), 2 * math.pi / n * (lower - upper)), 0)
+    apart = wrapped(lower - upper - torch.angle(phasor.sum(-1, keepdim=True)) * (n / (2 * math.pi)), n)
+    apart = torch.where(present, apart, 0) / _APART
+    count = (present.sum(-1) - 1).clamp_min(1)
+    if std is not None:
+        agree = (apart.square().sum(-1) / count).sqrt() < GOOD_CELLS
+        return std, agree & (std < GOOD_CELLS / 2)
+    # a pulse whose halves differ by far is aligned at a wrong maximum by one of them
+    usual = _FAR * robust_std(apart.abs(), present)
+    agree = (apart.abs() > usual).sum(-1) <= _MOST_FAR * count
+    envelopes = Envelopes.of(lines)
+    likeliest = refined_shifts(envelopes, single_shifts(envelopes, shift, "likelihood", 3))
+    terms = torch.minimum(apart.abs(), usual).square() + torch.where(present, wrapped(likeliest - shift, n), 0).square()
+    return (terms.sum(-1) / count + _INTERPOLATION_CELLS**2).sqrt(), agree
+
+
+def assessed(found: Estimate, std: Tensor, agree: Tensor, cells: int) -> Estimate:
+    """Add the standard deviation, the quality and the outcome to shifts.
+
+    Args:
+        found: Estimate of `shift_cells`.
+        std: Standard deviation in cells, shape (...,).
+        agree: Whether halves of the band confirm the shifts, bool, shape (...,).
+        cells: Number of range cells.
+    """
+    count, random = found.info["present"].sum(-1), cells / math.sqrt(12)
+    std = torch.where(count < 2, random, std)
+    outcome = worst(
+        (Outcome.INEXACT, std >= GOOD_CELLS),
+        (Outcome.PARTS_DISAGREE, ~agree),
+        (Outcome.TOO_FEW, (count < 2) | (cells < _LEAST_RANGE_CELLS)),
+        (Outcome.NOISE, (std > _RANDOM * random) & (count >= 2) & (cells >= _LEAST_RANGE_CELLS)),
+        (Outcome.EMPTY, count == 0),
+    )
+    wide = std[..., None].expand_as(found["shift_cells"])
+    return replace(found, std={"shift_cells": wide}, quality=1 / (1 + (std / GOOD_CELLS).square()), outcome=outcome)
