@@ -14,7 +14,6 @@ from torchsar.compensate.path.curve import Curve, Solution
 from torchsar.compensate.path.ground import for_each, trials_of
 from torchsar.compensate.path.motion import cosines, expected_power
 from torchsar.compensate.path.scatterers import Echoes, prominent_places
-from torchsar.compensate.pulse_phase.assess import LEAST_STREHL
 from torchsar.compensate.pulse_phase.data import or_one, without_line
 from torchsar.core import Estimate, Outcome, checked_samples, cis
 from torchsar.focus import ImageGrid, ProcessedBeam, TilePlan
