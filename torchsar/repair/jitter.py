@@ -50,6 +50,18 @@ def smallest_gap(offset_samples: Tensor) -> Tensor:
     return 1 + (torch.roll(offset_samples, -1, -1) - offset_samples).amin(-1)
 
 
+def uncrossed(offset_samples: Tensor) -> Tensor:
+    """Return timing offsets, zero in trials in which sample instants would coincide or cross.
+
+    Args:
+        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M).
+
+    Returns:
+        Offsets in samples, same shape.
+    """
+    return torch.where((smallest_gap(offset_samples) >= MIN_GAP)[..., None], offset_samples, 0)
+
+
 def refuse_crossing(offset_samples: Tensor) -> None:
     """Raise ValueError if sample instants lie less than 0.01 sample apart, or cross.
 

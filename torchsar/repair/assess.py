@@ -1,0 +1,130 @@
+"""Assessment of the estimators of receiver damage: standard deviations and outcomes.
+
+Every function here takes what an estimator has found, and returns the fields `std`, `quality` and
+`outcome` of its `Estimate`. The questions are the same for all of them: Is there anything beyond
+noise? Do the data determine the values? Is the predicted deviation small enough for use? Where the
+deviation does not follow from a model of the noise, the data are divided into parts that are left
+out in turn.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Outcome, worst
+from torchsar.repair.jitter import uncrossed
+
+# Least number of blocks of lines from which a deviation is taken.
+_LEAST_BLOCKS = 8
+# Largest standard deviation of a phase in rad and of a relative gain: the remaining imbalance is 20
+# dB below the signal.
+_MOST_IMBALANCE = 0.1
+# Standard deviation of a phase in rad from which on it is taken for that of noise, by choice.
+_NOISE_PHASE = 0.25
+# Standard deviations by which the noise may be wrong, the relative error of a power whose noise is
+# not known, and the least coherence of lines whose noise is not known, by choice.
+_NOISE_SIGMAS, _WEAK_NOISE, _LEAST_COHERENCE = 3.0, 0.03, 0.2
+# Largest standard deviation of an offset of sampling instants, in samples (-24 dB of the signal).
+_MOST_OFFSET = 0.01
+
+
+def root(square: Tensor) -> Tensor:
+    """Return the square root, with a gradient of zero at zero.
+
+    Args:
+        square: Any shape, 0 or more.
+
+    Returns:
+        Square roots, same shape.
+    """
+    return torch.where(square > 0, square.clamp_min(torch.finfo(square.dtype).tiny).sqrt(), 0)
+
+
+def left_out_deviation(values: Tensor) -> Tensor:
+    """Return the standard deviation of an estimate from those without one part of the data.
+
+    Of two parts, it is half the difference of their estimates.
+
+    Args:
+        values: Estimates without each part in turn, shape (..., part, n).
+
+    Returns:
+        Standard deviation, shape (..., n).
+    """
+    parts = values.shape[-2]
+    return root((values - values.mean(-2, keepdim=True)).square().sum(-2) * ((parts - 1) / parts))
+
+
+def assess_imbalance(
+    gain: Tensor,
+    lag: Tensor,
+    power: Tensor,
+    noise: Tensor,
+    left_out: tuple[Tensor, Tensor],
+    looks: tuple[float, float],
+) -> dict[str, Any]:
+    """Assess gains and phases of channels.
+
+    Args:
+        gain: Gains, shape (..., channel).
+        lag: Mean product of each line with the line before over the mean power of the lines, shape
+            (..., channel), complex.
+        power: Mean power of the lines, shape (...,).
+        noise: Noise power of each channel, 0 where it is not known, shape (..., channel).
+        left_out: Gains and phases without one block of lines, shape (..., block, channel) each.
+        looks: Samples of a channel, and samples over which its noise is averaged.
+
+    Returns:
+        Fields of an Estimate: NOISE where the coherence of neighbouring lines may be due to chance or
+        a phase is that of noise, SINGULAR where a
+        channel has no power, TOO_FEW with fewer than 8 blocks of lines, INEXACT where a deviation
+        exceeds 0.1.
+    """
+    product = gain * torch.roll(gain, 1, -1) / gain.square().mean(-1, keepdim=True)
+    coherence = (lag.abs() / product.clamp_min(1e-300)).mean(-1).clamp(0, 1)
+    gain_std, phase_std = (left_out_deviation(values) for values in left_out)
+    share = (noise / power[..., None].clamp_min(1e-300)).clamp_max(0.99)
+    # an error of the noise level brings the powers of the channels closer together or farther apart
+    bias = torch.where(share > 0, _NOISE_SIGMAS / math.sqrt(looks[1]) * share / (1 - share), _WEAK_NOISE)
+    gain_std = root(gain_std.square() + (gain * torch.log(gain) * bias).square())
+    chance = (coherence < 5 / math.sqrt(looks[0])) | (phase_std > _NOISE_PHASE).any(-1)
+    known = (share > 0).all(-1) | (coherence > _LEAST_COHERENCE)
+    inexact = (phase_std > _MOST_IMBALANCE) | (gain_std > _MOST_IMBALANCE * gain)
+    outcome = worst(
+        (Outcome.INEXACT, inexact.any(-1)),
+        (Outcome.TOO_FEW, torch.full_like(known, left_out[0].shape[-2] < _LEAST_BLOCKS)),
+        (Outcome.NOISE, ~known | chance),
+        (Outcome.SINGULAR, ((gain < 1e-3) | (gain > 1e3)).any(-1)),
+        (Outcome.EMPTY, power == 0),
+    )
+    return {"std": {"gain": gain_std, "phase_rad": phase_std}, "quality": coherence, "outcome": outcome}
+
+
+def assess_offsets(
+    offsets: Tensor, std: Tensor, tested: Tensor, found: Tensor, lit: Tensor, quality: Tensor
+) -> dict[str, Any]:
+    """Assess timing offsets.
+
+    Args:
+        offsets: Timing offsets in samples, shape (..., M).
+        std: Their standard deviations, same shape.
+        tested: Deviation of the offsets of the longest period tested, shape (...,).
+        found: Whether there is a signal beyond noise, shape (...,), bool.
+        lit: Whether there are samples that are finite and not zero, shape (...,), bool.
+        quality: Quality 0..1, shape (...,).
+
+    Returns:
+        Fields of an Estimate: EMPTY without samples, SINGULAR where sample instants would coincide
+        or cross, NOISE without a signal, INEXACT where a deviation is 0.01 samples or more.
+    """
+    outcome = worst(
+        (Outcome.INEXACT, ~((std < _MOST_OFFSET).all(-1) & (tested < _MOST_OFFSET))),
+        (Outcome.NOISE, ~found),
+        (Outcome.EMPTY, ~lit),
+        (Outcome.SINGULAR, lit & found & (uncrossed(offsets) != offsets).any(-1)),
+    )
+    return {"std": {"offset_samples": torch.where((outcome >= Outcome.NOISE)[..., None], 0, std)}, "quality": quality, "outcome": outcome}
