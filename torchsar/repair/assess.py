@@ -104,8 +104,28 @@ def assess_imbalance(
     return {"std": {"gain": gain_std, "phase_rad": phase_std}, "quality": coherence, "outcome": outcome}
 
 
+def of_trials(fields: dict[str, Any], trials: torch.Size) -> dict[str, Any]:
+    """Return fields of an Estimate of trials in a row with the trial dimensions of the data.
+
+    Args:
+        fields: Fields `std`, `quality` and `outcome`, whose tensors begin with one dimension.
+        trials: Trial dimensions; may be empty.
+
+    Returns:
+        The same fields with other shapes.
+    """
+    std = {name: value.reshape(*trials, *value.shape[1:]) for name, value in fields["std"].items()}
+    return {"std": std, **{name: fields[name].reshape(trials) for name in ("quality", "outcome")}}
+
+
 def assess_offsets(
-    offsets: Tensor, std: Tensor, tested: Tensor, found: Tensor, lit: Tensor, quality: Tensor
+    offsets: Tensor,
+    std: Tensor,
+    tested: Tensor,
+    found: Tensor,
+    lit: Tensor,
+    quality: Tensor,
+    most_rms: float = math.inf,
 ) -> dict[str, Any]:
     """Assess timing offsets.
 
@@ -116,15 +136,19 @@ def assess_offsets(
         found: Whether there is a signal beyond noise, shape (...,), bool.
         lit: Whether there are samples that are finite and not zero, shape (...,), bool.
         quality: Quality 0..1, shape (...,).
+        most_rms: Largest rms offset to which the method leads, in samples.
 
     Returns:
         Fields of an Estimate: EMPTY without samples, SINGULAR where sample instants would coincide
-        or cross, NOISE without a signal, INEXACT where a deviation is 0.01 samples or more.
+        or cross, NOISE without a signal, MISFIT where the offsets are too large for the method,
+        INEXACT where a deviation is 0.01 samples or more.
     """
     outcome = worst(
         (Outcome.INEXACT, ~((std < _MOST_OFFSET).all(-1) & (tested < _MOST_OFFSET))),
+        (Outcome.MISFIT, offsets.square().mean(-1).sqrt() >= most_rms),
         (Outcome.NOISE, ~found),
         (Outcome.EMPTY, ~lit),
         (Outcome.SINGULAR, lit & found & (uncrossed(offsets) != offsets).any(-1)),
     )
-    return {"std": {"offset_samples": torch.where((outcome >= Outcome.NOISE)[..., None], 0, std)}, "quality": quality, "outcome": outcome}
+    std = torch.where((outcome >= Outcome.NOISE)[..., None], 0, std)
+    return {"std": {"offset_samples": std}, "quality": quality, "outcome": outcome}
