@@ -152,3 +152,29 @@ def assess_offsets(
     )
     std = torch.where((outcome >= Outcome.NOISE)[..., None], 0, std)
     return {"std": {"offset_samples": std}, "quality": quality, "outcome": outcome}
+
+
+def assess_lines(lines: Tensor, lost: Tensor, reach: int = 8) -> dict[str, Any]:
+    """Assess lines that are corrected for interference.
+
+    Args:
+        lines: Lines, shape (..., pulse, range), complex.
+        lost: Lines that were given up, shape (..., pulse), bool.
+        reach: Number of lines on either side with which the power of a line is compared.
+
+    Returns:
+        Fields of an Estimate: EMPTY for zeros, MISFIT where lines that stand out among their
+        neighbours hold more power than the rest, TOO_FEW where less than half of the lines remain.
+    """
+    power = lines.abs().to(torch.float64).square().mean(-1)
+    row = torch.arange(power.shape[-1], device=power.device)
+    near = (row[:, None] + torch.arange(-reach, reach + 1, device=power.device)).clamp(0, power.shape[-1] - 1)
+    usual = torch.where(power > 0, power, torch.nan)[..., near].nanmedian(-1).values.nan_to_num(0)
+    excess = torch.where(power > 4 * usual, power - usual, 0)
+    quality = 1 - lost.to(torch.float64).mean(-1)
+    outcome = worst(
+        (Outcome.MISFIT, excess.sum(-1) > (power - excess).sum(-1)),
+        (Outcome.TOO_FEW, quality < 0.5),
+        (Outcome.EMPTY, (power == 0).all(-1) & ~lost.any(-1)),
+    )
+    return {"quality": quality, "outcome": outcome}

@@ -276,7 +276,10 @@ def estimate_jitter_blind(
             offsets[chosen], std[chosen] = total[:, tiled % m], deviation[:, None].expand(-1, longest)
         elif assess:
             std[chosen] = cyclic_fit(rows[chosen], longest).std_samples[:, None].expand(-1, longest)
-    value = {"offset_samples": uncrossed(offsets).reshape(*y.shape[:-2], longest), "period": periods.reshape(y.shape[:-2])}
+    value = {
+        "offset_samples": uncrossed(offsets).reshape(*y.shape[:-2], longest),
+        "period": periods.reshape(y.shape[:-2]),
+    }
     if not assess:
         return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(value["period"]))
     size = offsets.square().mean(-1)

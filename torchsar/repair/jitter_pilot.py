@@ -86,7 +86,9 @@ def estimate_jitter_pilot(
     fits = [_fit(x, _peak_frequency(x), m) for m in periods]
     best = _choose(fits) if period is None else torch.zeros(x.shape[:-1], dtype=torch.int64, device=x.device)
     tiled = torch.arange(longest, device=x.device)
-    phase = take(torch.stack([fit.phase_rad[..., tiled % m] for m, fit in zip(periods, fits, strict=True)], -2), best, -2)
+    phase = take(
+        torch.stack([fit.phase_rad[..., tiled % m] for m, fit in zip(periods, fits, strict=True)], -2), best, -2
+    )
     frequency, noise, power = (
         take(torch.stack([getattr(fit, name) for fit in fits], -1), best) for name in ("frequency", "noise", "power")
     )
