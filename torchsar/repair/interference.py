@@ -9,12 +9,11 @@ lines. Lines without interference are unchanged bit for bit.
 
 Detection: the power of each cell of the range spectrum is compared with its level, the power
 without interference. The level is the larger of two estimates. The first is the gain of the line
-times a clean spectrum that all lines share: a median over lines, followed by a running median over
+times a clean spectrum that all lines share: a median over lines, followed by a local median over
 frequency. The median over lines rejects interferers whose frequency changes from line to line; the
-running median rejects narrowband interferers of constant frequency, and preserves the steep edges
-of the pulse band. The second is the median over neighbouring cells of the line's own spectrum. It
-is needed for lines without an echo, whose spectrum has another shape than that of lines with an
-echo. Regularly spaced targets also make narrow spectral peaks. A line is therefore treated only if
+local median rejects narrowband interferers of constant frequency, and preserves the steep edges of
+the pulse band. The second is the local median of the line's own spectrum. It is needed for lines
+without an echo, whose spectrum has another shape than that of lines with an echo. Regularly spaced targets also make narrow spectral peaks. A line is therefore treated only if
 the energy near its peak lasts most of the line.
 
 Tones are estimated by maximum likelihood. A tone is A exp(2j pi (f t + r t^2 / 2)) over the whole
@@ -67,7 +66,7 @@ from torchsar.repair.response import unit_legendre
 # In units of the mean level. Speckle is exponential: exp(-30) leaves one false cell in 1e13. The
 # clean RADARSAT-1 blocks stay below 24.
 THRESHOLD = 30.0
-# Width of the running median over the band, by choice: an interferer of half of it does not raise
+# Width of the local median over the band, by choice: an interferer of half of it does not raise
 # the median; one that is wider than this is not narrowband.
 _LEVEL_SHARE = 1 / 16
 # Least median over mean power of the blocks of a line for energy that lasts (1 for a tone, 0.7 for
@@ -322,15 +321,6 @@ def _excess(power: Tensor, density: Tensor) -> Tensor:
     return torch.where(density > 0, power / torch.where(density > 0, density, 1), 0)
 
 
-def _running_median(x: Tensor, width: int) -> Tensor:
-    """Circular running median along the last dimension, from at most 33 samples, spread evenly."""
-    stride = max(1, round(width / 32))
-    half = min(16, max(1, (x.shape[-1] - 1) // (2 * stride)))
-    taps = stride * torch.arange(-half, half + 1, device=x.device)
-    index = (torch.arange(x.shape[-1], device=x.device)[:, None] + taps) % x.shape[-1]
-    return x[..., index].median(-1).values
-
-
 def _local_median(power: Tensor, width: int) -> Tensor:
     """For each cell the larger of the medians of the two windows, overlapping by half, that hold it."""
     n = power.shape[-1]
@@ -350,7 +340,7 @@ def _clean_density(power: Tensor) -> Tensor:
 
     def shape_for(gain: Tensor) -> Tensor:
         relative = torch.where(gain[..., None] > 0, power / torch.where(gain > 0, gain, 1)[..., None], torch.nan)
-        return _running_median(relative.nanmedian(-2).values.nan_to_num(0.0), width)
+        return _local_median(relative.nanmedian(-2).values.nan_to_num(0.0), width)
 
     # lines relative to their median over the whole band, then over the part that holds signal
     shape = shape_for(power.median(-1).values)
