@@ -80,11 +80,15 @@ def test_outcomes_and_values_without_assessment(monkeypatch):
     assert found.outcome.tolist() == [Outcome.NOISE, Outcome.EMPTY, Outcome.OK]
     few = unbalanced(scene(10, 16, trials=40), (1, 1.3), (0, 50))
     found = estimate_imbalance(few)
-    assert set(found.outcome.tolist()) <= {Outcome.TOO_FEW, Outcome.NOISE} and float(found.doubtful.double().mean()) > 0.9
+    assert (
+        set(found.outcome.tolist()) <= {Outcome.TOO_FEW, Outcome.NOISE} and float(found.doubtful.double().mean()) > 0.9
+    )
     error = found["phase_rad"][found.doubtful, 1] - 50 * DEGREE
     assert float(error.square().mean().sqrt()) < 10 * DEGREE  # a fifth of what it corrects
     monkeypatch.setattr("torchsar.repair.channels.assess_imbalance", None)
-    plain = EstimateImbalance(assess=False)(Signal(few, (Axis("pulse", 10, 0.0, 1.0, "s"), Axis("range", 16, 0.0, 1.0, "m"))))
+    plain = EstimateImbalance(assess=False)(
+        Signal(few, (Axis("pulse", 10, 0.0, 1.0, "s"), Axis("range", 16, 0.0, 1.0, "m")))
+    )
     assert plain.outcome.tolist() == [Outcome.NOT_ASSESSED] * 40 and not plain.std
     assert all(torch.equal(plain[name], found[name]) for name in found.value)
 

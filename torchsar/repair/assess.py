@@ -36,6 +36,13 @@ _MOST_OFFSET = 0.01
 _MOST_RESPONSE, _MOST_BOUND = 0.125, 0.08
 # Least curvature of the entropy in nats per rad^2, by measurement: 5 to 20 in sharp windows.
 _CURVATURE = 4.0
+# Least certainties of the order of up and down sweeps and of a fringe, in standard deviations, by
+# choice: in a normal distribution the chance is 3e-7 above 5 and 1e-3 above 3.
+_ORDER_SIGMAS, _FRINGE_SIGMAS = 5.0, 3.0
+# Least symmetry of a reliable result, over the share of the scene in the power. Measured on scenes
+# of 1 to 40 scatterers: above 0.7 in 97 % of the results that are right, below 0.66 where they are
+# wrong. And least share of a scene, by choice: chance gives 0.02 to white noise.
+_LEAST_SYMMETRY, _LEAST_SHARE = 0.7, 0.05
 
 
 def root(square: Tensor) -> Tensor:
@@ -226,3 +233,30 @@ def assess_response(
     )
     std = torch.where(torch.isfinite(std) & sided & (bound < _MOST_BOUND), std, math.pi)[:, None].expand_as(phase_rad)
     return {"std": {"phase_rad": std}, "quality": 1 / (1 + std[:, 0].square()), "outcome": outcome}
+
+
+def assess_trigger(
+    order: Tensor, fringe: Tensor, symmetry: Tensor, share: Tensor, outside: Tensor, quality: Tensor
+) -> dict[str, Any]:
+    """Assess the start of triangular sweeps.
+
+    Args:
+        order: Certainty of the order of up and down sweeps in standard deviations, shape (...,).
+        fringe: Certainty of the fringe in standard deviations, shape (...,).
+        symmetry: Symmetry 0..1 of the record about the turning points, shape (...,).
+        share: Share of the scene in the power of the record, shape (...,).
+        outside: Whether no whole period fits its block, shape (...,), bool.
+        quality: Quality 0..1, shape (...,).
+
+    Returns:
+        Fields of an Estimate: NOISE where no scene rises above the noise, OUTSIDE_SEARCH where no
+        period fits, AMBIGUOUS for an uncertain order or fringe, MISFIT where the record is not
+        symmetric.
+    """
+    outcome = worst(
+        (Outcome.MISFIT, ~(symmetry > _LEAST_SYMMETRY * share)),
+        (Outcome.AMBIGUOUS, ~((order > _ORDER_SIGMAS) & (fringe > _FRINGE_SIGMAS))),
+        (Outcome.OUTSIDE_SEARCH, outside),
+        (Outcome.NOISE, ~(share > _LEAST_SHARE)),
+    )
+    return {"quality": quality.clamp(0, 1), "outcome": outcome}
