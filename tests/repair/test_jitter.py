@@ -22,9 +22,7 @@ from torchsar.repair import (
     Lagrange,
     PilotJitter,
     correct_jitter,
-    correct_jitter_band_limited,
     correct_jitter_exact,
-    correct_jitter_lagrange,
     estimate_jitter_blind,
     estimate_jitter_pilot,
 )
@@ -48,9 +46,9 @@ def test_errors_reach_the_reference_figures():
     x = clutter(8, 2048)
     y = sample_unevenly(x, OFFSETS)
     assert abs(float(error_db(y, x)) + 16) < 0.5
-    assert float(error_db(correct_jitter_lagrange(y, OFFSETS, 4), x)) < -23.5
-    assert float(error_db(correct_jitter_lagrange(y, OFFSETS, 8), x)) < -27
-    assert float(error_db(correct_jitter_band_limited(y, OFFSETS, 8, 0.8), x)) < -42
+    assert float(error_db(Lagrange(4)(y, OFFSETS), x)) < -23.5
+    assert float(error_db(Lagrange(8)(y, OFFSETS), x)) < -27
+    assert float(error_db(BandLimited(8, 0.8)(y, OFFSETS), x)) < -42
     assert float(error_db(correct_jitter_exact(y, OFFSETS), x)) < -250
 
 
@@ -81,7 +79,7 @@ def test_periods_differ_between_trials_and_zero_offsets_change_nothing():
 
 def test_zero_offsets_change_nothing():
     x = clutter(2, 100)
-    assert torch.equal(correct_jitter_lagrange(x, torch.zeros(4), 8), x)
+    assert torch.equal(Lagrange(8)(x, torch.zeros(4)), x)
     assert float(error_db(correct_jitter_exact(x, torch.zeros(4)), x)) < -250
 
 
