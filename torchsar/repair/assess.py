@@ -31,8 +31,8 @@ _NOISE_PHASE = 0.25
 _NOISE_SIGMAS, _WEAK_NOISE, _LEAST_COHERENCE = 3.0, 0.03, 0.2
 # Largest standard deviation of an offset of sampling instants, in samples (-24 dB of the signal).
 _MOST_OFFSET = 0.01
-# Largest standard deviation of a phase response in rad (-18 dB of the signal), and bound up to which
-# the search finds the right minimum, by measurement: wrong from 0.09 on.
+# Largest standard deviation of a phase response in rad (-18 dB of the signal), and bound up to
+# which the search finds the right minimum, by measurement: wrong from 0.09 on.
 _MOST_RESPONSE, _MOST_BOUND = 0.125, 0.08
 # Least curvature of the entropy in nats per rad^2, by measurement: 5 to 20 in sharp windows.
 _CURVATURE = 4.0
@@ -92,9 +92,9 @@ def assess_imbalance(
         looks: Samples of a channel, and samples over which its noise is averaged.
 
     Returns:
-        Fields of an Estimate: NOISE where the coherence of neighbouring lines may be due to chance or
-        a phase is that of noise, SINGULAR where a
-        channel has no power, TOO_FEW with fewer than 8 blocks of lines, INEXACT where a deviation
+        Fields of an Estimate: NOISE where the coherence of neighbouring lines may be due to chance
+        or a phase is that of noise, SINGULAR where a channel has no power, EMPTY for zeros, TOO_FEW
+        with fewer than 8 blocks of lines, INEXACT where a deviation
         exceeds 0.1.
     """
     product = gain * torch.roll(gain, 1, -1) / gain.square().mean(-1, keepdim=True)

@@ -13,8 +13,9 @@ times a clean spectrum that all lines share: a median over lines, followed by a 
 frequency. The median over lines rejects interferers whose frequency changes from line to line; the
 local median rejects narrowband interferers of constant frequency, and preserves the steep edges of
 the pulse band. The second is the local median of the line's own spectrum. It is needed for lines
-without an echo, whose spectrum has another shape than that of lines with an echo. Regularly spaced targets also make narrow spectral peaks. A line is therefore treated only if
-the energy near its peak lasts most of the line.
+without an echo, whose spectrum has another shape than that of lines with an echo. Regularly spaced
+targets also make narrow spectral peaks. A line is therefore treated only if the energy near its
+peak lasts most of the line.
 
 Tones are estimated by maximum likelihood. A tone is A exp(2j pi (f t + r t^2 / 2)) over the whole
 line, with t in samples from the middle of the line. Each line has its own complex amplitude A,
@@ -41,6 +42,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -322,7 +324,7 @@ def _excess(power: Tensor, density: Tensor) -> Tensor:
 
 
 def _local_median(power: Tensor, width: int) -> Tensor:
-    """For each cell the larger of the medians of the two windows, overlapping by half, that hold it."""
+    """For each cell the larger median of the two windows, overlapping by half, that hold it."""
     n = power.shape[-1]
     width = min(width, n)
     hop = max(1, width // 2)
@@ -406,13 +408,13 @@ class _Tone:
         return unit_phasor((self.frequency[..., None] + self.rate[..., None] * (t / 2)) * t, like.dtype)
 
     def waveform(self, lines: Tensor) -> Tensor:
-        """The tone with the amplitude that fits each line by least squares; 0 where there is none."""
+        """The tone with the amplitude of least squares in each line; 0 where there is none."""
         unit = self.phasor(lines)
         return (lines * unit.conj()).mean(-1, keepdim=True) * unit * self.present[..., None]
 
 
 def _of_phase(n: int) -> tuple[float, float]:
-    """Frequency, and drift, that one radian of the first and second Legendre polynomial stand for."""
+    """Frequency and drift that one radian of the first and second Legendre polynomial add."""
     return math.sqrt(3) / (math.pi * n), 6 * math.sqrt(5) / (math.pi * n * n)
 
 
@@ -438,8 +440,8 @@ def _coarse_offset(blocks: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _fit_tone(lines: Tensor, cell: Tensor, present: Tensor, density: Tensor) -> _Tone:
-    """Tone near a frequency cell (..., pulse) of each line by maximum likelihood, present only where
-    it lasts the whole line, for a density (..., pulse) of the clutter.
+    """Tone near a frequency cell (..., pulse) of each line by maximum likelihood, present only
+    where it lasts the whole line, for a density (..., pulse) of the clutter.
     """
     n = lines.shape[-1]
     signed = torch.where(cell > n // 2, cell - n, cell).to(torch.float64)
@@ -721,7 +723,7 @@ class _InterferenceCorrection(Stage):
             "touched": result.touched,
             "tone_cycles_per_sample": result.tone_cycles,
         }
-        judged = {"outcome": Outcome.NOT_ASSESSED.like(info["lines_touched"])}
+        judged: dict[str, Any] = {"outcome": Outcome.NOT_ASSESSED.like(info["lines_touched"])}
         if self.assess:
             judged = assess_lines(result.data, result.missing)
         return signal.with_data(result.data), Estimate({"missing": given_up}, **judged, info=info)

@@ -37,7 +37,7 @@ def estimate_jitter_pilot(
     """Estimate the period and the offsets of periodic timing jitter from a pilot tone.
 
     >>> import torch
-    >>> n = torch.arange(64) + torch.tensor([-0.1, 0.1]).repeat(32)
+    >>> n = torch.arange(64.0).double() + torch.tensor([-0.1, 0.1]).repeat(32)
     >>> found = estimate_jitter_pilot(torch.exp(2j * torch.pi * 0.2 * n), max_period=4)
     >>> int(found["period"]), round(float(found["offset_samples"][1]), 3)
     (2, 0.1)

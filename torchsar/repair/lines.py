@@ -363,11 +363,11 @@ class LineIntegrity(Stage):
         Returns:
             The signal on the grid, with missing lines zero (regular input is unchanged bit for
             bit), and an Estimate with `missing` of shape (..., pulse), bool. `quality` is the share
-            of numbers that were accepted; the outcome is SINGULAR where it is below one half, and the
-            lines stay in the order received there. `info` has `source`, `number`, `corrected`, `repeated`, `unplaced` and `first_number` (see
-            `LinePlan`), and the counts `received`, `placed`, `repeated_count`, `corrected_count`,
-            `unplaced_count` and `missing_count` per trial, with received = placed + repeated +
-            unplaced.
+            of numbers that were accepted; the outcome is SINGULAR where it is below one half, and
+            the lines stay in the order received there. `info` has `source`, `number`, `corrected`,
+            `repeated`, `unplaced` and `first_number` (see `LinePlan`), and the counts `received`,
+            `placed`, `repeated_count`, `corrected_count`, `unplaced_count` and `missing_count` per
+            trial, with received = placed + repeated + unplaced.
 
         Raises:
             ValueError: If the numbers do not fit the lines or are not integers, `longest_gap` is

@@ -331,7 +331,8 @@ def estimate_response_sharpest(
     >>> import torch
     >>> image = torch.zeros(8, 64, dtype=torch.complex64)
     >>> image[2, 20] = image[5, 40] = 1
-    >>> estimate_response_sharpest(image, 0.8, width=16, orders=(4,), assess=False)["phase_rad"].shape
+    >>> found = estimate_response_sharpest(image, band=0.8, width=16, orders=(4,), assess=False)
+    >>> found["phase_rad"].shape
     torch.Size([1025])
 
     Sharpness is measured by the entropy of range windows about the points. After each pass the
@@ -538,9 +539,9 @@ _METHODS = {"sharpest": estimate_response_sharpest, "points": estimate_response_
 class EstimateResponse(Stage):
     """Estimator of the channel's phase and amplitude response from a focused image.
 
-    The abrupt edges of the pulse have frequencies that alias. The phase that they leave in the image
-    depends on where they lie between samples; it is about 0.01 rad, and no part of the predicted
-    standard deviation.
+    The abrupt edges of the pulse have frequencies that alias. The phase that they leave in the
+    image depends on where they lie between samples; it is about 0.01 rad, and no part of the
+    predicted standard deviation.
 
     The amplitude is estimated only if the range power spectrum of scene and noise is given as
     `expected_power`.

@@ -52,8 +52,8 @@ _FRINGES = 3
 # interpolation; and the share of the greatest symmetry below which a fringe may be excluded, by
 # trial on scenes of 1 to 40 scatterers.
 _FINE, _SYMMETRIC = 8, 0.9
-# Certainty above which a fringe is excluded, and above which another one than the nearest is chosen,
-# in standard deviations, by choice.
+# Certainty above which a fringe is excluded, and above which another one than the nearest is
+# chosen, in standard deviations, by choice.
 _EXCLUDED, _CHOSEN = 5.0, 3.0
 
 
@@ -221,8 +221,8 @@ def _turning_by_stft(windows: _Windows) -> tuple[Tensor, Tensor]:
 
 
 def _sharpness(windows: _Windows, start: Tensor) -> Tensor:
-    """Sharpness (..., o) of sweeps from start samples (..., o) on, averaged over the sweeps: the sum
-    of the squared power of their spectra over the square of its sum.
+    """Sharpness (..., o) of sweeps from start samples (..., o) on, averaged over the sweeps: the
+    sum of the squared power of their spectra over the square of its sum.
     """
 
     def sharpness(first: Tensor) -> Tensor:
