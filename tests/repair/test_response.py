@@ -24,7 +24,7 @@ from torchsar.repair import (
     estimate_response_sharpest,
 )
 from torchsar.repair.response import band_grid, band_power, on_axis, unit_legendre, without_line
-from torchsar.repair.response_phase import brightest_windows, minimise
+from torchsar.repair.response_phase import brightest_windows
 from torchsar.scene import Dwell, RandomPoints, StripmapWorld
 
 
@@ -201,20 +201,6 @@ def test_a_trial_gives_alone_what_it_gives_beside_others(method):
         alone = EstimateResponse(radar, method)(image.with_data(image.data[trial]))
         torch.testing.assert_close(alone["phase_rad"], together["phase_rad"][trial], atol=1e-9, rtol=0)
         torch.testing.assert_close(alone.std["phase_rad"], together.std["phase_rad"][trial], atol=1e-9, rtol=1e-6)
-
-
-def test_the_search_costs_only_the_trials_that_go_on():
-    """One cost whose minimum lies along its slope, and one that takes many steps."""
-    curvature = torch.stack([torch.ones(30), torch.logspace(-1, 1, 30)]).to(torch.float64)
-    asked = []
-
-    def cost(c: torch.Tensor, trials: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        asked.append(trials.tolist())
-        return 1 + (curvature[trials] * c.square()).sum(-1) / 2, curvature[trials] * c
-
-    start = torch.full((2, 30), 0.3, dtype=torch.float64)
-    assert float(minimise(cost, start, 60).abs().max()) < 1e-2
-    assert asked[0] == [0, 1] and asked[-1] == [1] and sum(0 in trials for trials in asked) < len(asked) / 2
 
 
 def test_the_brightest_maxima_are_apart():

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, cis, linear_phasor, power_of, unit_level
+from torchsar.optim import lbfgs
 from torchsar.radar import StripmapRadar
 from torchsar.repair.assess import assess_response, of_trials
 from torchsar.repair.response import (
@@ -157,16 +158,6 @@ class _Spectra:
         share = weight / weight.sum(-1, keepdim=True).clamp_min(1e-300)
         return _Spectra(spectra, share[used], used.nonzero()[:, 0])
 
-    def part(self, trials: Tensor, count: int) -> _Spectra:
-        """Spectra of some of `count` trials, which are numbered anew in this order, rising."""
-        if trials.numel() == count:
-            return self
-        number = torch.full((count,), -1, device=trials.device).scatter(
-            0, trials, torch.arange(trials.numel(), device=trials.device)
-        )[self.trial]
-        kept = number >= 0
-        return _Spectra(self.unit[kept], self.weight[kept], number[kept])
-
 
 def _transformed(windows: Tensor) -> Tensor:
     """Unitary FFT of windows (window, n), of which there may be none."""
@@ -212,76 +203,6 @@ def _entropy_slope(turned: Tensor) -> tuple[Tensor, Tensor]:
     return -(p * log).sum(-1), 2 * (slope.real * turned.imag - slope.imag * turned.real)
 
 
-def minimise(
-    cost: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
-    start: Tensor,
-    steps: int,
-    first_step: float = 0.3,
-    rtol: float = 1e-7,
-) -> Tensor:
-    """Minimise a cost by quasi-Newton (BFGS) descent, for each trial separately.
-
-    A step is halved until the cost falls enough (Armijo rule). A trial stops when no step lowers
-    its cost, or when a step lowers the cost by less than the fraction rtol. The cost is computed
-    for the trials that go on alone.
-
-    Args:
-        cost: Function of parameters (k, p) and of the numbers (k,) of their trials, rising, that
-            returns costs (k,) and gradients (k, p).
-        start: First parameters, shape (trial, p), float64.
-        steps: Largest number of steps.
-        first_step: Length of the first step.
-        rtol: Relative improvement below which a trial stops.
-
-    Returns:
-        Parameters, shape (trial, p).
-    """
-    found, running = start.clone(), torch.arange(start.shape[0], device=start.device)
-    x, (value, slope) = start, cost(start, running)
-    eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
-    inverse = eye * (first_step / torch.linalg.vector_norm(slope, dim=-1).clamp_min(1e-12))[:, None, None]
-    for number in range(steps):
-        step = -(inverse @ slope[..., None])[..., 0]
-        fall = (step * slope).sum(-1)
-        new, new_value, new_slope = x.clone(), value.clone(), slope.clone()
-        left = torch.arange(running.numel(), device=x.device)
-        for halving in range(12):
-            share = 0.5**halving
-            here = x[left] + share * step[left]
-            v, g = cost(here, running[left])
-            good = v <= value[left] + 1e-4 * share * fall[left]
-            new[left[good]], new_value[left[good]], new_slope[left[good]] = here[good], v[good], g[good]
-            left = left[~good]
-            if not left.numel():
-                break
-        found[running] = new
-        on = value - new_value > rtol * value.abs()
-        if not bool(on.any()):
-            break
-        moved, turned = (new - x)[on], (new_slope - slope)[on]
-        scaled = inverse[on] if number else _curvature(moved, turned)[:, None, None] * eye
-        inverse = _bfgs(scaled, moved, turned, eye)
-        running, x, value, slope = running[on], new[on], new_value[on], new_slope[on]
-    return found
-
-
-def _curvature(moved: Tensor, turned: Tensor) -> Tensor:
-    """Inverse curvature along the change of the gradient, (trial,); 1 where it is not positive."""
-    curvature, square = (moved * turned).sum(-1), turned.square().sum(-1)
-    return torch.where(curvature > 0, curvature / square.clamp_min(1e-300), 1)
-
-
-def _bfgs(inverse: Tensor, moved: Tensor, turned: Tensor, eye: Tensor) -> Tensor:
-    """Update of the inverse Hessian; trials without positive curvature keep theirs."""
-    curvature = (moved * turned).sum(-1)
-    good = curvature > 1e-12 * torch.linalg.vector_norm(moved, dim=-1) * torch.linalg.vector_norm(turned, dim=-1)
-    good = good & (curvature > 0)
-    r = torch.where(good, 1 / torch.where(good, curvature, 1), 0)[:, None, None]
-    left = eye - r * moved[..., :, None] * turned[..., None, :]
-    new = left @ inverse @ left.mT + r * moved[..., :, None] * moved[..., None, :]
-    return torch.where(good[:, None, None], new, inverse)
-
-
 def sharpest_coefficients(
     windows: Tensor, weight: Tensor, band: float, orders: tuple[int, ...] = ORDERS, steps: int = 40
 ) -> Tensor:
@@ -307,11 +228,12 @@ def sharpest_coefficients(
     for order in orders:
         part = basis[: order - 1]
 
-        def cost(c: Tensor, trials: Tensor, part: Tensor = part) -> tuple[Tensor, Tensor]:
-            value, slope = window_entropy(spectra.part(trials, windows.shape[0]), c @ part)
+        def cost(c: Tensor, part: Tensor = part) -> tuple[Tensor, Tensor]:
+            value, slope = window_entropy(spectra, c @ part)
             return value, slope @ part.mT
 
-        c = minimise(cost, torch.nn.functional.pad(c, (0, order - 1 - c.shape[-1])), steps)
+        start = torch.nn.functional.pad(c, (0, order - 1 - c.shape[-1]))
+        c = lbfgs(cost, start, steps=steps, history=12, value_tolerance=1e-7, first_step=0.3, with_gradient=True).x
     return c
 
 
