@@ -272,19 +272,9 @@ FUNCTIONS = [
         lambda x: repair.correct_jitter(x, torch.tensor([0.05, -0.03, 0.02, -0.04], dtype=F64)),
     ),
     _entry(
-        "repair.correct_jitter_band_limited",
-        "raw",
-        lambda x: repair.correct_jitter_band_limited(x, 0.05 * torch.sin(ramp(x.shape[-1]))),
-    ),
-    _entry(
         "repair.correct_jitter_exact",
         "raw",
         lambda x: repair.correct_jitter_exact(x, torch.tensor([0.05, -0.03, 0.02, -0.04], dtype=F64)),
-    ),
-    _entry(
-        "repair.correct_jitter_lagrange",
-        "raw",
-        lambda x: repair.correct_jitter_lagrange(x, 0.05 * torch.sin(ramp(x.shape[-1]))),
     ),
     _entry(
         "repair.correct_response",

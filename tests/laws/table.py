@@ -176,9 +176,7 @@ NOT_SHIFTED = {
             (
                 "CorrectJitter:correct_jitter",
                 "repair.correct_jitter",
-                "repair.correct_jitter_band_limited",
                 "repair.correct_jitter_exact",
-                "repair.correct_jitter_lagrange",
             ),
             "the jitter has a place on the clock",
         ),

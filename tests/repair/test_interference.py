@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.helpers import kondor_radar, small_radar, small_recording
-from torchsar.core import Chain, Draws, Recording, Signal, use
+from torchsar.core import Chain, Draws, Outcome, Recording, Signal, use
 from torchsar.echo import Quantiser, Tone, WideInterferer, simulate
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
@@ -304,4 +304,25 @@ def test_interference_that_is_not_narrowband_is_not_ok(stage):
     chirp = 30 * torch.polar(torch.ones_like(n), math.pi * 0.5 * n.square() / 128).to(clean.dtype)
     hit = torch.rand(64, 1, generator=generator) < 0.3
     data = torch.stack([clean[0], clean[1] + hit * chirp])
-    assert stage()(Signal(data, small_radar().raw_axes(64, 128)))[1].ok.tolist() == [True, False]
+    found = stage()(Signal(data, small_radar().raw_axes(64, 128)))[1]
+    assert found.outcome.tolist() == [Outcome.OK, Outcome.MISFIT]
+
+
+@pytest.mark.parametrize("stage", [SubtractInterference, NotchInterference, DropInterference])
+def test_outcomes_and_lines_without_assessment(stage, monkeypatch):
+    """Most lines are given up where they all hold six wide interferers."""
+    clean = acquire("speckle", 20.0, seed=6, n_pulse=64)
+    impaired = clean
+    for frequency in (-80e6, -50e6, -20e6, 20e6, 50e6, 75e6):
+        impaired, _ = WideInterferer(10.0, frequency, 1e6, share=0.7)(impaired, Draws(3))
+    signal = clean.signal.with_data(torch.stack([clean.signal.data, 0 * clean.signal.data, impaired.signal.data]))
+    before = torch.zeros(3, 64, dtype=torch.bool)
+    before[:, 5] = True
+    out, found = stage()(signal, missing=before)
+    last = Outcome.OK if stage is NotchInterference else Outcome.TOO_FEW
+    assert found.outcome.tolist() == [Outcome.OK, Outcome.EMPTY, last]
+    assert torch.equal(found["missing"] & before, before)
+    monkeypatch.setattr("torchsar.repair.interference.assess_lines", None)
+    plain_out, plain = stage(assess=False)(signal, missing=before)
+    assert plain.outcome.tolist() == [Outcome.NOT_ASSESSED] * 3
+    assert torch.equal(plain_out.data, out.data) and torch.equal(plain["missing"], found["missing"])

@@ -8,21 +8,21 @@ import pytest
 import torch
 
 from tests.audit.repairs import jitter
-from torchsar.core import Chain, Draws, use
+from tests.helpers import small_recording
+from torchsar.core import Chain, Draws, Outcome, use
 from torchsar.echo import PeriodicJitter
 from torchsar.echo.jitter import sample_unevenly
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation, error_db
 from torchsar.repair import (
     BandLimited,
+    BlindJitter,
     CorrectJitter,
     Exact,
     Lagrange,
     PilotJitter,
     correct_jitter,
-    correct_jitter_band_limited,
     correct_jitter_exact,
-    correct_jitter_lagrange,
     estimate_jitter_blind,
     estimate_jitter_pilot,
 )
@@ -46,9 +46,9 @@ def test_errors_reach_the_reference_figures():
     x = clutter(8, 2048)
     y = sample_unevenly(x, OFFSETS)
     assert abs(float(error_db(y, x)) + 16) < 0.5
-    assert float(error_db(correct_jitter_lagrange(y, OFFSETS, 4), x)) < -23.5
-    assert float(error_db(correct_jitter_lagrange(y, OFFSETS, 8), x)) < -27
-    assert float(error_db(correct_jitter_band_limited(y, OFFSETS, 8, 0.8), x)) < -42
+    assert float(error_db(Lagrange(4)(y, OFFSETS), x)) < -23.5
+    assert float(error_db(Lagrange(8)(y, OFFSETS), x)) < -27
+    assert float(error_db(BandLimited(8, 0.8)(y, OFFSETS), x)) < -42
     assert float(error_db(correct_jitter_exact(y, OFFSETS), x)) < -250
 
 
@@ -79,7 +79,7 @@ def test_periods_differ_between_trials_and_zero_offsets_change_nothing():
 
 def test_zero_offsets_change_nothing():
     x = clutter(2, 100)
-    assert torch.equal(correct_jitter_lagrange(x, torch.zeros(4), 8), x)
+    assert torch.equal(Lagrange(8)(x, torch.zeros(4)), x)
     assert float(error_db(correct_jitter_exact(x, torch.zeros(4)), x)) < -250
 
 
@@ -235,6 +235,30 @@ def test_offsets_on_which_the_fit_may_settle_wrongly_are_not_ok():
     true = torch.tensor([0.45, -0.35, -0.08, -0.02], dtype=torch.float64)
     found = estimate_jitter_blind(sample_unevenly(clutter(32, 512, seed=9), true), period=4)
     assert not bool(found.ok)
+
+
+def test_outcomes_and_values_without_assessment(monkeypatch):
+    x = clutter(32, 512, seed=3, dtype=torch.complex64)
+    noise = clutter(32, 512, 1.0, 4, torch.complex64)
+    y = torch.stack([sample_unevenly(x, OFFSETS), noise, 0 * x, sample_unevenly(x, OFFSETS) + 0.4 * noise])
+    blind = estimate_jitter_blind(y, 8)
+    assert blind.outcome.tolist() == [Outcome.OK, Outcome.NOISE, Outcome.EMPTY, Outcome.INEXACT]
+    true = (OFFSETS - OFFSETS.mean()).repeat(2)  # a doubtful value is better than none
+    assert float((blind["offset_samples"][3] - true).square().mean()) < 0.1 * float(true.square().mean())
+    tone = torch.polar(torch.ones(512, dtype=torch.float64), 2 * math.pi * 0.21 * torch.arange(512.0).double())
+    noise = noise[:1].to(torch.complex128)
+    pilots = torch.cat([sample_unevenly(tone[None], OFFSETS), noise, 0 * noise, tone[None] + 0.5 * noise])
+    pilot = estimate_jitter_pilot(pilots, 8)
+    assert pilot.outcome.tolist() == [Outcome.OK, Outcome.NOISE, Outcome.EMPTY, Outcome.INEXACT]
+    for module in ("jitter_blind", "jitter_pilot"):
+        monkeypatch.setattr(f"torchsar.repair.{module}.assess_offsets", None)
+    signal = small_recording(32, 512, trials=4)[0].signal
+    for found, plain in (
+        (blind, BlindJitter(8, assess=False)(signal.with_data(y))),
+        (pilot, PilotJitter(8, assess=False)(signal, pilot=pilots)),
+    ):
+        assert plain.outcome.tolist() == [Outcome.NOT_ASSESSED] * 4 and not plain.std
+        assert all(torch.equal(plain[name], found[name]) for name in found.value)
 
 
 def test_jitter_too_small_to_find_is_in_the_deviation_of_the_pilot_estimate():

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tests.helpers import small_radar
-from torchsar.core import Draws, Estimate, Recording, Signal
+from torchsar.core import Draws, Estimate, Outcome, Recording, Signal
 from torchsar.echo import CorruptedNumbers, LostGaps, LostLines, RepeatedLines, apply_impairments
 from torchsar.repair import LineIntegrity, line_integrity
 from torchsar.repair.lines import place_per_line
@@ -126,7 +126,8 @@ def test_one_inconsistent_trial_does_not_change_others() -> None:
     x, number = lines(2), torch.arange(N).repeat(2, 1)
     number[1] = torch.randperm(N, generator=torch.Generator().manual_seed(1))
     out, estimate = LineIntegrity()(Signal(x, small_radar().raw_axes(N, 3)), number)
-    assert estimate.ok.tolist() == [True, False] and torch.equal(out.data, x) and not estimate["missing"].any()
+    assert estimate.outcome.tolist() == [Outcome.OK, Outcome.SINGULAR]
+    assert torch.equal(out.data, x) and not estimate["missing"].any()
     check_counts(estimate)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.repair.triangles import ground, record, sweeps, table1
-from torchsar.core import Chain, Signal
+from torchsar.core import Chain, Outcome, Signal
 from torchsar.repair import BlankTurningPoints, SplitSweeps, find_trigger
 
 SHARES = (0.0, 0.07, 0.3, 0.511, 0.97)
@@ -110,6 +110,21 @@ def test_empty_and_noise_trials_are_not_ok_and_do_not_change_others():
     together = find_trigger(torch.cat([x, 0 * x, 1e6 * noise]), radar)
     assert together.ok.tolist() == [True, False, False] and bool(torch.isfinite(together["trigger_s"]).all())
     torch.testing.assert_close(together["trigger_s"][0], find_trigger(x[0], radar)["trigger_s"], atol=1e-15, rtol=0)
+
+
+def test_outcomes_and_triggers_without_assessment(monkeypatch):
+    radar = table1()
+    x, _ = made(radar, 24, shares=(0.3,), snr_db=None)
+    noise = torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(3))
+    weak, _ = made(radar, 24, shares=(0.3,), snr_db=-10.0)
+    data = torch.cat([x, 0 * x, noise, weak])
+    signal = Signal(data, radar.record_axes(24, 1024))
+    found = SplitSweeps(radar, "search")(signal)[1]
+    assert found.outcome.tolist() == [Outcome.OK, Outcome.NOISE, Outcome.NOISE, Outcome.AMBIGUOUS]
+    monkeypatch.setattr("torchsar.repair.trigger.assess_trigger", None)
+    plain = SplitSweeps(radar, "search", assess=False)(signal)[1]
+    assert plain.outcome.tolist() == [Outcome.NOT_ASSESSED] * 4
+    assert torch.equal(plain["trigger_s"], found["trigger_s"])
 
 
 def test_single_precision_gives_the_same_trigger():

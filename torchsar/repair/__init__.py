@@ -29,9 +29,7 @@ from torchsar.repair.jitter import (
     Exact,
     Lagrange,
     correct_jitter,
-    correct_jitter_band_limited,
     correct_jitter_exact,
-    correct_jitter_lagrange,
 )
 from torchsar.repair.jitter_blind import BlindJitter, estimate_jitter_blind
 from torchsar.repair.jitter_pilot import PilotJitter, estimate_jitter_pilot
@@ -85,9 +83,7 @@ __all__ = [
     "circular_shift",
     "correct_imbalance",
     "correct_jitter",
-    "correct_jitter_band_limited",
     "correct_jitter_exact",
-    "correct_jitter_lagrange",
     "correct_response",
     "drop_interference",
     "estimate_amplitude_response",

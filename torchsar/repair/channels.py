@@ -24,40 +24,17 @@ from torchsar.core import (
     cis,
     real_dtype,
     refuse_non_finite_values,
+    take,
     unit_level,
 )
+from torchsar.repair.assess import assess_imbalance
 
-# Blocks of lines for standard deviations, by choice, and least number of them.
-_BLOCKS, _LEAST_BLOCKS = 16, 8
+# Blocks of lines that are left out in turn for standard deviations, by choice.
+_BLOCKS = 16
 # Samples of a line from which on the noise is measured beside the band of the signal.
 _LEAST_BAND = 32
-# Standard deviations of the averaged noise by which it must lie below the mean power, and by which
-# its lowest twentieth may lie below its mean; and where the noise is not known, its ratio to the
-# signal and the least coherence, by choice.
-_SURE, _LOWEST, _WEAK_NOISE, _LEAST_COHERENCE = 6.0, 3.0, 0.03, 0.2
-# Largest standard deviation of a phase in rad and of a relative gain: the remaining imbalance is 20
-# dB below the signal.
-_MOST_STD = 0.1
-
-
-def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
-    """Compute products of successive lines and powers, averaged for each channel.
-
-    Channel c of C channels recorded the lines i with i mod C = c. Products and powers of all
-    channels are interpolated to the same lines, so that a slow change of the scene is not taken for
-    an imbalance.
-
-    Args:
-        x: Raw lines, shape (..., pulse, range), complex.
-        channels: Number of channels C.
-
-    Returns:
-        The product s[i] conj(s[i - 1]) of the samples s of successive lines, averaged over range
-        and over the lines i of each channel and divided by the power of the strongest line, shape
-        (..., C), complex128; and ln(power / power of channel 0), shape (..., C), float64.
-    """
-    sums = _Sums.of(x, channels).total
-    return sums.lag, sums.log_power
+# Standard deviations of the averaged noise by which it must lie below the mean power, by choice.
+_SURE = 6.0
 
 
 @dataclass(frozen=True)
@@ -70,22 +47,23 @@ class _Sums:
     Args:
         product: Products of each line with the conjugate of the line before, in their channel.
         own: Powers above the noise of the lines of a channel.
-        count: Number of groups, (block, 1).
     """
 
     product: Tensor
     own: Tensor
-    count: Tensor
 
     @staticmethod
-    def of(x: Tensor, channels: int, blocks: int = 1) -> _Sums:
-        """Sums of lines (..., line, range), divided by the power of the strongest line."""
+    def of(x: Tensor, noise: Tensor, blocks: int) -> _Sums:
+        """Sums of lines (..., line, range) with noise (..., channel), divided by the power of the
+        strongest line.
+        """
+        channels = noise.shape[-1]
         groups, device = x.shape[-2] // channels - 1, x.device
         power = x.abs().square().mean(-1).to(torch.float64)
         scale = power.amax(-1, keepdim=True).clamp_min(1e-300)
         product = (x[..., 1:, :] * x[..., :-1, :].conj()).mean(-1).to(torch.complex128) / scale
         channel = torch.arange(x.shape[-2], device=device) % channels
-        clean = power / scale - (_noise(x, channels) / scale)[..., channel]
+        clean = power / scale - (noise / scale)[..., channel]
         before = torch.arange(channels, dtype=torch.float64, device=device) / channels
         block = torch.arange(groups, device=device) * blocks // groups
 
@@ -95,31 +73,24 @@ class _Sums:
             total = torch.zeros(*centred.shape[:-2], blocks, channels, dtype=values.dtype, device=device)
             return total.index_add(-2, block, centred)
 
-        count = torch.bincount(block, minlength=blocks).to(torch.float64)[:, None]
-        return _Sums(summed(torch.nn.functional.pad(product, (1, 0))), summed(clean), count)
+        return _Sums(summed(torch.nn.functional.pad(product, (1, 0))), summed(clean))
 
     @property
     def total(self) -> _Sums:
         """Sums over all blocks, without the dimension of the blocks."""
-        return _Sums(self.product.sum(-2), self.own.sum(-2), self.count.sum(-2))
+        return _Sums(self.product.sum(-2), self.own.sum(-2))
 
     @property
     def left_out(self) -> _Sums:
         """Sums over all blocks but one, in turn."""
         whole = self.total
-        return _Sums(
-            whole.product[..., None, :] - self.product, whole.own[..., None, :] - self.own, whole.count - self.count
-        )
+        return _Sums(whole.product[..., None, :] - self.product, whole.own[..., None, :] - self.own)
 
     @property
-    def lag(self) -> Tensor:
-        """Mean products, (..., channel)."""
-        return self.product / self.count.clamp_min(1)
-
-    @property
-    def log_power(self) -> Tensor:
-        """Logarithm of each channel's power over that of channel 0, (..., channel)."""
-        return torch.log(self.own.clamp_min(1e-300) / self.own[..., :1].clamp_min(1e-300))
+    def gain(self) -> Tensor:
+        """Gain of each channel relative to channel 0, (..., channel)."""
+        own = self.own.clamp_min(1e-300)
+        return torch.exp(torch.log(own / own[..., :1]) / 2)
 
 
 def _noise(x: Tensor, channels: int) -> Tensor:
@@ -149,13 +120,22 @@ def _looks(x: Tensor, channels: int) -> int:
     return (2 * (x.shape[-1] // 32) + 1) * (x.shape[-2] // channels)
 
 
-def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | float | None = None) -> Estimate:
+def estimate_imbalance(
+    x: Tensor, channels: int = 2, doppler_cycles: Tensor | float | None = None, *, assess: bool = True
+) -> Estimate:
     """Estimate gain and phase of every channel relative to channel 0, which records the first line.
+
+    >>> import torch
+    >>> lines = torch.tensor([1.0, 2.0], dtype=torch.complex128).repeat(8)[:, None]
+    >>> estimate_imbalance(lines, assess=False)["gain"]
+    tensor([1., 2.], dtype=torch.float64)
 
     The C channels record the lines in turn. The products of neighbouring lines give the phase
     increment from line to line only modulo 2 pi / C, and the phases of the channels are ambiguous
     accordingly. For two channels, the phases phi and phi + pi cannot be distinguished; they
-    correspond to Doppler spectra that are displaced by PRF / 2.
+    correspond to Doppler spectra that are displaced by PRF / 2. Noise is measured in the part of
+    the range band or of the range cells that the signal leaves empty, and its bias of the gains is
+    removed. Without such a part, noise must be weak.
 
     Args:
         x: Raw lines, shape (..., pulse, range), complex.
@@ -163,18 +143,15 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
         doppler_cycles: Baseband Doppler centroid over PRF, shape (...,), accurate to 1 / (2 C);
             resolves the ambiguity. If it is None, the set of phases with the smallest mean square
             is taken: for two channels, the phase within 90 degrees.
+        assess: Whether to add standard deviations, quality and outcome.
 
     Returns:
         Estimate with `gain` of shape (..., C), 1 for channel 0, and `phase_rad` of shape (..., C)
         in radians, 0 for channel 0, which `correct_imbalance` removes. Standard deviations follow
-        from blocks of lines that are left out in turn; with fewer than eight blocks they assume a
-        Gaussian scene. Noise is measured in the part of the range band or of the range cells that
-        the signal leaves empty, and its bias of the gains is removed. Without such a part, noise
-        must be weak. `quality` is the coherence of neighbouring lines. `ok`
-        is False where a channel has no power (gain outside 1e-3..1e3), or the coherence is below 5
-        / sqrt(range samples x lines per channel) and may be due to chance, or below 0.2 without
-        such a part, or a standard deviation exceeds 0.1; gains are then 1 and
-        phases 0.
+        from blocks of lines that are left out in turn; `quality` is the coherence of neighbouring
+        lines. The outcome is NOISE where this coherence may be due to chance, SINGULAR where a
+        channel has no power (gain outside 1e-3..1e3), TOO_FEW for fewer than 9 C lines, and INEXACT
+        where a standard deviation exceeds 0.1.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -188,15 +165,26 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
             f"got {channels} channels and {x.shape[-2]} lines"
         )
     x = unit_level(x)
-    blocks = _Sums.of(x, channels, min(_BLOCKS, x.shape[-2] // channels - 1))
+    noise = _noise(x, channels)
+    blocks = _Sums.of(x, noise, min(_BLOCKS, x.shape[-2] // channels - 1))
     sums = blocks.total
-    return _assess(x, sums.lag, _phases(sums.lag, channels, doppler_cycles), sums.log_power, blocks)
+    value = {"gain": sums.gain, "phase_rad": _phases(sums.product, channels, doppler_cycles)}
+    if not assess:
+        return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(sums.gain[..., 0]))
+    some = blocks.left_out
+    turns = torch.angle(some.product * sums.product.conj()[..., None, :])
+    phases = torch.nn.functional.pad((turns - turns.mean(-1, keepdim=True))[..., 1:].cumsum(-1), (1, 0))
+    power = x.abs().square().mean(-1).to(torch.float64)
+    level = power.mean(-1) / power.amax(-1).clamp_min(1e-300)
+    lag = sums.product / (level * (x.shape[-2] // channels - 1)).clamp_min(1e-300)[..., None]
+    looks = (x.shape[-1] * x.shape[-2] / channels, _looks(x, channels))
+    return Estimate(value, **assess_imbalance(sums.gain, lag, power.mean(-1), noise, (some.gain, phases), looks))
 
 
-def _phases(lag: Tensor, channels: int, doppler_cycles: Tensor | float | None) -> Tensor:
+def _phases(product: Tensor, channels: int, doppler_cycles: Tensor | float | None) -> Tensor:
     """Phases of the channels from the products of successive lines, (..., channel) each."""
-    angle = torch.angle(lag)
-    turns = torch.arange(channels, dtype=torch.float64, device=lag.device) / channels
+    angle = torch.angle(product)
+    turns = torch.arange(channels, dtype=torch.float64, device=product.device) / channels
     rho = torch.angle(torch.polar(torch.ones_like(angle), angle).prod(-1))[..., None] / channels + 2 * math.pi * turns
     increments = angle[..., None, 1:] - rho[..., None]
     phases = torch.nn.functional.pad(torch.cumsum(increments, -1), (1, 0))
@@ -204,65 +192,9 @@ def _phases(lag: Tensor, channels: int, doppler_cycles: Tensor | float | None) -
     if doppler_cycles is None:
         cost = phases.square().sum(-1)
     else:
-        expected = 2 * math.pi * torch.as_tensor(doppler_cycles, dtype=torch.float64, device=lag.device)
+        expected = 2 * math.pi * torch.as_tensor(doppler_cycles, dtype=torch.float64, device=product.device)
         cost = -torch.cos(rho - expected[..., None])
-    branch = cost.argmin(-1)[..., None, None].expand(*cost.shape[:-1], 1, channels)
-    return torch.gather(phases, -2, branch)[..., 0, :]
-
-
-def _assess(x: Tensor, lag: Tensor, phase: Tensor, log_power: Tensor, blocks: _Sums) -> Estimate:
-    """Estimate with standard deviations, coherence and reliability."""
-    gain = torch.exp(log_power / 2)
-    channels, lines = gain.shape[-1], x.shape[-2]
-    power = x.abs().square().mean((-2, -1)).to(torch.float64)
-    mean_gain = gain.square().mean(-1)
-    level = power / x.abs().square().mean(-1).amax(-1).to(torch.float64).clamp_min(1e-300)
-    product = gain * torch.roll(gain, 1, -1) / mean_gain[..., None]
-    coherence = (lag.abs() / (level[..., None] * product).clamp_min(1e-300)).mean(-1).clamp(0, 1)
-    looks = x.shape[-1] * lines / channels
-    some = blocks.left_out
-    order = torch.arange(channels, dtype=torch.float64, device=x.device)
-    if blocks.count.shape[-2] < _LEAST_BLOCKS:  # a Gaussian scene
-        looks_apart = looks / (1 - coherence.square()).clamp_min(1e-3)  # neighbouring lines resemble each other
-        single = torch.sqrt(
-            (1 - coherence.square()).clamp_min(0) / (2 * looks_apart * coherence.square().clamp_min(1e-12))
-        )
-        phase_std = single[..., None] * torch.sqrt(order * (channels - order) / channels)
-        gain_std = gain * torch.sqrt(0.5 / looks_apart)[..., None] * (order > 0)
-    else:
-        turns = torch.angle(some.lag * lag.conj()[..., None, :])
-        turns = turns - turns.mean(-1, keepdim=True)
-        phase_std = _jackknife(torch.nn.functional.pad(turns[..., 1:].cumsum(-1), (1, 0)))
-        gain_std = _jackknife(torch.exp(some.log_power / 2))
-    noise = (_noise(x, channels) / x.abs().square().mean((-2, -1)).clamp_min(1e-300)[..., None]).clamp_max(0.99)
-    # an error of the noise level brings the powers of the channels closer together or farther apart
-    bias = torch.where(noise > 0, _LOWEST / math.sqrt(_looks(x, channels)) * noise / (1 - noise), _WEAK_NOISE)
-    gain_std = _root(gain_std.square() + (gain * log_power / 2 * bias).square())
-    clear = (coherence > 5 / math.sqrt(looks)) & ((noise > 0).all(-1) | (coherence > _LEAST_COHERENCE))
-    ok = (
-        torch.isfinite(gain).all(-1)
-        & (power > 0)
-        & (gain > 1e-3).all(-1)
-        & (gain < 1e3).all(-1)
-        & clear
-        & (phase_std < _MOST_STD).all(-1)
-        & (gain_std < _MOST_STD * gain).all(-1)
-    )
-    value = {"gain": torch.where(ok[..., None], gain, 1), "phase_rad": torch.where(ok[..., None], phase, 0)}
-    return Estimate(
-        value, {"gain": gain_std, "phase_rad": phase_std}, torch.where(ok, coherence, 0), Outcome.of(ok, Outcome.NOISE)
-    )
-
-
-def _jackknife(values: Tensor) -> Tensor:
-    """Standard deviation (..., channel) from values without one block, (..., block, channel)."""
-    blocks = values.shape[-2]
-    return _root((values - values.mean(-2, keepdim=True)).square().sum(-2) * ((blocks - 1) / blocks))
-
-
-def _root(square: Tensor) -> Tensor:
-    """Square root whose gradient is zero at zero, as for channel 0, which has no error."""
-    return torch.where(square > 0, square.clamp_min(torch.finfo(square.dtype).tiny).sqrt(), 0)
+    return take(phases, cost.argmin(-1), -2)
 
 
 def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
@@ -302,14 +234,15 @@ class EstimateImbalance(Stage):
 
     Args:
         channels: Number of channels.
+        assess: Whether to add standard deviations, quality and outcome.
     """
 
     provides = ("gain", "phase_rad")
     neutral = {"gain": 1.0, "phase_rad": 0.0}
 
-    def __init__(self, channels: int = 2) -> None:
+    def __init__(self, channels: int = 2, *, assess: bool = True) -> None:
         super().__init__()
-        self.channels = channels
+        self.channels, self.assess = channels, assess
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None) -> Estimate:
         """Estimate gain and phase of every channel; see `estimate_imbalance`.
@@ -323,7 +256,7 @@ class EstimateImbalance(Stage):
             Estimate with `gain` and `phase_rad`, shape (..., channel) each.
         """
         cycles = None if doppler_hz is None else doppler_hz * signal.axis("pulse").step
-        return estimate_imbalance(signal.data, self.channels, cycles)
+        return estimate_imbalance(signal.data, self.channels, cycles, assess=self.assess)
 
 
 class CorrectImbalance(Stage):

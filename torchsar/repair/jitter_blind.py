@@ -23,11 +23,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples
-from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap
+from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, unit_level
+from torchsar.repair.assess import assess_offsets, of_trials
+from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap, uncrossed
 
-# Largest standard deviation of an offset that is ok, in samples (-24 dB of the signal).
-_MOST_STD = 0.01
 # Largest rms offset that is ok, in samples, found by trial: above 0.23 the fits settle on wrong
 # offsets.
 _MOST_RMS = 0.22
@@ -63,37 +62,6 @@ class CyclicFit:
     converter: Tensor
     converter_std: Tensor
 
-    def significance(self, primitive: bool = False) -> Tensor:
-        """Return the chi-squared statistic of the Fourier coefficients of the jitter.
-
-        Without jitter it has as many degrees of freedom as coefficients are counted.
-
-        Args:
-            primitive: Whether to count only the coefficients E_k for which k and the period have no
-                common divisor. Coefficients with a common divisor also occur for a shorter period.
-
-        Returns:
-            Statistic, shape (...,).
-        """
-        m = self.coefficient.shape[-1] + 1
-        used = [k - 1 for k in range(1, m) if not primitive or math.gcd(k, m) == 1]
-        return (self.coefficient.abs().square() / self.variance)[..., used].sum(-1)
-
-    def excess(self, period: int) -> Tensor:
-        """Return the mean square of jitter that a shorter period lacks, beyond what chance gives.
-
-        Args:
-            period: Shorter period, which divides M.
-
-        Returns:
-            Mean square in samples^2, less the mean and twice the standard deviation of chance,
-            shape (...,); it may be negative.
-        """
-        m = self.coefficient.shape[-1] + 1
-        other = torch.arange(1, m, device=self.variance.device) * period % m != 0
-        chance = (self.variance * other).sum(-1) + 2 * ((self.variance * other).square().sum(-1) * 2).sqrt()
-        return (self.coefficient.abs().square() * other).sum(-1) - chance
-
     @property
     def offset_samples(self) -> Tensor:
         """Timing offsets of the M converters in samples, with mean zero, shape (..., M)."""
@@ -127,55 +95,56 @@ def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None, converte
     taper = _taper(n, y.device)
     spectrum = torch.fft.fft(y[..., :n] * taper.to(y.real.dtype)).to(torch.complex128)
     related = n * taper.pow(4).sum() / taper.square().sum().square()  # neighbours in a tapered spectrum
-    lines = y.shape[-2]
-    power = _smooth(spectrum.abs().square().mean(-2), max(1, 256 // lines))
+    power = _smooth(spectrum.abs().square().mean(-2), max(1, 256 // y.shape[-2]))
     power = power / power.mean(-1, keepdim=True).clamp_min(1e-300)
-    noise = None if corrected is None else _corrected_noise(corrected, n)
-    density = torch.ones_like(power) if noise is None else noise.abs().square().mean(-2)
+    noise = _corrected_noise(period, n, y.device, corrected)
+    density = noise.abs().square().mean(-2)
     floor = noise_floor(power / density)[..., None]
-    share = torch.as_tensor(converter, dtype=torch.float64, device=y.device).expand(floor.shape[:-1])[..., None]
-    level = floor * share
-    signal = (power - level * density).clamp_min(0)  # noise of the converter has no jitter
-    scale = spectrum.abs().square().mean((-2, -1)).clamp_min(1e-300)
-    frequency = torch.fft.fftfreq(n, dtype=torch.float64, device=y.device)
-    coefficient, variance = [], []
-    seen, information_seen = torch.zeros_like(level[..., 0]), torch.zeros_like(level[..., 0])
-    scatter_seen = torch.zeros_like(seen)
+    share = torch.as_tensor(converter, dtype=torch.float64, device=y.device)[..., None]
+    signal = (power - floor * share * density).clamp_min(0)  # noise of the converter has no jitter
+    scale = spectrum.abs().square().mean((-2, -1)).clamp_min(1e-300)[..., None]
+    tilted = torch.fft.fftfreq(n, dtype=torch.float64, device=y.device) * signal
+    coefficient, variance, of_noise = [], [], []
     for k in range(1, period // 2 + 1):
         step = k * (n // period)
-        cross = (spectrum * torch.roll(spectrum, step, -1).conj()).mean(-2) / scale[..., None]
-        own = None if noise is None else floor * (noise * torch.roll(noise, step, -1).conj()).mean(-2)
-        if own is not None:
-            cross = cross - share * own
-        other = torch.roll(power, step, -1)
-        slope = 2j * math.pi * (torch.roll(frequency * signal, step, -1) - frequency * signal)
-        weight = 1 / (power.clamp_min(_LEAST_POWER) * other.clamp_min(_LEAST_POWER))
-        both = power + other  # the correlation that a periodic gain gives; its share is taken out
-        scale_both = (weight * both.square()).sum(-1, keepdim=True).clamp_min(1e-150)
-        slope = slope - both * ((weight * both * slope).sum(-1, keepdim=True) / scale_both)
-        cross = cross - both * ((weight * both * cross).sum(-1, keepdim=True) / scale_both)
-        information = (weight * slope.abs().square()).sum(-1).clamp_min(1e-150)
-        value = (weight * slope.conj() * cross).sum(-1) / information
-        rest = cross - slope * value[..., None]
-        scatter = (weight * slope).abs() * rest.abs()
-        coefficient.append(value)
-        variance.append(related * scatter.square().sum(-1).clamp_min(1e-300) / information.square())
-        if own is not None:  # the part of the noise's correlation that jitter and gain do not explain
-            own = own - both * ((weight * both * own).sum(-1, keepdim=True) / scale_both)
-            own = own - slope * ((weight * slope.conj() * own).sum(-1) / information)[..., None]
-            seen = seen + (weight * (own.conj() * rest).real).sum(-1)
-            information_seen = information_seen + (weight * own.abs().square()).sum(-1)
-            scatter_seen = scatter_seen + (weight * own.abs() * rest.abs()).square().sum(-1)
-    mirrored = [c.conj() for c in reversed(coefficient[: (period - 1) // 2])]
+        own = floor * _lagged(noise, step)
+        both = power + torch.roll(power, step, -1)  # the correlation that a periodic gain gives
+        weight = 1 / (power.clamp_min(_LEAST_POWER) * torch.roll(power, step, -1).clamp_min(_LEAST_POWER))
+        slope = 2j * math.pi * (torch.roll(tilted, step, -1) - tilted)
+        slope = slope - both * _along(slope, both, weight)
+        cross = _lagged(spectrum, step) / scale - share * own
+        cross = cross - both * _along(cross, both, weight)
+        value = _along(cross, slope, weight)
+        rest, information = cross - slope * value, (weight * slope.abs().square()).sum(-1).clamp_min(1e-150)
+        scatter = (weight * slope.abs() * rest.abs()).square().sum(-1).clamp_min(1e-300)
+        coefficient.append(value[..., 0])
+        variance.append(related * scatter / information.square())
+        # the part of the noise's correlation that jitter and gain do not explain
+        own = own - both * _along(own, both, weight)
+        own = own - slope * _along(own, slope, weight)
+        sums = (own.conj() * rest).real, own.abs().square(), weight * (own.abs() * rest.abs()).square()
+        of_noise.append(torch.stack([(weight * x).sum(-1) for x in sums]))
+    mirrored = slice(0, (period - 1) // 2)
+    seen, of_own, scatter = torch.stack(of_noise).sum(0)
+    of_own = of_own.clamp_min(1e-150)
     return CyclicFit(
-        torch.stack(coefficient + mirrored, -1),
-        torch.stack(variance + list(reversed(variance[: (period - 1) // 2])), -1),
+        torch.stack(coefficient + [c.conj() for c in coefficient[mirrored]][::-1], -1),
+        torch.stack(variance + variance[mirrored][::-1], -1),
         (floor * density).mean(-1),
-        share[..., 0] + seen / information_seen.clamp_min(1e-150),
-        torch.where(
-            information_seen > 1e-150, (related * scatter_seen).sqrt() / information_seen.clamp_min(1e-150), math.inf
-        ),
+        share[..., 0] + seen / of_own,
+        (related * scatter).sqrt() / of_own,
     )
+
+
+def _lagged(spectra: Tensor, step: int) -> Tensor:
+    """Mean products (..., n) of spectra (..., line, n) at frequencies a step apart."""
+    return (spectra * torch.roll(spectra, step, -1).conj()).mean(-2)
+
+
+def _along(x: Tensor, regressor: Tensor, weight: Tensor) -> Tensor:
+    """Coefficient (..., 1) of the weighted least-squares fit of a regressor to x (..., n)."""
+    square = (weight * regressor.abs().square()).sum(-1, keepdim=True).clamp_min(1e-150)
+    return (weight * regressor.conj() * x).sum(-1, keepdim=True) / square
 
 
 def _taper(n: int, device: torch.device) -> Tensor:
@@ -186,15 +155,16 @@ def _taper(n: int, device: torch.device) -> Tensor:
     return torch.sin(math.pi / 2 * torch.minimum(end, end.flip(0)).clamp_max(1)).square()
 
 
-def _corrected_noise(offsets: Tensor, n: int) -> Tensor:
-    """Spectra of corrected impulses at the first M samples, (..., M, n).
+def _corrected_noise(m: int, n: int, device: torch.device, offsets: Tensor | None) -> Tensor:
+    """Spectra of impulses at the first M samples, corrected with offsets (..., M), (..., M, n).
 
     The correction repeats every M samples, so that the means over the M impulses of their power and
     of their products at k / M apart are those of corrected white noise of unit power.
     """
-    m = offsets.shape[-1]
-    impulse = torch.eye(m, n, dtype=torch.complex128, device=offsets.device)
-    return torch.fft.fft(correct_jitter_exact(impulse.expand(*offsets.shape[:-1], m, n), offsets))
+    impulse = torch.eye(m, n, dtype=torch.complex128, device=device)
+    if offsets is not None:
+        impulse = correct_jitter_exact(impulse.expand(*offsets.shape[:-1], m, n), offsets)
+    return torch.fft.fft(impulse)
 
 
 def noise_floor(power: Tensor) -> Tensor:
@@ -230,10 +200,13 @@ def detect_jitter_period(y: Tensor, max_period: int = 16) -> Tensor:
     Returns:
         Period in samples, 1 where there is no jitter, shape (...,), int64.
     """
-    found = {m: cyclic_fit(_some_lines(y), m).significance(primitive=True) for m in range(2, max_period + 1)}
-    leak = 0.002 * torch.stack(list(found.values())).amax(0)
-    new = {m: sum(math.gcd(k, m) == 1 for k in range(1, m)) for m in found}
-    counted = {m: torch.where(chi > 9 * new[m] + 16 + leak, chi, 0) for m, chi in found.items()}
+    found = {}
+    some = y[..., :: max(1, y.shape[-2] // 256), :]
+    for m in range(2, max_period + 1):
+        fit, primitive = cyclic_fit(some, m), [k - 1 for k in range(1, m) if math.gcd(k, m) == 1]
+        found[m] = (fit.coefficient.abs().square() / fit.variance)[..., primitive].sum(-1), 9 * len(primitive) + 16
+    leak = 0.002 * torch.stack([chi for chi, _ in found.values()]).amax(0)
+    counted = {m: torch.where(chi > least + leak, chi, 0) for m, (chi, least) in found.items()}
     explained = [
         sum((counted[m] for m in counted if p % m == 0), torch.zeros_like(leak)) * (1 - 1e-9 * p)
         for p in range(1, max_period + 1)
@@ -241,27 +214,15 @@ def detect_jitter_period(y: Tensor, max_period: int = 16) -> Tensor:
     return torch.stack(explained).argmax(0) + 1
 
 
-def _some_lines(y: Tensor, lines: int = 256) -> Tensor:
-    """About this number of lines, spread over the recording."""
-    return y[..., :: max(1, y.shape[-2] // lines), :]
-
-
-def _hidden(y: Tensor, period: int, offsets: Tensor, converter: Tensor, max_period: int) -> Tensor:
-    """Largest mean square in samples^2 of jitter that a multiple of the period shows beyond chance
-    in lines (trial, pulse, range) after correction of the offsets (trial, period), (trial,).
-    """
-    y = _some_lines(y)
-    most = torch.zeros(y.shape[0], dtype=torch.float64, device=y.device)
-    for p in range(2 * period, max_period + 1, period):
-        cut = y[..., : y.shape[-1] - y.shape[-1] % p]
-        tiled = offsets.repeat(1, p // period)
-        fit = cyclic_fit(correct_jitter_exact(cut, tiled), p, tiled, converter) if period > 1 else cyclic_fit(cut, p)
-        most = torch.maximum(most, fit.excess(period))
-    return most
-
-
-def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = None, passes: int = 12) -> Estimate:
+def estimate_jitter_blind(
+    y: Tensor, max_period: int = 16, period: int | None = None, passes: int = 12, *, assess: bool = True
+) -> Estimate:
     """Estimate the period and the offsets of periodic timing jitter from clutter, without a pilot.
+
+    >>> import torch
+    >>> noise = torch.randn(16, 256, dtype=torch.complex64)
+    >>> estimate_jitter_blind(noise, max_period=4).failed
+    tensor(True)
 
     The signal must fill most of the sampled band, but leave a twentieth of it to noise alone, where
     the power of the noise is measured: noise that the converter adds has no jitter, and its share
@@ -274,18 +235,19 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
         period: Known period in samples; None: the period is estimated.
         passes: Largest number of fits; before each, lines are corrected with the offsets found so
             far.
+        assess: Whether to add standard deviations, quality and outcome.
 
     Returns:
         Estimate with `offset_samples` of shape (..., P), in samples, with mean zero, and their
         standard deviations; and `period` of shape (...,), int64. P is the known period or
-        `max_period`; beyond the period of a trial its offsets repeat. The standard deviation
-        includes jitter that is visible, but not so far above chance that its period is certain.
-        `quality` is m / (m + v), with the mean square m of the offsets and the variance v of their
-        errors, or 1 where there is no jitter. `ok` is False, and the offsets are zero, where a
-        trial is all zero, the standard deviation is 0.01 samples or more (for `max_period` where no
-        jitter is found; so for a scene of one or few points, whose lines resemble each other), less
-        than half of the power is above the noise, the rms of the offsets is 0.22 samples or more,
-        or sample instants would coincide or cross.
+        `max_period`; beyond the period of a trial its offsets repeat. Offsets with which sample
+        instants would coincide or cross are zero. Where no jitter is found, the deviation is that
+        for the longest period. `quality` is m / (m + v), with the mean square m of the offsets and
+        the variance v of their errors, or 1 where there is no jitter. The outcome is EMPTY for
+        zeros, SINGULAR where offsets would coincide or cross, NOISE where less than half of the
+        power is above the noise, MISFIT where the rms of the offsets is 0.22 samples or more, and
+        INEXACT where the standard deviation is 0.01 samples or more for the longest period tested
+        (so for a scene of one or few points, whose lines resemble each other).
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -306,53 +268,41 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
         else torch.full(rows.shape[:1], period, device=y.device)
     )
     offsets, std = (torch.zeros((rows.shape[0], longest), dtype=torch.float64, device=y.device) for _ in range(2))
-    share = _signal_share(rows)
-    ok = (rows.abs().amax((-2, -1)) > 0) & (share >= 0.5)
     tiled = torch.arange(longest, device=y.device)
     for m in torch.unique(periods).tolist():
         chosen = (periods == m).nonzero()[:, 0]
-        if m == 1:
-            total = torch.zeros((len(chosen), 1), dtype=torch.float64, device=y.device)
-            converter = total[:, 0]
-            chance, left = cyclic_fit(rows[chosen], longest).std_samples, total[:, 0]
-        else:
-            total, chance, left, converter = refine_offsets(rows[chosen], m, passes)
-        offsets[chosen] = total[..., tiled % m]
-        hidden = left.square() * 0 if period else _hidden(rows[chosen], m, total, converter, max_period)
-        chance = chance.square()
-        # offsets of zero err by the jitter alone
-        square = torch.maximum(chance, hidden) if m == 1 else chance + left.square() + hidden
-        std[chosen] = square.sqrt()[..., None].expand(-1, longest)
-    ok = (
-        ok
-        & (std[:, 0] < _MOST_STD)
-        & (offsets.square().mean(-1).sqrt() < _MOST_RMS)
-        & (smallest_gap(offsets) >= MIN_GAP)
-    )
-    offsets = torch.where(ok[..., None], offsets, 0)
-    size, chance = offsets.square().mean(-1), std.square().mean(-1)
-    quality = torch.where(ok, size / (size + chance).clamp_min(1e-300), 0) + (ok & (periods == 1)).to(torch.float64)
-    shape = y.shape[:-2]
-    value = {"offset_samples": offsets.reshape(*shape, longest), "period": periods.reshape(shape)}
-    return Estimate(
-        value,
-        {"offset_samples": std.reshape(*shape, longest)},
-        quality.clamp(0, 1).reshape(shape),
-        Outcome.of(ok.reshape(shape), Outcome.NOISE),
-    )
+        if m > 1:
+            total, deviation = refine_offsets(rows[chosen], m, passes)
+            offsets[chosen], std[chosen] = total[:, tiled % m], deviation[:, None].expand(-1, longest)
+        elif assess:
+            std[chosen] = cyclic_fit(rows[chosen], longest).std_samples[:, None].expand(-1, longest)
+    value = {
+        "offset_samples": uncrossed(offsets).reshape(*y.shape[:-2], longest),
+        "period": periods.reshape(y.shape[:-2]),
+    }
+    if not assess:
+        return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(value["period"]))
+    size = offsets.square().mean(-1)
+    quality = torch.where(periods == 1, 1, size / (size + std[:, 0].square()).clamp_min(1e-300))
+    lit = (rows != 0).any(-1).any(-1)
+    tested = std[:, 0] * torch.sqrt((longest - 1) / (torch.where(periods == 1, longest, periods) - 1))
+    fields = assess_offsets(offsets, std, tested, _signal_share(rows) >= 0.5, lit, quality, _MOST_RMS)
+    return Estimate(value, **of_trials(fields, y.shape[:-2]))
 
 
 def _signal_share(y: Tensor) -> Tensor:
     """Share of the power of lines (trial, pulse, range) that lies above the noise, (trial,)."""
-    unit = y / y.abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(y.real.dtype).tiny)
-    unit = unit * _taper(y.shape[-1], y.device).to(y.real.dtype)
+    unit = unit_level(y) * _taper(y.shape[-1], y.device).to(y.real.dtype)
     power = torch.fft.fft(unit).abs().square().mean(-2).to(torch.float64)
     power = _smooth(power, max(1, 256 // y.shape[-2]))
     return 1 - noise_floor(power) / power.mean(-1).clamp_min(1e-300)
 
 
-def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor]:
     """Fit the timing offsets, correct the recording with them, and fit what remains, repeatedly.
+
+    The changes are scaled by the factor of Irons and Tuck (1969), since large jitter makes the
+    first-order fit too long or too short.
 
     Args:
         y: Lines, shape (trial, pulse, range), complex.
@@ -360,12 +310,9 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor,
         passes: Largest number of fits. A trial is finished when its offsets no longer change.
 
     Returns:
-        The total offsets in samples, shape (trial, M), the standard deviation that chance and the
-        unknown share of the converter in the noise give them, the rms of their last change, and the
-        share of the converter in the noise, shape (trial,) each.
-
-    The changes are scaled by the factor of Irons and Tuck (1969), since large jitter makes the
-    first-order fit too long or too short.
+        The total offsets in samples, shape (trial, M), and their standard deviation, shape
+        (trial,), by chance, by the unknown share of the converter in the noise, and by what
+        further fits would change.
     """
     y = y[..., : y.shape[-1] - y.shape[-1] % period]
     total, change = (torch.zeros((y.shape[0], period), dtype=torch.float64, device=y.device) for _ in range(2))
@@ -390,7 +337,7 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor,
         active = active[step.square().mean(-1).sqrt() > _SETTLED * fit.std_samples]
         if not len(active):
             break
-    return total, std, change.square().mean(-1).sqrt(), converter
+    return total, torch.hypot(std, change.square().mean(-1).sqrt())
 
 
 class BlindJitter(Stage):
@@ -402,14 +349,15 @@ class BlindJitter(Stage):
     Args:
         max_period: Longest period that is tested, in samples.
         period: Known period in samples; None: the period is estimated.
+        assess: Whether to add standard deviations, quality and outcome.
     """
 
     provides = ("offset_samples", "period")
     neutral = {"offset_samples": 0.0, "period": 1}
 
-    def __init__(self, max_period: int = 16, period: int | None = None) -> None:
+    def __init__(self, max_period: int = 16, period: int | None = None, *, assess: bool = True) -> None:
         super().__init__()
-        self.max_period, self.period = max_period, period
+        self.max_period, self.period, self.assess = max_period, period, assess
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate period and offsets of the timing jitter; see `estimate_jitter_blind`.
@@ -420,4 +368,4 @@ class BlindJitter(Stage):
         Returns:
             Estimate with `offset_samples` in samples and `period`.
         """
-        return estimate_jitter_blind(signal.data, self.max_period, self.period)
+        return estimate_jitter_blind(signal.data, self.max_period, self.period, assess=self.assess)

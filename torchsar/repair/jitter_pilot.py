@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, linear_phasor, unit_level
-from torchsar.repair.jitter import MIN_GAP, smallest_gap
+from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, linear_phasor, take, unit_level
+from torchsar.repair.assess import assess_offsets
+from torchsar.repair.jitter import uncrossed
 
 # Rounding of float64 in a record of up to 1024 samples without noise, relative to the squares of
 # phases of jitter and to the power: without it, rounding errors look like jitter of a longer
@@ -26,17 +27,20 @@ from torchsar.repair.jitter import MIN_GAP, smallest_gap
 _OF_JITTER, _OF_POWER, _SAMPLES = 1e-13, 1e-28, 1024
 # steps after which the frequency is exact even in short records of strong jitter
 _STEPS = 12
-# Largest standard deviation of an offset that is ok, in samples: jitter below the threshold of
-# detection, about three standard deviations, then stays below -15 dB of the signal.
-_MOST_STD = 0.01
 # conventions for the offset that no pilot can determine
 ORIGINS = ("mean", "first")
 
 
 def estimate_jitter_pilot(
-    pilot: Tensor, max_period: int = 16, period: int | None = None, origin: str = "mean"
+    pilot: Tensor, max_period: int = 16, period: int | None = None, origin: str = "mean", *, assess: bool = True
 ) -> Estimate:
     """Estimate the period and the offsets of periodic timing jitter from a pilot tone.
+
+    >>> import torch
+    >>> n = torch.arange(64.0).double() + torch.tensor([-0.1, 0.1]).repeat(32)
+    >>> found = estimate_jitter_pilot(torch.exp(2j * torch.pi * 0.2 * n), max_period=4)
+    >>> int(found["period"]), round(float(found["offset_samples"][1]), 3)
+    (2, 0.1)
 
     The pilot cannot determine the mean offset, which is a delay; `origin` sets it by convention.
 
@@ -45,48 +49,70 @@ def estimate_jitter_pilot(
         max_period: Longest period that is tested.
         period: Known period in samples; None: the period is estimated.
         origin: "mean" sets the mean offset to zero, "first" the first one.
+        assess: Whether to add standard deviations, quality and outcome.
 
     Returns:
         Estimate with `offset_samples` of shape (..., P), in samples, and `period` of shape (...,),
         int64. P is the known period or `max_period`; beyond the period of a trial its offsets
-        repeat. The standard deviation is the Cramer-Rao bound at the measured noise, where no
-        jitter is found for the longest period, and includes jitter that is visible, but not so far
-        above chance that its period is certain. `quality` is the share of the record's power that
-        belongs to the tone. `ok` is False, and the offsets are zero, where the record is not finite
-        or all zero, where no tone exceeds the noise or the tone is too close to zero frequency,
-        where the bound for the longest period tested is 0.01 samples or more, so that jitter may be
-        missed, and where sample instants would coincide or cross.
-        `info` has the frequency of the tone in cycles per sample, `frequency_cycles`.
+        repeat. Offsets with which sample instants would coincide or cross are zero. The standard
+        deviation is the Cramer-Rao bound at the measured noise; where no jitter is found, that for
+        the longest period. `quality` is the share of the record's power that belongs to the tone.
+        `info` has the frequency of the tone in cycles per sample, `frequency_cycles`. The outcome
+        is EMPTY for a record of zeros or one that is not finite, SINGULAR where offsets would
+        coincide or cross, NOISE where no tone exceeds the noise or the tone is too close to zero
+        frequency, and INEXACT where the bound for the longest period tested is 0.01 samples or
+        more, so that jitter may be missed.
 
     Raises:
         ValueError: If the record is shorter than 4 periods, the period is less than one, or the
             origin is unknown.
         TypeError: If the record is real.
     """
-    _check(pilot, max_period, period, origin)
-    pilot = checked_samples(pilot, "estimate_jitter_pilot", "range", finite=False)
-    finite = torch.isfinite(torch.view_as_real(pilot)).flatten(-2).all(-1)
-    x = torch.where(finite[..., None], pilot, 0).to(torch.complex128)
-    x = unit_level(x, 1)
-    periods = range(1, max_period + 1) if period is None else [period]
-    fits = [_fit(x, _peak_frequency(x), m) for m in periods]
-    best = _choose(fits) if period is None else torch.zeros(x.shape[:-1], dtype=torch.int64, device=x.device)
-    return _estimate(fits, best, finite, x.shape[-1], origin)
-
-
-def _check(pilot: Tensor, max_period: int, period: int | None, origin: str) -> None:
-    """Raise an error for invalid arguments."""
     longest = max_period if period is None else period
     if longest < 1:
         raise ValueError(f"a jitter period must be at least one sample, got {longest}")
     if origin not in ORIGINS:
         raise ValueError(f"origin {origin!r} is unknown; choose one of {ORIGINS}")
-    if pilot.ndim < 1 or pilot.shape[-1] < 4 * longest:
-        length = pilot.shape[-1] if pilot.ndim else 0
+    n = pilot.shape[-1] if pilot.ndim else 0
+    if n < 4 * longest:
         raise ValueError(
-            f"pilot must hold at least {4 * longest} samples, 4 jitter periods of {longest} samples, got {length}; "
+            f"pilot must hold at least {4 * longest} samples, 4 jitter periods of {longest} samples, got {n}; "
             "record a longer tone or lower max_period"
         )
+    pilot = checked_samples(pilot, "estimate_jitter_pilot", "range", finite=False)
+    finite = torch.isfinite(torch.view_as_real(pilot)).flatten(-2).all(-1)
+    x = unit_level(torch.where(finite[..., None], pilot, 0).to(torch.complex128), 1)
+    periods = range(1, longest + 1) if period is None else [longest]
+    fits = [_fit(x, _peak_frequency(x), m) for m in periods]
+    best = _choose(fits) if period is None else torch.zeros(x.shape[:-1], dtype=torch.int64, device=x.device)
+    tiled = torch.arange(longest, device=x.device)
+    phase = take(
+        torch.stack([fit.phase_rad[..., tiled % m] for m, fit in zip(periods, fits, strict=True)], -2), best, -2
+    )
+    frequency, noise, power = (
+        take(torch.stack([getattr(fit, name) for fit in fits], -1), best) for name in ("frequency", "noise", "power")
+    )
+    m = best + periods[0]
+    radians = 2 * math.pi * torch.where(frequency.abs() > 1 / n, frequency, torch.inf)
+    offsets = phase / radians[..., None]
+    if origin == "first":
+        offsets = offsets - offsets[..., :1]
+    value = {"offset_samples": uncrossed(offsets), "period": m}
+    info = {"frequency_cycles": frequency}
+    if not assess:
+        return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(m), info=info)
+    # Cramer-Rao bound of an offset, about the mean of all or about the first one
+    bound = torch.sqrt(noise / (2 * n * power.clamp_min(1e-300))) / radians.abs()
+    tested = bound * math.sqrt(longest - 1)
+    std = torch.where(m == 1, tested, bound * torch.sqrt(m - 1.0))[..., None].expand(offsets.shape)
+    if origin == "first":
+        std = std * math.sqrt(2) * torch.sqrt(m / (m - 1).clamp_min(1))[..., None] * (tiled % m[..., None] != 0)
+    tone = (power * n > 50 * noise) & torch.isfinite(radians)
+    return Estimate(
+        value,
+        **assess_offsets(offsets, std, tested, tone, finite & (power > 0), power / (power + noise).clamp_min(1e-300)),
+        info=info,
+    )
 
 
 def _peak_frequency(x: Tensor, oversampling: int = 4) -> Tensor:
@@ -150,59 +176,6 @@ def _choose(fits: list[_Fit]) -> Tensor:
     return torch.stack(gain).argmax(0)
 
 
-def _hidden(fits: list[_Fit], m: Tensor, phase_rad: Tensor) -> Tensor:
-    """Largest mean square phase in rad^2, less the mean and twice the standard deviation of chance,
-    that a multiple of the chosen period m shows beyond the phases of that period, (...,).
-    """
-    most = torch.zeros_like(phase_rad[..., 0])
-    for fit in fits:
-        p = fit.phasor.shape[-1]
-        chance = fit.noise / (2 * fit.count.sum() * fit.power).clamp_min(1e-300)
-        more = (p - m).clamp_min(0)
-        excess = (fit.phase_rad - phase_rad[..., :p]).square().mean(-1) - chance * (more + 2 * (2 * more).sqrt())
-        most = torch.where((p > m) & (p % m == 0), torch.maximum(excess, most), most)
-    return most
-
-
-def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: str) -> Estimate:
-    """Estimate from the fit of the chosen period in each trial."""
-    longest = fits[-1].phasor.shape[-1]
-    tiled = torch.arange(longest, device=best.device)
-
-    def pick(parts: list[Tensor]) -> Tensor:
-        stacked = torch.stack(torch.broadcast_tensors(*parts))
-        return torch.gather(
-            stacked,
-            0,
-            best.reshape(1, *best.shape, *(1,) * (stacked.ndim - 1 - best.ndim)).expand(1, *stacked.shape[1:]),
-        )[0]
-
-    frequency, noise, power = (pick([getattr(f, name) for f in fits]) for name in ("frequency", "noise", "power"))
-    m = pick([torch.full_like(best, f.phasor.shape[-1]) for f in fits])
-    phase = pick([f.phase_rad[..., tiled % f.phasor.shape[-1]] for f in fits])
-    radians = 2 * math.pi * torch.where(frequency.abs() > 1 / n, frequency, torch.inf)
-    offsets = phase / radians[..., None]
-    std = torch.sqrt(noise * m / (2 * n * power.clamp_min(1e-300))) / radians.abs()
-    std = (std * torch.sqrt((m - 1) / m))[..., None].expand(offsets.shape)
-    tested = (torch.sqrt(noise * (longest - 1) / (2 * n * power.clamp_min(1e-300))) / radians.abs())[..., None]
-    std = torch.where((m == 1)[..., None], tested, std)
-    std = torch.hypot(std, (_hidden(fits, m, phase).sqrt() / radians.abs())[..., None])
-    if origin == "first":
-        offsets = offsets - offsets[..., :1]
-        std = std * math.sqrt(2) * torch.sqrt(m / (m - 1).clamp_min(1))[..., None] * (tiled % m[..., None] != 0)
-    detected = finite & (power * n > 50 * noise) & (power > 0) & torch.isfinite(radians)
-    ok = detected & (tested[..., 0] < _MOST_STD) & (std.amax(-1) < _MOST_STD) & (smallest_gap(offsets) >= MIN_GAP)
-    offsets, m = torch.where(ok[..., None], offsets, 0), torch.where(ok, m, 1 if len(fits) > 1 else longest)
-    quality = torch.where(ok, power / (power + noise).clamp_min(1e-300), 0)
-    return Estimate(
-        {"offset_samples": offsets, "period": m},
-        {"offset_samples": torch.where(ok[..., None], std, 0)},
-        quality,
-        Outcome.of(ok, Outcome.NOISE),
-        info={"frequency_cycles": frequency},
-    )
-
-
 class PilotJitter(Stage):
     """Estimator of periodic sampling jitter from a recorded pilot tone.
 
@@ -213,14 +186,17 @@ class PilotJitter(Stage):
         max_period: Longest period that is tested, in samples.
         period: Known period in samples; None: the period is estimated.
         origin: "mean" sets the mean offset to zero, "first" the first one.
+        assess: Whether to add standard deviations, quality and outcome.
     """
 
     provides = ("offset_samples", "period")
     neutral = {"offset_samples": 0.0, "period": 1}
 
-    def __init__(self, max_period: int = 16, period: int | None = None, origin: str = "mean") -> None:
+    def __init__(
+        self, max_period: int = 16, period: int | None = None, origin: str = "mean", *, assess: bool = True
+    ) -> None:
         super().__init__()
-        self.max_period, self.period, self.origin = max_period, period, origin
+        self.max_period, self.period, self.origin, self.assess = max_period, period, origin, assess
 
     def forward(self, signal: Signal, pilot: Tensor) -> Estimate:
         """Estimate period and offsets of the timing jitter; see `estimate_jitter_pilot`.
@@ -240,6 +216,5 @@ class PilotJitter(Stage):
                 f"pilot must have the shape (n,), or (*trials, n) with the trials {tuple(signal.trials)} of the "
                 f"signal, got the shape {tuple(pilot.shape)}"
             )
-        return estimate_jitter_pilot(
-            pilot.expand(*signal.trials, pilot.shape[-1]), self.max_period, self.period, self.origin
-        )
+        pilot = pilot.expand(*signal.trials, pilot.shape[-1])
+        return estimate_jitter_pilot(pilot, self.max_period, self.period, self.origin, assess=self.assess)

@@ -335,13 +335,22 @@ class LineIntegrity(Stage):
             the line numbers span more.
         longest_gap: Largest number of successive lost lines that is accepted; a larger step of the
             numbers is taken for an error.
+        assess: Whether to add the outcome.
     """
 
     provides = ("missing",)
     neutral = {"missing": False}
 
-    def __init__(self, first_number: int | None = None, n_lines: int | None = None, longest_gap: int = 1000) -> None:
+    def __init__(
+        self,
+        first_number: int | None = None,
+        n_lines: int | None = None,
+        longest_gap: int = 1000,
+        *,
+        assess: bool = True,
+    ) -> None:
         super().__init__()
+        self.assess = assess
         self.first_number, self.n_lines, self.longest_gap = first_number, n_lines, longest_gap
 
     def forward(self, signal: Signal, line_number: Tensor) -> tuple[Signal, Estimate]:
@@ -354,11 +363,11 @@ class LineIntegrity(Stage):
         Returns:
             The signal on the grid, with missing lines zero (regular input is unchanged bit for
             bit), and an Estimate with `missing` of shape (..., pulse), bool. `quality` is the share
-            of numbers that were accepted; `ok` is False where it is below one half. `info` has
-            `source`, `number`, `corrected`, `repeated`, `unplaced` and `first_number` (see
-            `LinePlan`), and the counts `received`, `placed`, `repeated_count`, `corrected_count`,
-            `unplaced_count` and `missing_count` per trial, with received = placed + repeated +
-            unplaced.
+            of numbers that were accepted; the outcome is SINGULAR where it is below one half, and
+            the lines stay in the order received there. `info` has `source`, `number`, `corrected`,
+            `repeated`, `unplaced` and `first_number` (see `LinePlan`), and the counts `received`,
+            `placed`, `repeated_count`, `corrected_count`, `unplaced_count` and `missing_count` per
+            trial, with received = placed + repeated + unplaced.
 
         Raises:
             ValueError: If the numbers do not fit the lines or are not integers, `longest_gap` is
@@ -377,14 +386,8 @@ class LineIntegrity(Stage):
             "unplaced_count": plan.unplaced.sum(-1),
             "missing_count": plan.missing.sum(-1),
         }
-        masks = {
-            name: getattr(plan, name)
-            for name in ("source", "number", "corrected", "repeated", "unplaced", "first_number")
-        }
-        estimate = Estimate(
-            {"missing": plan.missing},
-            quality=plan.trusted,
-            outcome=Outcome.of(plan.ok, Outcome.NOISE),
-            info={**masks, **counts},
-        )
+        names = ("source", "number", "corrected", "repeated", "unplaced", "first_number")
+        info = {name: getattr(plan, name) for name in names} | counts
+        outcome = Outcome.of(plan.ok, Outcome.SINGULAR) if self.assess else Outcome.NOT_ASSESSED.like(plan.ok)
+        estimate = Estimate({"missing": plan.missing}, quality=plan.trusted, outcome=outcome, info=info)
         return signal.with_axis(place_lines(signal.data, plan.source), pulse=axis), estimate

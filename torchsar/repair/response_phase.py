@@ -22,7 +22,9 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, cis, linear_phasor, power_of, unit_level
-from torchsar.radar import LinearFM, StripmapRadar
+from torchsar.optim import lbfgs
+from torchsar.radar import StripmapRadar
+from torchsar.repair.assess import assess_response, of_trials
 from torchsar.repair.response import (
     GRID,
     band_axis,
@@ -36,14 +38,8 @@ from torchsar.repair.response import (
 # Highest Legendre degrees of the stages of a fit, by choice: a large smooth phase first, then
 # ripple of up to about 20 periods over the band.
 ORDERS = (2, 4, 8, 16, 40)
-# Samples of a compressed echo in which the phase of the edges of its pulse is sought, by choice.
-_EDGE_WIDTH = 256
-# Least curvature of the entropy in nats per rad^2, by measurement: 5 to 20 in sharp windows.
-_CURVATURE = 4.0
 # Ratio of the power of a peak to that of the noise at which its weight is one half, by choice.
 _FULL = 100.0
-# Bound in rad up to which the search finds the right minimum, by measurement: wrong from 0.09 on.
-_MOST_NOISE = 0.08
 # Windows computed at once, by measurement: so few that they stay in the cache of a processor.
 _BLOCK = 128
 
@@ -162,16 +158,6 @@ class _Spectra:
         share = weight / weight.sum(-1, keepdim=True).clamp_min(1e-300)
         return _Spectra(spectra, share[used], used.nonzero()[:, 0])
 
-    def part(self, trials: Tensor, count: int) -> _Spectra:
-        """Spectra of some of `count` trials, which are numbered anew in this order, rising."""
-        if trials.numel() == count:
-            return self
-        number = torch.full((count,), -1, device=trials.device).scatter(
-            0, trials, torch.arange(trials.numel(), device=trials.device)
-        )[self.trial]
-        kept = number >= 0
-        return _Spectra(self.unit[kept], self.weight[kept], number[kept])
-
 
 def _transformed(windows: Tensor) -> Tensor:
     """Unitary FFT of windows (window, n), of which there may be none."""
@@ -217,76 +203,6 @@ def _entropy_slope(turned: Tensor) -> tuple[Tensor, Tensor]:
     return -(p * log).sum(-1), 2 * (slope.real * turned.imag - slope.imag * turned.real)
 
 
-def minimise(
-    cost: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
-    start: Tensor,
-    steps: int,
-    first_step: float = 0.3,
-    rtol: float = 1e-7,
-) -> Tensor:
-    """Minimise a cost by quasi-Newton (BFGS) descent, for each trial separately.
-
-    A step is halved until the cost falls enough (Armijo rule). A trial stops when no step lowers
-    its cost, or when a step lowers the cost by less than the fraction rtol. The cost is computed
-    for the trials that go on alone.
-
-    Args:
-        cost: Function of parameters (k, p) and of the numbers (k,) of their trials, rising, that
-            returns costs (k,) and gradients (k, p).
-        start: First parameters, shape (trial, p), float64.
-        steps: Largest number of steps.
-        first_step: Length of the first step.
-        rtol: Relative improvement below which a trial stops.
-
-    Returns:
-        Parameters, shape (trial, p).
-    """
-    found, running = start.clone(), torch.arange(start.shape[0], device=start.device)
-    x, (value, slope) = start, cost(start, running)
-    eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
-    inverse = eye * (first_step / torch.linalg.vector_norm(slope, dim=-1).clamp_min(1e-12))[:, None, None]
-    for number in range(steps):
-        step = -(inverse @ slope[..., None])[..., 0]
-        fall = (step * slope).sum(-1)
-        new, new_value, new_slope = x.clone(), value.clone(), slope.clone()
-        left = torch.arange(running.numel(), device=x.device)
-        for halving in range(12):
-            share = 0.5**halving
-            here = x[left] + share * step[left]
-            v, g = cost(here, running[left])
-            good = v <= value[left] + 1e-4 * share * fall[left]
-            new[left[good]], new_value[left[good]], new_slope[left[good]] = here[good], v[good], g[good]
-            left = left[~good]
-            if not left.numel():
-                break
-        found[running] = new
-        on = value - new_value > rtol * value.abs()
-        if not bool(on.any()):
-            break
-        moved, turned = (new - x)[on], (new_slope - slope)[on]
-        scaled = inverse[on] if number else _curvature(moved, turned)[:, None, None] * eye
-        inverse = _bfgs(scaled, moved, turned, eye)
-        running, x, value, slope = running[on], new[on], new_value[on], new_slope[on]
-    return found
-
-
-def _curvature(moved: Tensor, turned: Tensor) -> Tensor:
-    """Inverse curvature along the change of the gradient, (trial,); 1 where it is not positive."""
-    curvature, square = (moved * turned).sum(-1), turned.square().sum(-1)
-    return torch.where(curvature > 0, curvature / square.clamp_min(1e-300), 1)
-
-
-def _bfgs(inverse: Tensor, moved: Tensor, turned: Tensor, eye: Tensor) -> Tensor:
-    """Update of the inverse Hessian; trials without positive curvature keep theirs."""
-    curvature = (moved * turned).sum(-1)
-    good = curvature > 1e-12 * torch.linalg.vector_norm(moved, dim=-1) * torch.linalg.vector_norm(turned, dim=-1)
-    good = good & (curvature > 0)
-    r = torch.where(good, 1 / torch.where(good, curvature, 1), 0)[:, None, None]
-    left = eye - r * moved[..., :, None] * turned[..., None, :]
-    new = left @ inverse @ left.mT + r * moved[..., :, None] * moved[..., None, :]
-    return torch.where(good[:, None, None], new, inverse)
-
-
 def sharpest_coefficients(
     windows: Tensor, weight: Tensor, band: float, orders: tuple[int, ...] = ORDERS, steps: int = 40
 ) -> Tensor:
@@ -312,11 +228,12 @@ def sharpest_coefficients(
     for order in orders:
         part = basis[: order - 1]
 
-        def cost(c: Tensor, trials: Tensor, part: Tensor = part) -> tuple[Tensor, Tensor]:
-            value, slope = window_entropy(spectra.part(trials, windows.shape[0]), c @ part)
+        def cost(c: Tensor, part: Tensor = part) -> tuple[Tensor, Tensor]:
+            value, slope = window_entropy(spectra, c @ part)
             return value, slope @ part.mT
 
-        c = minimise(cost, torch.nn.functional.pad(c, (0, order - 1 - c.shape[-1])), steps)
+        start = torch.nn.functional.pad(c, (0, order - 1 - c.shape[-1]))
+        c = lbfgs(cost, start, steps=steps, history=12, value_tolerance=1e-7, first_step=0.3, with_gradient=True).x
     return c
 
 
@@ -328,8 +245,17 @@ def estimate_response_sharpest(
     orders: tuple[int, ...] = ORDERS,
     passes: int = 3,
     valid: int | None = None,
+    *,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the phase response as that whose removal makes bright points sharpest in range.
+
+    >>> import torch
+    >>> image = torch.zeros(8, 64, dtype=torch.complex64)
+    >>> image[2, 20] = image[5, 40] = 1
+    >>> found = estimate_response_sharpest(image, band=0.8, width=16, orders=(4,), assess=False)
+    >>> found["phase_rad"].shape
+    torch.Size([1025])
 
     Sharpness is measured by the entropy of range windows about the points. After each pass the
     image is corrected and the points are chosen again. The last pass fits two halves of the points
@@ -348,92 +274,75 @@ def estimate_response_sharpest(
         passes: Number of passes.
         valid: Number of range columns, from the first on, that are fully compressed and may be
             used; by default all.
+        assess: Whether to add standard deviations, quality and outcome.
 
     Returns:
         Estimate with `phase_rad` in radians and its standard deviation, at GRID = 1025 equally
-        spaced frequencies of the pulse band, shape (..., GRID), without constant and linear part;
-        and `amplitude` of the same shape, all ones. `quality` is 1 / (1 + variance in rad^2). `ok`
-        is False, and the phase is zero, where the standard deviation is 0.125 rad or more: the
-        image has too few bright points, or the response has a ripple finer than the degrees; and
-        where noise alone would leave more than 0.08 rad, since such fits may be far off. A
-        ripple finer than twice the highest degree is not noticed, since it looks like targets side
-        by side.
+        spaced frequencies of the pulse band, shape (..., GRID), and `amplitude` of the same shape,
+        all ones. `quality` is 1 / (1 + variance in rad^2). The outcome is NOISE
+        where no point rises so far above the background that the search finds the right phase (the
+        phase is that of noise), TOO_FEW where one of the two halves has no point, MISFIT where
+        finer ripple is left in both halves, and INEXACT where the standard deviation is 0.125 rad
+        or more.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples or a sample is not finite, or if there are fewer than 32
             valid columns, or the width is below 16 samples.
     """
-    image = checked_samples(image, "estimate_response_sharpest", "azimuth, range")
-    used = image.detach()[..., :valid] if valid else image.detach()
-    rows = unit_level(used.reshape(-1, *used.shape[-2:]))
+    rows = _rows(image, "estimate_response_sharpest", valid)
     basis = unit_legendre(band_grid(image.device), orders[-1])[2:]
     total = torch.zeros((rows.shape[0], basis.shape[0]), dtype=torch.float64, device=image.device)
     for i in range(passes):
-        sharper = correct_response(rows, total @ basis, None, band) if i else rows
-        windows, line = brightest_windows(sharper, points, min(width, sharper.shape[-1] // 4 * 2))
-        weight = window_weights(windows, sharper)
+        windows, line, weight = _windows(rows, total @ basis, band, points, width, 8)
         if i < passes - 1:
             total = total + sharpest_coefficients(windows, weight, band, orders if i == 0 else orders[-1:])
     halves, weights = windows.repeat(2, 1, 1), halved(weight, line)
     found = sharpest_coefficients(halves, weights, band, orders[-1:])
     phase_rad = (total + sum(found.chunk(2)) / 2) @ basis
-    std = _deviation(halves, weights, band, found, _bound(weight, found.shape[-1]))
-    return _phase_estimate(phase_rad, std, image.shape[:-2])
+    return _estimate(phase_rad, image, (halves, weights, found, weight, band) if assess else None)
 
 
-def _bound(weight: Tensor, count: int) -> Tensor:
-    """Cramer-Rao bound in rad, (trial,), of `count` coefficients from weights (trial, point).
+def _rows(image: Tensor, name: str, valid: int | None) -> Tensor:
+    """Valid columns of images in a row, (trial, azimuth, range), of unit level."""
+    image = checked_samples(image, name, "azimuth, range").detach()[..., :valid]
+    return unit_level(image.reshape(-1, *image.shape[-2:]))
 
-    A window whose peak has s times the power of the noise gives each coefficient a variance of
-    1 / (2 s).
+
+def _windows(
+    rows: Tensor, phase_rad: Tensor, band: float, points: int, width: int, apart: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Windows about the brightest points after removal of a phase, their lines and weights."""
+    sharper = correct_response(rows, phase_rad, None, band) if bool(phase_rad.any()) else rows
+    width = min(width, rows.shape[-1] // 4 * 2)
+    windows, line = brightest_windows(sharper, points, width, min(apart, width // 2))
+    return windows, line, window_weights(windows, sharper)
+
+
+def _estimate(phase_rad: Tensor, image: Tensor, fit: tuple[Tensor, Tensor, Tensor, Tensor, float] | None) -> Estimate:
+    """Estimate of a phase response (trial, GRID), assessed from the fit of two halves of windows.
+
+    fit: Windows and weights of the halves (2 trial, ...), their coefficients, the weights of all
+    windows, which tell their peaks over the noise, and the band; None for no assessment.
     """
-    s = _FULL * weight / (1 - weight)
-    return (count / (2 * s.sum(-1))).sqrt()
-
-
-def _deviation(halves: Tensor, weights: Tensor, band: float, found: Tensor, bound: Tensor) -> Tensor:
-    """Standard deviation in rad, (trial,), of the mean of coefficients (2 trial, p) of two halves.
-
-    It is the bound or more, and infinite where the bound is too large for any trust, or a half has
-    no window.
-    """
-    first, second = found.chunk(2)
-    std = torch.hypot(torch.linalg.vector_norm(first - second, dim=-1) / 2, _finer(halves, weights, band, found))
-    return torch.where(
-        (weights.sum(-1) > 0).reshape(2, -1).all(0) & (bound < _MOST_NOISE), torch.maximum(std, bound), torch.inf
-    )
-
-
-def _finer(halves: Tensor, weights: Tensor, band: float, found: Tensor) -> Tensor:
-    """Phase in rad, (trial,), that degrees up to twice the highest one would add in both halves.
-
-    One step of descent from the coefficients found, (2 trial, p), of length slope over curvature.
-    """
+    trials = image.shape[:-2]
+    value = {"phase_rad": phase_rad.reshape(*trials, GRID), "amplitude": torch.ones(*trials, GRID).to(phase_rad)}
+    if fit is None:
+        return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(value["phase_rad"][..., 0]))
+    halves, weights, found, strength, band = fit
     spectra, count = _Spectra.of(halves, weights), found.shape[-1]
     basis = unit_legendre(band_axis(halves.shape[-1], band, halves.device).clamp(-1, 1), 2 * (count + 1))[2:]
-    slope = window_entropy(spectra, found @ basis[:count])[1] @ basis[count:].mT
-    both = sum(slope.chunk(2))
-    step = 0.05 * both / torch.linalg.vector_norm(both, dim=-1, keepdim=True).clamp_min(1e-300)
-    moved = torch.cat([found, step.repeat(2, 1)], -1)
-    change = window_entropy(spectra, moved @ basis)[1] @ basis[count:].mT - slope
-    first, second = slope.chunk(2)
-    curvature = (sum(change.chunk(2)) / 2 * step).sum(-1) / step.square().sum(-1).clamp_min(1e-300)
-    return (first * second).sum(-1).clamp_min(0).sqrt() / curvature.clamp_min(_CURVATURE)
 
+    def slope(coefficients: Tensor) -> Tensor:
+        return window_entropy(spectra, coefficients @ basis)[1] @ basis[count:].mT
 
-def _phase_estimate(phase_rad: Tensor, std: Tensor, trials: torch.Size) -> Estimate:
-    """Estimate of a phase response with its reliability."""
-    ok = torch.isfinite(std) & (std < 0.125) & torch.isfinite(phase_rad).all(-1)
-    phase_rad = torch.where(ok[:, None], phase_rad, 0).reshape(*trials, GRID)
-    std = torch.where(torch.isfinite(std), std, math.pi)[:, None].expand(-1, GRID).reshape(*trials, GRID)
-    quality = torch.where(ok.reshape(trials), 1 / (1 + std[..., 0].square()), 0)
-    return Estimate(
-        {"phase_rad": phase_rad, "amplitude": torch.ones_like(phase_rad)},
-        {"phase_rad": std},
-        quality,
-        Outcome.of(ok.reshape(trials), Outcome.NOISE),
-    )
+    # a window whose peak has s times the power of the noise gives each coefficient a variance of
+    # 1 / (2 s)
+    s = _FULL * strength / (1 - strength)
+    bound = (count / (2 * s.sum(-1))).sqrt()
+    sided = (weights.sum(-1) > 0).reshape(2, -1).all(0)
+    fields = assess_response(found, basis.shape[0], slope, bound, sided, phase_rad)
+    return Estimate(value, **of_trials(fields, trials))
 
 
 def point_average_coefficients(
@@ -499,6 +408,8 @@ def estimate_response_points(
     order: int = 24,
     passes: int = 3,
     valid: int | None = None,
+    *,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the phase response by the coherent average of the spectra of isolated bright points.
 
@@ -517,60 +428,42 @@ def estimate_response_points(
         passes: Number of passes.
         valid: Number of range columns, from the first on, that are fully compressed and may be
             used; by default all.
+        assess: Whether to add standard deviations, quality and outcome.
 
     Returns:
         Estimate with `phase_rad` in radians and its standard deviation, at GRID = 1025 equally
         spaced frequencies of the pulse band, shape (..., GRID), and `amplitude` of the same shape,
-        all ones. `quality` is 1 / (1 + variance in rad^2). `ok` is False, and the phase is zero,
-        where the standard deviation is 0.125 rad or more, as there.
+        all ones. `quality` is 1 / (1 + variance in rad^2). The outcomes are those of
+        `estimate_response_sharpest`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples or a sample is not finite, or if there are fewer than 32
             valid columns, or the width is below 16 samples.
     """
-    image = checked_samples(image, "estimate_response_points", "azimuth, range")
-    used = image.detach()[..., :valid] if valid else image.detach()
-    rows = unit_level(used.reshape(-1, *used.shape[-2:]))
-    width = min(width, rows.shape[-1] // 4 * 2)
+    rows = _rows(image, "estimate_response_points", valid)
     basis = unit_legendre(band_grid(image.device), order)[2:]
     total = torch.zeros((rows.shape[0], basis.shape[0]), dtype=torch.float64, device=image.device)
-    for i in range(passes):
-        sharper = correct_response(rows, total @ basis, None, band) if i else rows
-        windows, line = brightest_windows(sharper, points, width, apart=width // 2)
-        strength = window_weights(windows, sharper)
+    for _ in range(passes):
+        windows, line, strength = _windows(rows, total @ basis, band, points, width, width // 2)
         weight = (strength > 0).to(torch.float64)
         total = total + point_average_coefficients(windows, weight, band, order)
+    if not assess:
+        return _estimate(total @ basis, image, None)
     halves, weights = windows.repeat(2, 1, 1), halved(weight, line)
     found = point_average_coefficients(halves, weights, band, order)
-    std = _deviation(halves, weights, band, found, _bound(strength, order - 1))
-    return _phase_estimate(total @ basis, std, image.shape[:-2])
+    return _estimate(total @ basis, image, (halves, weights, found, strength, band))
 
 
 _METHODS = {"sharpest": estimate_response_sharpest, "points": estimate_response_points}
 
 
-def _edge_phase(pulse: LinearFM, sampling_hz: float, flat: bool) -> Tensor:
-    """Size in rad, (GRID,), of the phase that is found in an echo whose edge lies on a sample.
-
-    The abrupt edges of the pulse have frequencies that alias. What they add to the phase of an echo
-    depends on where its edges lie between samples, and no image shows it apart from a response.
-    """
-    n = max(4 * pulse.n_samples(sampling_hz), 2 * _EDGE_WIDTH)
-    band, mean = pulse.bandwidth_hz / sampling_hz, pulse.band_spectrum(n, sampling_hz)
-    compressed = pulse.spectrum(n, sampling_hz) * mean.conj()
-    if flat:
-        compressed = torch.where(band_axis(n, band).abs() <= 1, compressed / mean.abs().square(), 0)
-    echo = torch.fft.ifft(compressed).roll(_EDGE_WIDTH // 2)[:_EDGE_WIDTH]
-    found = sharpest_coefficients(echo[None, None], torch.ones(1, 1, dtype=torch.float64), band)
-    return (found[0] @ unit_legendre(band_grid(), ORDERS[-1])[2:]).abs()
-
-
 class EstimateResponse(Stage):
     """Estimator of the channel's phase and amplitude response from a focused image.
 
-    The standard deviation of the phase includes that of the method and the phase that the edges of
-    the pulse, which lie between samples, leave in the image.
+    The abrupt edges of the pulse have frequencies that alias. The phase that they leave in the
+    image depends on where they lie between samples; it is about 0.01 rad, and no part of the
+    predicted standard deviation.
 
     The amplitude is estimated only if the range power spectrum of scene and noise is given as
     `expected_power`.
@@ -579,9 +472,11 @@ class EstimateResponse(Stage):
         radar: Radar; gives bandwidth, sampling rate and length of the pulse.
         method: "sharpest" for `estimate_response_sharpest` (default), "points" for
             `estimate_response_points`, or any function of (image, band, valid=columns) that returns
-            such an Estimate, where `columns` is the number of fully compressed range columns.
+            such an Estimate, where `columns` is the number of fully compressed range columns; also
+            with `assess=False` if the stage is not to assess it.
         expected_power: Range power spectrum of an image of this kind without the response (see
             `band_power`), FFT order, shape (n,); None: the amplitude is one.
+        assess: Whether to add standard deviations, quality and outcome.
     """
 
     works_on = ("azimuth", "range")
@@ -595,9 +490,11 @@ class EstimateResponse(Stage):
         radar: StripmapRadar,
         method: Literal["sharpest", "points"] | Callable[..., Estimate] = "sharpest",
         expected_power: Tensor | None = None,
+        *,
+        assess: bool = True,
     ) -> None:
         super().__init__()
-        self.radar = radar
+        self.radar, self.assess = radar, assess
         self.method = _METHODS[method] if isinstance(method, str) else method
         self.register_buffer("expected_power", expected_power)
 
@@ -614,13 +511,12 @@ class EstimateResponse(Stage):
         """
         return self._estimated(signal, self.expected_power)
 
-    def _estimated(self, signal: Signal, expected: Tensor | None, flat: bool = False) -> Estimate:
+    def _estimated(self, signal: Signal, expected: Tensor | None) -> Estimate:
         """Estimate, with the amplitude if a power spectrum is expected."""
-        pulse, fs, columns = self.radar.pulse, self.radar.sampling_hz, signal.data.shape[-1]
-        band = pulse.bandwidth_hz / fs
-        estimate = self.method(signal.data, band, valid=max(1, columns - self.radar.pulse_samples))
-        edges = _edge_phase(pulse, fs, flat).to(signal.data.device)
-        estimate = replace(estimate, std={"phase_rad": torch.hypot(estimate.std["phase_rad"], edges)})
+        band = self.radar.pulse.bandwidth_hz / self.radar.sampling_hz
+        asked = {} if self.assess else {"assess": False}
+        valid = max(1, signal.data.shape[-1] - self.radar.pulse_samples)
+        estimate = self.method(signal.data, band, valid=valid, **asked)
         if expected is None:
             return estimate
         amplitude = estimate_amplitude_response(band_power(unit_level(signal.data)), expected, band)
@@ -637,12 +533,17 @@ class EstimateFlatResponse(EstimateResponse):
     Args:
         radar: Radar; gives bandwidth, sampling rate and length of the pulse.
         method: "sharpest", "points" or a function; see `EstimateResponse`.
+        assess: Whether to add standard deviations, quality and outcome.
     """
 
     def __init__(
-        self, radar: StripmapRadar, method: Literal["sharpest", "points"] | Callable[..., Estimate] = "sharpest"
+        self,
+        radar: StripmapRadar,
+        method: Literal["sharpest", "points"] | Callable[..., Estimate] = "sharpest",
+        *,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, method)
+        super().__init__(radar, method, assess=assess)
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the phase and amplitude response of the channel along range.
@@ -656,4 +557,4 @@ class EstimateFlatResponse(EstimateResponse):
             1025 equally spaced frequencies of the pulse band.
         """
         flat = torch.ones(signal.data.shape[-1], dtype=torch.float64, device=signal.data.device)
-        return self._estimated(signal, flat, flat=True)
+        return self._estimated(signal, flat)

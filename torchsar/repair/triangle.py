@@ -306,6 +306,7 @@ class SplitSweeps(Stage):
         trigger: Start of the triangle in seconds on the time axis of the record; "recorded" if
             `forward` receives the trigger; or "search" to estimate it by `find_trigger`.
         nearer: Whether the scene is nearer than the reference range.
+        assess: Whether an estimate of the trigger is assessed.
 
     Raises:
         ValueError: If the trigger is neither a finite number nor "recorded" nor "search".
@@ -314,13 +315,15 @@ class SplitSweeps(Stage):
     works_on = ("pulse", "time")
     takes_real = True
 
-    def __init__(self, radar: TriangularLadar, trigger: float | str = 0.0, nearer: bool = False) -> None:
+    def __init__(
+        self, radar: TriangularLadar, trigger: float | str = 0.0, nearer: bool = False, *, assess: bool = True
+    ) -> None:
         super().__init__()
         if isinstance(trigger, str) and trigger not in ("recorded", "search"):
             raise ValueError(f"trigger must be a number of seconds, 'recorded' or 'search', got {trigger!r}")
         if not isinstance(trigger, str) and not math.isfinite(trigger):
             raise ValueError(f"trigger must be a finite number of seconds, got {trigger}")
-        self.radar, self.trigger, self.nearer = radar, trigger, nearer
+        self.radar, self.trigger, self.nearer, self.assess = radar, trigger, nearer, assess
         self.provides = ("trigger_s",) if trigger == "search" else ()
         self.neutral = {"trigger_s": "a record has no nominal start of the triangle"} if self.provides else {}
 
@@ -335,7 +338,7 @@ class SplitSweeps(Stage):
         Returns:
             Sweeps, shape (..., ramp, pulse, fast_time), complex. If the trigger is searched for,
             also the Estimate of `find_trigger`, with `trigger_s` on the time axis of the record;
-            trials with an unreliable estimate (`ok` False) are separated all the same.
+            trials without a reliable estimate are separated all the same.
 
         Raises:
             ValueError: If a recorded trigger is missing, the sampling rate is not that of the
@@ -343,7 +346,7 @@ class SplitSweeps(Stage):
         """
         if self.trigger == "search":
             contiguous = self._contiguous(signal)
-            found = find_trigger(signal.data, self.radar, contiguous, self.nearer)
+            found = find_trigger(signal.data, self.radar, contiguous, self.nearer, assess=self.assess)
             found = replace(found, value={"trigger_s": found["trigger_s"] + signal.axis("time").start})
             return self._split(signal, _fitting(found["trigger_s"], signal, self.radar, contiguous)), found
         if self.trigger == "recorded" and trigger_s is None:

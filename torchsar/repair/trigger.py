@@ -39,6 +39,7 @@ from torch import Tensor
 from torchsar.core import Estimate, Outcome, checked_samples, real_dtype, take, unit_level, unit_phasor
 from torchsar.radar import TriangularLadar
 from torchsar.repair.analytic import delayed
+from torchsar.repair.assess import assess_trigger
 
 # Sweeps that are used in the search for turning points, by choice: more are more accurate but take
 # more time.
@@ -51,12 +52,9 @@ _FRINGES = 3
 # interpolation; and the share of the greatest symmetry below which a fringe may be excluded, by
 # trial on scenes of 1 to 40 scatterers.
 _FINE, _SYMMETRIC = 8, 0.9
-# Least symmetry of a reliable result, over the share of the scene in the power. Measured on such
-# scenes: above 0.7 in 97 % of the results that are right, below 0.66 where they are wrong.
-_LEAST_SYMMETRY = 0.7
-# Certainty below which a result is unreliable, in standard deviations, by choice: in a normal
-# distribution the chance is 3e-7 above 5 and 1e-3 above 3.
-ORDER_SIGMAS, FRINGE_SIGMAS = 5.0, 3.0
+# Certainty above which a fringe is excluded, and above which another one than the nearest is
+# chosen, in standard deviations, by choice.
+_EXCLUDED, _CHOSEN = 5.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,12 @@ class _Windows:
 
 
 def find_trigger(
-    record: Tensor, radar: TriangularLadar, contiguous: bool | None = None, nearer: bool = False
+    record: Tensor,
+    radar: TriangularLadar,
+    contiguous: bool | None = None,
+    nearer: bool = False,
+    *,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the start of the up sweep in the blocks of a record, one block per period.
 
@@ -111,12 +114,13 @@ def find_trigger(
             are one period long and every period is recorded. Blocks with gaps need at least 1.7
             periods of samples.
         nearer: Whether the scene is nearer than the reference range. A complex record cannot show
-            this: if it is wrong, the estimate is wrong by about half a period, and `ok`.
+            this: if it is wrong, the estimate is wrong by about half a period, and its outcome OK.
+        assess: Whether to add quality and outcome.
 
     Returns:
         Estimate with `trigger_s` of shape (...,), in seconds after the first sample of a block,
         from -1 sample to one period - 1 sample. `quality`, 0..1, is the relative drop of the
-        concentration of short-time spectra at turning points, or 0 where `ok` is False.
+        concentration of short-time spectra at turning points.
 
         `info` has three values for each trial. `order_sigmas` is the certainty, in standard
         deviations, that the up sweep is not mistaken for the down sweep. `fringe_sigmas` is the
@@ -124,16 +128,17 @@ def find_trigger(
         phases was chosen; it is 0 if the best of them is the last one tried. `coarse_s` is the
         estimate without use of phases, in seconds modulo half a period.
 
-        `ok` is False where `order_sigmas` is below 5, `fringe_sigmas` below 3 or the drop below
-        0.05, where the record is less symmetric about the turning points than the power of the
-        scene in its spectrum lets expect, or where no whole period fits its block.
+        The outcome is NOISE where no scene rises above the noise, OUTSIDE_SEARCH where no whole
+        period fits its block, AMBIGUOUS where `order_sigmas` is below 5 or `fringe_sigmas` below 3,
+        and MISFIT where the record is less symmetric about the turning points than the power of the
+        scene in its spectrum lets expect.
 
     Raises:
         TypeError: If the record is not a tensor of real or complex samples.
         ValueError: If the record is not finite or too short.
     """
     record = checked_samples(record, "find_trigger", "pulse, time", real=True)
-    n = radar.sweep_samples
+    n, is_complex = radar.sweep_samples, record.is_complex()
     joined = (radar.keep_every == 1 and record.shape[-1] == 2 * n) if contiguous is None else contiguous
     lines = record.flatten(-2)[..., None, :] if joined else record
     windows = _Windows(_scaled(lines), radar, n // 8)
@@ -147,7 +152,37 @@ def find_trigger(
     middle = _apex(windows, coarse, windows.margin)
     middle = _apex(windows, torch.round(middle).long(), max(n // 32, 6))
     middle = windows.margin + torch.remainder(middle - windows.margin, n)
-    return _assess(windows, middle, depth, nearer, record.is_complex(), joined, record.shape[-1])
+    base = torch.round(middle).long().clamp(0, n + 2 * windows.margin)
+    cycles, value = _find_tones(windows.cut(base[..., None], every=True).squeeze(-4), max(2, n // 32))
+    turns = torch.angle(value[..., 0]) / (2 * math.pi)
+    # strongest tones of even and odd sweeps, (..., line, pair); those of a complex detector
+    side = 1 if is_complex else -1
+    even, odd = cycles[..., 0::2, 0], side * cycles[..., 1::2, 0]
+    gap, doppler = even - odd, (even + odd) / 2
+    middle_gap = gap.flatten(-2).median(-1).values
+    order = _order_by_beat if is_complex else _order_by_envelope
+    even_is_up, order_sigmas = order(gap, doppler, nearer, radar)
+    phase_difference = turns[..., 0::2] - side * turns[..., 1::2] + n * doppler
+    meeting = _meeting(phase_difference, middle_gap / 2, middle - base)
+    symmetry = _symmetry(windows, base, _without_outliers(doppler.flatten(-2)), is_complex)
+    fine, fringe_sigmas, symmetric = _fringe(windows, base, (cycles, value), meeting, middle_gap.abs() / 2, symmetry)
+    # the tones have equal phase half a transient, f+ / (2 K), after the turning point of the
+    # reference; before it if the scene is nearer
+    per_cycle = radar.sample_rate_hz**2 / radar.chirp_rate_hz_s / 2 * (-1 if nearer else 1)
+    half_transient = middle_gap.abs() / 2 * per_cycle
+    start = base + fine - 0.5 - half_transient + torch.where(even_is_up, 0, n)
+    start = torch.nan_to_num(torch.remainder(start + 1, 2 * n) - 1)
+    value = {"trigger_s": start / radar.sample_rate_hz}
+    info = {
+        "order_sigmas": order_sigmas,
+        "fringe_sigmas": fringe_sigmas,
+        "coarse_s": torch.nan_to_num(middle - 0.5 - half_transient) / radar.sample_rate_hz,
+    }
+    if not assess:
+        return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(start), info=info)
+    outside = torch.zeros_like(even_is_up) if joined else (start <= -0.5) | (start + 2 * n > record.shape[-1])
+    share = _scene_share(windows, base, is_complex)
+    return Estimate(value, **assess_trigger(order_sigmas, fringe_sigmas, symmetric, share, outside, depth), info=info)
 
 
 def _scaled(lines: Tensor) -> Tensor:
@@ -185,23 +220,28 @@ def _turning_by_stft(windows: _Windows) -> tuple[Tensor, Tensor]:
     return torch.where(position < windows.margin, position + n, position), drop.to(torch.float64)
 
 
-def _sharpness(sweeps: Tensor) -> Tensor:
-    """Sum of the squared power of spectra over the square of its sum."""
-    power = torch.fft.fft(sweeps).abs().square().to(torch.float64)
-    return power.square().sum(-1) / power.sum(-1).square().clamp_min(1e-300)
+def _sharpness(windows: _Windows, start: Tensor) -> Tensor:
+    """Sharpness (..., o) of sweeps from start samples (..., o) on, averaged over the sweeps: the
+    sum of the squared power of their spectra over the square of its sum.
+    """
+
+    def sharpness(first: Tensor) -> Tensor:
+        power = torch.fft.fft(windows.cut(first)).abs().square().to(torch.float64)
+        return (power.square().sum(-1) / power.sum(-1).square().clamp_min(1e-300)).mean((-3, -2, -1))
+
+    return torch.stack([sharpness(start[..., i : i + 1]) for i in range(start.shape[-1])], -1)
 
 
 def _apex(windows: _Windows, near: Tensor, reach: int) -> Tensor:
     """First sample (...,) of the sharpest sweeps: lines through both slopes meet there."""
     step = max(1, reach // 8)
-    offset = torch.arange(-8, 9, device=near.device) * step
-    start = (near[..., None] + offset).clamp(0, windows.radar.sweep_samples + 2 * windows.margin)
-    mean = torch.stack([_sharpness(windows.cut(start[..., i : i + 1])).mean((-3, -2, -1)) for i in range(17)], -1)
+    offset = torch.tensor([*range(-8, -2), *range(3, 9)], device=near.device) * step
+    mean = _sharpness(windows, (near[..., None] + offset).clamp(0, windows.radar.sweep_samples + 2 * windows.margin))
     left, right = (
-        _line_through(offset[part].to(torch.float64), mean[..., part]) for part in (slice(0, 6), slice(11, 17))
+        _line_through(offset[part].to(torch.float64), mean[..., part]) for part in (slice(0, 6), slice(6, 12))
     )
     top = (right[0] - left[0]) / (left[1] - right[1]).clamp_min(1e-300)
-    return start[..., 8].to(torch.float64) + top.clamp(-8 * step, 8 * step)
+    return near.to(torch.float64) + top.clamp(-8 * step, 8 * step)
 
 
 def _line_through(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -209,25 +249,6 @@ def _line_through(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     centred = x - x.mean()
     slope = (y * centred).sum(-1) / centred.square().sum()
     return y.mean(-1) - slope * x.mean(), slope
-
-
-@dataclass(frozen=True)
-class _Tones:
-    """Strongest tones of the even and the odd sweeps (..., pair).
-
-    Frequency in cycles per sample, and phase in turns at the middle of the sweep.
-    """
-
-    even_cycles: Tensor
-    odd_cycles: Tensor
-    even_turns: Tensor
-    odd_turns: Tensor
-
-
-def _tones(cycles: Tensor, value: Tensor) -> _Tones:
-    """Strongest tones of sweeps (..., line, sweep, tone), even and odd."""
-    turns = torch.angle(value[..., 0]) / (2 * math.pi)
-    return _Tones(cycles[..., 0::2, 0], cycles[..., 1::2, 0], turns[..., 0::2], turns[..., 1::2])
 
 
 def _find_tones(sweeps: Tensor, skip: int, count: int = TONES) -> tuple[Tensor, Tensor]:
@@ -259,54 +280,6 @@ def _peak_cycles(x: Tensor) -> Tensor:
     )
     cycles = (peak + ((high - low) / (2 * (2 * top - low - high).clamp_min(1e-12))).clamp(-0.5, 0.5)) / n
     return cycles - torch.round(cycles)
-
-
-def _assess(
-    windows: _Windows, middle: Tensor, depth: Tensor, nearer: bool, is_complex: bool, joined: bool, block: int
-) -> Estimate:
-    """Estimate from the middle of the transients: fringe, order and reliability."""
-    radar, n = windows.radar, windows.radar.sweep_samples
-    base = torch.round(middle).long().clamp(0, n + 2 * windows.margin)
-    cycles, value = _find_tones(windows.cut(base[..., None], every=True).squeeze(-4), max(2, n // 32))
-    tones = _tones(cycles, value)
-    if is_complex:
-        even_is_up, order = _order_by_beat(tones, nearer, radar)
-        plus = (tones.even_cycles - tones.odd_cycles).flatten(-2).median(-1).values.abs() / 2
-        phase_difference = (tones.even_turns - tones.odd_turns) + n / 2 * (tones.even_cycles + tones.odd_cycles)
-        sign = torch.sign((tones.even_cycles - tones.odd_cycles).flatten(-2).median(-1).values)
-    else:
-        even_is_up, order = _order_by_envelope(tones, radar)
-        plus = (tones.even_cycles + tones.odd_cycles).flatten(-2).median(-1).values.abs() / 2
-        phase_difference = (tones.even_turns + tones.odd_turns) + n / 2 * (tones.even_cycles - tones.odd_cycles)
-        sign = torch.ones_like(plus)
-    doppler = (tones.even_cycles + tones.odd_cycles) / 2 if is_complex else (tones.even_cycles - tones.odd_cycles) / 2
-    doppler = _without_outliers(doppler.flatten(-2)).unflatten(-1, doppler.shape[-2:])
-    meeting = _meeting(phase_difference, plus * sign, middle - base)
-    symmetry = _symmetry(windows, base, doppler, is_complex)
-    fine, fringe, symmetric = _fringe(windows, base, (cycles, value), meeting, plus, symmetry)
-    # the tones have equal phase half a transient, f+ / (2 K), after the turning point of the
-    # reference; before it if the scene is nearer
-    half_transient = (
-        plus * radar.sample_rate_hz / radar.chirp_rate_hz_s / 2 * radar.sample_rate_hz * (-1 if nearer else 1)
-    )
-    start = base + fine - 0.5 - half_transient + torch.where(even_is_up, 0, n)
-    start = torch.remainder(start + 1, 2 * n) - 1
-    ok = (order > ORDER_SIGMAS) & (fringe > FRINGE_SIGMAS) & (depth > 0.05) & torch.isfinite(start)
-    ok = ok & (symmetric > _LEAST_SYMMETRY * _scene_share(windows, base, is_complex))
-    if not joined:
-        ok = ok & (start > -0.5) & (start + 2 * n <= block)
-    start = torch.where(torch.isfinite(start), start, 0)
-    info = {
-        "order_sigmas": order,
-        "fringe_sigmas": fringe,
-        "coarse_s": torch.nan_to_num(middle - 0.5 - half_transient) / radar.sample_rate_hz,
-    }
-    return Estimate(
-        {"trigger_s": start / radar.sample_rate_hz},
-        quality=torch.where(ok, depth.clamp(0, 1), 0),
-        outcome=Outcome.of(ok, Outcome.NOISE),
-        info=info,
-    )
 
 
 def _meeting(phase_difference: Tensor, plus_cycles: Tensor, expected: Tensor) -> Tensor:
@@ -351,7 +324,7 @@ def _fringe(
     most, at = mean.max(-1)
     short = symmetry.gather(-1, at[..., None, None].expand(*symmetry.shape[:-1], 1)) - found
     clear = _sigmas(short)
-    excluded = (found.mean(-2) < _SYMMETRIC * most[..., None]) & (clear > ORDER_SIGMAS)
+    excluded = (found.mean(-2) < _SYMMETRIC * most[..., None]) & (clear > _EXCLUDED)
     best = torch.where(excluded, -torch.inf, gain.mean(-2)).argmax(-1)
     sigmas = _sigmas(take(gain.movedim(-1, -2), best, -2)[..., None] - gain)
     others = torch.arange(len(order), device=base.device) != best[..., None]
@@ -359,7 +332,7 @@ def _fringe(
     # at an end of the search, further fringes may be better
     beyond = (best == 0) | (best == len(order) - 1) | excluded.all(-1)
     certainty = torch.where(beyond, 0, certainty)
-    sure = certainty > FRINGE_SIGMAS
+    sure = certainty > _CHOSEN
     return torch.where(sure, take(offsets, best), expected), certainty, take(found.mean(-2), best)
 
 
@@ -376,13 +349,13 @@ def _symmetry(windows: _Windows, base: Tensor, shift_cycles: Tensor, is_complex:
     an instant is greatest there. The instants run from -margin to margin about base in steps of
     1 / (2 _FINE) sample. An analytic signal is conjugate-symmetric instead.
 
-    shift_cycles: Doppler shift in cycles per sample, (..., line, pair).
+    shift_cycles: Doppler shift in cycles per sample, (..., k).
     """
     n, reach = windows.radar.sweep_samples, windows.margin
     half = n // 2 - reach
     x = windows.cut((base + n - half)[..., None], every=True).squeeze(-4)[..., 0::2, : 2 * half].flatten(-3, -2)
     step = max(1, x.shape[-2] // MAX_WINDOWS)
-    x, shift_cycles = x[..., ::step, :], shift_cycles.flatten(-2)[..., ::step]
+    x, shift_cycles = x[..., ::step, :], shift_cycles[..., ::step]
     position = torch.arange(2 * half, dtype=torch.float64, device=base.device) - (half - 0.5)
     position = position if is_complex else -position.abs()
     x = x.to(torch.complex128) * unit_phasor(-shift_cycles[..., None] * position, torch.complex128)
@@ -401,7 +374,7 @@ def _scene_share(windows: _Windows, base: Tensor, is_complex: bool) -> Tensor:
     power = (spectra if is_complex else spectra[..., : spectra.shape[-1] // 2]).abs().square()
     mean = power.mean((-3, -2, -1), dtype=torch.float64)
     # the median of an exponential distribution is ln 2 times its mean
-    return 1 - power.flatten(-3).median(-1).values / math.log(2) / mean.clamp_min(1e-300)
+    return torch.where(mean > 0, 1 - power.flatten(-3).median(-1).values / math.log(2) / mean.clamp_min(1e-300), 0)
 
 
 def _extrapolated(cycles: Tensor, value: Tensor, position: Tensor) -> Tensor:
@@ -423,35 +396,30 @@ def _interpolated(x: Tensor, position: Tensor) -> Tensor:
     return low + (position - first)[..., None, :] * (high - low)
 
 
-def _order_by_beat(tones: _Tones, nearer: bool, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
-    """Whether even sweeps are up, from the higher beat of up sweeps, and how certain."""
-    gap = (tones.even_cycles - tones.odd_cycles).flatten(-2)
-    up_higher = (radar.dechirp_sign == "lo_conj_echo") != nearer
+def _order_by_beat(gap: Tensor, _: Tensor, nearer: bool, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
+    """Whether even sweeps are up, from the higher beat of up sweeps, and how certain; gap (...,
+    line, pair) of the beats of even and odd sweeps in cycles per sample.
+    """
+    gap = gap.flatten(-2)
     middle = gap.median(-1).values
     std = (gap - middle[..., None]).abs().median(-1).values * 1.5 + 1e-3 / radar.sweep_samples
+    up_higher = (radar.dechirp_sign == "lo_conj_echo") != nearer
     return (middle > 0) == up_higher, middle.abs() / std * math.sqrt(gap.shape[-1] / 2)
 
 
-def _order_by_envelope(tones: _Tones, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
+def _order_by_envelope(gap: Tensor, doppler: Tensor, _: bool, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
     """Whether even sweeps of a real record are up, and how certain.
 
     Even sweeps are up if the range of the beats rises with the velocity that this assumption gives.
     Range changes by plus or minus the integrated velocity. The certainty is the correlation of both
     relative to that due to the scatter of the range from period to period.
     """
-    plus, shift = (tones.even_cycles + tones.odd_cycles) / 2, (tones.even_cycles - tones.odd_cycles) / 2
-    per_cycle = radar.sample_rate_hz * radar.wave_speed_m_s / (2 * radar.chirp_rate_hz_s)
-    range_m = _without_outliers(plus.flatten(-2) if plus.shape[-2] == 1 else plus[..., 0]) * per_cycle
-    velocity = (
-        _without_outliers(shift.flatten(-2) if shift.shape[-2] == 1 else shift[..., 0])
-        * radar.sample_rate_hz
-        * radar.wavelength_m
-        / 2
-    )
+    plus, shift = (_without_outliers(x.flatten(-2) if x.shape[-2] == 1 else x[..., 0]) for x in (gap / 2, doppler))
+    range_m = plus * (radar.sample_rate_hz * radar.wave_speed_m_s / (2 * radar.chirp_rate_hz_s))
+    velocity = shift * (radar.sample_rate_hz * radar.wavelength_m / 2)
     if range_m.shape[-1] < 4:
         return torch.ones_like(range_m[..., 0], dtype=torch.bool), torch.zeros_like(range_m[..., 0])
-    displacement = torch.cumulative_trapezoid(velocity, dx=radar.pulse_step_s)
-    displacement = torch.nn.functional.pad(displacement, (1, 0))
+    displacement = torch.nn.functional.pad(torch.cumulative_trapezoid(velocity, dx=radar.pulse_step_s), (1, 0))
     displacement, range_m = (x - x.mean(-1, keepdim=True) for x in (displacement, range_m))
     noise = torch.diff(range_m).square().mean(-1).clamp_min(1e-30).sqrt() / math.sqrt(2)
     certainty = (range_m * displacement).sum(-1) / (noise * displacement.square().sum(-1).clamp_min(1e-30).sqrt())
