@@ -35,6 +35,9 @@ from torchsar.radar import BistaticRadar
 
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _HALVINGS = 4  # trials of a step: whole, half, quarter, eighth; then it is omitted
+# Predicted gain of energy below which no step is taken, relative to the noise of a sample (a step
+# of 3e-4 standard deviations) and to the energy that is explained already (rounding).
+_LEAST_GAIN, _LEAST_SHARE = 1e-7, 1e-13
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,8 @@ class PointFit:
 
 class Likelihood(Protocol):
     """Likelihood of the motion of one or several points."""
+
+    data: Tensor
 
     def fit(self, motion: PointMotion) -> PointFit:
         """Return the least-squares amplitudes for a motion, with derivatives by the unknowns."""
@@ -89,7 +94,8 @@ def maximum_likelihood(
 
     The expected amplitude is computed once, for the start, so that the steps do not fit the
     position to the ends of the aperture. A step that does not explain more energy is halved or
-    omitted, separately in each trial.
+    omitted, separately in each trial. A trial takes no further steps when a step would gain less
+    than 1e-7 of the noise of a sample.
 
     Args:
         data: Channels with the transmit range removed and slow time zero at pulse n // 2, shape
@@ -100,7 +106,7 @@ def maximum_likelihood(
         unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`; the others
             keep the values of the start.
         whitening: Clutter covariance, None for white noise.
-        steps: Number of Gauss-Newton steps.
+        steps: Largest number of Gauss-Newton steps.
 
     Returns:
         The fit with motion, amplitude, residual noise power and covariance of the unknowns.
@@ -114,8 +120,7 @@ def maximum_likelihood(
     problem = PointLikelihood.of(data, radar, start, aperture, unknowns, whitening)
     motion = start.each(lambda value: value.expand(data.shape[:-2]))
     fit = problem.fit(motion)
-    for _ in range(steps):
-        motion, fit = stepped(problem, motion, fit, unknowns)
+    motion, fit = climbed(problem, motion, fit, unknowns, steps)
     return Found(motion, fit.amplitude, problem.noise_power(fit), problem.covariance(motion, fit), fit.energy, unknowns)
 
 
@@ -250,28 +255,48 @@ def _coloured(data: Tensor, model: Tensor, tilted: Tensor, columns: Tensor) -> P
     return PointFit(amplitude, power * total + changed, gradient, power[..., None, None] * normal)
 
 
-def stepped(
-    problem: Likelihood, motion: PointMotion, fit: PointFit, unknowns: tuple[str, ...]
+def climbed(
+    problem: Likelihood, motion: PointMotion, fit: PointFit, unknowns: tuple[str, ...], steps: int
 ) -> tuple[PointMotion, PointFit]:
-    """Take one Gauss-Newton step, halved or omitted in trials where it explains less energy.
+    """Take Gauss-Newton steps until none of the trials gains by a step.
 
     Args:
         problem: Likelihood of one point, or of several that are fitted together.
-        motion: Motion, shape (...,), or (..., point) for several points.
+        motion: Starting motion, shape (...,), or (..., point) for several points.
         fit: Fit for this motion, with the unknowns of all points in its gradient.
         unknowns: Names of the parameters to estimate.
+        steps: Largest number of steps.
 
     Returns:
-        Motion after the step, and the fit for it.
+        Motion after the steps, and the fit for it.
     """
+    channels, samples = problem.data.shape[-2:]
+    total = problem.data.abs().square().sum((-2, -1))
+    for _ in range(steps):
+        step = solved(fit.normal, fit.gradient[..., None])[..., 0]
+        noise = (total - fit.energy).clamp_min(0) / (channels * samples)
+        pending = (step * fit.gradient).sum(-1) > _LEAST_GAIN * noise + _LEAST_SHARE * fit.energy
+        if not bool(pending.any()):
+            break
+        motion, fit = _stepped(problem, motion, fit, unknowns, step, pending)
+    return motion, fit
+
+
+def _stepped(
+    problem: Likelihood,
+    motion: PointMotion,
+    fit: PointFit,
+    unknowns: tuple[str, ...],
+    step: Tensor,
+    pending: Tensor,
+) -> tuple[PointMotion, PointFit]:
+    """Take a step in the pending trials, halved or omitted where it explains less energy."""
     ndim = fit.energy.ndim
-    step = solved(fit.normal, fit.gradient[..., None])[..., 0].reshape(*motion.u_r_m_s.shape, len(unknowns))
-    step = _bounded(step, motion, unknowns)
+    step = _bounded(step.reshape(*motion.u_r_m_s.shape, len(unknowns)), motion, unknowns)
     # on an accelerator all sizes of a step at once take less time than one after the other
     together = 1 if step.device.type == "cpu" else _HALVINGS
     sizes = torch.exp2(-torch.arange(_HALVINGS, dtype=step.dtype, device=step.device))
     begin, before, problem = motion, fit.energy, problem.repeated(together)
-    pending = torch.ones_like(before, dtype=torch.bool)
     for size in sizes.split(together):
         there = moved(begin, size[(..., *(None,) * step.ndim)] * step, unknowns)
         fit_there = problem.fit(there)

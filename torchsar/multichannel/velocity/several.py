@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsar.core import linear_solve, take
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
-from torchsar.multichannel.velocity.likelihood import PointFit, stepped
+from torchsar.multichannel.velocity.likelihood import PointFit, climbed
 from torchsar.multichannel.velocity.model import Found, covariance_of, phase_slopes, point_phasor
 from torchsar.radar import BistaticRadar
 
@@ -56,8 +56,7 @@ def fitted_together(
     weight = aperture.weight(radar, start, time_s)[..., None, :]
     problem, motion = _Points(data, radar, weight, time_s, unknowns), start
     fit = problem.fit(motion)
-    for _ in range(_STEPS):
-        motion, fit = stepped(problem, motion, fit, unknowns)
+    motion, fit = climbed(problem, motion, fit, unknowns, _STEPS)
     echoes = fit.amplitude[..., None, None] * problem.echo(motion)
     left = data - echoes.sum(-3)
     noise = left.abs().square().mean((-2, -1))
