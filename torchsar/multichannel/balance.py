@@ -112,6 +112,13 @@ def estimate_balance(
 ) -> Estimate:
     """Estimate phase, gain and delay of each channel from stationary clutter.
 
+    >>> import torch
+    >>> from torchsar.multichannel import estimate_balance
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> estimate_balance(torch.zeros(3, 32, 64, dtype=torch.complex64), radar).failed
+    tensor(True)
+
     The noise level is estimated as well. Not differentiable. Where the clutter fills fewer bands
     than there are channels, prefer the prior `FlatBand(bands * PRF)`: it suits any scene, since it
     only assumes that the rest of the spectrum is empty, and the phases err by 0.02 degree instead
@@ -148,7 +155,7 @@ def estimate_balance(
         deviations follow from the scatter of the gradient of the likelihood, see `balance_assess`.
 
         Outcomes: `EMPTY` where a channel has no power; `SINGULAR` where a phase is not determined;
-        `NOISE` where its standard deviation exceeds 0.5 rad; `TOO_FEW` where fewer than three of 32
+        `NOISE` where its standard deviation exceeds 0.25 rad; `TOO_FEW` where fewer than three of 32
         parts of the swath hold the power, since one moving point could be most of it; `AMBIGUOUS`
         where the clutter could as well lie in another Doppler band; `MISFIT` where parts of the
         Doppler band contradict each other, as with a wrong prior; and `INEXACT` where the standard

@@ -40,7 +40,7 @@ _LEAST_LEAD = 100.0
 # about -20 dB when three bands are reconstructed at a PRF of 180 Hz. So do amplitudes. Phases that
 # delays turn over the range band weigh less, since their mean is zero.
 _LARGEST_STD_RAD, _LARGEST_ACROSS_RAD = 0.033, 0.1
-_NOTHING_RAD = 0.5  # standard deviation from which a phase is that of noise, by choice
+_NOTHING_RAD = 0.25  # standard deviation from which a phase is that of noise, by choice
 _TINY = torch.finfo(torch.float64).tiny
 
 

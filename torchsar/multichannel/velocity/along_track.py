@@ -44,6 +44,14 @@ def along_track_velocity(
 ) -> Estimate:
     """Estimate the along-track speed u_a of a point of known slant-range speed and position.
 
+    >>> import torch
+    >>> from torchsar.multichannel import Dwell, PointMotion, along_track_velocity
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> data = torch.zeros(3, 90, dtype=torch.complex64)
+    >>> along_track_velocity(data, radar, PointMotion.of(radar, data.real), Dwell(0.5)).failed
+    tensor(True)
+
     A grid with the step `step_m_s` is followed by `fine` grids of five points, each with 2/5 of the
     previous step. In every grid, a parabola through the maximum refines the speed.
 

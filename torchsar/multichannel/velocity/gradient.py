@@ -59,6 +59,14 @@ def gradient_likelihood(
 ) -> Estimate:
     """Estimate the motion of highest likelihood by limited-memory BFGS with autograd gradients.
 
+    >>> import torch
+    >>> from torchsar.multichannel import Dwell, PointMotion, gradient_likelihood
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> data = torch.zeros(3, 90, dtype=torch.complex64)
+    >>> gradient_likelihood(data, radar, PointMotion.of(radar, data.real), Dwell(0.5)).failed
+    tensor(True)
+
     The function serves as a check of `maximum_likelihood`, which is faster, and as an example for
     other objectives.
 

@@ -13,7 +13,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchsar.core import take
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
@@ -68,10 +67,6 @@ class Likelihood(Protocol):
 
     def fit(self, motion: PointMotion) -> PointFit:
         """Return the least-squares amplitudes for a motion, with derivatives by the unknowns."""
-        ...
-
-    def repeated(self, count: int) -> Likelihood:
-        """Return this likelihood for `count` motions per trial, which are a first dimension."""
         ...
 
 
@@ -173,10 +168,6 @@ class PointLikelihood:
         tilted = self.time_s / self.time_s.abs().amax().clamp_min(_TINY) * model
         applied = self.whitening.applied
         return _coloured(self.data, applied(model), applied(tilted), applied(1j * slopes * model[..., None, :, :]))
-
-    def repeated(self, count: int) -> PointLikelihood:
-        """Return this likelihood for `count` motions per trial, shape (count, ...)."""
-        return self if self.whitening is None else replace(self, whitening=self.whitening.expanded(count))
 
     def noise_power(self, fit: PointFit) -> Tensor:
         """Return the residual power per sample in the pulses in which the point is illuminated.
@@ -291,28 +282,21 @@ def _stepped(
     pending: Tensor,
 ) -> tuple[PointMotion, PointFit]:
     """Take a step in the pending trials, halved or omitted where it explains less energy."""
-    ndim = fit.energy.ndim
+    begin, before = motion, fit.energy
     step = _bounded(step.reshape(*motion.u_r_m_s.shape, len(unknowns)), motion, unknowns)
-    # on an accelerator all sizes of a step at once take less time than one after the other
-    together = 1 if step.device.type == "cpu" else _HALVINGS
-    sizes = torch.exp2(-torch.arange(_HALVINGS, dtype=step.dtype, device=step.device))
-    begin, before, problem = motion, fit.energy, problem.repeated(together)
-    for size in sizes.split(together):
-        there = moved(begin, size[(..., *(None,) * step.ndim)] * step, unknowns)
+    for halvings in range(_HALVINGS):
+        there = moved(begin, 0.5**halvings * step, unknowns)
         fit_there = problem.fit(there)
-        explains = fit_there.energy > before
-        largest, better = explains.to(torch.uint8).argmax(0), pending & explains.any(0)
+        better = pending & (fit_there.energy > before)
 
-        def improved(new: Tensor, old: Tensor, at: Tensor = largest, better: Tensor = better) -> Tensor:
-            # the largest step that explains more energy
-            new = take(new.movedim(0, ndim), at, ndim)
-            return torch.where(better[(...,) + (None,) * (new.ndim - ndim)], new, old)
+        def improved(new: Tensor, old: Tensor, better: Tensor = better) -> Tensor:
+            return torch.where(better[(...,) + (None,) * (new.ndim - better.ndim)], new, old)
 
         values = {name: improved(getattr(there, name), getattr(motion, name)) for name in unknowns}
         motion = replace(motion, **values)
         fit = PointFit(*map(improved, vars(fit_there).values(), vars(fit).values()))
         pending = pending & ~better
-        if together == _HALVINGS or not bool(pending.any()):
+        if not bool(pending.any()):
             break
     return motion, fit
 

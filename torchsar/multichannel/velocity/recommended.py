@@ -54,6 +54,14 @@ def moving_point_velocity(
 ) -> Estimate:
     """Estimate velocity and position of the strongest moving point per trial, without a start.
 
+    >>> import torch
+    >>> from torchsar.multichannel import Dwell, moving_point_velocity
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> data = torch.zeros(3, 90, dtype=torch.complex64)
+    >>> moving_point_velocity(data, radar, Dwell(0.5), u_a_m_s=0.0).failed
+    tensor(True)
+
     If no clutter covariance is given, the point is first sought in white noise. If the residual
     shows clutter, the search is repeated with the covariance of the data. Each of the two fits is
     refined with the covariance of its own residual. In each trial, the fit of higher likelihood is

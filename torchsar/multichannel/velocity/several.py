@@ -129,10 +129,6 @@ class _Points:
             (columns.conj() @ columns.mT).real,
         )
 
-    def repeated(self, count: int) -> _Points:
-        """Return this likelihood for `count` motions per trial, shape (count, ..., point)."""
-        return self
-
     def echo(self, motion: PointMotion) -> Tensor:
         """Return the echoes of unit amplitude of the points, (..., point, channel, pulse)."""
         return self.weight * point_phasor(self.radar, motion, self.time_s, torch.complex128)
