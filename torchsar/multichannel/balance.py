@@ -32,7 +32,7 @@ from torchsar.core import (
     unit_level,
     unit_phasor,
 )
-from torchsar.multichannel.balance_assess import BalanceFit, Rivals, assessed_balance
+from torchsar.multichannel.balance_assess import BalanceFit, assessed_balance
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.clutter_fit import ClutterModel, hann
 from torchsar.multichannel.response import ElementPattern, Prior
@@ -155,12 +155,12 @@ def estimate_balance(
         deviations follow from the scatter of the gradient of the likelihood, see `balance_assess`.
 
         Outcomes: `EMPTY` where a channel has no power; `SINGULAR` where a phase is not determined;
-        `NOISE` where its standard deviation exceeds 0.25 rad; `TOO_FEW` where fewer than three of 32
-        parts of the swath hold the power, since one moving point could be most of it; `AMBIGUOUS`
-        where the clutter could as well lie in another Doppler band; `MISFIT` where parts of the
-        Doppler band contradict each other, as with a wrong prior; and `INEXACT` where the standard
-        deviation of a phase exceeds 0.033 rad, that of a gain 0.29 dB, or that of a delay turns the
-        phase by more than 0.1 rad rms over the range band.
+        `NOISE` where its standard deviation exceeds 0.25 rad; `TOO_FEW` where fewer than three of
+        32 parts of the swath hold the power, since one moving point could be most of it;
+        `AMBIGUOUS` where the clutter could as well lie in another Doppler band; `MISFIT` where
+        parts of the Doppler band contradict each other, as with a wrong prior; and `INEXACT` where
+        the standard deviation of a phase exceeds 0.033 rad, that of a gain 0.29 dB, or that of a
+        delay turns the phase by more than 0.1 rad rms over the range band.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -192,8 +192,8 @@ def estimate_balance(
             products = _products(_turned(lines, turn, position), blocks, no_power)
         mean = products.mean(-3)
         snr_db = model.snr_db(mean)
-        prior_model, first_db = model, snr_db
         weights = model.weights(mean, snr_db)[0]
+        first = model, snr_db
         if bands < radar.channels:
             model = model.adapted(mean, weights, snr_db)
             snr_db = model.snr_db(mean)
@@ -213,8 +213,8 @@ def estimate_balance(
         if position is not None:
             lines = _turned(lines, turn, position)
         found = BalanceFit(lines, model, fit, snr_db, position, reference, no_power)
-        rivals = Rivals(prior_model, mean, weights, first_db) if 1 < bands < radar.channels else None
-        (phase_std, log_std, turn_std), quality, outcome = assessed_balance(found, rivals)
+        lead = first[0].lead(mean, weights, first[1]) if 1 < bands < radar.channels else None
+        (phase_std, log_std, turn_std), quality, outcome = assessed_balance(found, lead)
         std = {
             "phase_rad": phase_std,
             "gain_db": log_std * (20 / math.log(10)),

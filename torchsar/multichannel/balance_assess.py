@@ -67,22 +67,13 @@ class BalanceFit:
     no_power: Tensor
 
 
-@dataclass(frozen=True)
-class Rivals:
-    """What is compared with clutter that lies in other Doppler bands, see `ClutterModel.lead`."""
-
-    prior: ClutterModel
-    products: Tensor
-    weights: Tensor
-    snr_db: Tensor
-
-
-def assessed_balance(found: BalanceFit, rivals: Rivals | None) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
+def assessed_balance(found: BalanceFit, lead: Tensor | None) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
     """Return standard deviations of phases, logarithms of gains and turns, quality and outcome.
 
     Args:
         found: The fit.
-        rivals: First fit, None where the clutter cannot lie in other Doppler bands.
+        lead: Lead of the first fit per look, see `ClutterModel.lead`; None where the clutter cannot
+            lie in other Doppler bands.
 
     Returns:
         Deviations, float64 (..., channel) each; quality of 0 to 1 and codes of the outcome, (...,).
@@ -123,13 +114,10 @@ def assessed_balance(found: BalanceFit, rivals: Rivals | None) -> tuple[tuple[Te
     # rms phase over the range band by a delay
     across = turn_std.amax(-1) / math.sqrt(3)
     relative = torch.maximum(largest / _LARGEST_STD_RAD, across / _LARGEST_ACROSS_RAD)
-    lead = torch.full_like(found.snr_db, torch.inf)
-    if rivals is not None:
-        lead = rivals.prior.lead(rivals.products, rivals.weights, rivals.snr_db) * looks
     outcome = worst(
         (Outcome.INEXACT, ~(relative < 1)),
         (Outcome.MISFIT, misfit.sqrt() >= _MISFIT),
-        (Outcome.AMBIGUOUS, lead <= _LEAST_LEAD),
+        (Outcome.AMBIGUOUS, found.no_power if lead is None else lead * looks <= _LEAST_LEAD),
         (Outcome.TOO_FEW, share.square().sum(-1) * _LEAST_PARTS >= 1),
         (Outcome.NOISE, phase_std.amax(-1) > _NOTHING_RAD),
         (Outcome.EMPTY, found.no_power),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -33,20 +33,6 @@ _STEPS = 6  # Gauss-Newton steps of a hypothesis, found by trial: more add less 
 _LARGE_DB = 250.0  # ratios of zeros are returned as -300 dB
 
 
-@dataclass(frozen=True)
-class Ambiguity:
-    """How other numbers of pulse rates are compared with a fit.
-
-    Args:
-        inside: Tells of a motion whether it lies within the search, bool (...,). Where it does, the
-            data must exclude it; where it does not, it must only explain the data no better.
-        assumed: Whether the along-track speed of the fit was assumed, and may be wrong.
-    """
-
-    inside: Callable[[PointMotion], Tensor]
-    assumed: bool = False
-
-
 @torch.no_grad()
 def outcome_of_point(
     data: Tensor,
@@ -54,7 +40,8 @@ def outcome_of_point(
     found: Found,
     aperture: Aperture,
     reasons: Sequence[tuple[Outcome, Tensor]] = (),
-    ambiguity: Ambiguity | None = None,
+    inside: Callable[[PointMotion], Tensor] | None = None,
+    assumed: bool = False,
     whitening: Whitening | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the outcome of the fit of a point, and the number of pulse rates it seems to be off.
@@ -65,7 +52,10 @@ def outcome_of_point(
         found: Fit of the point.
         aperture: Expected amplitude over slow time, as the fit used it.
         reasons: Further outcomes, with a bool tensor (...,) that is True where each applies.
-        ambiguity: How other numbers of pulse rates are compared, None for no comparison.
+        inside: Tells of a motion with another number of pulse rates whether it lies within the
+            search, bool (...,). Where it does, the data must exclude it; where it does not, it must
+            only explain the data no better. None for no comparison.
+        assumed: Whether the along-track speed of the fit was assumed, and may be wrong.
         whitening: Clutter covariance, None for white noise.
 
     Returns:
@@ -73,7 +63,7 @@ def outcome_of_point(
         `MISFIT` where the illumination is not understood (see `lit_as_expected`) or only another
         along-track speed than the assumed one rises above the noise, `AMBIGUOUS` where
         another number of pulse rates explains the data as well, or one of `reasons`. With
-        `ambiguity`, also `pulse_rates` of shape (...,): the number of PRFs to add to the Doppler,
+        `inside`, also `pulse_rates` of shape (...,): the number of PRFs to add to the Doppler,
         -1, 0 or 1, and 0 where nothing is found.
     """
     empty, weak = found.snr_db < -_LARGE_DB, found.snr_db < DETECTED_DB
@@ -82,11 +72,11 @@ def outcome_of_point(
         (Outcome.MISFIT, weak | ~lit_as_expected(data, radar, found.motion, aperture, whitening)),
         *((code, applies & ~empty) for code, applies in reasons),
     ]
-    if ambiguity is None:
+    if inside is None:
         return worst((Outcome.NOISE, weak), *codes), {}
-    if not (ambiguity.assumed or bool((~weak).any())):
+    if not (assumed or bool((~weak).any())):
         return worst((Outcome.NOISE, weak), *codes), {"pulse_rates": torch.zeros_like(found.energy)}
-    off, ambiguous, snr_db = _compared(unit_level(data), radar, found, aperture, ambiguity, whitening)
+    off, ambiguous, snr_db = _compared(unit_level(data), radar, found, aperture, inside, assumed, whitening)
     noise = weak & (snr_db < DETECTED_DB)
     off, before = torch.where(noise, 0, off), worst((Outcome.NOISE, noise), *codes)
     _warn(radar, (off != 0) & (before == Outcome.OK))
@@ -98,7 +88,8 @@ def _compared(
     radar: BistaticRadar,
     found: Found,
     aperture: Aperture,
-    ambiguity: Ambiguity,
+    inside: Callable[[PointMotion], Tensor],
+    assumed: bool,
     whitening: Whitening | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the number of pulse rates a fit is off, whether it is ambiguous, and the best SNR.
@@ -106,26 +97,25 @@ def _compared(
     Speeds that differ by lambda PRF differ in the cubic phase of the range history.
     """
     seen, unknowns = data if whitening is None else whitening.backed(data), found.unknowns
-    if ambiguity.assumed:
+    if assumed:
         unknowns = tuple(dict.fromkeys((*unknowns, "u_a_m_s")))
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     aperture = Kept(aperture.weight(radar, found.motion, time_s))  # energies are of the same pulses
-    fits, inside = [], []
+    fits = []
     for number in (-1, 0, 1):
         there = found.motion.each(lambda value: value.expand(data.shape[:-2]))
         u_r = there.u_r_m_s + number * radar.ambiguous_velocity_m_s
         if "u_a_m_s" in unknowns:  # keep the curvature of the phase
             u_a = there.speed_m_s - (there.square_m2_s2 - u_r.square()).clamp_min(1.0).sqrt()
             there = replace(there, u_a_m_s=u_a.clamp_max(_FASTEST * there.speed_m_s))
-        there, steps = replace(there, u_r_m_s=u_r), _STEPS if number or ambiguity.assumed else 0
-        if ambiguity.assumed:
+        there, steps = replace(there, u_r_m_s=u_r), _STEPS if number or assumed else 0
+        if assumed:
             there = _sharpest(seen, radar, there, aperture)
         fits.append(maximum_likelihood(data, radar, there, aperture, unknowns, whitening, steps))
-        inside.append(ambiguity.inside(fits[-1].motion))
     energy, own = torch.stack([fit.energy for fit in fits]), fits[1].energy
     noise = torch.stack([fit.noise_power for fit in fits]).amin(0)
     off = torch.where(energy.amax(0) - own > _RESOLVED * noise, energy.argmax(0) - 1, 0).to(torch.float64)
-    rivals = torch.where(inside[0], energy[0], 0).maximum(torch.where(inside[2], energy[2], 0))
+    rivals = torch.stack([torch.where(inside(fit.motion), fit.energy, 0) for fit in fits[::2]]).amax(0)
     snr_db = torch.stack([fit.snr_db for fit in fits]).amax(0)
     return off, (off != 0) | (own - rivals <= _RESOLVED * noise), snr_db
 

@@ -21,7 +21,7 @@ from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
-from torchsar.multichannel.velocity.assess import Ambiguity, outcome_of_point
+from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.illumination import seen_aperture
 from torchsar.multichannel.velocity.model import (
     Found,
@@ -99,8 +99,8 @@ def interferometry(
     if not assess:
         return estimate_of(found)
     everywhere = torch.ones_like(found.energy, dtype=torch.bool)
-    ambiguity = Ambiguity(lambda _: everywhere, assumed=True) if check_ambiguity else None
-    return estimate_of(found, *outcome_of_point(data, radar, found, aperture, ambiguity=ambiguity))
+    inside = (lambda _: everywhere) if check_ambiguity else None
+    return estimate_of(found, *outcome_of_point(data, radar, found, aperture, inside=inside, assumed=True))
 
 
 def interfered(

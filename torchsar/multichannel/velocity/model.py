@@ -108,17 +108,11 @@ class Found:
     energy: Tensor
     unknowns: tuple[str, ...]
 
-    def zipped(self, change: Callable[..., Tensor], *others: Found) -> Found:
-        """Return a fit whose tensors are a function of those of this fit and of others."""
-        rows = zip(*(fit._tensors for fit in (self, *others)), strict=True)
-        u_r, u_a, y0, near, *rest = (change(*row) for row in rows)
-        return Found(PointMotion(u_r, u_a, y0, near, self.motion.speed_m_s), *rest, unknowns=self.unknowns)
-
-    @property
-    def _tensors(self) -> list[Tensor]:
-        motion = [getattr(self.motion, name) for name in (*UNKNOWNS, "range_m")]
-        shaped = [value.expand(self.energy.shape) for value in motion]
-        return [*shaped, self.amplitude, self.noise_power, self.covariance, self.energy]
+    def each(self, change: Callable[..., Tensor], *others: Found) -> Found:
+        """Return the fit with a function applied to all tensors, followed by those of `others`."""
+        motion = self.motion.each(change, *(fit.motion for fit in others))
+        names = ("amplitude", "noise_power", "covariance", "energy")
+        return Found(motion, *(change(*(getattr(fit, n) for fit in (self, *others))) for n in names), self.unknowns)
 
     @property
     def snr_db(self) -> Tensor:
@@ -254,7 +248,7 @@ def round_units(normal: Tensor) -> Tensor:
 
 def _of_unit_diagonal(normal: Tensor) -> tuple[Tensor, Tensor]:
     """Return matrices of unit diagonal, with a floor, and the scale (..., n) on either side."""
-    diagonal = normal.diagonal(dim1=-2, dim2=-1)
+    diagonal = normal.diagonal(dim1=-2, dim2=-1).real
     scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
     unit = normal * scale[..., :, None] * scale[..., None, :] + torch.diag_embed((diagonal <= 0).to(normal.dtype))
     return unit + _ROUNDING * torch.eye(unit.shape[-1], dtype=unit.dtype, device=unit.device), scale
@@ -295,11 +289,7 @@ def chosen(motion: PointMotion, other: PointMotion, first: Tensor) -> PointMotio
     Returns:
         Motion with parameters of shape (...,).
     """
-    pairs = {
-        name: torch.where(first, getattr(motion, name), getattr(other, name))
-        for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
-    }
-    return PointMotion(**pairs, speed_m_s=motion.speed_m_s)
+    return motion.each(lambda mine, others: torch.where(first, mine, others), other)
 
 
 def estimate_of(found: Found, outcome: Tensor | None = None, info: Mapping[str, Tensor] | None = None) -> Estimate:

@@ -24,7 +24,7 @@ from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
 from torchsar.multichannel.velocity.aperture import Dwell
-from torchsar.multichannel.velocity.assess import Ambiguity, outcome_of_point
+from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.interferometry import interfered
 from torchsar.multichannel.velocity.model import point_phasor
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
@@ -311,8 +311,8 @@ class SignalIntensityRatio(Stage):
         tone, aperture = interfered(line, radar, motion, Dwell(dwell_s))
         apart = (motion.u_r_m_s - tone.motion.u_r_m_s).abs()
         reasons = [*reasons, (Outcome.MISFIT, ~_is_point(line, radar, motion))]
-        ambiguity = Ambiguity(lambda there: torch.full_like(apart > 0, not self.bounded), assumed=True)
-        outcome, info = outcome_of_point(line, radar, tone, aperture, reasons, ambiguity)
+        within = torch.full_like(apart > 0, not self.bounded)
+        outcome, info = outcome_of_point(line, radar, tone, aperture, reasons, lambda _: within, assumed=True)
         return torch.where(apart > _UNLIKELY * std, apart, std), outcome, info
 
     def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
