@@ -30,6 +30,12 @@ _ROUNDS = 2  # refinements of the residual covariance
 # Least share of the energy of a further point in what is left: clutter that fills 800 Doppler cells
 # gives 0.01 to its strongest tone; a point just detected in noise gives 0.03.
 _POINT_SHARE = 0.02
+# Share from which it is a point rather than clutter, and Doppler cells within which it then bends
+# the fit unless it is separated, by choice.
+_CLEAR_SHARE, _OVERLAP = 0.05, 8.0
+# Least energy of such a point over that of the first: the model of the echo of a wide chirp leaves
+# 0.001 of the energy of the point itself.
+_LEAST_HIDDEN = 0.002
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _PASSES = 2  # of their fit: the second has the expected amplitudes at the positions found
 _OTHERS = 3  # points fitted besides the strongest, by choice: each takes a search of its own
@@ -88,12 +94,12 @@ def moving_point_velocity(
         and everywhere if `whitening` is given). Where the point is lit in a part of the aperture
         only, as in a range line that it crosses, this part is used, see `seen_aperture`.
 
-        Outcomes: those of `outcome_of_point`; `OUTSIDE_SEARCH`; and `SINGULAR` where the standard
-        deviation of u_r exceeds the half width of the search, as with a single channel. A further
-        point whose chirp is too similar to be separated is not noticed. `AMBIGUOUS` are speeds
-        where another one within the search that differs by lambda PRF explains the data as well.
-        The cubic phase, which separates them, is small for short wavelengths and dwells; a search
-        of half that width then gives what is known a priori.
+        Outcomes: those of `outcome_of_point`; `OUTSIDE_SEARCH`; `SINGULAR` where the standard
+        deviation of u_r exceeds the half width of the search, as with a single channel; and
+        `PARTS_DISAGREE` where a further point of nearly the same Doppler frequency cannot be
+        separated. `AMBIGUOUS` are speeds where another one within the search that differs by lambda
+        PRF explains the data as well. The cubic phase, which separates them, is small for short
+        wavelengths and dwells; a search of half that width then gives what is known a priori.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -110,12 +116,12 @@ def moving_point_velocity(
     if whitening is not None:
         job, found = job.as_seen(job.found(whitening), whitening)
         coloured = torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device)
-        return job.estimate(found, coloured, assess, whitening)
+        return job.estimate(found, coloured, torch.zeros_like(coloured), assess, whitening)
     seen, plain = job.as_seen(job.found(None), None)
-    white, plain = seen.separated(plain, aperture)
+    white, plain, hidden = seen.separated(plain, aperture)
     plain = white.refined(plain)
     if not bool(plain.coloured.any()):
-        return white.estimate(plain.found, plain.coloured, assess)
+        return white.estimate(plain.found, plain.coloured, hidden, assess)
     # what the fit in white noise shows of the aperture and of other points may be clutter
     clutter = sample_whitening(job.data, radar)
     job, found = job.as_seen(job.found(clutter), clutter)
@@ -124,6 +130,7 @@ def moving_point_velocity(
     return white.or_other(job, first).estimate(
         _chosen_fit(plain.found, other.found, first),
         torch.where(first, plain.coloured, other.coloured),
+        hidden & (first | job._overlap(plain.found.motion, other.found.motion)),
         assess,
     )
 
@@ -184,16 +191,18 @@ class _Job:
         )
         return replace(self, data=data, aperture=SeenAperture(expected, torch.where(first[..., None], mine, others)))
 
-    def separated(self, found: Found, aperture: Aperture) -> tuple[_Job, Found]:
+    def separated(self, found: Found, aperture: Aperture) -> tuple[_Job, Found, Tensor]:
         """Fit up to three further points together with the first, where these leave white noise.
 
         Their echo is then removed from the data. A point of the same Doppler frequency is otherwise
-        taken for clutter, whose covariance over several Doppler bins does not describe it.
+        taken for clutter, whose covariance over several Doppler bins does not describe it. Returns
+        also where there is such a point that cannot be separated.
         """
         job, whole = self, replace(self, aperture=aperture)
         tried = sample_whitening(self.left(found), self.radar).coloured
+        hidden = torch.zeros_like(tried)
         if not bool(tried.any()):
-            return job, found
+            return job, found, hidden
         # with a slant-range speed that is wrong by lambda PRF, one point leaves others over
         found = _chosen_fit(self.resolved(found, None), found, tried)
         tried = tried & sample_whitening(self.left(found), self.radar).coloured
@@ -204,13 +213,21 @@ class _Job:
             tried = tried & (share > _POINT_SHARE)
             if not bool(tried.any()):
                 break
+            clear = (share > _CLEAR_SHARE) & (further.energy > _LEAST_HIDDEN * found.energy)
+            hidden = hidden | (tried & clear & self._overlap(found.motion, further.motion))
             points = joined(points, further.motion)
             for _ in range(_PASSES):
                 fit = fitted_together(self.data, self.radar, points, aperture, self.unknowns)
                 points, left = fit.motion, fit.left
             done = tried & ~sample_whitening(left, self.radar).coloured
             found, job, tried = _chosen_fit(fit.found, found, done), job.without(fit.others, done), tried & ~done
-        return job, found
+            hidden = hidden & ~done
+        return job, found, hidden
+
+    def _overlap(self, motion: PointMotion, other: PointMotion) -> Tensor:
+        """Whether the Doppler frequencies of two points differ by few Doppler cells."""
+        doppler_hz = [(m.u_r_m_s + m.along_m_s * m.y0_m / m.range_m) / self.radar.wavelength_m for m in (motion, other)]
+        return (doppler_hz[0] - doppler_hz[1]).abs() < _OVERLAP / self.coarse.duration_s
 
     def without(self, echo: Tensor, where: Tensor) -> _Job:
         """Remove the echo of other points in some trials, which then use the whole aperture."""
@@ -283,8 +300,10 @@ class _Job:
             inside = inside & ((motion.u_a_m_s - self.u_a_m_s).abs() <= reach)
         return inside
 
-    def estimate(self, found: Found, coloured: Tensor, assess: bool, whitening: Whitening | None = None) -> Estimate:
-        """Form the estimate, and assess it."""
+    def estimate(
+        self, found: Found, coloured: Tensor, hidden: Tensor, assess: bool, whitening: Whitening | None = None
+    ) -> Estimate:
+        """Form the estimate, and assess it; `hidden` tells where another point bends it."""
         found = self.resolved(found, whitening)
         if not assess:
             return estimate_of(found, None, {"coloured": coloured})
@@ -293,6 +312,7 @@ class _Job:
         reasons = [
             (Outcome.OUTSIDE_SEARCH, ~self.inside(found.motion)),
             (Outcome.SINGULAR, ~(found.covariance[..., 0, 0].sqrt() <= half)),
+            (Outcome.PARTS_DISAGREE, hidden),
         ]
         fit = self.data, self.radar, found, self.aperture, reasons
         outcome, info = outcome_of_point(*fit, self.inside, whitening=whitening)

@@ -26,7 +26,6 @@ from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offset
 from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.interferometry import interfered
-from torchsar.multichannel.velocity.model import point_phasor
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
 
@@ -44,9 +43,6 @@ _REST = 8e-4
 # Predicted deviations by which the interferometric speed of the strongest point may differ by
 # chance, by convention.
 _UNLIKELY = 2.0
-# Least share of the energy of a deramped line in its strongest tone: clutter that fills 800 Doppler
-# cells has 0.01; a target of ten equal points has 0.1.
-_POINT_SHARE = 0.05
 _GROUPS = 16  # of the jackknife: 8 and 32 groups give the same standard deviation within 6 %
 
 
@@ -263,9 +259,8 @@ class SignalIntensityRatio(Stage):
             then holds `pulse_rates`, the number of PRFs to add to the Doppler (-1, 0 or 1), (...,).
 
             Outcomes: those of `outcome_of_point` for the interferometric speed; `NOISE` where the
-            quality is below `least_quality`; `OUTSIDE_SEARCH` where the maximum lies at an end of
-            the interval; and `MISFIT` where no tone holds 5 % of the energy of the strongest line,
-            as in clutter.
+            quality is below `least_quality`; and `OUTSIDE_SEARCH` where the maximum lies at an end
+            of the interval.
 
         Raises:
             ValueError: If the reconstruction is singular.
@@ -310,7 +305,6 @@ class SignalIntensityRatio(Stage):
         dwell_s = self.bandwidth_hz * radar.wavelength_m * radar.reference_range_m / radar.speed_m_s**2
         tone, aperture = interfered(line, radar, motion, Dwell(dwell_s))
         apart = (motion.u_r_m_s - tone.motion.u_r_m_s).abs()
-        reasons = [*reasons, (Outcome.MISFIT, ~_is_point(line, radar, motion))]
         within = torch.full_like(apart > 0, not self.bounded)
         outcome, info = outcome_of_point(line, radar, tone, aperture, reasons, lambda _: within, assumed=True)
         return torch.where(apart > _UNLIKELY * std, apart, std), outcome, info
@@ -318,14 +312,6 @@ class SignalIntensityRatio(Stage):
     def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
         """Return the motion with a candidate of u_r."""
         return PointMotion.of(self.radar, lines, u_r_m_s, u_a_m_s, y0_m, self.range_m)
-
-
-def _is_point(line: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
-    """Whether one tone of a deramped line has a share of the energy that clutter lacks, (...,)."""
-    time_s = radar.pulse_axis(line.shape[-1]).values(line.device)
-    still = line.to(torch.complex128) * point_phasor(radar, motion, time_s, torch.complex128).conj()
-    power = torch.fft.fft(still, norm="ortho").abs().square().sum(-2)
-    return power.amax(-1) > _POINT_SHARE * power.sum(-1)
 
 
 def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor, rest_m_s: float) -> Tensor:
