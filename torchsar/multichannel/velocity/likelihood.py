@@ -63,7 +63,10 @@ class PointFit:
 class Likelihood(Protocol):
     """Likelihood of the motion of one or several points."""
 
-    data: Tensor
+    @property
+    def data(self) -> Tensor:
+        """Channels, shape (..., channel, pulse), complex128."""
+        ...
 
     def fit(self, motion: PointMotion) -> PointFit:
         """Return the least-squares amplitudes for a motion, with derivatives by the unknowns."""
