@@ -118,7 +118,7 @@ class PointMotion:
         The function gets the value of this motion, followed by those of `others`.
         """
         values = [change(*(getattr(motion, name) for motion in (self, *others))) for name in _VALUES]
-        return PointMotion(*values, self.speed_m_s)
+        return PointMotion(*values, speed_m_s=self.speed_m_s)
 
     @property
     def along_m_s(self) -> Tensor:

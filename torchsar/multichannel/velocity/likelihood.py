@@ -266,13 +266,15 @@ def climbed(
     """
     channels, samples = problem.data.shape[-2:]
     total = problem.data.abs().square().sum((-2, -1))
+    stuck = torch.zeros_like(fit.energy, dtype=torch.bool)  # no part of the step gained anything
     for _ in range(steps):
         step = solved(fit.normal, fit.gradient[..., None])[..., 0]
         noise = (total - fit.energy).clamp_min(0) / (channels * samples)
-        pending = (step * fit.gradient).sum(-1) > _LEAST_GAIN * noise + _LEAST_SHARE * fit.energy
+        pending = ~stuck & ((step * fit.gradient).sum(-1) > _LEAST_GAIN * noise + _LEAST_SHARE * fit.energy)
         if not bool(pending.any()):
             break
-        motion, fit = _stepped(problem, motion, fit, unknowns, step, pending)
+        motion, fit, failed = _stepped(problem, motion, fit, unknowns, step, pending)
+        stuck = stuck | failed
     return motion, fit
 
 
@@ -283,8 +285,11 @@ def _stepped(
     unknowns: tuple[str, ...],
     step: Tensor,
     pending: Tensor,
-) -> tuple[PointMotion, PointFit]:
-    """Take a step in the pending trials, halved or omitted where it explains less energy."""
+) -> tuple[PointMotion, PointFit, Tensor]:
+    """Take a step in the pending trials, halved or omitted where it explains less energy.
+
+    Returns also in which of these trials it was omitted.
+    """
     begin, before = motion, fit.energy
     step = _bounded(step.reshape(*motion.u_r_m_s.shape, len(unknowns)), motion, unknowns)
     for halvings in range(_HALVINGS):
@@ -301,7 +306,7 @@ def _stepped(
         pending = pending & ~better
         if not bool(pending.any()):
             break
-    return motion, fit
+    return motion, fit, pending
 
 
 def _bounded(step: Tensor, motion: PointMotion, unknowns: tuple[str, ...]) -> Tensor:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, cholesky_factor, linear_solve, matrix_inverse, unit_phasor
+from torchsar.core import Estimate, Outcome, cholesky_factor, linear_solve, matrix_inverse, unit_phasor
 from torchsar.multichannel.motion import PointMotion
 from torchsar.radar import BistaticRadar, receive_range
 
@@ -112,7 +112,9 @@ class Found:
         """Return the fit with a function applied to all tensors, followed by those of `others`."""
         motion = self.motion.each(change, *(fit.motion for fit in others))
         names = ("amplitude", "noise_power", "covariance", "energy")
-        return Found(motion, *(change(*(getattr(fit, n) for fit in (self, *others))) for n in names), self.unknowns)
+        return Found(
+            motion, *(change(*(getattr(fit, n) for fit in (self, *others))) for n in names), unknowns=self.unknowns
+        )
 
     @property
     def snr_db(self) -> Tensor:
@@ -309,7 +311,9 @@ def estimate_of(found: Found, outcome: Tensor | None = None, info: Mapping[str, 
     std_all = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     std = {name: std_all[..., i] for i, name in enumerate(found.unknowns)}
     info = {"snr_db": snr_db, "noise_power": found.noise_power, **(info or {})}
-    return Estimate(value, std, None if outcome is None else quality_of(snr_db), outcome, info)
+    if outcome is None:
+        return Estimate(value, std, outcome=Outcome.NOT_ASSESSED.like(snr_db), info=info)
+    return Estimate(value, std, quality_of(snr_db), outcome, info)
 
 
 def quality_of(snr_db: Tensor) -> Tensor:
