@@ -107,7 +107,7 @@ def assessed_balance(found: BalanceFit, lead: Tensor | None) -> tuple[tuple[Tens
     # balanced channels have equal power, but with a wrong prior other gains are more likely
     looks = lines.shape[-2] * lines.shape[-1] * HANN_LOOKS
     level = lines.abs().square().mean((-2, -1))
-    uneven = torch.log((level / level[..., reference, None].clamp_min(_TINY)).clamp_min(1e-3)).abs() / 2
+    uneven = torch.log((level / level[..., reference, None].clamp_min(1e-300)).clamp_min(1e-3)).abs() / 2
     chance = model.chance(found.snr_db, reference, looks) / 2
     log_std = torch.where(uneven > _UNLIKELY * chance, torch.hypot(log_std, uneven), log_std)
     largest = torch.maximum(phase_std, log_std).amax(-1)
