@@ -14,7 +14,7 @@ from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rm
 from tests.direct.bistatic import Survey
 from tests.multichannel import ocean
 from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar
-from torchsar.core import Draws, Estimate, Outcome, Signal
+from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_bistatic
 from torchsar.multichannel import (
     AlongTrackAutofocus,
@@ -240,7 +240,7 @@ def nearest(found: Tensor, truth: Tensor) -> Tensor:
 def strongest(found: Estimate) -> Estimate:
     """The estimate of the strongest target alone."""
     value, std = ({name: x[:, 0] for name, x in table.items()} for table in (found.value, found.std))
-    return Estimate(value, std, found.quality[:, 0], Outcome.of(found.ok[:, 0], Outcome.NOISE))
+    return Estimate(value, std, found.quality[:, 0], found.outcome[:, 0])
 
 
 def worlds(given: tuple[str, ...] = (), known_u_a: bool = False) -> list[World]:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar
-from torchsar.core import Axis, Draws, Signal
+from torchsar.core import Axis, Draws, Outcome, Signal
 from torchsar.echo import sea_echo
 from torchsar.metrics import bistatic_bounds, radial_velocity_bound_m_s
 from torchsar.multichannel import (
@@ -214,6 +214,7 @@ def test_a_second_point_of_the_same_doppler_is_no_clutter():
     found = MovingPointVelocity(RADAR, GATE, search=NEAR)(Signal(10 * clean + noise(6, 3), RADAR.axes(N)))
     ok = found.ok
     assert ok.tolist() == [True, True, False, True, True, True] and not bool(found.info["coloured"][ok].any())
+    assert found.outcome[2] == Outcome.PARTS_DISAGREE
     for key, true in (("u_r_m_s", 5.0), ("u_a_m_s", 0.0), ("y0_m", 10.0)):
         assert float(((found[key] - true) / found.std[key])[ok].abs().max()) < 3.5, key
         assert bool((found.std[key][ok] < 2.5 * bound(20.0, u_r=5.0, y0=10.0)[key]).all()), key

@@ -49,7 +49,7 @@ class FoundMotion:
 
     Args:
         value: Estimates by name, (row,) each; values that the chain was given are left out.
-        std: Predicted standard deviations of the estimates, by the same names.
+        std: Predicted standard deviations of the estimates, by the same names, where there are any.
         outcome: Codes of the estimates by the same names, (row,) each; see `torchsar.Outcome`.
     """
 
@@ -67,10 +67,10 @@ class FoundMotion:
         Returns:
             The last estimate of each unknown.
         """
-        last = {key: e for e in estimates.values() for key in UNKNOWNS if key in e.std}
+        last = {key: e for e in estimates.values() for key in UNKNOWNS if key in (e.std or e.value)}
         return FoundMotion(
             {key: e.value[key] for key, e in last.items()},
-            {key: e.std[key] for key, e in last.items()},
+            {key: e.std[key] for key, e in last.items() if key in e.std},
             {key: e.outcome for key, e in last.items()},
         )
 

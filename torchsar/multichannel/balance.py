@@ -32,28 +32,14 @@ from torchsar.core import (
     unit_level,
     unit_phasor,
 )
+from torchsar.multichannel.balance_assess import BalanceFit, assessed_balance
 from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.clutter_deviation import deviations
-from torchsar.multichannel.clutter_fit import HANN_LOOKS, ClutterModel, hann
+from torchsar.multichannel.clutter_fit import ClutterModel, hann
 from torchsar.multichannel.response import ElementPattern, Prior
 from torchsar.radar import BistaticRadar
 
 # SNR assumed while delays are estimated, found by trial: from 20 dB on they hardly depend on it.
 _COARSE_DB = 20.0
-
-# Difference of the powers of balanced channels over that by chance from which the prior is taken to
-# be wrong, by choice.
-_UNLIKELY = 4.0
-# Ratio of deviations by the scatter of Doppler bins and of range cells from which the prior is
-# taken to be wrong, and least number of parts of the swath that hold the power, both by choice. The
-# ratio is at most 1.8 where the prior suits; a point that holds 58 % of the power leaves 3 parts.
-_MISFIT, _LEAST_PARTS = 2.5, 3.0
-# Least logarithm of the likelihood ratio to clutter displaced by whole bands, by choice.
-_LEAST_LEAD = 100.0
-# Convention: a linear phase error of 0.1 rad, three times as much, already makes false targets of
-# about -20 dB when three bands are reconstructed at a PRF of 180 Hz. So do amplitudes. Phases that
-# delays turn over the range band weigh less, since their mean is zero.
-_LARGEST_STD_RAD, _LARGEST_ACROSS_RAD = 0.033, 0.1
 
 
 def correct_balance(
@@ -121,8 +107,17 @@ def estimate_balance(
     bands: int | None = None,
     delays: bool = True,
     blocks: int = 16,
+    *,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate phase, gain and delay of each channel from stationary clutter.
+
+    >>> import torch
+    >>> from torchsar.multichannel import estimate_balance
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> estimate_balance(torch.zeros(3, 32, 64, dtype=torch.complex64), radar).failed
+    tensor(True)
 
     The noise level is estimated as well. Not differentiable. Where the clutter fills fewer bands
     than there are channels, prefer the prior `FlatBand(bands * PRF)`: it suits any scene, since it
@@ -151,20 +146,21 @@ def estimate_balance(
         blocks: Number of parts into which the range band is divided; within each part a delay is
             approximated by a constant phase. A delay of two samples changes the phase across one of
             16 blocks by a tenth of a cycle.
+        assess: Whether standard deviations, quality and outcome are assessed.
 
     Returns:
         `phase_rad`, `gain_db` and `delay_s`, float64 (..., channel), relative to the channel whose
-        along-track position is nearest to zero. Standard deviations of phases and gains follow from
-        the scatter of the likelihood's gradient over range cells, those of delays from its scatter
-        over range frequencies; those of gains contain the difference that remains between the
-        powers of the balanced channels, as with a wrong prior.
-        `info` holds `snr_db` (...,), the ratio of the highest power over Doppler to that of the
-        noise. `ok` is False, and the values are zero, where a channel has no power, the
-        standard deviation of a phase exceeds 0.033 rad or that of a gain 0.29 dB, or that of a
-        delay turns the phase by more than 0.1 rad rms over the range band. It is also False where
-        parts of the Doppler band contradict each other, as with a wrong prior, where fewer than
-        three of 32 parts of the swath hold the power, since one moving point could be most of it,
-        and where the clutter lies in one of several bands, but could lie in another one as well.
+        along-track position is nearest to zero, and zero where a channel has no power. `info` holds
+        `snr_db` (...,), the ratio of the highest power over Doppler to that of the noise. Standard
+        deviations follow from the scatter of the gradient of the likelihood, see `balance_assess`.
+
+        Outcomes: `EMPTY` where a channel has no power; `SINGULAR` where a phase is not determined;
+        `NOISE` where its standard deviation exceeds 0.25 rad; `TOO_FEW` where fewer than three of
+        32 parts of the swath hold the power, since one moving point could be most of it;
+        `AMBIGUOUS` where the clutter could as well lie in another Doppler band; `MISFIT` where
+        parts of the Doppler band contradict each other, as with a wrong prior; and `INEXACT` where
+        the standard deviation of a phase exceeds 0.033 rad, that of a gain 0.29 dB, or that of a
+        delay turns the phase by more than 0.1 rad rms over the range band.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -194,29 +190,37 @@ def estimate_balance(
             products = _products(_turned(lines, turn, position), blocks, no_power)
             turn = turn + model.fit(products, _COARSE_DB, middle).turn
             products = _products(_turned(lines, turn, position), blocks, no_power)
-        mean, looks = products.mean(-3), data.shape[-2] * frequency.numel() * HANN_LOOKS
+        mean = products.mean(-3)
         snr_db = model.snr_db(mean)
         weights = model.weights(mean, snr_db)[0]
-        lead = torch.full_like(snr_db, math.inf)
+        first = model, snr_db
         if bands < radar.channels:
-            if bands > 1:
-                lead = model.lead(mean, weights, snr_db) * looks
             model = model.adapted(mean, weights, snr_db)
             snr_db = model.snr_db(mean)
         fit = model.fit(products, snr_db, middle)
-        lines, turn = lines * fit.weights[..., None, None], turn + fit.turn
+        turn = turn + fit.turn
+        delay = turn / (2 * math.pi * highest)
+        own = fit.weights[..., reference, None]
+        value = {
+            "phase_rad": torch.angle(fit.weights.conj() * own),
+            "gain_db": 20 * torch.log10(own.abs() / fit.weights.abs()),
+            "delay_s": delay - delay[..., reference, None],
+        }
+        value = {name: torch.where(no_power[..., None], 0.0, v).nan_to_num(0.0, 0.0, 0.0) for name, v in value.items()}
+        if not assess:
+            return Estimate(value, info={"snr_db": snr_db}, outcome=Outcome.NOT_ASSESSED.like(snr_db))
+        lines = lines * fit.weights[..., None, None]
         if position is not None:
             lines = _turned(lines, turn, position)
-        delay = turn / (2 * math.pi * highest)
-        std = deviations(lines, model.noisy(snr_db), 10 ** (-snr_db / 10), fit, position, reference)
-        balanced = lines.abs().square().mean((-2, -1))
-        # balanced channels have equal power, but with a wrong prior other gains are more likely
-        uneven = torch.log((balanced / balanced[..., reference, None].clamp_min(1e-300)).clamp_min(1e-3)).abs() / 2
-        chance = model.chance(snr_db, reference, looks) / 2
-        log_std = torch.where(uneven > _UNLIKELY * chance, torch.hypot(std.log_gain, uneven), std.log_gain)
-        delay_std = std.turn / (2 * math.pi * highest)
-        clear = ~no_power & (std.misfit < _MISFIT) & (std.parts > _LEAST_PARTS) & (lead > _LEAST_LEAD)
-        return _estimate_of(fit.weights, delay, (log_std, std.phase, delay_std), snr_db, clear, reference, radar)
+        found = BalanceFit(lines, model, fit, snr_db, position, reference, no_power)
+        lead = first[0].lead(mean, weights, first[1]) if 1 < bands < radar.channels else None
+        (phase_std, log_std, turn_std), quality, outcome = assessed_balance(found, lead)
+        std = {
+            "phase_rad": phase_std,
+            "gain_db": log_std * (20 / math.log(10)),
+            "delay_s": turn_std / (2 * math.pi * highest),
+        }
+        return Estimate(value, std, quality, outcome, {"snr_db": snr_db})
 
 
 def _check_data(data: Tensor, radar: BistaticRadar, blocks: int, bands: int | None) -> None:
@@ -288,34 +292,6 @@ def _slope(weights: Tensor, position: Tensor, reference: int) -> Tensor:
     return coarse + (counts * angle * f).sum(-2) / (counts * f.square()).sum(-2)
 
 
-def _estimate_of(
-    weights: Tensor,
-    delay: Tensor,
-    stds: tuple[Tensor, Tensor, Tensor],
-    snr_db: Tensor,
-    clear: Tensor,
-    reference: int,
-    radar: BistaticRadar,
-) -> Estimate:
-    """Form the estimate relative to the reference channel and judge it."""
-    log_std, phase_std, delay_std = stds
-    value = {
-        "phase_rad": torch.angle(weights.conj() * weights[..., reference, None]),
-        "gain_db": 20 * torch.log10(weights[..., reference, None].abs() / weights.abs()),
-        "delay_s": delay - delay[..., reference, None],
-    }
-    std = {"phase_rad": phase_std, "gain_db": log_std * (20 / math.log(10)), "delay_s": delay_std}
-    # rms phase over the range band by a delay
-    by_delay = math.pi * radar.pulse.bandwidth_hz / math.sqrt(3) * delay_std.amax(-1)
-    worst = torch.maximum(phase_std, log_std).amax(-1) / _LARGEST_STD_RAD
-    worst = torch.maximum(worst, by_delay / _LARGEST_ACROSS_RAD)
-    ok = torch.stack([v.isfinite().all(-1) for v in value.values()]).all(0) & clear & (worst < 1)
-    value = {name: torch.where(ok[..., None], v, 0.0) for name, v in value.items()}
-    return Estimate(
-        value, std, torch.where(ok, 1 - worst, 0.0).clamp(0, 1), Outcome.of(ok, Outcome.NOISE), info={"snr_db": snr_db}
-    )
-
-
 class EstimateBalance(Stage):
     """Stage that estimates phase, gain and delay of each channel; see `estimate_balance`.
 
@@ -329,6 +305,7 @@ class EstimateBalance(Stage):
         delays: False to assume zero delays.
         blocks: Number of parts into which the range band is divided; within each part a delay is
             approximated by a constant phase.
+        assess: Whether standard deviations, quality and outcome are assessed.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -342,9 +319,12 @@ class EstimateBalance(Stage):
         bands: int | None = None,
         delays: bool = True,
         blocks: int = 16,
+        *,
+        assess: bool = True,
     ) -> None:
         super().__init__()
         self.radar, self.prior, self.bands, self.delays, self.blocks = radar, prior, bands, delays, blocks
+        self.assess = assess
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate phase, gain and delay of each channel from stationary clutter.
@@ -356,7 +336,9 @@ class EstimateBalance(Stage):
         Returns:
             `phase_rad`, `gain_db` and `delay_s` of shape (..., channel), see `estimate_balance`.
         """
-        return estimate_balance(signal.data, self.radar, self.prior, self.bands, self.delays, self.blocks)
+        return estimate_balance(
+            signal.data, self.radar, self.prior, self.bands, self.delays, self.blocks, assess=self.assess
+        )
 
 
 class CorrectBalance(Stage):

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_phasor, unit_level
+from torchsar.core import Outcome, linear_phasor, unit_level, worst
 from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
@@ -68,9 +68,10 @@ class Body:
         picture: Image of the body.
         level: Mean intensity of the pixels of the body (`picture.bright`) divided by that of the
             residual sea and noise in `picture`.
-        ok: False if `level` is below 40 (16 dB), the standard deviation of u_r is 0.3 m/s or more
-            (as where the echoes of two bodies overlap), u_r lies at an end of its search interval,
-            or the motion found during the search left the range lines or the pulses of the data.
+        outcome: Code of an `Outcome`: `NOISE` if `level` is below 40 (16 dB); `OUTSIDE_SEARCH` if
+            u_r lies at an end of its search interval, or the motion found during the search left
+            the range lines or the pulses of the data; `INEXACT` if the standard deviation of u_r is
+            0.3 m/s or more, as where the echoes of two bodies overlap.
     """
 
     motion: PointMotion
@@ -78,7 +79,12 @@ class Body:
     chip: Chip
     picture: Picture
     level: Tensor
-    ok: Tensor
+    outcome: Tensor
+
+    @property
+    def ok(self) -> Tensor:
+        """True if the motion is reliable, bool, shape ()."""
+        return self.outcome < Outcome.INEXACT
 
 
 def find_body(
@@ -110,8 +116,7 @@ def find_body(
         rounds: Number of rounds.
 
     Returns:
-        The body. Its `ok` is False where it is too weak or was not found within the search, see
-        `Body`.
+        The body, with its outcome.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -160,8 +165,13 @@ def _body_of(chip: Chip, std: Tensor, half_m_s: float, lost: bool = False) -> Bo
     picture = chip.picture()
     bright = picture.bright
     level = (picture.level * bright).sum() / bright.sum().clamp_min(1)
-    ok = (level > _CREDIBLE) & (chip.motion.u_r_m_s.abs() < _INSIDE * half_m_s) & (std < _USABLE_M_S)
-    return Body(chip.motion, std, chip, picture, level, ok & (not lost))
+    inside = (chip.motion.u_r_m_s.abs() < _INSIDE * half_m_s) & (not lost)
+    outcome = worst(
+        (Outcome.NOISE, ~(level > _CREDIBLE)),
+        (Outcome.OUTSIDE_SEARCH, ~inside),
+        (Outcome.INEXACT, ~(std < _USABLE_M_S)),
+    )
+    return Body(chip.motion, std, chip, picture, level, outcome)
 
 
 def _closing_speed(chip: Chip, image_s: float, image_m: float, half_m_s: float) -> tuple[Tensor, Tensor]:

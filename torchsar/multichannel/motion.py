@@ -112,11 +112,13 @@ class PointMotion:
             y0_m=(motion.along_m_s * turned - motion.u_r_m_s * least) / speed,
         )
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> PointMotion:
-        """Return the motion with a function applied to u_r_m_s, u_a_m_s, y0_m and range_m."""
-        return PointMotion(
-            change(self.u_r_m_s), change(self.u_a_m_s), change(self.y0_m), change(self.range_m), self.speed_m_s
-        )
+    def each(self, change: Callable[..., Tensor], *others: PointMotion) -> PointMotion:
+        """Return the motion with a function applied to u_r_m_s, u_a_m_s, y0_m and range_m.
+
+        The function gets the value of this motion, followed by those of `others`.
+        """
+        values = [change(*(getattr(motion, name) for motion in (self, *others))) for name in _VALUES]
+        return PointMotion(*values, speed_m_s=self.speed_m_s)
 
     @property
     def along_m_s(self) -> Tensor:

@@ -336,13 +336,14 @@ class ImageMovers(Stage):
             name: row([getattr(body.motion, name) for body in bodies])
             for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
         }
-        ok = row([body.ok.to(torch.float64) for body in bodies]) > 0
+        missing = row([torch.ones_like(body.level) for body in bodies]) == 0
+        outcome = row([body.outcome for body in bodies]).long().masked_fill(missing, Outcome.NOISE)
         level = row([body.level for body in bodies])
         return Estimate(
             value,
             {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])},
             level / (_HALF_QUALITY_LEVEL + level),
-            Outcome.of(ok, Outcome.NOISE),
+            outcome,
             info={"level": level},
         )
 
@@ -360,6 +361,8 @@ class MoversImage(Stage):
         extraction: Extent of a target in the data.
         detector: Settings of the detection.
         u_a_half_m_s: Half width of the search in the along-track speed u_a in m/s.
+        assess: Whether the outcomes of the targets are reported. A target is removed and focused
+            again only if its motion is reliable, with either value.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -373,10 +376,13 @@ class MoversImage(Stage):
         extraction: Extraction,
         detector: Detector,
         u_a_half_m_s: float = 20.0,
+        *,
+        assess: bool = True,
     ) -> None:
         super().__init__()
         self.flow = ImageMovers(radar, extraction, detector, rebuild, removal, u_a_half_m_s=u_a_half_m_s)
         self.neutral = {**dict.fromkeys(self.provides, 0.0), "range_m": radar.reference_range_m}
+        self.assess = assess
 
     def forward(
         self,
@@ -397,9 +403,9 @@ class MoversImage(Stage):
         Returns:
             The images with every moving target at its true position, (..., azimuth, range), and the
             estimate of the motions with values of shape (..., target), padded with zeros to
-            `Detector.most` targets. The `info` of the estimate holds `level`, the ratio of the mean
-            intensity of each target to the residual sea and noise (0 where there is no target), and
-            the images `rest` and `conventional`, see `SceneImage`.
+            `Detector.most` targets, whose outcome is `NOISE`. The `info` of the estimate holds
+            `level`, the ratio of the mean intensity of each target to the residual sea and noise (0
+            where there is no target), and the images `rest` and `conventional`, see `SceneImage`.
 
         Raises:
             ValueError: If some of the four values are missing, or as in `ImageMovers`.
@@ -427,7 +433,10 @@ class MoversImage(Stage):
             info = {**one.estimate.info, "rest": one.rest.data, "conventional": one.conventional.data}
             tables = (one.estimate.value, one.estimate.std, info)
             value, std, info = ({name: x[None] for name, x in table.items()} for table in tables)
-            parts.append(Estimate(value, std, one.estimate.quality[None], one.estimate.outcome[None], info=info))
+            outcome = one.estimate.outcome[None]
+            if not self.assess:
+                outcome = torch.where(info["level"] > 0, Outcome.NOT_ASSESSED, outcome)
+            parts.append(Estimate(value, std, one.estimate.quality[None], outcome, info))
         fused = stacked([one.fused for one in made])
         image = Signal(fused if signal.trials else fused[0], made[0].fused.axes)
         return image, Estimate.joined(parts, signal.trials)

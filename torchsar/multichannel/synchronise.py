@@ -17,7 +17,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, linear_phasor, unit_phasor
+from torchsar.core import Estimate, Outcome, Signal, Stage, linear_phasor, unit_phasor, worst
 from torchsar.radar import BistaticRadar
 
 # The maximum of samples interpolated four times lies within an eighth of a sample of the peak.
@@ -27,7 +27,7 @@ _NEWTON = 4
 _LEAST_SNR = 10.0  # 10 dB after compression: below, the strongest sample is often one of noise
 
 
-def estimate_synchronisation(direct: Tensor, radar: BistaticRadar) -> Estimate:
+def estimate_synchronisation(direct: Tensor, radar: BistaticRadar, *, assess: bool = True) -> Estimate:
     """Estimate the clock phase and delay of each pulse from the direct path.
 
     The estimator is that of maximum likelihood. The direct path carries the factor exp(j phase) and
@@ -38,12 +38,13 @@ def estimate_synchronisation(direct: Tensor, radar: BistaticRadar) -> Estimate:
             sample), complex. Its spectrum is flat over the bandwidth of the pulse. Its peak lies at
             sample n // 2 of n when the clocks agree.
         radar: Radar parameters.
+        assess: Whether quality and outcome are assessed.
 
     Returns:
         `phase_rad` in -pi..pi and `delay_s` in seconds, shape (..., pulse) each, with their
         standard deviations. `info` holds `snr_db` (..., pulse), the SNR of the compressed peak
-        within the band. `ok` is False in a trial where the SNR of any pulse is below 10 dB; the
-        phase and the delay of such a pulse are zero.
+        within the band. Where it is below 10 dB, phase and delay of the pulse are zero. Outcomes:
+        `NOISE` where this is so in all pulses of a trial, `INEXACT` where it is so in some.
 
     Raises:
         ValueError: If the direct path is not complex, or has fewer than 8 samples.
@@ -61,14 +62,12 @@ def estimate_synchronisation(direct: Tensor, radar: BistaticRadar) -> Estimate:
     phase_std = (2 * snr).clamp_min(0.05).rsqrt()
     std = {"phase_rad": phase_std, "delay_s": phase_std / (2 * math.pi * frequency.square().mean().sqrt())}
     value = {"phase_rad": torch.where(detected, torch.angle(peak), 0.0), "delay_s": torch.where(detected, delay, 0.0)}
+    info = {"snr_db": 10 * torch.log10(snr.clamp_min(1e-6))}
+    if not assess:
+        return Estimate(value, std, outcome=Outcome.NOT_ASSESSED.like(snr[..., 0]), info=info)
     quality = (1 - phase_std.square().mean(-1).sqrt()).clamp(0, 1)
-    return Estimate(
-        value,
-        std,
-        quality,
-        Outcome.of(detected.all(-1), Outcome.NOISE),
-        info={"snr_db": 10 * torch.log10(snr.clamp_min(1e-6))},
-    )
+    outcome = worst((Outcome.INEXACT, ~detected.all(-1)), (Outcome.NOISE, ~detected.any(-1)))
+    return Estimate(value, std, quality, outcome, info)
 
 
 def _direct_band(direct: Tensor, radar: BistaticRadar) -> tuple[Tensor, Tensor]:
@@ -164,6 +163,7 @@ class EstimateSynchronisation(Stage):
 
     Args:
         radar: Radar parameters.
+        assess: Whether quality and outcome are assessed.
     """
 
     works_on = ("channel", "pulse")
@@ -172,9 +172,9 @@ class EstimateSynchronisation(Stage):
     neutral = {"phase_rad": 0.0, "delay_s": 0.0}
     takes_empty = False
 
-    def __init__(self, radar: BistaticRadar) -> None:
+    def __init__(self, radar: BistaticRadar, *, assess: bool = True) -> None:
         super().__init__()
-        self.radar = radar
+        self.radar, self.assess = radar, assess
 
     def forward(self, signal: Signal, direct_path: Tensor) -> Estimate:
         """Estimate the clock phase and delay of each pulse from the direct path.
@@ -195,7 +195,7 @@ class EstimateSynchronisation(Stage):
                 f"direct_path (..., pulse, sample) needs a line for each of the {signal.axis('pulse').n} pulses, got "
                 f"shape {tuple(direct_path.shape)}"
             )
-        return estimate_synchronisation(direct_path, self.radar)
+        return estimate_synchronisation(direct_path, self.radar, assess=self.assess)
 
 
 class RemoveSynchronisation(Stage):

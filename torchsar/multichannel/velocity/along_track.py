@@ -13,7 +13,6 @@ Reference:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,10 +21,11 @@ from torchsar.core import Estimate, Outcome, unit_phasor
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.velocity.aperture import Aperture
-from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
-from torchsar.multichannel.velocity.interferometry import DETECTED_DB, tone_frequency
-from torchsar.multichannel.velocity.model import energy_ratio_db, noise_beside, point_phasor
+from torchsar.multichannel.velocity.aperture import Aperture, Kept
+from torchsar.multichannel.velocity.assess import outcome_of_point
+from torchsar.multichannel.velocity.illumination import seen_aperture
+from torchsar.multichannel.velocity.interferometry import tone_frequency
+from torchsar.multichannel.velocity.model import Found, noise_beside, point_phasor, quality_of
 from torchsar.radar import BistaticRadar
 
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
@@ -39,8 +39,18 @@ def along_track_velocity(
     half_m_s: float = 20.0,
     step_m_s: float = 0.5,
     fine: int = 3,
+    *,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the along-track speed u_a of a point of known slant-range speed and position.
+
+    >>> import torch
+    >>> from torchsar.multichannel import Dwell, PointMotion, along_track_velocity
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> data = torch.zeros(3, 90, dtype=torch.complex64)
+    >>> along_track_velocity(data, radar, PointMotion.of(radar, data.real), Dwell(0.5)).failed
+    tensor(True)
 
     A grid with the step `step_m_s` is followed by `fine` grids of five points, each with 2/5 of the
     previous step. In every grid, a parabola through the maximum refines the speed.
@@ -58,14 +68,14 @@ def along_track_velocity(
         half_m_s: Half width of the search in m/s.
         step_m_s: Step of the first grid in m/s.
         fine: Number of finer grids.
+        assess: Whether standard deviation and outcome are assessed.
 
     Returns:
-        `u_a_m_s` of shape (...,), positive in the flight direction of the receiver, with its
-        standard deviation, which follows from the curvature of the likelihood. `info` holds
-        `snr_db`, the SNR over all samples, and `at_the_end`, True where the maximum lies at an end
-        of the search. Where the point is lit in a part of the aperture only, this part is used, see
-        `seen_aperture`. `ok` is False where this SNR is below 19 dB, where `at_the_end` is True, or
-        where the illumination of the point is not understood, see `lit_as_expected`.
+        `u_a_m_s` of shape (...,), positive in the flight direction of the receiver. Where the point
+        is lit in a part of the aperture only, this part is used, see `seen_aperture`. The
+        assessment adds the standard deviation, which follows from the curvature of the likelihood,
+        and `snr_db`, the SNR over all samples, in `info`. Outcomes: those of `outcome_of_point`,
+        and `OUTSIDE_SEARCH` where the maximum lies at an end of the search.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -92,27 +102,19 @@ def along_track_velocity(
         top = _best(data, radar, start, aperture, centre, offsets)
     ended = top.edge
     # the ends of the aperture move with u_a from pulse to pulse: they are kept from here on
-    seen = _Kept(aperture.weight(radar, replace(start, u_a_m_s=top.u_a_m_s), time_s))
+    seen = Kept(aperture.weight(radar, replace(start, u_a_m_s=top.u_a_m_s), time_s))
     for _ in range(fine):
         step = 2 * step / 5
         offsets = step * torch.arange(-2, 3, dtype=torch.float64, device=data.device)
         top = _best(data, radar, start, seen, top.u_a_m_s, offsets)
     found = torch.where(top.energy > 0, top.u_a_m_s.clamp(centre - half_m_s, centre + half_m_s), centre)
-    return _estimate_at(data, radar, replace(start, u_a_m_s=found), seen, top.energy, top.curvature, ended)
+    if not assess:
+        return Estimate({"u_a_m_s": found})
+    return _assessed(data, radar, replace(start, u_a_m_s=found), seen, replace(top, edge=ended))
 
 
 @dataclass(frozen=True)
-class _Kept:
-    """Expected amplitude that is the same for all motions, float64 (..., pulse)."""
-
-    amplitude: Tensor
-
-    def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
-        """Return the expected amplitude, see `Aperture.weight`."""
-        return self.amplitude
-
-
-class _Top(NamedTuple):
+class _Top:
     """Maximum of tone energies over a grid: position, height, curvature, end of grid."""
 
     u_a_m_s: Tensor
@@ -159,32 +161,21 @@ def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture
     return spectrum.amax(-1) / weight.square().sum(-1).clamp_min(_TINY)
 
 
-def _estimate_at(
-    data: Tensor,
-    radar: BistaticRadar,
-    motion: PointMotion,
-    aperture: Aperture,
-    energy: Tensor,
-    curvature: Tensor,
-    ended: Tensor,
-) -> Estimate:
-    """Form the estimate at the maximum and judge it."""
+def _assessed(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture, top: _Top) -> Estimate:
+    """Add standard deviation and outcome to the maximum."""
     weight = aperture.weight(radar, motion, radar.pulse_axis(data.shape[-1]).values(data.device))[..., None, :]
-    illuminated = (weight != 0).expand(data.shape)
-    noise = ((data.abs().square() * illuminated).sum((-2, -1)) - energy).clamp_min(0) / illuminated.sum(
-        (-2, -1)
-    ).clamp_min(1)
-    snr = energy_ratio_db(energy, noise)
-    value = {"u_a_m_s": motion.u_a_m_s}
-    ok = (snr >= DETECTED_DB) & ~ended & lit_as_expected(data, radar, motion, aperture)
+    lit = (weight != 0).expand(data.shape)
+    noise = ((data.abs().square() * lit).sum((-2, -1)) - top.energy).clamp_min(0) / lit.sum((-2, -1)).clamp_min(1)
     beside = _noise_beside(data, radar, motion, weight).diagonal(dim1=-2, dim2=-1).mean(-1)
-    std = torch.where(energy > 0, torch.sqrt(beside / curvature.clamp_min(_TINY)), torch.inf)
+    variance = torch.where(top.energy > 0, beside / top.curvature.clamp_min(_TINY), torch.inf)
+    found = Found(motion, top.energy.sqrt(), noise, variance[..., None, None], top.energy, ("u_a_m_s",))
+    outcome, _ = outcome_of_point(data, radar, found, aperture, [(Outcome.OUTSIDE_SEARCH, top.edge)])
     return Estimate(
-        value,
-        {"u_a_m_s": std},
-        torch.sigmoid((snr - DETECTED_DB) / 3),
-        Outcome.of(ok, Outcome.NOISE),
-        info={"snr_db": snr, "at_the_end": ended},
+        {"u_a_m_s": motion.u_a_m_s},
+        {"u_a_m_s": variance.sqrt()},
+        quality_of(found.snr_db),
+        outcome,
+        info={"snr_db": found.snr_db},
     )
 
 

@@ -82,6 +82,17 @@ class ElementBeam:
         return torch.sinc(turns)
 
 
+@dataclass(frozen=True)
+class Kept:
+    """Expected amplitude that is the same for all motions, float64 (..., pulse)."""
+
+    amplitude: Tensor
+
+    def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
+        """Return the expected amplitude, see `Aperture.weight`."""
+        return self.amplitude
+
+
 def _abeam_s(motion: PointMotion) -> Tensor:
     """Return the time in seconds at which a point is at broadside."""
     return (motion.y0_m / motion.along_m_s).detach()

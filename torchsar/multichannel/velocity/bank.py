@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import host_values, level_of, per_trial, take, unit_phasor
+from torchsar.core import host_values, level_of, per_trial, unit_phasor
 from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.motion import Number, PointMotion
@@ -127,41 +127,6 @@ def bank_search(
         u_r = there.u_r_m_s.expand(found.shape)
         best = chosen(replace(best, u_r_m_s=u_r, u_a_m_s=along, y0_m=position), best, better)
     return best, energy * level[..., 0, 0].square()
-
-
-def sharpest_tone(
-    data: Tensor, radar: BistaticRadar, motions: PointMotion, aperture: Aperture, reach_m: float
-) -> tuple[PointMotion, Tensor]:
-    """Find the one of several hypotheses of the motion that explains most of the energy per trial.
-
-    The along-track position of each hypothesis may change by up to `reach_m`.
-
-    Args:
-        data: Channels, shape (..., channel, pulse), complex.
-        radar: Radar parameters.
-        motions: Hypotheses of one slant-range speed, shape (..., hypothesis).
-        aperture: Expected amplitude over slow time.
-        reach_m: Largest along-track distance in metres from the position of a hypothesis.
-
-    Returns:
-        The motion, and the energy that it explains by normalised correlation, float64 (...,).
-    """
-    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
-    motions, prepared = (
-        motions.each(lambda value: torch.broadcast_to(value, motions.u_a_m_s.shape)),
-        data.to(torch.complex64),
-    )
-    size = max(1, _BLOCK_BYTES // (32 * data.numel()))
-    parts = [slice(at, at + size) for at in range(0, motions.u_a_m_s.shape[-1], size)]
-    hypotheses = [motions.each(lambda value, part=part: value[..., part]) for part in parts]
-    found = [
-        _best_tone(prepared, radar, there, aperture, time_s, reach_m, fastest, None)
-        for there, fastest in zip(hypotheses, _tone_rates(radar, hypotheses), strict=True)
-    ]
-    energy, position, along = (torch.stack(values, -1) for values in zip(*found, strict=True))
-    at = energy.argmax(-1)
-    best = motions.each(lambda value: value[..., 0])
-    return replace(best, u_a_m_s=take(along, at, -1), y0_m=take(position, at, -1)), take(energy, at, -1)
 
 
 def _steps(half: float, step: float, device: torch.device) -> Tensor:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate
+from torchsar.core import Estimate, Outcome
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
-from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
-from torchsar.multichannel.velocity.interferometry import DETECTED_DB
+from torchsar.multichannel.velocity.assess import outcome_of_point
+from torchsar.multichannel.velocity.illumination import seen_aperture
 from torchsar.multichannel.velocity.likelihood import PointLikelihood, maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of, moved, point_phasor, round_units
 from torchsar.optim import lbfgs
@@ -54,8 +54,18 @@ def gradient_likelihood(
     aperture: Aperture,
     unknowns: tuple[str, ...] = UNKNOWNS,
     steps: int = 60,
+    *,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the motion of highest likelihood by limited-memory BFGS with autograd gradients.
+
+    >>> import torch
+    >>> from torchsar.multichannel import Dwell, PointMotion, gradient_likelihood
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> data = torch.zeros(3, 90, dtype=torch.complex64)
+    >>> gradient_likelihood(data, radar, PointMotion.of(radar, data.real), Dwell(0.5)).failed
+    tensor(True)
 
     The function serves as a check of `maximum_likelihood`, which is faster, and as an example for
     other objectives.
@@ -68,13 +78,13 @@ def gradient_likelihood(
         aperture: Expected amplitude over slow time.
         unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`.
         steps: Largest number of steps.
+        assess: Whether the outcome is assessed.
 
     Returns:
         `u_r_m_s`, `u_a_m_s`, `y0_m` of shape (...,) with standard deviations of the unknowns.
-        `info` holds `snr_db` (over all samples), `noise_power` (per sample) and `converged`. `ok`
-        is False where the search failed, `snr_db` is below 19, or the illumination of the point is
-        not understood, see `lit_as_expected`. Where it is lit in a part of the aperture only, this
-        part is used, see `seen_aperture`.
+        `info` holds `snr_db` (over all samples), `noise_power` (per sample) and `converged`. Where
+        the point is lit in a part of the aperture only, this part is used, see `seen_aperture`.
+        Outcomes: those of `outcome_of_point`, and `NOT_CONVERGED` where the search failed.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -103,9 +113,7 @@ def gradient_likelihood(
         cost, torch.zeros(*data.shape[:-2], len(unknowns), dtype=torch.float64, device=data.device), steps=steps
     )
     fit = maximum_likelihood(data, radar, there(found.x), aperture, unknowns, steps=0)
-    return estimate_of(
-        fit,
-        found.ok & (fit.snr_db >= DETECTED_DB) & lit_as_expected(data, radar, fit.motion, aperture),
-        torch.sigmoid((fit.snr_db - DETECTED_DB) / 3),
-        converged=found.converged,
-    )
+    outcome = None
+    if assess:
+        outcome, _ = outcome_of_point(data, radar, fit, aperture, [(Outcome.NOT_CONVERGED, ~found.ok)])
+    return estimate_of(fit, outcome, {"converged": found.converged})

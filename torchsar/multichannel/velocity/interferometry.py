@@ -16,13 +16,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome
+from torchsar.core import Estimate
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
 from torchsar.multichannel.velocity.aperture import Aperture
-from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
+from torchsar.multichannel.velocity.assess import outcome_of_point
+from torchsar.multichannel.velocity.illumination import seen_aperture
 from torchsar.multichannel.velocity.model import (
     Found,
     centred_slopes,
@@ -38,9 +38,6 @@ from torchsar.radar import BistaticRadar
 _PAD = 4
 _STARTS = 9  # chosen: 3 m/s from the next one, the cubic phase loses at most 1 dB of the tone
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
-# Detection threshold over all samples, -15 dB per sample with three channels and 810 pulses: below
-# it the strongest tone is often one of noise.
-DETECTED_DB = 19.0
 
 
 def interferometry(
@@ -50,15 +47,25 @@ def interferometry(
     aperture: Aperture,
     passes: int = 4,
     check_ambiguity: bool = True,
+    *,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate slant-range speed and position of one point per trial by along-track interferometry.
+
+    >>> import torch
+    >>> from torchsar.multichannel import Dwell, PointMotion, interferometry
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> data = torch.ones(1, 3, 180, dtype=torch.complex128)  # a point that moves with the receiver
+    >>> interferometry(data, radar, PointMotion.of(radar, data), Dwell(1.0), assess=False).ok
+    tensor([True])
 
     The first pass weights all pulses equally. Later passes weight them by the expected amplitude of
     a point at the position found so far. The slant-range speed u_r is measured modulo lambda PRF
     and returned within lambda PRF / 2 of the start. Only the cubic phase shows a speed beyond it,
-    and `ok` is False where the aperture is too short for that at the SNR, whatever the speed: pass
-    `check_ambiguity=False` where the start is known to be so near. The along-track speed u_a keeps
-    the value of the start.
+    which a short aperture does not show at a low SNR: pass `check_ambiguity=False` where the start
+    is known to be so near. The along-track speed u_a keeps the value of the start. Where the point
+    is lit in a part of the aperture only, this part is used, see `seen_aperture`.
 
     Args:
         data: Channels with the transmit range removed, shape (..., channel, pulse), complex.
@@ -66,18 +73,15 @@ def interferometry(
         start: Starting motion, shape (...,).
         aperture: Expected amplitude over slow time.
         passes: Number of passes, each of which starts from the result of the previous one.
-        check_ambiguity: Whether to check that the velocity is not wrong by lambda * PRF, in about
-            20 ms per trial. Where it is or may be wrong, `ok` is False; where it is, a warning is
-            given.
+        check_ambiguity: Whether the assessment asks if the velocity may be wrong by lambda PRF. A
+            warning is given where it is.
+        assess: Whether the outcome is assessed.
 
     Returns:
         `u_r_m_s` (closing positive), `u_a_m_s` and `y0_m` of shape (...,). Standard deviations of
         u_r and y0 follow from the residual noise. `info` holds `snr_db` (over all samples) and
         `noise_power` (per sample), and with `check_ambiguity` also `pulse_rates`, the number of
-        PRFs to add to the Doppler (-1, 0 or 1). `ok` is False where `snr_db` is below 19,
-        `pulse_rates` is not zero, the data do not exclude other numbers, or the
-        illumination of the point is not understood, see `lit_as_expected`. Where it is lit in a
-        part of the aperture only, this part is used, see `seen_aperture`.
+        PRFs to add to the Doppler (-1, 0 or 1). Outcomes: those of `outcome_of_point`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -90,28 +94,25 @@ def interferometry(
             "interferometry needs two channels or more, got 1: one channel cannot separate position and "
             "velocity; use data of more channels"
         )
-    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     data = data.to(torch.complex128)
+    found, aperture = interfered(data, radar, start, aperture, passes)
+    if not assess:
+        return estimate_of(found)
+    everywhere = torch.ones_like(found.energy, dtype=torch.bool)
+    inside = (lambda _: everywhere) if check_ambiguity else None
+    return estimate_of(found, *outcome_of_point(data, radar, found, aperture, inside=inside, assumed=True))
+
+
+def interfered(
+    data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, passes: int = 4
+) -> tuple[Found, Aperture]:
+    """Return the fit of `interferometry`, and the aperture in which the point is seen."""
+    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     motion = _begun(data, radar, start, time_s)
     aperture, _ = seen_aperture(data, radar, motion, aperture)
     for _ in range(passes - 1):
         motion = _improved(data, radar, motion, aperture.weight(radar, motion, time_s), time_s)
-    found = _fit_at(data, radar, motion, aperture.weight(radar, motion, time_s), time_s)
-    snr = found.snr_db
-    estimate = estimate_of(found, snr >= DETECTED_DB, _quality(snr))
-    if check_ambiguity:
-        estimate = warned_of_ambiguity(estimate, data, radar, motion, aperture, exclude=True)
-    return replace(
-        estimate,
-        outcome=torch.maximum(
-            estimate.outcome, Outcome.of(lit_as_expected(data, radar, motion, aperture), Outcome.MISFIT)
-        ),
-    )
-
-
-def _quality(snr_db: Tensor) -> Tensor:
-    """Map the SNR to 0..1, with one half at the threshold."""
-    return torch.sigmoid((snr_db - DETECTED_DB) / 3)
+    return _fit_at(data, radar, motion, aperture.weight(radar, motion, time_s), time_s), aperture
 
 
 def _begun(data: Tensor, radar: BistaticRadar, start: PointMotion, time_s: Tensor) -> PointMotion:

@@ -13,7 +13,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchsar.core import take
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
@@ -35,6 +34,9 @@ from torchsar.radar import BistaticRadar
 
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _HALVINGS = 4  # trials of a step: whole, half, quarter, eighth; then it is omitted
+# Predicted gain of energy below which no step is taken, relative to the noise of a sample (a step
+# of 3e-4 standard deviations) and to the energy that is explained already (rounding).
+_LEAST_GAIN, _LEAST_SHARE = 1e-7, 1e-13
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,13 @@ class PointFit:
 class Likelihood(Protocol):
     """Likelihood of the motion of one or several points."""
 
-    def fit(self, motion: PointMotion) -> PointFit:
-        """Return the least-squares amplitudes for a motion, with derivatives by the unknowns."""
+    @property
+    def data(self) -> Tensor:
+        """Channels, shape (..., channel, pulse), complex128."""
         ...
 
-    def repeated(self, count: int) -> Likelihood:
-        """Return this likelihood for `count` motions per trial, which are a first dimension."""
+    def fit(self, motion: PointMotion) -> PointFit:
+        """Return the least-squares amplitudes for a motion, with derivatives by the unknowns."""
         ...
 
 
@@ -89,7 +92,8 @@ def maximum_likelihood(
 
     The expected amplitude is computed once, for the start, so that the steps do not fit the
     position to the ends of the aperture. A step that does not explain more energy is halved or
-    omitted, separately in each trial.
+    omitted, separately in each trial. A trial takes no further steps when a step would gain less
+    than 1e-7 of the noise of a sample.
 
     Args:
         data: Channels with the transmit range removed and slow time zero at pulse n // 2, shape
@@ -100,7 +104,7 @@ def maximum_likelihood(
         unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`; the others
             keep the values of the start.
         whitening: Clutter covariance, None for white noise.
-        steps: Number of Gauss-Newton steps.
+        steps: Largest number of Gauss-Newton steps.
 
     Returns:
         The fit with motion, amplitude, residual noise power and covariance of the unknowns.
@@ -114,8 +118,7 @@ def maximum_likelihood(
     problem = PointLikelihood.of(data, radar, start, aperture, unknowns, whitening)
     motion = start.each(lambda value: value.expand(data.shape[:-2]))
     fit = problem.fit(motion)
-    for _ in range(steps):
-        motion, fit = stepped(problem, motion, fit, unknowns)
+    motion, fit = climbed(problem, motion, fit, unknowns, steps)
     return Found(motion, fit.amplitude, problem.noise_power(fit), problem.covariance(motion, fit), fit.energy, unknowns)
 
 
@@ -168,10 +171,6 @@ class PointLikelihood:
         tilted = self.time_s / self.time_s.abs().amax().clamp_min(_TINY) * model
         applied = self.whitening.applied
         return _coloured(self.data, applied(model), applied(tilted), applied(1j * slopes * model[..., None, :, :]))
-
-    def repeated(self, count: int) -> PointLikelihood:
-        """Return this likelihood for `count` motions per trial, shape (count, ...)."""
-        return self if self.whitening is None else replace(self, whitening=self.whitening.expanded(count))
 
     def noise_power(self, fit: PointFit) -> Tensor:
         """Return the residual power per sample in the pulses in which the point is illuminated.
@@ -250,46 +249,64 @@ def _coloured(data: Tensor, model: Tensor, tilted: Tensor, columns: Tensor) -> P
     return PointFit(amplitude, power * total + changed, gradient, power[..., None, None] * normal)
 
 
-def stepped(
-    problem: Likelihood, motion: PointMotion, fit: PointFit, unknowns: tuple[str, ...]
+def climbed(
+    problem: Likelihood, motion: PointMotion, fit: PointFit, unknowns: tuple[str, ...], steps: int
 ) -> tuple[PointMotion, PointFit]:
-    """Take one Gauss-Newton step, halved or omitted in trials where it explains less energy.
+    """Take Gauss-Newton steps until none of the trials gains by a step.
 
     Args:
         problem: Likelihood of one point, or of several that are fitted together.
-        motion: Motion, shape (...,), or (..., point) for several points.
+        motion: Starting motion, shape (...,), or (..., point) for several points.
         fit: Fit for this motion, with the unknowns of all points in its gradient.
         unknowns: Names of the parameters to estimate.
+        steps: Largest number of steps.
 
     Returns:
-        Motion after the step, and the fit for it.
+        Motion after the steps, and the fit for it.
     """
-    ndim = fit.energy.ndim
-    step = solved(fit.normal, fit.gradient[..., None])[..., 0].reshape(*motion.u_r_m_s.shape, len(unknowns))
-    step = _bounded(step, motion, unknowns)
-    # on an accelerator all sizes of a step at once take less time than one after the other
-    together = 1 if step.device.type == "cpu" else _HALVINGS
-    sizes = torch.exp2(-torch.arange(_HALVINGS, dtype=step.dtype, device=step.device))
-    begin, before, problem = motion, fit.energy, problem.repeated(together)
-    pending = torch.ones_like(before, dtype=torch.bool)
-    for size in sizes.split(together):
-        there = moved(begin, size[(..., *(None,) * step.ndim)] * step, unknowns)
-        fit_there = problem.fit(there)
-        explains = fit_there.energy > before
-        largest, better = explains.to(torch.uint8).argmax(0), pending & explains.any(0)
+    channels, samples = problem.data.shape[-2:]
+    total = problem.data.abs().square().sum((-2, -1))
+    stuck = torch.zeros_like(fit.energy, dtype=torch.bool)  # no part of the step gained anything
+    for _ in range(steps):
+        step = solved(fit.normal, fit.gradient[..., None])[..., 0]
+        noise = (total - fit.energy).clamp_min(0) / (channels * samples)
+        pending = ~stuck & ((step * fit.gradient).sum(-1) > _LEAST_GAIN * noise + _LEAST_SHARE * fit.energy)
+        if not bool(pending.any()):
+            break
+        motion, fit, failed = _stepped(problem, motion, fit, unknowns, step, pending)
+        stuck = stuck | failed
+    return motion, fit
 
-        def improved(new: Tensor, old: Tensor, at: Tensor = largest, better: Tensor = better) -> Tensor:
-            # the largest step that explains more energy
-            new = take(new.movedim(0, ndim), at, ndim)
-            return torch.where(better[(...,) + (None,) * (new.ndim - ndim)], new, old)
+
+def _stepped(
+    problem: Likelihood,
+    motion: PointMotion,
+    fit: PointFit,
+    unknowns: tuple[str, ...],
+    step: Tensor,
+    pending: Tensor,
+) -> tuple[PointMotion, PointFit, Tensor]:
+    """Take a step in the pending trials, halved or omitted where it explains less energy.
+
+    Returns also in which of these trials it was omitted.
+    """
+    begin, before = motion, fit.energy
+    step = _bounded(step.reshape(*motion.u_r_m_s.shape, len(unknowns)), motion, unknowns)
+    for halvings in range(_HALVINGS):
+        there = moved(begin, 0.5**halvings * step, unknowns)
+        fit_there = problem.fit(there)
+        better = pending & (fit_there.energy > before)
+
+        def improved(new: Tensor, old: Tensor, better: Tensor = better) -> Tensor:
+            return torch.where(better[(...,) + (None,) * (new.ndim - better.ndim)], new, old)
 
         values = {name: improved(getattr(there, name), getattr(motion, name)) for name in unknowns}
         motion = replace(motion, **values)
         fit = PointFit(*map(improved, vars(fit_there).values(), vars(fit).values()))
         pending = pending & ~better
-        if together == _HALVINGS or not bool(pending.any()):
+        if not bool(pending.any()):
             break
-    return motion, fit
+    return motion, fit, pending
 
 
 def _bounded(step: Tensor, motion: PointMotion, unknowns: tuple[str, ...]) -> Tensor:

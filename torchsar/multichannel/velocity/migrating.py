@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from torchsar.core import Estimate, Signal, Stage
+import torch
+
+from torchsar.core import Estimate, Outcome, Signal, Stage
 from torchsar.multichannel.migration import CorrectMigration, Keystone
 from torchsar.multichannel.velocity.stages import strongest_line
 from torchsar.multichannel.velocity.walk import WalkAmbiguity
@@ -26,23 +28,26 @@ class MigratingLines(Stage):
         estimator: Estimator of the velocity, a stage on (channel, pulse, range) or, with
             `one_line`, on (channel, pulse).
         one_line: Whether the estimator gets only the strongest range line.
+        assess: Whether the range walk is assessed; `estimator` has a switch of its own.
     """
 
     works_on = ("channel", "pulse", "range")
     also_on = (("channel", "pulse"),)
 
-    def __init__(self, radar: BistaticRadar, estimator: Stage, one_line: bool = False) -> None:
+    def __init__(self, radar: BistaticRadar, estimator: Stage, one_line: bool = False, *, assess: bool = True) -> None:
         super().__init__()
         self.estimator, self.one_line = estimator, one_line
-        self.walk, self.correct = WalkAmbiguity(radar), CorrectMigration(radar, Keystone(whole_swath=False))
+        self.walk = WalkAmbiguity(radar, assess=assess)
+        self.correct = CorrectMigration(radar, Keystone(whole_swath=False))
         self.provides, self.neutral = estimator.provides, estimator.neutral
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the velocity from channels with the axes (channel, pulse[, range]).
 
         Returns:
-            Values of the estimator, with the ambiguity number of the range walk as `ambiguity` in
-            `info` if there is a range axis. `ok` is False also where this number is not reliable.
+            Values of the estimator. If there is a range axis, `info` holds the ambiguity number of
+            the range walk as `ambiguity`. Outcomes: those of the estimator, and `IN_DOUBT` where
+            this number is not reliable.
         """
         if "range" not in signal.names:
             return self.estimator(signal)
@@ -52,7 +57,7 @@ class MigratingLines(Stage):
         found = self._estimate(self.correct(signal, **{name: first[name] for name in self.provides}))
         return replace(
             found,
-            ok=found.ok & walk.ok,
+            outcome=torch.maximum(found.outcome, Outcome.of(walk.ok, Outcome.IN_DOUBT)),
             quality=found.quality.minimum(walk.quality),
             info={**found.info, "ambiguity": walk["ambiguity"]},
         )

@@ -11,16 +11,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate
+from torchsar.core import Estimate, Outcome
 from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.velocity.ambiguity import RESOLVED
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell
+from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.bank import Search, bank_search
-from torchsar.multichannel.velocity.illumination import SeenAperture, lit_as_expected, seen_aperture
-from torchsar.multichannel.velocity.interferometry import DETECTED_DB
+from torchsar.multichannel.velocity.illumination import SeenAperture, seen_aperture
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
-from torchsar.multichannel.velocity.model import UNKNOWNS, Found, chosen, estimate_of, point_phasor
+from torchsar.multichannel.velocity.model import UNKNOWNS, Found, estimate_of, point_phasor
 from torchsar.multichannel.velocity.several import fitted_together, joined
 from torchsar.multichannel.velocity.whitening import Whitening, sample_whitening
 from torchsar.radar import BistaticRadar
@@ -50,8 +49,18 @@ def moving_point_velocity(
     u_a_m_s: Tensor | float | None = None,
     range_m: Number | None = None,
     whitening: Whitening | None = None,
+    *,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate velocity and position of the strongest moving point per trial, without a start.
+
+    >>> import torch
+    >>> from torchsar.multichannel import Dwell, moving_point_velocity
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> data = torch.zeros(3, 90, dtype=torch.complex64)
+    >>> moving_point_velocity(data, radar, Dwell(0.5), u_a_m_s=0.0).failed
+    tensor(True)
 
     If no clutter covariance is given, the point is first sought in white noise. If the residual
     shows clutter, the search is repeated with the covariance of the data. Each of the two fits is
@@ -76,20 +85,21 @@ def moving_point_velocity(
         range_m: Closest range in metres, None for the reference range of the radar.
         whitening: Clutter covariance, for example from neighbouring range lines; None to estimate
             it from the data.
+        assess: Whether the outcome is assessed.
 
     Returns:
         Slant-range speed `u_r_m_s` (closing positive), along-track speed `u_a_m_s` and along-track
         position at t = 0 `y0_m` of shape (...,), with standard deviations. `info` holds `snr_db`
         (over all samples), `noise_power` (per sample) and `coloured` (True where clutter was found,
-        and everywhere if `whitening` is given). `ok` is False where `snr_db` is below 19, the
-        estimate lies outside the search, the standard deviation of u_r exceeds the half width of
-        the search, as with a single channel, a slant-range speed within the search that differs by
-        multiples of lambda PRF explains the data as well, the illumination of the point is not
-        understood, see `lit_as_expected`, or a further point of nearly the same Doppler frequency
-        cannot be separated. Where it is lit in a part of the aperture only, as in a
-        range line that it crosses, this part is used, see `seen_aperture`. The cubic phase, which
-        separates multiples of lambda PRF, is small for short wavelengths and dwells; the speed is
-        then `ok` only within a search of half that width.
+        and everywhere if `whitening` is given). Where the point is lit in a part of the aperture
+        only, as in a range line that it crosses, this part is used, see `seen_aperture`.
+
+        Outcomes: those of `outcome_of_point`; `OUTSIDE_SEARCH`; `SINGULAR` where the standard
+        deviation of u_r exceeds the half width of the search, as with a single channel; and
+        `PARTS_DISAGREE` where a further point of nearly the same Doppler frequency cannot be
+        separated. `AMBIGUOUS` are speeds where another one within the search that differs by lambda
+        PRF explains the data as well. The cubic phase, which separates them, is small for short
+        wavelengths and dwells; a search of half that width then gives what is known a priori.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -105,12 +115,13 @@ def moving_point_velocity(
     job = _Job(data.to(torch.complex128), radar, aperture, coarse, search, u_a, range_m, unknowns)
     if whitening is not None:
         job, found = job.as_seen(job.found(whitening), whitening)
-        return job.estimate(found, torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device), whitening)
+        coloured = torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device)
+        return job.estimate(found, coloured, torch.zeros_like(coloured), assess, whitening)
     seen, plain = job.as_seen(job.found(None), None)
     white, plain, hidden = seen.separated(plain, aperture)
     plain = white.refined(plain)
     if not bool(plain.coloured.any()):
-        return white.estimate(plain.found, plain.coloured, hidden=hidden)
+        return white.estimate(plain.found, plain.coloured, hidden, assess)
     # what the fit in white noise shows of the aperture and of other points may be clutter
     clutter = sample_whitening(job.data, radar)
     job, found = job.as_seen(job.found(clutter), clutter)
@@ -119,7 +130,8 @@ def moving_point_velocity(
     return white.or_other(job, first).estimate(
         _chosen_fit(plain.found, other.found, first),
         torch.where(first, plain.coloured, other.coloured),
-        hidden=hidden & (first | job._overlap(plain.found.motion, other.found.motion)),
+        hidden & (first | job._overlap(plain.found.motion, other.found.motion)),
+        assess,
     )
 
 
@@ -157,7 +169,7 @@ class _Job:
             beside = replace(start, u_a_m_s=start.u_a_m_s + side * self.search.u_a_step_m_s)
             other = maximum_likelihood(self.data, self.radar, beside, self.coarse, self.unknowns, whitening)
             near = _chosen_fit(other, near, other.energy > near.energy)
-        return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
+        return self.fitted(near.motion, whitening)
 
     def as_seen(self, found: Found, whitening: Whitening | None) -> tuple[_Job, Found]:
         """Refit points that are lit in a part of the aperture only, and keep that part."""
@@ -165,8 +177,7 @@ class _Job:
         if not bool(uneven.any()):
             return self, found
         job = replace(self, aperture=aperture)
-        again = maximum_likelihood(self.data, self.radar, found.motion, aperture, self.unknowns, whitening)
-        return job, _chosen_fit(again, found, uneven)
+        return job, _chosen_fit(job.fitted(found.motion, whitening), found, uneven)
 
     def or_other(self, other: _Job, first: Tensor) -> _Job:
         """Take the data and the seen aperture of another job where `first` is False."""
@@ -193,7 +204,7 @@ class _Job:
         if not bool(tried.any()):
             return job, found, hidden
         # with a slant-range speed that is wrong by lambda PRF, one point leaves others over
-        found = _chosen_fit(self.resolved(found, None)[0], found, tried)
+        found = _chosen_fit(self.resolved(found, None), found, tried)
         tried = tried & sample_whitening(self.left(found), self.radar).coloured
         points, left = found.motion.each(lambda value: value.expand(tried.shape)[..., None]), whole.left(found)
         for _ in range(_OTHERS):
@@ -235,8 +246,7 @@ class _Job:
         for _ in range(_ROUNDS):
             if not bool(whitening.coloured.any()):
                 break
-            again = maximum_likelihood(self.data, self.radar, found.motion, self.aperture, self.unknowns, whitening)
-            found = _chosen_fit(again, found, whitening.coloured)
+            found = _chosen_fit(self.fitted(found.motion, whitening), found, whitening.coloured)
             whitening = sample_whitening(self.left(found), self.radar)
         return _Refined(found, whitening.log_det, whitening.coloured)
 
@@ -248,27 +258,39 @@ class _Job:
             self.radar, found.motion, time_s, self.data.dtype
         )
 
-    def resolved(self, found: Found, whitening: Whitening | None) -> tuple[Found, Tensor]:
-        """Choose among slant-range speeds whole multiples of lambda PRF apart, within the search.
-
-        Returns:
-            The fit of highest likelihood, and whether it is so beyond chance, (...,).
-        """
-        whitening = sample_whitening(self.left(found), self.radar) if whitening is None else whitening
+    def resolved(self, found: Found, whitening: Whitening | None) -> Found:
+        """Choose the likeliest of the speeds lambda PRF apart that lie within the search."""
         span, begin = self.radar.ambiguous_velocity_m_s, found.motion
-        best = maximum_likelihood(self.data, self.radar, begin, self.aperture, self.unknowns, whitening, 0)
-        noise, most, second = best.noise_power, best.energy, torch.zeros_like(best.energy)
         reach = self.search.u_r_m_s + self.search.u_r_step_m_s
+        most = torch.zeros_like(found.energy)
         for number in range(-int(2 * reach / span), int(2 * reach / span) + 1):
             there = replace(begin, u_r_m_s=begin.u_r_m_s + number * span)
-            if number == 0 or not bool(self.inside(there).any()):
+            rivals = self.inside(there)
+            if number == 0 or not bool(rivals.any()):
                 continue
-            other = maximum_likelihood(self.data, self.radar, there, self.aperture, self.unknowns, whitening)
-            energy = torch.where(self.inside(other.motion), other.energy, 0.0)
-            better = energy > most
-            found, noise = _chosen_fit(other, found, better), torch.where(better, other.noise_power, noise)
-            most, second = torch.maximum(energy, most), torch.maximum(second, torch.minimum(energy, most))
-        return found, most - second > RESOLVED * noise
+            whitening = sample_whitening(self.left(found), self.radar) if whitening is None else whitening
+            job, seen = self.at(rivals), whitening.at(rivals)
+            own = job.fitted(begin.each(lambda value, rivals=rivals: value[rivals]), seen, 0)
+            other = job.fitted(there.each(lambda value, rivals=rivals: value[rivals]), seen)
+            most[rivals] = torch.maximum(own.energy, most[rivals])
+            better = job.inside(other.motion) & (other.energy > most[rivals])
+            most[rivals] = torch.where(better, other.energy, most[rivals])
+            rivals = rivals.masked_scatter(rivals, better)
+            found = found.each(lambda x, y: x.masked_scatter(_beside(rivals, x), y[better]), other)  # noqa: B023
+        return found
+
+    def at(self, trials: Tensor) -> _Job:
+        """Return the job of some trials, which a bool tensor (...,) selects."""
+        aperture, u_a = self.aperture, self.u_a_m_s
+        if isinstance(aperture, SeenAperture):
+            aperture = replace(aperture, profile=aperture.profile.expand(*trials.shape, -1)[trials])
+        if isinstance(u_a, Tensor):
+            u_a = u_a.expand(trials.shape)[trials]
+        return replace(self, data=self.data[trials], aperture=aperture, u_a_m_s=u_a)
+
+    def fitted(self, start: PointMotion, whitening: Whitening | None, steps: int = 12) -> Found:
+        """Return the fit of highest likelihood near a start."""
+        return maximum_likelihood(self.data, self.radar, start, self.aperture, self.unknowns, whitening, steps)
 
     def inside(self, motion: PointMotion) -> Tensor:
         """Whether a motion lies within the search, bool (...,)."""
@@ -279,32 +301,29 @@ class _Job:
         return inside
 
     def estimate(
-        self, found: Found, coloured: Tensor, whitening: Whitening | None = None, hidden: Tensor | None = None
+        self, found: Found, coloured: Tensor, hidden: Tensor, assess: bool, whitening: Whitening | None = None
     ) -> Estimate:
-        """Form the estimate and judge it; it is not ok where another point is hidden in it."""
+        """Form the estimate, and assess it; `hidden` tells where another point bends it."""
+        found = self.resolved(found, whitening)
+        if not assess:
+            return estimate_of(found, None, {"coloured": coloured})
         whitening = sample_whitening(self.left(found), self.radar) if whitening is None else whitening
-        found, resolved = self.resolved(found, whitening)
-        snr = found.snr_db
-        determined = (
-            found.covariance[..., 0, 0].sqrt() <= self.search.u_r_m_s + self.search.u_r_step_m_s
-        )  # False for one channel, which cannot separate velocity and position
-        lit = lit_as_expected(self.data, self.radar, found.motion, self.aperture, whitening)
-        lit = lit if hidden is None else lit & ~hidden
-        return estimate_of(
-            found,
-            self.inside(found.motion) & determined & lit & resolved & (snr >= DETECTED_DB),
-            torch.sigmoid((snr - DETECTED_DB) / 3),
-            coloured=coloured,
-        )
+        half = self.search.u_r_m_s + self.search.u_r_step_m_s
+        reasons = [
+            (Outcome.OUTSIDE_SEARCH, ~self.inside(found.motion)),
+            (Outcome.SINGULAR, ~(found.covariance[..., 0, 0].sqrt() <= half)),
+            (Outcome.PARTS_DISAGREE, hidden),
+        ]
+        fit = self.data, self.radar, found, self.aperture, reasons
+        outcome, info = outcome_of_point(*fit, self.inside, whitening=whitening)
+        return estimate_of(found, outcome, {"coloured": coloured, **info})
 
 
 def _chosen_fit(a: Found, b: Found, first: Tensor) -> Found:
     """Select one of two fits per trial."""
+    return a.each(lambda x, y: torch.where(_beside(first, x), x, y), b)
 
-    def pick(x: Tensor, y: Tensor) -> Tensor:
-        return torch.where(first[(...,) + (None,) * (x.ndim - first.ndim)], x, y)
 
-    tensors = {
-        name: pick(getattr(a, name), getattr(b, name)) for name in ("amplitude", "noise_power", "covariance", "energy")
-    }
-    return Found(chosen(a.motion, b.motion, first), **tensors, unknowns=a.unknowns)
+def _beside(trials: Tensor, x: Tensor) -> Tensor:
+    """Return a tensor (...,) with dimensions of 1 in place of the further ones of x."""
+    return trials[(...,) + (None,) * (x.ndim - trials.ndim)]

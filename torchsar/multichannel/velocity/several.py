@@ -7,16 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_solve, take
+from torchsar.core import take
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
-from torchsar.multichannel.velocity.likelihood import PointFit, stepped
-from torchsar.multichannel.velocity.model import Found, covariance_of, phase_slopes, point_phasor
+from torchsar.multichannel.velocity.likelihood import PointFit, climbed
+from torchsar.multichannel.velocity.model import Found, covariance_of, phase_slopes, point_phasor, solved
 from torchsar.radar import BistaticRadar
 
 _STEPS = 8  # Gauss-Newton steps, found by trial: points 10 dB apart have converged
-_ROUNDING = 1e-13  # added to the unit diagonal of Gram matrices
-_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,7 @@ def fitted_together(
     weight = aperture.weight(radar, start, time_s)[..., None, :]
     problem, motion = _Points(data, radar, weight, time_s, unknowns), start
     fit = problem.fit(motion)
-    for _ in range(_STEPS):
-        motion, fit = stepped(problem, motion, fit, unknowns)
+    motion, fit = climbed(problem, motion, fit, unknowns, _STEPS)
     echoes = fit.amplitude[..., None, None] * problem.echo(motion)
     left = data - echoes.sum(-3)
     noise = left.abs().square().mean((-2, -1))
@@ -87,11 +84,7 @@ def joined(points: PointMotion, further: PointMotion) -> PointMotion:
     Returns:
         Motions of all points.
     """
-    pairs = {
-        name: torch.cat([getattr(points, name), getattr(further, name)[..., None]], -1)
-        for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
-    }
-    return PointMotion(**pairs, speed_m_s=points.speed_m_s)
+    return points.each(lambda these, one: torch.cat([these, one[..., None]], -1), further)
 
 
 @dataclass(frozen=True)
@@ -117,12 +110,12 @@ class _Points:
         echo = self.echo(motion)
         x, s = self.data.flatten(-2), echo.flatten(-2)
         gram = s.conj() @ s.mT
-        amplitude = _solved(gram, s.conj() @ x[..., None])[..., 0]
+        amplitude = solved(gram, s.conj() @ x[..., None])[..., 0]
         left = x - (amplitude[..., None, :] @ s)[..., 0, :]
         slopes = phase_slopes(self.radar, motion, self.time_s, self.unknowns)
         columns = (amplitude[..., None, None, None] * 1j * slopes * echo[..., None, :, :]).flatten(-2).flatten(-3, -2)
         # without the parts that other amplitudes would take up
-        columns = columns - _solved(gram, s.conj() @ columns.mT).mT @ s
+        columns = columns - solved(gram, s.conj() @ columns.mT).mT @ s
         return PointFit(
             amplitude,
             x.abs().square().sum(-1) - left.abs().square().sum(-1),
@@ -130,18 +123,6 @@ class _Points:
             (columns.conj() @ columns.mT).real,
         )
 
-    def repeated(self, count: int) -> _Points:
-        """Return this likelihood for `count` motions per trial, shape (count, ..., point)."""
-        return self
-
     def echo(self, motion: PointMotion) -> Tensor:
         """Return the echoes of unit amplitude of the points, (..., point, channel, pulse)."""
         return self.weight * point_phasor(self.radar, motion, self.time_s, torch.complex128)
-
-
-def _solved(gram: Tensor, right: Tensor) -> Tensor:
-    """Solve for amplitudes, which stay finite where echoes are equal or zero."""
-    scale = gram.diagonal(dim1=-2, dim2=-1).real.clamp_min(_TINY).rsqrt()
-    eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
-    unit = scale[..., :, None] * gram * scale[..., None, :] + _ROUNDING * eye
-    return scale[..., :, None] * linear_solve(unit, scale[..., :, None] * right)

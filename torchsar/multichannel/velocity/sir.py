@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -23,10 +23,9 @@ from torchsar.core import Estimate, Outcome, Signal, Stage, take
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
-from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
 from torchsar.multichannel.velocity.aperture import Dwell
-from torchsar.multichannel.velocity.interferometry import interferometry
-from torchsar.multichannel.velocity.model import point_phasor
+from torchsar.multichannel.velocity.assess import outcome_of_point
+from torchsar.multichannel.velocity.interferometry import interfered
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
 
@@ -44,9 +43,6 @@ _REST = 8e-4
 # Predicted deviations by which the interferometric speed of the strongest point may differ by
 # chance, by convention.
 _UNLIKELY = 2.0
-# Least share of the energy of a deramped line in its strongest tone: clutter that fills 800 Doppler
-# cells has 0.01; a target of ten equal points has 0.1.
-_POINT_SHARE = 0.05
 _GROUPS = 16  # of the jackknife: 8 and 32 groups give the same standard deviation within 6 %
 
 
@@ -189,12 +185,13 @@ class SignalIntensityRatio(Stage):
         rebuild: Reconstruction method, `LeastSquares(3)` by default, since two bands leave little
             outside the processed band.
         search_m_s: Least and largest velocity of the search in m/s, where the velocity is known to
-            lie between them. None for the interval +-lambda PRF / 2; `ok` is then False where the
-            dwell is too short for the cubic phase to exclude velocities beyond it.
+            lie between them. None for the interval +-lambda PRF / 2; the dwell must then be long
+            enough for the cubic phase to exclude velocities beyond it.
         step_m_s: Step of the grid in m/s.
         range_m: Closest range in metres, None for the reference range of the radar.
         least_quality: Least quality (0 to 1) of an estimate that is `ok`, see `forward`. Below 0.6,
             where noise displaces the maximum, errors of 8 predicted standard deviations occur.
+        assess: Whether standard deviation, quality and outcome are assessed.
 
     Raises:
         ValueError: If the search interval is shorter than two steps, the reconstructed band does
@@ -219,6 +216,8 @@ class SignalIntensityRatio(Stage):
         step_m_s: float = 0.5,
         range_m: float | None = None,
         least_quality: float = 0.6,
+        *,
+        assess: bool = True,
     ) -> None:
         super().__init__()
         half = radar.ambiguous_velocity_m_s / 2
@@ -229,7 +228,7 @@ class SignalIntensityRatio(Stage):
             range_m,
         )
         self.search_m_s, self.step_m_s, self.least_quality = search_m_s or (-half, half), step_m_s, least_quality
-        self.bounded = search_m_s is not None
+        self.bounded, self.assess = search_m_s is not None, assess
         low, high = self.search_m_s
         if not (low < high and 0 < step_m_s <= (high - low) / 2):
             raise ValueError(
@@ -250,17 +249,18 @@ class SignalIntensityRatio(Stage):
             y0_m: Along-track position at t = 0 in metres, shape (...,) or a number.
 
         Returns:
-            `u_r_m_s` of shape (...,), closing positive, with a jackknife standard deviation that
-            includes a systematic error of lambda PRF / 1250. Where the interferometric speed of the
-            strongest point differs by more than two of these deviations, as beside another target,
-            the difference is the standard deviation. The
-            quality is 1 - median / maximum of the intensity ratio Gamma over the grid of speeds.
-            `info` holds `log_ratio`, ln Gamma over the grid, shape (..., speed), and `pulse_rates`,
-            the number of PRFs to add to the Doppler (-1, 0 or 1), shape (...,). `ok` is False if
-            the data are zero (the value is then the middle of the search interval), the maximum
-            lies at an end of the interval, the quality is below `least_quality`, `pulse_rates` is
-            not zero, other numbers are not excluded (unless `search_m_s` is given), no tone holds
-            5 % of the energy of the strongest line, as in clutter, or interferometry is not `ok`.
+            `u_r_m_s` of shape (...,), closing positive; the middle of the search interval for
+            zeros. `info` holds `log_ratio`, ln Gamma over the grid of speeds, (..., speed).
+
+            The assessment adds a jackknife standard deviation, which includes a systematic error of
+            lambda PRF / 1250. Where the interferometric speed of the strongest point differs by
+            more than two of these deviations, as beside another target, the difference is the
+            standard deviation. The quality is 1 - median / maximum of Gamma over the grid. `info`
+            then holds `pulse_rates`, the number of PRFs to add to the Doppler (-1, 0 or 1), (...,).
+
+            Outcomes: those of `outcome_of_point` for the interferometric speed; `NOISE` where the
+            quality is below `least_quality`; and `OUTSIDE_SEARCH` where the maximum lies at an end
+            of the interval.
 
         Raises:
             ValueError: If the reconstruction is singular.
@@ -281,53 +281,37 @@ class SignalIntensityRatio(Stage):
         reach = (self.search_m_s[1] - self.search_m_s[0]) / 2
         coarse, costs = grid_minimum(cost, start, reach, 2 * round(reach / self.step_m_s) + 1)
         fine, _ = parabola_minimum(cost, coarse, self.step_m_s / 2, _TOLERANCE_M_S)
-        found = self._estimate(
-            fine, coarse, costs, lines, _standard_deviation(intensity, fine, _REST * self.radar.ambiguous_velocity_m_s)
-        )
-        return self._checked_for_ambiguity(found, lines, u_a_m_s, y0_m)
+        low, high = self.search_m_s
+        has_data = lines.detach().abs().amax((-3, -2, -1)) > 0
+        value = torch.where(has_data, fine.clamp(low, high), middle)
+        if not self.assess:
+            return Estimate({"u_r_m_s": value}, info={"log_ratio": -costs})
+        std = _standard_deviation(intensity, fine, _REST * self.radar.ambiguous_velocity_m_s)
+        quality = torch.where(has_data, 1 - torch.exp(costs.amin(-1) - costs.median(-1).values), 0.0).clamp(0, 1)
+        ended = (coarse - low).abs().minimum((coarse - high).abs()) <= self.step_m_s / 2
+        reasons = [(Outcome.NOISE, ~(quality >= self.least_quality)), (Outcome.OUTSIDE_SEARCH, ended)]
+        std, outcome, info = self._beside_tone(lines, self._motion(lines, value, u_a_m_s, y0_m), std, reasons)
+        return Estimate({"u_r_m_s": value}, {"u_r_m_s": std}, quality, outcome, {"log_ratio": -costs, **info})
 
-    def _checked_for_ambiguity(self, found: Estimate, lines: Tensor, u_a_m_s: Number, y0_m: Number) -> Estimate:
-        """Check for a velocity wrong by a multiple of lambda * PRF, on the strongest range line."""
-        motion = self._motion(lines, found["u_r_m_s"], u_a_m_s, y0_m)
+    def _beside_tone(
+        self, lines: Tensor, motion: PointMotion, std: Tensor, reasons: list[tuple[Outcome, Tensor]]
+    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """Compare the speed with that of interferometry on the strongest range line.
+
+        Clutter and other targets displace the maximum of the ratio, but not the tone of a point.
+        """
         line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
-        dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2
-        found = replace(
-            found, outcome=torch.maximum(found.outcome, Outcome.of(_is_point(line, self.radar, motion), Outcome.MISFIT))
-        )
-        # clutter and other targets displace the maximum of the ratio, but not the tone of a point
-        tone = interferometry(line, self.radar, motion, Dwell(dwell_s), check_ambiguity=False)
-        there = replace(motion, u_r_m_s=tone["u_r_m_s"], y0_m=tone["y0_m"])
-        found = warned_of_ambiguity(found, line, self.radar, there, Dwell(dwell_s), exclude=not self.bounded)
-        apart, std = (found["u_r_m_s"] - tone["u_r_m_s"]).abs(), found.std["u_r_m_s"]
-        std = torch.where(apart > _UNLIKELY * std, apart, std)
-        return replace(found, outcome=torch.maximum(found.outcome, tone.outcome), std={"u_r_m_s": std})
+        line, radar = line.to(torch.complex128), self.radar
+        dwell_s = self.bandwidth_hz * radar.wavelength_m * radar.reference_range_m / radar.speed_m_s**2
+        tone, aperture = interfered(line, radar, motion, Dwell(dwell_s))
+        apart = (motion.u_r_m_s - tone.motion.u_r_m_s).abs()
+        within = torch.full_like(apart > 0, not self.bounded)
+        outcome, info = outcome_of_point(line, radar, tone, aperture, reasons, lambda _: within, assumed=True)
+        return torch.where(apart > _UNLIKELY * std, apart, std), outcome, info
 
     def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
         """Return the motion with a candidate of u_r."""
         return PointMotion.of(self.radar, lines, u_r_m_s, u_a_m_s, y0_m, self.range_m)
-
-    def _estimate(self, fine: Tensor, coarse: Tensor, costs: Tensor, lines: Tensor, std: Tensor) -> Estimate:
-        """Return the estimate with its quality and `ok`."""
-        low, high = self.search_m_s
-        has_data = lines.detach().abs().amax((-3, -2, -1)) > 0
-        value = torch.where(has_data, fine.clamp(low, high), (low + high) / 2)
-        quality = torch.where(has_data, 1 - torch.exp(costs.amin(-1) - costs.median(-1).values), 0.0).clamp(0, 1)
-        inside = (coarse - low).abs().minimum((coarse - high).abs()) > self.step_m_s / 2
-        return Estimate(
-            {"u_r_m_s": value},
-            {"u_r_m_s": std},
-            quality,
-            Outcome.of(has_data & inside & (quality >= self.least_quality), Outcome.NOISE),
-            info={"log_ratio": -costs},
-        )
-
-
-def _is_point(line: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
-    """Whether one tone of a deramped line has a share of the energy that clutter lacks, (...,)."""
-    time_s = radar.pulse_axis(line.shape[-1]).values(line.device)
-    still = line.to(torch.complex128) * point_phasor(radar, motion, time_s, torch.complex128).conj()
-    power = torch.fft.fft(still, norm="ortho").abs().square().sum(-2)
-    return power.amax(-1) > _POINT_SHARE * power.sum(-1)
 
 
 def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor, rest_m_s: float) -> Tensor:

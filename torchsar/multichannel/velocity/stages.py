@@ -9,16 +9,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, take, unit_level
+from torchsar.core import Estimate, Outcome, Signal, Stage, take, unit_level
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import refuse_shifted
 from torchsar.multichannel.velocity.along_track import along_track_velocity, motion_from
-from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
 from torchsar.multichannel.velocity.aperture import Aperture
+from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.bank import Search
 from torchsar.multichannel.velocity.gradient import gradient_likelihood
-from torchsar.multichannel.velocity.illumination import lit_as_expected, seen_aperture
-from torchsar.multichannel.velocity.interferometry import DETECTED_DB, interferometry
+from torchsar.multichannel.velocity.illumination import seen_aperture
+from torchsar.multichannel.velocity.interferometry import interferometry
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of, refuse_unknowns
 from torchsar.multichannel.velocity.recommended import moving_point_velocity
@@ -48,9 +48,11 @@ class _Velocity(Stage):
     provides = UNKNOWNS
     neutral = dict.fromkeys(UNKNOWNS, 0.0)  # a point at rest in the middle of the scene
 
-    def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None) -> None:
+    def __init__(
+        self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, *, assess: bool = True
+    ) -> None:
         super().__init__()
-        self.radar, self.aperture, self.range_m = radar, aperture, range_m
+        self.radar, self.aperture, self.range_m, self.assess = radar, aperture, range_m, assess
 
     def line(self, signal: Signal) -> tuple[Tensor, Tensor | float | None]:
         """Return the data (..., channel, pulse) of the strongest range line and its closest range.
@@ -91,15 +93,20 @@ class Interferometry(_Velocity):
         aperture: Expected amplitude over slow time.
         range_m: Closest range in metres, None for that of the strongest range line, or for the
             reference range of the radar if there is no range axis.
-        check_ambiguity: Whether to check that the velocity is not wrong by lambda * PRF, in about
-            20 ms per trial. Where it is or may be wrong, `ok` is False; where it is, a warning is
-            given.
+        check_ambiguity: Whether the assessment asks if the velocity may be wrong by lambda PRF.
+        assess: Whether the outcome is assessed.
     """
 
     def __init__(
-        self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, check_ambiguity: bool = True
+        self,
+        radar: BistaticRadar,
+        aperture: Aperture,
+        range_m: float | None = None,
+        check_ambiguity: bool = True,
+        *,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, aperture, range_m)
+        super().__init__(radar, aperture, range_m, assess=assess)
         self.check_ambiguity = check_ambiguity
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
@@ -112,16 +119,14 @@ class Interferometry(_Velocity):
             y0_m: Starting along-track position at t = 0 in metres, shape (...,) or a number.
 
         Returns:
-            `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), see `interferometry`. With
-            `check_ambiguity`, `info` also holds `pulse_rates`, the number of PRFs to add to the
-            Doppler (-1, 0 or 1).
+            `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), see `interferometry`.
 
         Raises:
             ValueError: If the radar has one channel, the data have other channels than the radar or
                 fewer than 4 pulses, or slow time is not zero at pulse n // 2.
         """
-        data, radar, start, aperture = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
-        return interferometry(data, radar, start, aperture, check_ambiguity=self.check_ambiguity)
+        begun = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
+        return interferometry(*begun, check_ambiguity=self.check_ambiguity, assess=self.assess)
 
 
 class AlongTrackAutofocus(_Velocity):
@@ -135,15 +140,22 @@ class AlongTrackAutofocus(_Velocity):
         range_m: Closest range in metres, None for that of the strongest range line, or for the
             reference range of the radar if there is no range axis.
         half_m_s: Half width of the search about an along-track speed of zero in m/s.
+        assess: Whether standard deviation and outcome are assessed.
     """
 
     provides = ("u_a_m_s",)
     neutral = {"u_a_m_s": 0.0}
 
     def __init__(
-        self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, half_m_s: float = 20.0
+        self,
+        radar: BistaticRadar,
+        aperture: Aperture,
+        range_m: float | None = None,
+        half_m_s: float = 20.0,
+        *,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, aperture, range_m)
+        super().__init__(radar, aperture, range_m, assess=assess)
         self.half_m_s = half_m_s
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
@@ -162,7 +174,7 @@ class AlongTrackAutofocus(_Velocity):
                 speed of the receiver, the data have other channels than the radar or fewer than 4
                 pulses, or slow time is not zero at pulse n // 2.
         """
-        return along_track_velocity(*self.begin(signal, u_r_m_s, 0.0, y0_m), self.half_m_s)
+        return along_track_velocity(*self.begin(signal, u_r_m_s, 0.0, y0_m), self.half_m_s, assess=self.assess)
 
 
 class LikelihoodVelocity(_Velocity):
@@ -176,6 +188,7 @@ class LikelihoodVelocity(_Velocity):
         range_m: Closest range in metres, None for that of the strongest range line, or for the
             reference range of the radar if there is no range axis.
         unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`.
+        assess: Whether the outcome is assessed.
 
     Raises:
         ValueError: If `unknowns` holds other names or a name twice.
@@ -187,8 +200,10 @@ class LikelihoodVelocity(_Velocity):
         aperture: Aperture,
         range_m: float | None = None,
         unknowns: tuple[str, ...] = UNKNOWNS,
+        *,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, aperture, range_m)
+        super().__init__(radar, aperture, range_m, assess=assess)
         self.unknowns = tuple(unknowns)
         refuse_unknowns(self.unknowns)
 
@@ -204,9 +219,8 @@ class LikelihoodVelocity(_Velocity):
         Returns:
             `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), with standard deviations of those
             estimated. Where the point is lit in a part of the aperture only, this part is used, see
-            `seen_aperture`. `ok` is False where the SNR of the point over all samples is below 19
-            dB, where its illumination is not understood, see `lit_as_expected`, or where the steps
-            have not reached the maximum.
+            `seen_aperture`. Outcomes: those of `outcome_of_point`, and `NOT_CONVERGED` where the
+            steps have not reached the maximum.
 
         Raises:
             ValueError: If the data have other channels than the radar or fewer than 4 pulses, or
@@ -215,39 +229,20 @@ class LikelihoodVelocity(_Velocity):
         data, radar, start, aperture = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
         aperture, _ = seen_aperture(data, radar, start, aperture)
         found = maximum_likelihood(data, radar, start, aperture, self.unknowns)
-        ok = (found.snr_db >= DETECTED_DB) & lit_as_expected(data, radar, found.motion, aperture)
+        if not self.assess:
+            return estimate_of(found)
         # from a start too far away, another step would explain more than the noise of a few samples
         again = maximum_likelihood(data, radar, found.motion, aperture, self.unknowns, steps=1)
-        ok = ok & (again.energy - found.energy <= 4 * found.noise_power + 1e-9 * found.energy)
-        return estimate_of(found, ok, ((found.snr_db - DETECTED_DB) / 3).sigmoid())
+        moving = again.energy - found.energy > 4 * found.noise_power + 1e-9 * found.energy
+        outcome, _ = outcome_of_point(data, radar, found, aperture, [(Outcome.NOT_CONVERGED, moving)])
+        return estimate_of(found, outcome)
 
 
-class GradientVelocity(_Velocity):
+class GradientVelocity(LikelihoodVelocity):
     """Stage that estimates velocity and position by maximum likelihood with autograd gradients.
 
-    See `gradient_likelihood`.
-
-    Args:
-        radar: Radar parameters.
-        aperture: Expected amplitude over slow time.
-        range_m: Closest range in metres, None for that of the strongest range line, or for the
-            reference range of the radar if there is no range axis.
-        unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`.
-
-    Raises:
-        ValueError: If `unknowns` holds other names or a name twice.
+    See `gradient_likelihood`; arguments as those of `LikelihoodVelocity`.
     """
-
-    def __init__(
-        self,
-        radar: BistaticRadar,
-        aperture: Aperture,
-        range_m: float | None = None,
-        unknowns: tuple[str, ...] = UNKNOWNS,
-    ) -> None:
-        super().__init__(radar, aperture, range_m)
-        self.unknowns = tuple(unknowns)
-        refuse_unknowns(self.unknowns)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
         """Estimate the parameters that `unknowns` names, near a starting motion.
@@ -265,14 +260,14 @@ class GradientVelocity(_Velocity):
             ValueError: If the data have other channels than the radar or fewer than 4 pulses, or
                 slow time is not zero at pulse n // 2.
         """
-        return gradient_likelihood(*self.begin(signal, u_r_m_s, u_a_m_s, y0_m), self.unknowns)
+        begun = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
+        return gradient_likelihood(*begun, self.unknowns, assess=self.assess)
 
 
 class MovingPointVelocity(_Velocity):
     """Recommended stage for velocity and position of a moving point, without prior knowledge.
 
-    See `moving_point_velocity`. If the half width of the search in slant-range speed is below
-    lambda PRF, a warning is given where the velocity seems to lie beyond it.
+    See `moving_point_velocity`.
 
     Args:
         radar: Radar parameters.
@@ -281,6 +276,7 @@ class MovingPointVelocity(_Velocity):
             reference range of the radar if there is no range axis.
         search: Extent of the search, by default +-1.5 lambda PRF in slant-range speed.
         u_a_m_s: Along-track speed in m/s where it is known a priori, None to estimate it.
+        assess: Whether the outcome is assessed.
     """
 
     def __init__(
@@ -290,8 +286,10 @@ class MovingPointVelocity(_Velocity):
         range_m: float | None = None,
         search: Search | None = None,
         u_a_m_s: float | None = None,
+        *,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, aperture, range_m)
+        super().__init__(radar, aperture, range_m, assess=assess)
         self.search, self.u_a_m_s = search, u_a_m_s
         self.neutral = {**self.neutral, "u_a_m_s": u_a_m_s or 0.0}
 
@@ -307,8 +305,6 @@ class MovingPointVelocity(_Velocity):
                 // 2.
         """
         data, range_m = self.line(signal)
-        found = moving_point_velocity(data, self.radar, self.aperture, self.search, self.u_a_m_s, range_m)
-        if self.search is None or self.search.u_r_m_s >= self.radar.ambiguous_velocity_m_s:
-            return found
-        there = motion_from(self.radar, data, found["u_r_m_s"], found["u_a_m_s"], found["y0_m"], range_m)
-        return warned_of_ambiguity(found, data, self.radar, there, self.aperture)
+        return moving_point_velocity(
+            data, self.radar, self.aperture, self.search, self.u_a_m_s, range_m, assess=self.assess
+        )

@@ -16,6 +16,7 @@ from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.radar import BistaticRadar
 
 _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
+_CONTRAST = 5.0  # least contrast of a line that is not one of noise, by choice
 
 
 def walk_ambiguity(
@@ -76,6 +77,7 @@ class WalkAmbiguity(Stage):
         most: Largest magnitude of the ambiguity numbers that are tried.
         range_m: Closest range of the reference point in metres, None for the reference range of the
             radar.
+        assess: Whether quality and outcome are assessed.
 
     Raises:
         ValueError: If `most` is below 1.
@@ -85,11 +87,13 @@ class WalkAmbiguity(Stage):
     provides = ("ambiguity",)
     neutral = {"ambiguity": 0.0}
 
-    def __init__(self, radar: BistaticRadar, most: int = 2, range_m: float | None = None) -> None:
+    def __init__(
+        self, radar: BistaticRadar, most: int = 2, range_m: float | None = None, *, assess: bool = True
+    ) -> None:
         super().__init__()
         if most < 1:
             raise ValueError(f"most must be 1 or more, the largest ambiguity number to try, got {most}")
-        self.radar, self.most, self.range_m = radar, most, range_m
+        self.radar, self.most, self.range_m, self.assess = radar, most, range_m, assess
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
         """Estimate the PRF ambiguity number of the strongest point from its range walk.
@@ -103,14 +107,14 @@ class WalkAmbiguity(Stage):
         Returns:
             `ambiguity` of shape (...,). `info` holds `line`, the index of the range line of the
             point, and `contrast`, the energy of this line minus that of the strongest line with the
-            next best number, in standard deviations of the energy of a line of noise. `ok` is False
-            unless the contrast is above 5; it says that a line stays bright, whatever its phases.
+            next best number, in standard deviations of the energy of a line of noise. Outcomes:
+            `NOISE` unless the contrast is above 5. `OK` says that a line stays bright, whatever its
+            phases.
         """
         reference = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         number, contrast, line = walk_ambiguity(signal.data, Frame.of(self.radar, signal), reference, self.most)
-        return Estimate(
-            {"ambiguity": number},
-            quality=contrast / (5 + contrast),
-            outcome=Outcome.of(contrast > 5, Outcome.NOISE),
-            info={"line": line.to(torch.float64), "contrast": contrast},
-        )
+        info = {"line": line.to(torch.float64), "contrast": contrast}
+        if not self.assess:
+            return Estimate({"ambiguity": number}, info=info)
+        outcome = Outcome.of(contrast > _CONTRAST, Outcome.NOISE)
+        return Estimate({"ambiguity": number}, {}, contrast / (_CONTRAST + contrast), outcome, info)

@@ -60,6 +60,10 @@ class Whitening:
     log_det: Tensor
     coloured: Tensor
 
+    def at(self, trials: Tensor) -> Whitening:
+        """Return the whitening of some trials, which a bool tensor (...,) selects."""
+        return Whitening(self.factor[trials], self.log_det[trials], self.coloured[trials])
+
     def expanded(self, count: int) -> Whitening:
         """Return this whitening repeated `count` times along a new first dimension."""
         factor, log_det, coloured = (x.expand(count, *x.shape) for x in (self.factor, self.log_det, self.coloured))

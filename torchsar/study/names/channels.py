@@ -33,7 +33,6 @@ from torchsar.multichannel import (
     StationaryImage,
 )
 from torchsar.radar import BistaticRadar
-from torchsar.study.names.factories import with_assess
 
 Unknown = Literal["u_r_m_s", "u_a_m_s", "y0_m"]
 Method = Literal["least_squares", "mmse"]
@@ -94,9 +93,12 @@ def rebuild_bands(
     return Reconstruct(radar, _rebuild(bands, method, band_hz, snr_db), range_m)
 
 
-@with_assess
 def channel_balance(
-    radar: BistaticRadar, band_hz: float | None = None, bands: int | None = None, delays: bool = True
+    radar: BistaticRadar,
+    band_hz: float | None = None,
+    bands: int | None = None,
+    delays: bool = True,
+    assess: bool = True,
 ) -> EstimateBalance:
     """Estimator of phase, gain and delay errors of the channels from stationary clutter.
 
@@ -106,12 +108,14 @@ def channel_balance(
         bands: Number of Doppler bands of the clutter, each as wide as the PRF; None for all in
             which a stationary scene has echoes.
         delays: Whether delays are estimated as well.
+        assess: Whether the outcome is assessed.
     """
-    return EstimateBalance(radar, _prior(band_hz), bands, delays)
+    return EstimateBalance(radar, _prior(band_hz), bands, delays, assess=assess)
 
 
-@with_assess
-def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: float | None = None) -> Interferometry:
+def interferometry(
+    radar: BistaticRadar, dwell_s: float | None = None, range_m: float | None = None, assess: bool = True
+) -> Interferometry:
     """Estimator of the slant-range speed u_r of a target by along-track interferometry, for a given
     along-track speed u_a.
 
@@ -120,13 +124,17 @@ def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: 
             pattern of the channels.
         range_m: Closest range of the target in m; None for that of the strongest range line, or for
             the reference range of the radar if the data have no range axis.
+        assess: Whether the outcome is assessed.
     """
-    return Interferometry(radar, _aperture(dwell_s), range_m)
+    return Interferometry(radar, _aperture(dwell_s), range_m, assess=assess)
 
 
-@with_assess
 def along_track_autofocus(
-    radar: BistaticRadar, dwell_s: float | None = None, half_m_s: float = 20.0, range_m: float | None = None
+    radar: BistaticRadar,
+    dwell_s: float | None = None,
+    half_m_s: float = 20.0,
+    range_m: float | None = None,
+    assess: bool = True,
 ) -> AlongTrackAutofocus:
     """Estimator of the along-track speed u_a of a target. Deramping for the true speed turns the
     echo into a tone; the estimate is the speed that gives the strongest tone.
@@ -137,16 +145,17 @@ def along_track_autofocus(
         half_m_s: Half width of the search interval of u_a about 0, in m/s.
         range_m: Closest range of the target in m; None for that of the strongest range line, or for
             the reference range of the radar if the data have no range axis.
+        assess: Whether the outcome is assessed.
     """
-    return AlongTrackAutofocus(radar, _aperture(dwell_s), range_m, half_m_s)
+    return AlongTrackAutofocus(radar, _aperture(dwell_s), range_m, half_m_s, assess=assess)
 
 
-@with_assess
 def likelihood_velocity(
     radar: BistaticRadar,
     dwell_s: float | None = None,
     unknowns: tuple[Unknown, ...] = ("u_r_m_s", "u_a_m_s", "y0_m"),
     range_m: float | None = None,
+    assess: bool = True,
 ) -> LikelihoodVelocity:
     """Maximum-likelihood estimator of the motion of a target by Gauss-Newton steps from given
     initial values.
@@ -159,16 +168,17 @@ def likelihood_velocity(
             values.
         range_m: Closest range of the target in m; None for that of the strongest range line, or for
             the reference range of the radar if the data have no range axis.
+        assess: Whether the outcome is assessed.
     """
-    return LikelihoodVelocity(radar, _aperture(dwell_s), range_m, unknowns)
+    return LikelihoodVelocity(radar, _aperture(dwell_s), range_m, unknowns, assess=assess)
 
 
-@with_assess
 def gradient_velocity(
     radar: BistaticRadar,
     dwell_s: float | None = None,
     unknowns: tuple[Unknown, ...] = ("u_r_m_s", "u_a_m_s", "y0_m"),
     range_m: float | None = None,
+    assess: bool = True,
 ) -> GradientVelocity:
     """Maximum-likelihood estimator of the motion of a target by gradient descent from given initial
     values.
@@ -181,11 +191,11 @@ def gradient_velocity(
             values.
         range_m: Closest range of the target in m; None for that of the strongest range line, or for
             the reference range of the radar if the data have no range axis.
+        assess: Whether the outcome is assessed.
     """
-    return GradientVelocity(radar, _aperture(dwell_s), range_m, unknowns)
+    return GradientVelocity(radar, _aperture(dwell_s), range_m, unknowns, assess=assess)
 
 
-@with_assess
 def moving_point_velocity(
     radar: BistaticRadar,
     dwell_s: float | None = None,
@@ -194,6 +204,7 @@ def moving_point_velocity(
     y0_reach_m: float = 150.0,
     u_a_m_s: float | None = None,
     range_m: float | None = None,
+    assess: bool = True,
 ) -> MigratingLines:
     """Recommended estimator of velocity and position of a moving target. It needs no initial
     values, only the limits of the search.
@@ -208,15 +219,14 @@ def moving_point_velocity(
         u_a_m_s: Along-track speed in m/s if it is known a priori; None to estimate it.
         range_m: Closest range of the target in m; None for that of the strongest range line, or for
             the reference range of the radar if the data have no range axis.
+        assess: Whether the outcome is assessed.
     """
     reach = 1.5 * radar.ambiguous_velocity_m_s if u_r_reach_m_s is None else u_r_reach_m_s
-    return MigratingLines(
-        radar,
-        MovingPointVelocity(radar, _aperture(dwell_s), range_m, Search(reach, u_a_reach_m_s, y0_reach_m), u_a_m_s),
-    )
+    search = Search(reach, u_a_reach_m_s, y0_reach_m)
+    estimator = MovingPointVelocity(radar, _aperture(dwell_s), range_m, search, u_a_m_s, assess=assess)
+    return MigratingLines(radar, estimator, assess=assess)
 
 
-@with_assess
 def intensity_ratio(
     radar: BistaticRadar,
     bandwidth_hz: float,
@@ -225,6 +235,7 @@ def intensity_ratio(
     search_m_s: tuple[float, float] | None = None,
     step_m_s: float = 0.5,
     range_m: float | None = None,
+    assess: bool = True,
 ) -> SignalIntensityRatio:
     """Estimator of the slant-range speed u_r of a target by the signal intensity ratio. This is the
     intensity of the rebuilt spectrum inside the processed Doppler band over that outside; it is
@@ -238,12 +249,12 @@ def intensity_ratio(
         search_m_s: Least and largest speed of the search in m/s; None for all unambiguous speeds.
         step_m_s: Step of the search in m/s.
         range_m: Closest range of the targets in m; None for the reference range of the radar.
+        assess: Whether the outcome is assessed.
     """
     rebuild = _rebuild(bands, method)
-    return SignalIntensityRatio(radar, bandwidth_hz, rebuild, search_m_s, step_m_s, range_m)
+    return SignalIntensityRatio(radar, bandwidth_hz, rebuild, search_m_s, step_m_s, range_m, assess=assess)
 
 
-@with_assess
 def alternate_velocity(
     radar: BistaticRadar,
     bandwidth_hz: float,
@@ -253,6 +264,7 @@ def alternate_velocity(
     rounds: int = 2,
     step_m_s: float = 0.5,
     half_m_s: float = 20.0,
+    assess: bool = True,
 ) -> MigratingLines:
     """Alternate estimation of the slant-range speed u_r of a target by the signal intensity ratio,
     and of its along-track speed u_a by autofocus.
@@ -267,15 +279,16 @@ def alternate_velocity(
         rounds: Number of rounds; each round estimates u_r and then u_a.
         step_m_s: Step of the search for u_r in m/s.
         half_m_s: Half width of the search interval of u_a about 0, in m/s.
+        assess: Whether the outcome is assessed.
 
     Reference:
         Remote Sens. 2020, 12, 1703, section 4.3.
     """
-    ratio = intensity_ratio(radar, bandwidth_hz, bands, method, step_m_s=step_m_s)
-    autofocus = along_track_autofocus(radar, dwell_s, half_m_s)
+    ratio = intensity_ratio(radar, bandwidth_hz, bands, method, step_m_s=step_m_s, assess=assess)
+    autofocus = along_track_autofocus(radar, dwell_s, half_m_s, assess=assess)
     made = Alternate(rounds, u_r=Turn(ratio), u_a=Turn(autofocus))
     made.works_on, made.also_on = autofocus.works_on, autofocus.also_on
-    return MigratingLines(radar, made, one_line=True)
+    return MigratingLines(radar, made, one_line=True, assess=assess)
 
 
 def stationary_image(
@@ -316,6 +329,7 @@ def movers_image(
     most: int = 8,
     u_a_reach_m_s: float = 20.0,
     suppressed_m_s: Sequence[float] = Detector().suppressed_m_s,
+    assess: bool = True,
 ) -> MoversImage:
     """Image of a scene with its moving targets focused at their true positions, and estimates of
     their motion.
@@ -340,6 +354,7 @@ def movers_image(
         u_a_reach_m_s: Half width of the search in the along-track speed in m/s.
         suppressed_m_s: Slant-range speeds in m/s for a further image in which the sea is
             suppressed, so that weaker targets are detected; empty to omit this image.
+        assess: Whether the outcome is assessed.
 
     Reference:
         Remote Sens. 2020, 12, 1703, Fig. 13.
@@ -347,4 +362,4 @@ def movers_image(
     extraction = Extraction(half_along_m, half_range_m, integration_s, segment_s)
     detector = Detector(threshold_db, most=most, suppressed_m_s=suppressed_m_s)
     rebuild = _rebuild(bands, method, band_hz, snr_db)
-    return MoversImage(radar, rebuild, removal, extraction, detector, u_a_reach_m_s)
+    return MoversImage(radar, rebuild, removal, extraction, detector, u_a_reach_m_s, assess=assess)

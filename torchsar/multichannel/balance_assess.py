@@ -1,0 +1,166 @@
+"""Assessment of channel weights that are fitted to stationary clutter: deviations and outcome.
+
+The model of the clutter errs: its power over Doppler and over range is not the expected one, or a
+few points make it up. The deviations therefore follow from the data. The gradient of the likelihood
+is a sum over range cells, whose clutter and noise are independent of each other: its scatter over
+blocks of cells gives its covariance, and with the Hessian that of the unknowns. What leaks
+coherently into all channels leaves the gradient of each cell at zero and does not count as noise.
+
+Reference:
+    White 1982 (covariance of a maximum-likelihood estimate whose model errs).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Outcome, matrix_inverse, worst
+from torchsar.multichannel.clutter_fit import HANN_LOOKS, ClutterModel, Fit
+
+# Blocks of range cells, of range frequencies and of Doppler bins, by choice: 32 give a standard
+# deviation to 13 %.
+_CELL_BLOCKS, _BIN_BLOCKS = 32, 16
+# Curvature below which a combination of unknowns is not determined, per look, and the standard
+# deviation in rad or neper of what is not determined.
+_LEAST_CURVED, _UNKNOWN = 1e-10, 1e3
+# Difference of the powers of balanced channels over that by chance from which the prior is taken to
+# be wrong, by choice.
+_UNLIKELY = 4.0
+# Ratio of deviations by the scatter of Doppler bins and of range cells from which the prior is
+# taken to be wrong, and least number of parts of the swath that hold the power, both by choice. The
+# ratio is at most 1.8 where the prior suits; a point that holds 58 % of the power leaves 3 parts.
+_MISFIT, _LEAST_PARTS = 2.5, 3.0
+# Least logarithm of the likelihood ratio to clutter displaced by whole bands, by choice.
+_LEAST_LEAD = 100.0
+# Convention: a linear phase error of 0.1 rad, three times as much, already makes false targets of
+# about -20 dB when three bands are reconstructed at a PRF of 180 Hz. So do amplitudes. Phases that
+# delays turn over the range band weigh less, since their mean is zero.
+_LARGEST_STD_RAD, _LARGEST_ACROSS_RAD = 0.033, 0.1
+_NOTHING_RAD = 0.25  # standard deviation from which a phase is that of noise, by choice
+_TINY = torch.finfo(torch.float64).tiny
+
+
+@dataclass(frozen=True)
+class BalanceFit:
+    """Fit of the weights of the channels, with what its assessment needs.
+
+    Args:
+        lines: Balanced spectra, complex128 (..., channel, bin, range frequency).
+        model: Model of the clutter.
+        fit: Minimum.
+        snr_db: SNR of the model, (...,).
+        position: Places of the range frequencies in the band, -1 to 1; None without turns.
+        reference: Index of the reference channel.
+        no_power: Where a channel has no power, bool (...,).
+    """
+
+    lines: Tensor
+    model: ClutterModel
+    fit: Fit
+    snr_db: Tensor
+    position: Tensor | None
+    reference: int
+    no_power: Tensor
+
+
+def assessed_balance(found: BalanceFit, lead: Tensor | None) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
+    """Return standard deviations of phases, logarithms of gains and turns, quality and outcome.
+
+    Args:
+        found: The fit.
+        lead: Lead of the first fit per look, see `ClutterModel.lead`; None where the clutter cannot
+            lie in other Doppler bands.
+
+    Returns:
+        Deviations, float64 (..., channel) each; quality of 0 to 1 and codes of the outcome, (...,).
+        Those of gains contain the difference that remains between the powers of the balanced
+        channels, as with a wrong prior.
+    """
+    lines, model, fit, reference = found.lines, found.model, found.fit, found.reference
+    inverse = matrix_inverse(model.noisy(found.snr_db))
+    inner = (inverse @ lines.movedim(-3, -2)).movedim(-2, -3)
+    cells, within = (torch.fft.ifft(x, norm="ortho") for x in (lines, inner))
+    along = _covariance(_score(cells, within, -2), _CELL_BLOCKS)
+    over_bins = _covariance(_score(lines, inner, -1), _BIN_BLOCKS)
+    hessian, determined = _inverse(fit.hessian, reference, lines.shape[-3])
+
+    def std(covariance: Tensor, rows: Tensor) -> Tensor:
+        variance = ((rows @ covariance) * rows).sum(-1).clamp_min(0)
+        return torch.where(determined[..., None], variance.sqrt(), _UNKNOWN).clamp_max(_UNKNOWN)
+
+    channels = lines.shape[-3]
+    rows = hessian[..., : 2 * channels, : 2 * channels].clone()
+    rows[..., :channels, :] -= rows[..., reference, None, :].clone()
+    log_std, phase_std = std(along, rows).unflatten(-1, (2, -1)).unbind(-2)
+    turn_std = torch.zeros_like(phase_std)
+    if found.position is not None:
+        turning = torch.cat([_score(lines, inner, -2), found.position * (lines.conj() * inner).mean(-2).imag], -2)
+        turn_std = std(_covariance(turning, _CELL_BLOCKS), hessian[..., 2 * channels :, :])
+    misfit = std(over_bins, rows).square().sum(-1) / std(along, rows).square().sum(-1).clamp_min(_TINY)
+    power = (cells.abs().square().mean((-3, -2)) - 10 ** (-found.snr_db[..., None] / 10)).clamp_min(0)
+    share = _blocks(power, _CELL_BLOCKS)
+    share = share / share.sum(-1, keepdim=True).clamp_min(_TINY)
+    # balanced channels have equal power, but with a wrong prior other gains are more likely
+    looks = lines.shape[-2] * lines.shape[-1] * HANN_LOOKS
+    level = lines.abs().square().mean((-2, -1))
+    uneven = torch.log((level / level[..., reference, None].clamp_min(1e-300)).clamp_min(1e-3)).abs() / 2
+    chance = model.chance(found.snr_db, reference, looks) / 2
+    log_std = torch.where(uneven > _UNLIKELY * chance, torch.hypot(log_std, uneven), log_std)
+    largest = torch.maximum(phase_std, log_std).amax(-1)
+    # rms phase over the range band by a delay
+    across = turn_std.amax(-1) / math.sqrt(3)
+    relative = torch.maximum(largest / _LARGEST_STD_RAD, across / _LARGEST_ACROSS_RAD)
+    outcome = worst(
+        (Outcome.INEXACT, ~(relative < 1)),
+        (Outcome.MISFIT, misfit.sqrt() >= _MISFIT),
+        (Outcome.AMBIGUOUS, found.no_power if lead is None else lead * looks <= _LEAST_LEAD),
+        (Outcome.TOO_FEW, share.square().sum(-1) * _LEAST_PARTS >= 1),
+        (Outcome.NOISE, phase_std.amax(-1) > _NOTHING_RAD),
+        (Outcome.EMPTY, found.no_power),
+        (Outcome.SINGULAR, ~determined & ~found.no_power),
+    )
+    return (phase_std, log_std, turn_std), (1 - relative).clamp(0, 1), outcome
+
+
+def _score(lines: Tensor, inner: Tensor, dim: int) -> Tensor:
+    """Return the gradient by logarithms and phases, averaged over `dim`, (..., 2 channel, n).
+
+    Args:
+        lines: Balanced lines, (..., channel, bin, cell).
+        inner: Lines times the inverse of the model.
+        dim: Dimension of bins or of cells.
+    """
+    product = (lines.conj() * inner).mean(dim)
+    return torch.cat([product.real - 1, product.imag], -2)
+
+
+def _blocks(values: Tensor, blocks: int) -> Tensor:
+    """Add neighbouring values along the last dimension to at most this number of blocks."""
+    count = values.shape[-1]
+    at = torch.arange(count, device=values.device) * min(blocks, count) // count
+    total = torch.zeros(*values.shape[:-1], min(blocks, count), dtype=values.dtype, device=values.device)
+    return total.index_add(-1, at, values)
+
+
+def _covariance(score: Tensor, blocks: int) -> Tensor:
+    """Return the covariance (..., n, n) of the mean of scores (..., n, cell) from their blocks."""
+    total = _blocks(score, blocks) / score.shape[-1]
+    count = total.shape[-1]
+    return total @ total.mT * (count / max(1, count - 1))
+
+
+def _inverse(hessian: Tensor, reference: int, channels: int) -> tuple[Tensor, Tensor]:
+    """Return the inverse of a Hessian, and whether it is that of a minimum, (...,).
+
+    Phase and turn of all channels together are not determined: those of the reference are zero.
+    """
+    kept = [i for i in range(hessian.shape[-1]) if i < channels or (i - reference) % channels]
+    free = torch.tensor(kept, device=hessian.device)
+    values, vectors = torch.linalg.eigh(hessian[..., free[:, None], free])
+    inverse = torch.zeros_like(hessian)
+    inverse[..., free[:, None], free] = (vectors / values.clamp_min(_LEAST_CURVED)[..., None, :]) @ vectors.mT
+    return inverse, values[..., 0] > _LEAST_CURVED
