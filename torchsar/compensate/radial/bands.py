@@ -41,8 +41,8 @@ class Bands:
     down(-u) exp(+2j pi s u / T). Both have the sign convention of Remote Sens. 2024, 16, 793
     (dechirp sign "lo_conj_echo"). A scatterer has the beat frequency of its range plus the
     remaining Doppler shift in `up`, and that of its range minus the remaining shift in `down`. The
-    remaining shift is about a bin or less. The residual video phase is removed unless `bands_of`
-    was asked to keep it. The samples of each trial are multiplied by a power of two that brings
+    remaining shift is about a bin or less. The residual video phase is removed unless
+    `Spectra.bands` was asked to keep it. The samples of each trial are multiplied by a power of two that brings
     them to about one.
 
     Args:
@@ -294,76 +294,103 @@ def _through_blocks(values: Tensor, pulses: int) -> Tensor:
     return values[..., low] * (1 - share) + values[..., low + 1] * share
 
 
-def bands_of(
-    sweeps: Tensor,
-    radar: TriangularLadar,
-    window_m: tuple[float, float] | None = None,
-    taper: float = 1.0,
-    oversampling: int = 1,
-    video: bool = False,
-) -> Bands:
-    """Filter both sweeps of every period to a range window.
-
-    The down sweeps are mirrored in time, and the bulk of the Doppler shift (whole bins, estimated
-    from the data) is removed. Differentiable, except that the removed shift is held constant.
+@dataclass(frozen=True)
+class Spectra:
+    """Beat spectra of both sweeps of every period, and the bulk of the Doppler shift.
 
     Args:
-        sweeps: Up and down sweeps of N samples as recorded, shape (..., 2, pulse, N), complex.
+        data: Spectra of the sweeps in the sign convention of `canonical`, zero frequency first,
+            shape (..., 2, pulse, N), complex.
+        scale: Power of two that brings the samples of a trial to about one, shape (..., 1, 1, 1).
+        shift: Doppler shift in whole bins, shape (..., pulse), int64, see `bulk_shift`.
+        alike: True where the spectra of both sweeps are similar, shape (..., pulse), bool.
         radar: Ladar parameters.
-        window_m: Lowest and highest range in metres, relative to the reference range; None for the
-            whole band.
-        taper: Share of the window that its raised-cosine edges take, 0..1. At 0 the window is cut
-            sharply; ringing at the ends of the sweep then limits the accuracy of `mirror_product`
-            at high SNR. At 1 the edges meet in the middle.
-        oversampling: Samples per bin; the number of samples is rounded up to a power of two.
-            Products of sweeps need 2.
-        video: True keeps the residual video phase. This suits methods that use single scatterers,
-            which that phase does not affect, because the filter that removes it rings at the ends
-            of the sweep.
-
-    Returns:
-        The filtered sweeps.
-
-    Raises:
-        ValueError: If the window is invalid, see `window_lines`.
     """
-    first, lines = window_lines(radar, window_m)
-    n = radar.sweep_samples
-    data = canonical(sweeps, radar)
-    spectrum, scale = torch.fft.fft(data), _scale(sweeps.detach())
-    shift, alike = bulk_shift(_block_power(spectrum.detach(), scale), sweeps.shape[-2])
-    shift, certain = _corrected_shift(spectrum.detach(), scale, shift, first, lines)
-    m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
-    line = torch.arange(lines, device=sweeps.device)
-    sides = torch.stack([shift, -shift], -2)
-    # a mirrored sweep has the mirrored spectrum
-    mirror = torch.arange(1, -2, -2, device=sweeps.device)[:, None, None]
-    kept = spectrum.gather(-1, mirror * (first + line + sides[..., None]) % n)
-    edges = taper if window_m is not None else 0.0
-    shape = _raised_cosine(line.to(torch.float64), lines, edges)
-    filters = torch.stack(
-        [shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)]
-    )
-    # phases refer to the middle of the sweep
-    middle = mirror[..., 0] * (first + sides).to(torch.float64)
-    turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
-    series = torch.fft.ifft(kept * filters[:, None, :] * (turned * scale[..., 0])[..., None], m) * (m / n)
-    beat = _beat_of_first(first, m, sweeps)
-    series = series * beat.to(series.dtype)
-    time_s = (torch.arange(m, dtype=torch.float64, device=sweeps.device) - (m - 1) / 2) * (radar.sweep_s / m)
-    up, down = series[..., 0, :, :], series[..., 1, :, :]
-    return Bands(
-        up,
-        down,
-        time_s,
-        shift,
-        alike & (certain | ~_without_echo(up, down, alike)),
-        lines,
-        first,
-        # computed on the host, for which the device need not be read
-        float(_raised_cosine(torch.arange(lines, dtype=torch.float64), lines, edges).square().sum()),
-        radar,
-    )
+
+    data: Tensor
+    scale: Tensor
+    shift: Tensor
+    alike: Tensor
+    radar: TriangularLadar
+
+    @staticmethod
+    def of(sweeps: Tensor, radar: TriangularLadar) -> Spectra:
+        """Transform sweeps and find the bulk of their Doppler shift.
+
+        Args:
+            sweeps: Up and down sweeps of N samples as recorded, shape (..., 2, pulse, N), complex.
+            radar: Ladar parameters.
+
+        Returns:
+            The spectra.
+        """
+        spectrum, scale = torch.fft.fft(canonical(sweeps, radar)), _scale(sweeps.detach())
+        return Spectra(spectrum, scale, *bulk_shift(_block_power(spectrum.detach(), scale), sweeps.shape[-2]), radar)
+
+    def bands(
+        self,
+        window_m: tuple[float, float] | None = None,
+        taper: float = 1.0,
+        oversampling: int = 1,
+        video: bool = False,
+    ) -> Bands:
+        """Filter both sweeps of every period to a range window.
+
+        The down sweeps are mirrored in time, and the Doppler shift is removed in whole bins.
+        Differentiable, except that the removed shift is held constant.
+
+        Args:
+            window_m: Lowest and highest range in metres, relative to the reference range; None for
+                the whole band.
+            taper: Share of the window that its raised-cosine edges take, 0..1. At 0 the window is
+                cut sharply; ringing at the ends of the sweep then limits the accuracy of
+                `mirror_product` at high SNR. At 1 the edges meet in the middle.
+            oversampling: Samples per bin; the number of samples is rounded up to a power of two.
+                Products of sweeps need 2.
+            video: True keeps the residual video phase. This suits methods that use single
+                scatterers, which that phase does not affect, because the filter that removes it
+                rings at the ends of the sweep.
+
+        Returns:
+            The filtered sweeps.
+
+        Raises:
+            ValueError: If the window is invalid, see `window_lines`.
+        """
+        spectrum, radar = self.data, self.radar
+        first, lines = window_lines(radar, window_m)
+        n, device = radar.sweep_samples, spectrum.device
+        shift, certain = _corrected_shift(spectrum.detach(), self.scale, self.shift, first, lines)
+        m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
+        line = torch.arange(lines, device=device)
+        sides = torch.stack([shift, -shift], -2)
+        # a mirrored sweep has the mirrored spectrum
+        mirror = torch.arange(1, -2, -2, device=device)[:, None, None]
+        kept = spectrum.gather(-1, mirror * (first + line + sides[..., None]) % n)
+        edges = taper if window_m is not None else 0.0
+        shape = _raised_cosine(line.to(torch.float64), lines, edges)
+        filters = torch.stack(
+            [shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)]
+        )
+        # phases refer to the middle of the sweep
+        middle = mirror[..., 0] * (first + sides).to(torch.float64)
+        turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
+        series = torch.fft.ifft(kept * filters[:, None, :] * (turned * self.scale[..., 0])[..., None], m) * (m / n)
+        series = series * _beat_of_first(first, m, kept).to(series.dtype)
+        time_s = (torch.arange(m, dtype=torch.float64, device=device) - (m - 1) / 2) * (radar.sweep_s / m)
+        up, down = series[..., 0, :, :], series[..., 1, :, :]
+        return Bands(
+            up,
+            down,
+            time_s,
+            shift,
+            self.alike & (certain | ~_without_echo(up, down, self.alike)),
+            lines,
+            first,
+            # computed on the host, for which the device need not be read
+            float(_raised_cosine(torch.arange(lines, dtype=torch.float64), lines, edges).square().sum()),
+            radar,
+        )
 
 
 def _without_echo(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:

@@ -10,10 +10,10 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
-from torchsar.compensate.radial.blocks import by_trials
+from torchsar.compensate.radial.bands import Bands, Spectra, refuse_other_sweeps
+from torchsar.compensate.radial.blocks import velocities
+from torchsar.compensate.radial.measured import Law, Measured
 from torchsar.compensate.radial.peak import from_beats
-from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate
 from torchsar.radar import TriangularLadar
 
@@ -28,6 +28,7 @@ def spectrum_correlation(
     upsampling: int = 20,
     window_m: tuple[float, float] | None = None,
     azimuth_m: Tensor | float = 0.0,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the radial velocity from the lag between the range envelopes of both sweeps.
 
@@ -67,19 +68,13 @@ def spectrum_correlation(
 
     floor = radar.wavelength_m / (4 * upsampling * radar.sweep_s * math.sqrt(12))
 
-    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
-        bands = bands_of(sweeps, radar, window_m, taper=0.0)
+    def measure(spectra: Spectra) -> Measured:
+        bands = spectra.bands(window_m, taper=0.0)
         doppler = envelope_lag(bands, upsampling) / (2 * radar.sweep_s)
-        return velocity_estimate(
-            from_beats(doppler, -doppler, bands),
-            bands_of(sweeps, radar, window_m, taper=0.5, oversampling=2),
-            pulse,
-            factor=3.0,
-            azimuth_m=azimuth_m,
-            floor_m_s=floor,
-        )
+        product = spectra.bands(window_m, taper=0.5, oversampling=2)
+        return Measured.of(from_beats(doppler, -doppler, bands), product, Law(3.0, floor_m_s=floor))
 
-    return by_trials(estimator, sweeps, azimuth_m)
+    return velocities(measure, sweeps, radar, pulse, azimuth_m, assess)
 
 
 @torch.no_grad()

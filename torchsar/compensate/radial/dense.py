@@ -9,6 +9,7 @@ also made without a start. Only a result that was reached twice is reliable.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,13 +17,13 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare
 from torchsar.compensate.pulse_phase.homogeneous import power_groups
 from torchsar.compensate.pulse_phase.linking import linked
-from torchsar.core import Estimate, Outcome, cis, power_of
+from torchsar.core import Estimate, cis, power_of
 from torchsar.core.spline import UniformSpline
 
 # Pulses are averaged to about so many blocks, over which the residual phase is smooth; it makes the
 # search fast, because its time grows with the cube of their number.
 _BLOCKS = 128
-_SAME_RAD = 0.1  # rms difference below which two results are the same
+SAME_RAD = 0.1  # rms difference below which two results are the same
 # Descent to a smooth walk of the phase: number of cosines, rms of the walk expected in rad, noise
 # floors relative to the mean power, steps for each, and length of a step. A high floor lets the
 # descent pass over local minima; the walks of velocities from dense scenes are 0.4 to 1.6 rad.
@@ -33,7 +34,23 @@ _WITHIN = 0.115
 _MEMORY = (0.9, 0.98)  # of the mean slope and of the mean squared slope
 
 
-def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estimate:
+class Walk(NamedTuple):
+    """Residual phases of dense scenes.
+
+    Args:
+        phase_rad: Phases in rad without steps of whole turns and without a straight line, shape
+            (trial, pulse), float64.
+        std_rad: Their standard deviation: that of the likelihood, of the walk within a block of
+            pulses, and that which the difference of the two nearest results shows, same shape.
+        apart_rad: Rms difference in rad of the nearest result from another start, shape (trial,).
+    """
+
+    phase_rad: Tensor
+    std_rad: Tensor
+    apart_rad: Tensor
+
+
+def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Walk:
     """Estimate the residual phase of each pulse of dense scenes by maximum likelihood.
 
     Args:
@@ -44,10 +61,7 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
             shape (trial,).
 
     Returns:
-        `phase_rad` of shape (trial, pulse), without steps of whole turns and without a straight
-        line. Its standard deviation is that of `link_phases`, of the walk within a block of pulses,
-        and that which the difference of the two nearest results shows. `ok` is False where no two
-        starts reach the same phases within 0.1 rad, or `link_phases` is not ok.
+        The most likely of the phases from two or three starts.
     """
     n = cells.shape[-2]
     size = max(1, n // _BLOCKS)
@@ -60,13 +74,13 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
     pulses = prepare(averaged(cells), "linked_walk", empty=False)
     start = torch.angle(averaged(cis(polished_rad.detach().to(torch.float64))))
     results = [linked(pulses, start, still=True), linked(pulses, smooth_walk(pulses.rows.detach()), still=True)]
-    phase, gain, std, ok = (torch.stack(parts) for parts in zip(*map(_parts, results), strict=True))
-    differ = (phase_difference(phase[0], phase[1]) > _SAME_RAD).nonzero()[:, 0]
+    phase, gain, std = (torch.stack(parts) for parts in zip(*map(_parts, results), strict=True))
+    differ = (phase_difference(phase[0], phase[1]) > SAME_RAD).nonzero()[:, 0]
     if len(differ):
         third = _parts(linked(Pulses(pulses.rows[differ], pulses.present[differ], differ.shape), still=True))
-        phase, gain, std, ok = (
+        phase, gain, std = (
             torch.cat([of_two, of_two[:1].index_copy(1, differ, of_third[None])])
-            for of_two, of_third in zip((phase, gain, std, ok), third, strict=True)
+            for of_two, of_third in zip((phase, gain, std), third, strict=True)
         )
     best = gain.argmax(0)
     trial = torch.arange(len(best), device=best.device)
@@ -79,18 +93,13 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
     middle = first + (size - 1) / 2
     at = torch.arange(n, dtype=torch.float64, device=cells.device)
     block = ((at - first) / size).floor().clamp(0, count - 1).long()
-    return Estimate(
-        {"phase_rad": UniformSpline(walk, middle, size).at(at)},
-        {"phase_rad": spread[:, block]},
-        torch.exp(-spread.square().mean(-1)),
-        Outcome.of(ok[best, trial] & (apart < _SAME_RAD), Outcome.NOISE),
-    )
+    return Walk(UniformSpline(walk, middle, size).at(at), spread[:, block], apart)
 
 
-def _parts(found: Estimate) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Phase, likelihood, deviation and verdict; the first and third of shape (trial, pulse)."""
+def _parts(found: Estimate) -> tuple[Tensor, Tensor, Tensor]:
+    """Phase, likelihood and deviation; the first and third of shape (trial, pulse)."""
     double = torch.float64
-    return found["phase_rad"].to(double), found.info["fit_nats"], found.std["phase_rad"].to(double), found.ok
+    return found["phase_rad"].to(double), found.info["fit_nats"], found.std["phase_rad"].to(double)
 
 
 @torch.no_grad()

@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_other_sweeps, window_lines
-from torchsar.compensate.radial.blocks import by_trials
+from torchsar.compensate.radial.bands import Bands, Spectra, inside, refuse_other_sweeps, window_lines
+from torchsar.compensate.radial.blocks import velocities
+from torchsar.compensate.radial.measured import Law, Measured
 from torchsar.compensate.radial.newton import climbed
-from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate, cis, power_of
 from torchsar.radar import TriangularLadar
 
@@ -27,6 +27,7 @@ def ml_peak(
     *,
     window_m: tuple[float, float] | None = None,
     azimuth_m: Tensor | float = 0.0,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the radial velocity from the periodogram peaks of both sweeps.
 
@@ -61,21 +62,18 @@ def ml_peak(
     refuse_other_sweeps(sweeps, radar, "ml_peak", pulse)
     window_lines(radar, window_m)
 
-    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
-        bands = bands_of(sweeps, radar, video=True)
+    def measure(spectra: Spectra) -> Measured:
+        bands = spectra.bands(video=True)
         up, down, lit = peak_frequencies(bands, window_m)
-        changes = [_amplitude_slope(x, hz.detach(), bands) for x, hz in ((bands.up, up), (bands.down, down))]
-        return velocity_estimate(
-            from_beats(up, down, bands),
-            bands_of(sweeps, radar, window_m, taper=0.5, oversampling=2),
-            pulse,
-            factor=3.0,
-            azimuth_m=azimuth_m,
-            spread_m_s=radar.wavelength_m / 2 * (changes[0] - changes[1]) / 2,
-            lit=bands.lit & lit,
-        )
 
-    return by_trials(estimator, sweeps, azimuth_m)
+        def changes() -> Tensor:
+            of_up, of_down = (_amplitude_slope(x, hz, bands) for x, hz in ((bands.up, up), (bands.down, down)))
+            return radar.wavelength_m / 2 * (of_up - of_down) / 2
+
+        product = spectra.bands(window_m, taper=0.5, oversampling=2)
+        return Measured.of(from_beats(up, down, bands), product, Law(3.0, changes=changes), bands.lit & lit)
+
+    return velocities(measure, sweeps, radar, pulse, azimuth_m, assess)
 
 
 def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:
@@ -146,5 +144,5 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
     peak, best = torch.where(distance.abs() <= round(_REACH * _PAD), power, -1).max(-1)
     best = torch.where(best >= _PAD * m // 2, best - _PAD * m, best)
     frequency = best.to(torch.float64) / (_PAD * bands.radar.sweep_s)
-    frequency = climbed(both, 2 * math.pi * bands.time_s, frequency, _NEWTON)
+    frequency = climbed(both, bands.radar.sweep_s / m, frequency, _NEWTON)
     return frequency[..., 0, :], frequency[..., 1, :], shining(peak[..., 0, :], peak[..., 1, :])

@@ -18,8 +18,6 @@ from torchsar.compensate.pulse_phase.sharpen import Run, Wiener, bright, in_turn
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate, power_of
 
-# standard deviation of the phase from which on it is not ok: a Strehl ratio of exp(-0.25) = 0.78
-ENOUGH_STD_RAD = 0.5
 # over-relaxation, found by trial: larger values converge faster, at 2 or more need not converge
 _RELAXATION = 1.7
 # found by trial: higher levels exclude weak scatterers, lower ones include noise
