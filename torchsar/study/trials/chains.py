@@ -72,7 +72,7 @@ def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any
             raise ConfigError(f"{loaded.file}: {path}: {reason_of(error, context.get('radar'))}") from error
         built[name] = use(
             stage,
-            in_doubt=entry.get("in_doubt", "neutral"),
+            in_doubt=entry.get("in_doubt", "apply"),
             **_sources(entry.get("uses", {}), method, loaded, path),
         )
     try:
