@@ -105,15 +105,15 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
 
     changes = _changes_of_product(measured, law.intercept or "free") if law.changes is None else law.changes()
     square = filled(variance(changes) / share, clear)
-    slope, bend = (_rms_difference(measured.raw_m_s, clear, order, mean_of(square, clear)) for order in (1, 2))
+    slope, bend = (_rms_difference(measured.raw_m_s, clear, order) for order in (1, 2))
     jerk = _JERK * bend * (measured.product.radar.period_s / pulse.step) ** 2
     square = square + _interpolated(clear, slope, bend).square() + jerk.square() + law.floor_m_s**2
     if law.intercept:
         return square
-    bands = measured.product
-    away = measured.raw_m_s - mirror_velocity(bands, "free")[0]
+    away = measured.velocity_m_s - mirror_velocity(measured.product, "free")[0]
     own = variance(changes if law.changes is None else _changes_of_product(measured, "free"))
-    apart = (mean_of(away.square() * share, clear) - own) / weight - (_BIAS * bands.radar.ambiguous_velocity_m_s) ** 2
+    bias = _BIAS * measured.product.radar.ambiguous_velocity_m_s
+    apart = mean_of(away.square() - own / share, clear) - bias**2
     judged = (measured.levels.squared_db >= _CLEAR_DB)[..., None]
     return torch.where(judged, torch.maximum(square, apart), square)
 
@@ -144,14 +144,11 @@ def _quotient(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(b > 0, a / torch.where(b > 0, b, 1), 0).to(torch.float64)
 
 
-def _rms_difference(velocity: Tensor, known: Tensor, order: int, noise: Tensor) -> Tensor:
-    """Rms first or second difference of velocities (..., pulse) in known periods beyond that of
-    noise with the variance (..., 1); (..., 1).
-    """
+def _rms_difference(velocity: Tensor, known: Tensor, order: int) -> Tensor:
+    """Rms first or second difference of velocities (..., pulse) in known periods, (..., 1)."""
     if velocity.shape[-1] <= order:
         return torch.zeros_like(velocity[..., :1])
-    square = mean_of(velocity.diff(n=order).square(), known.unfold(-1, order + 1, 1).all(-1))
-    return (square - math.comb(2 * order, order) * noise).clamp_min(0).sqrt()
+    return mean_of(velocity.diff(n=order).square(), known.unfold(-1, order + 1, 1).all(-1)).sqrt()
 
 
 def _interpolated(known: Tensor, slope: Tensor, bend: Tensor) -> Tensor:
