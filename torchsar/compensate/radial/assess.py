@@ -13,16 +13,15 @@ from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.radial.bands import filled
-from torchsar.compensate.radial.dense import SAME_RAD, Walk, phase_difference
-from torchsar.compensate.radial.measured import Intercept, Levels, Measured, mean_of
+from torchsar.compensate.radial.dense import SAME_RAD, Walk
+from torchsar.compensate.radial.measured import LEAST_SQUARED, TINY, Intercept, Levels, Measured, mean_of
 from torchsar.compensate.radial.product import mirror_velocity
 from torchsar.core import Axis, Estimate, Outcome, cis, host_value, power_of, true_positions, worst
+from torchsar.metrics.phase import phase_rmse
 
-_TINY = torch.finfo(torch.float64).tiny
-# SNR of the product of both sweeps from which on its peak exceeds the noise in all periods, and
-# that below which noise alone may make it; by trial
-_CLEAR_DB, _NOISE_DB = 15.0, 9.0
-# a velocity at which both sweeps have so much more power in common, in a larger share of the periods
+# SNR of the product of both sweeps, 9 dB, below which noise alone may make its peak, by trial
+_NOISE = 10**0.9
+# a velocity at which both sweeps have so much more power in common, in more than so many periods
 _HIGHER, _CHANCE = 1.1, 0.05
 # bias of the product that the edges of the window leave, in halves of wavelength over sweep length
 _BIAS = 5e-4
@@ -73,7 +72,7 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estim
         - NOISE where they have no more in common than noise at any velocity;
         - EMPTY where all samples are zero.
     """
-    product, lit, levels = measured.product, measured.lit, measured.levels
+    product, lit = measured.product, measured.lit
     bin_m_s = product.radar.ambiguous_velocity_m_s
     square = _variance(measured, pulse)
     m = measured.still.shape[-1]
@@ -83,9 +82,9 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estim
     useless = mean_of(square, product.lit)[..., 0] >= (_USELESS * bin_m_s) ** 2
     outcome = worst(
         (Outcome.INEXACT, ~measured.enough | useless),
-        (Outcome.AMBIGUOUS, (best.squared_db >= _CLEAR_DB) & (elsewhere > _CHANCE)),
-        (Outcome.NOISE, ~lit.any(-1) | (~measured.enough & (best.squared_db < _NOISE_DB))),
-        (Outcome.EMPTY, levels.signal + levels.noise == 0),
+        (Outcome.AMBIGUOUS, (best.squared >= LEAST_SQUARED) & (elsewhere > _CHANCE)),
+        (Outcome.NOISE, ~lit.any(-1) | (~measured.enough & (best.squared < _NOISE))),
+        (Outcome.EMPTY, measured.levels.total == 0),
     )
     return replace(found, std={**found.std, "velocity_m_s": square.sqrt()}, outcome=outcome)
 
@@ -93,9 +92,9 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estim
 def _variance(measured: Measured, pulse: Axis) -> Tensor:
     """Variance (..., pulse) of the velocities, see `assessed_velocity`."""
     law, lit, clear, common = measured.law, measured.lit, measured.clear, measured.common
-    share = (common / mean_of(common, lit | ~lit.any(-1, keepdim=True)).clamp_min(_TINY)).clamp_min(1e-6)
+    share = (common / mean_of(common, lit | ~lit.any(-1, keepdim=True)).clamp_min(TINY)).clamp_min(1e-6)
     white, count = measured.white_m_s.square()[..., None], clear.sum(-1, keepdim=True)
-    weight = mean_of(share, clear).clamp_min(_TINY)
+    weight = mean_of(share, clear).clamp_min(TINY)
 
     def variance(changes: Tensor) -> Tensor:
         # a constant part is that of the detector or of the laser: sweeps that differ in power
@@ -114,7 +113,7 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
     own = variance(changes if law.changes is None else _changes_of_product(measured, "free"))
     bias = _BIAS * measured.product.radar.ambiguous_velocity_m_s
     apart = mean_of(away.square() - own / share, clear) - bias**2
-    judged = (measured.levels.squared_db >= _CLEAR_DB)[..., None]
+    judged = (measured.levels.squared >= LEAST_SQUARED)[..., None]
     return torch.where(judged, torch.maximum(square, apart), square)
 
 
@@ -199,7 +198,7 @@ def assessed_motion(found: Estimate, cells: Tensor, walk: Walk) -> Estimate:
         at = true_positions(compared, count)
         pulses = prepare(lines[at], "radial_motion")
         other = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
-        apart = apart.index_put((at,), 2 * phase_difference(walk.phase_rad[at], other.to(apart.dtype), lit[at]))
+        apart = apart.index_put((at,), 2 * phase_rmse(walk.phase_rad[at], other, lit[at]))
         std = (std.square() + apart[:, None].square()).sqrt()
     reasons = worst(
         (Outcome.INEXACT, mean_of(std.square(), lit)[:, 0] >= ENOUGH_STD_RAD**2),
@@ -220,4 +219,4 @@ def _modulation(lines: Tensor, lit: Tensor) -> Tensor:
     lines: (trial, pulse, range); lit: (trial, pulse), bool.
     """
     power = power_of(lines).sum(-1, dtype=torch.float64)
-    return mean_of((power / mean_of(power, lit).clamp_min(_TINY) - 1).square(), lit)[:, 0].sqrt()
+    return mean_of((power / mean_of(power, lit).clamp_min(TINY) - 1).square(), lit)[:, 0].sqrt()

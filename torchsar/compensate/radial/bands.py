@@ -42,8 +42,8 @@ class Bands:
     (dechirp sign "lo_conj_echo"). A scatterer has the beat frequency of its range plus the
     remaining Doppler shift in `up`, and that of its range minus the remaining shift in `down`. The
     remaining shift is about a bin or less. The residual video phase is removed unless
-    `Spectra.bands` was asked to keep it. The samples of each trial are multiplied by a power of two that brings
-    them to about one.
+    `Spectra.bands` was asked to keep it. The samples of each trial are multiplied by a power of two
+    that brings them to about one.
 
     Args:
         up: Up sweeps, shape (..., pulse, m), complex, sampled symmetrically about the middle of the
@@ -301,6 +301,7 @@ class Spectra:
     Args:
         data: Spectra of the sweeps in the sign convention of `canonical`, zero frequency first,
             shape (..., 2, pulse, N), complex.
+        smooth: Spectra of Hann-windowed sweeps, times the scale, same shape.
         scale: Power of two that brings the samples of a trial to about one, shape (..., 1, 1, 1).
         shift: Doppler shift in whole bins, shape (..., pulse), int64, see `bulk_shift`.
         alike: True where the spectra of both sweeps are similar, shape (..., pulse), bool.
@@ -308,6 +309,7 @@ class Spectra:
     """
 
     data: Tensor
+    smooth: Tensor
     scale: Tensor
     shift: Tensor
     alike: Tensor
@@ -325,7 +327,9 @@ class Spectra:
             The spectra.
         """
         spectrum, scale = torch.fft.fft(canonical(sweeps, radar)), _scale(sweeps.detach())
-        return Spectra(spectrum, scale, *bulk_shift(_block_power(spectrum.detach(), scale), sweeps.shape[-2]), radar)
+        smooth = _smoothed(spectrum.detach(), scale)
+        blocks = torch.stack([power_of(part).mean(-2) for part in smooth.split(_BLOCK, -2)], -2)
+        return Spectra(spectrum, smooth, scale, *bulk_shift(blocks, sweeps.shape[-2]), radar)
 
     def bands(
         self,
@@ -360,20 +364,18 @@ class Spectra:
         spectrum, radar = self.data, self.radar
         first, lines = window_lines(radar, window_m)
         n, device = radar.sweep_samples, spectrum.device
-        shift, certain = _corrected_shift(spectrum.detach(), self.scale, self.shift, first, lines)
+        shift, certain = _corrected_shift(self.smooth, self.shift, first, lines)
         m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
         line = torch.arange(lines, device=device)
-        sides = torch.stack([shift, -shift], -2)
-        # a mirrored sweep has the mirrored spectrum
-        mirror = torch.arange(1, -2, -2, device=device)[:, None, None]
-        kept = spectrum.gather(-1, mirror * (first + line + sides[..., None]) % n)
+        line = torch.arange(lines, device=device)
+        kept = _in_window(spectrum, shift, first, lines)
         edges = taper if window_m is not None else 0.0
         shape = _raised_cosine(line.to(torch.float64), lines, edges)
         filters = torch.stack(
             [shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)]
         )
         # phases refer to the middle of the sweep
-        middle = mirror[..., 0] * (first + sides).to(torch.float64)
+        middle = torch.stack([first + shift, shift - first], -2).to(torch.float64)
         turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
         series = torch.fft.ifft(kept * filters[:, None, :] * (turned * self.scale[..., 0])[..., None], m) * (m / n)
         series = series * _beat_of_first(first, m, kept).to(series.dtype)
@@ -409,28 +411,16 @@ def _scale(sweeps: Tensor) -> Tensor:
     return 1 / level_of(sweeps[..., middle - 4 : middle + 4], 3)
 
 
-def _block_power(spectrum: Tensor, scale: Tensor) -> Tensor:
-    """Power spectra of Hann-windowed sweeps, averaged over blocks of periods.
+def _smoothed(spectrum: Tensor, scale: Tensor) -> Tensor:
+    """Spectra of Hann-windowed sweeps, times a scale.
 
-    (..., 2, pulse, N) to (..., 2, block, N). With a rectangular window, a peak between two bins
-    would lose more than half of its power.
+    With a rectangular window, a peak between two bins would lose more than half of its power.
     """
-    # real and imaginary parts alternate; the window is the same for both
-    parts = torch.view_as_real(spectrum).flatten(-2)
-    inner = _windowed_power(parts[..., :-4], parts[..., 2:-2], parts[..., 4:], scale)
-    first, second, last_but_one, last = parts[..., :2], parts[..., 2:4], parts[..., -4:-2], parts[..., -2:]
-    ends = _windowed_power(last, first, second, scale), _windowed_power(last_but_one, last, first, scale)
-    return torch.cat([ends[0], inner, ends[1]], -1).unflatten(-1, (-1, 2)).sum(-1)
+    between = torch.cat([spectrum[..., -1:], spectrum, spectrum[..., :1]], -1)
+    return torch.sub(spectrum, between[..., :-2] + between[..., 2:], alpha=0.5).mul_(scale)
 
 
-def _windowed_power(before: Tensor, here: Tensor, after: Tensor, scale: Tensor) -> Tensor:
-    """Power of the Hann-windowed spectrum from three neighbouring bins, averaged over blocks."""
-    windowed = torch.sub(here, before + after, alpha=0.5).mul_(scale)
-    windowed = windowed.mul_(windowed)
-    return torch.stack([part.mean(-2) for part in windowed.split(_BLOCK, -2)], -2)
-
-
-def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines: int) -> tuple[Tensor, Tensor]:
+def _corrected_shift(smooth: Tensor, shift: Tensor, first: int, lines: int) -> tuple[Tensor, Tensor]:
     """The shift of every period, corrected by its own envelopes, and where it is certain.
 
     It is corrected where the envelopes are similar and their lag is two bins or more. Eight periods
@@ -439,13 +429,7 @@ def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int,
     scatterer that enters the beam between its two sweeps is seen in one of them only. The search
     for the velocity reaches further than that.
     """
-    n = spectrum.shape[-1]
-    sides = torch.stack([shift, -shift], -2)
-    mirror = torch.arange(1, -2, -2, device=spectrum.device)[:, None, None]
-    line = torch.arange(first - 1, first + lines + 1, device=spectrum.device)
-    kept = spectrum.gather(-1, mirror * (line + sides[..., None]) % n) * scale
-    smooth = kept[..., 1:-1] - (kept[..., :-2] + kept[..., 2:]) / 2
-    power = power_of(smooth)
+    power = power_of(_in_window(smooth, shift, first, lines))
     power = power - power.mean(-1, keepdim=True)
     power = power / power.square().sum(-1, keepdim=True).sqrt().clamp_min(torch.finfo(power.dtype).tiny)
     length = 2 ** math.ceil(math.log2(2 * lines))
@@ -456,6 +440,17 @@ def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int,
     own = shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0)
     typical = _median_of_three(own)
     return torch.where((own - typical).abs() >= _ALONE, typical, own), certain
+
+
+def _in_window(spectrum: Tensor, shift: Tensor, first: int, lines: int) -> Tensor:
+    """Bins of a range window in the spectra of up sweeps and of mirrored down sweeps.
+
+    The Doppler shift (..., pulse) in bins moves the window. A mirrored sweep has the mirrored
+    spectrum.
+    """
+    line = torch.arange(first, first + lines, device=spectrum.device)
+    at = torch.stack([line + shift[..., None], shift[..., None] - line], -3)
+    return spectrum.gather(-1, at % spectrum.shape[-1])
 
 
 def _line_phase(

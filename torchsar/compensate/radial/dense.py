@@ -2,8 +2,8 @@
 
 Many scatterers in a range cell interfere, and sharpness then prefers wrong phases. The phases of
 greatest likelihood are the right ones, but a search that starts too far away ends in a local
-maximum. It is therefore started from two independent estimates, and if their results differ it is
-also made without a start. Only a result that was reached twice is reliable.
+maximum. It is therefore started from the phases that sharpen the image and from zero, and if the
+results differ it is also made without a start. Only a result that was reached twice is reliable.
 """
 
 from __future__ import annotations
@@ -14,24 +14,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare
-from torchsar.compensate.pulse_phase.homogeneous import power_groups
+from torchsar.compensate.pulse_phase.data import Pulses, prepare
 from torchsar.compensate.pulse_phase.linking import linked
-from torchsar.core import Estimate, cis, power_of
+from torchsar.core import Estimate, cis
 from torchsar.core.spline import UniformSpline
+from torchsar.metrics.phase import phase_rmse
 
 # Pulses are averaged to about so many blocks, over which the residual phase is smooth; it makes the
 # search fast, because its time grows with the cube of their number.
 _BLOCKS = 128
 SAME_RAD = 0.1  # rms difference below which two results are the same
-# Descent to a smooth walk of the phase: number of cosines, rms of the walk expected in rad, noise
-# floors relative to the mean power, steps for each, and length of a step. A high floor lets the
-# descent pass over local minima; the walks of velocities from dense scenes are 0.4 to 1.6 rad.
-_COSINES, _WALK_RAD, _FLOORS, _STEPS, _LENGTH = 60, 1.0, (1e-1, 1e-2, 1e-3, 1e-4), 40, 0.3
 # variance of a random walk about a spline through the means of blocks of n steps, over n times that
 # of a step; simulated for n = 2 to 16
 _WITHIN = 0.115
-_MEMORY = (0.9, 0.98)  # of the mean slope and of the mean squared slope
 
 
 class Walk(NamedTuple):
@@ -73,9 +68,9 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Walk:
 
     pulses = prepare(averaged(cells), "linked_walk", empty=False)
     start = torch.angle(averaged(cis(polished_rad.detach().to(torch.float64))))
-    results = [linked(pulses, start, still=True), linked(pulses, smooth_walk(pulses.rows.detach()), still=True)]
+    results = [linked(pulses, begin, still=True) for begin in (start, torch.zeros_like(start))]
     phase, gain, std = (torch.stack(parts) for parts in zip(*map(_parts, results), strict=True))
-    differ = (phase_difference(phase[0], phase[1]) > SAME_RAD).nonzero()[:, 0]
+    differ = (phase_rmse(phase[0], phase[1]) > SAME_RAD).nonzero()[:, 0]
     if len(differ):
         third = _parts(linked(Pulses(pulses.rows[differ], pulses.present[differ], differ.shape), still=True))
         phase, gain, std = (
@@ -85,7 +80,7 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Walk:
     best = gain.argmax(0)
     trial = torch.arange(len(best), device=best.device)
     chosen = phase[best, trial]
-    apart = phase_difference(phase, chosen).index_put((best, trial), torch.full_like(gain[0], torch.inf)).amin(0)
+    apart = phase_rmse(phase, chosen).index_put((best, trial), torch.full_like(gain[0], torch.inf)).amin(0)
     walk = _without_line(chosen)
     within = step_rad.to(torch.float64).square() * size * _WITHIN
     # two results of the same deviation differ by the square root of two of it
@@ -100,83 +95,6 @@ def _parts(found: Estimate) -> tuple[Tensor, Tensor, Tensor]:
     """Phase, likelihood and deviation; the first and third of shape (trial, pulse)."""
     double = torch.float64
     return found["phase_rad"].to(double), found.info["fit_nats"], found.std["phase_rad"].to(double)
-
-
-@torch.no_grad()
-def smooth_walk(rows: Tensor) -> Tensor:
-    """Find the smooth walk of the phase that makes the spectra of the range cells most likely.
-
-    The walk is a sum of cosines, whose amplitudes fall like those of a random walk. Range cells of
-    similar power share a spectrum P. The sum of ln(P + floor) and of the squared amplitudes is
-    minimised, with four floors, from the highest to the lowest. Every trial takes its own steps
-    (Adam).
-
-    Args:
-        rows: Pulses, shape (trial, range, pulse), complex.
-
-    Returns:
-        The phase in rad, shape (trial, pulse), float64.
-
-    Reference:
-        Kingma and Ba, Adam: a method for stochastic optimization, ICLR 2015.
-    """
-    n, real = rows.shape[-1], rows.real.dtype
-    order = torch.arange(2, min(n // 2, _COSINES) + 2, dtype=real, device=rows.device)
-    pulse = (torch.arange(n, dtype=real, device=rows.device) + 0.5) / n
-    walks = torch.cos(math.pi * order[:, None] * pulse) * (_WALK_RAD * math.sqrt(30) / math.pi / order[:, None])
-    power = power_of(rows).mean(-1)
-    member = power_groups(power).to(real)
-    cells = member.sum(-1)
-    window = torch.hann_window(n + 2, periodic=False, dtype=real, device=rows.device)[1:-1]
-    level = power.mean(-1)[:, None, None].sqrt()
-    z = rows / or_one(level) * (window / window.norm())
-
-    def cost(amplitude: Tensor, floor: float) -> Tensor:
-        image = torch.fft.fft(z * cis(-amplitude @ walks)[:, None])
-        spectra = torch.einsum("gtr,trk->gtk", member, power_of(image))
-        spectra = spectra / or_one(cells)[..., None]
-        raised = spectra + floor * spectra.mean(-1, keepdim=True) + torch.finfo(real).tiny
-        return (cells * raised.log().sum(-1)).sum() + amplitude.square().sum() / 2
-
-    amplitude = torch.zeros(len(rows), len(order), dtype=real, device=rows.device)
-    for floor in _FLOORS:
-        mean, square = torch.zeros_like(amplitude), torch.zeros_like(amplitude)
-        for step in range(_STEPS):
-            with torch.enable_grad():
-                (slope,) = torch.autograd.grad(cost(amplitude.requires_grad_(), floor), amplitude)
-            mean = _MEMORY[0] * mean + (1 - _MEMORY[0]) * slope
-            square = _MEMORY[1] * square + (1 - _MEMORY[1]) * slope.square()
-            unbiased = mean / (1 - _MEMORY[0] ** (step + 1))
-            size = (square / (1 - _MEMORY[1] ** (step + 1))).sqrt()
-            length = _LENGTH * (1 + math.cos(math.pi * step / _STEPS)) / 2
-            amplitude = amplitude.detach() - length * unbiased / or_one(size)
-    return (amplitude @ walks).to(torch.float64)
-
-
-def _slope(phasors: Tensor) -> Tensor:
-    """Slope in rad per pulse of the tone nearest to phasors (..., pulse), to 1/64 of a cell."""
-    n = phasors.shape[-1]
-    at = torch.fft.fft(phasors, 64 * n).abs().argmax(-1)
-    return at.to(torch.float64) * (2 * math.pi / (64 * n))
-
-
-def phase_difference(a: Tensor, b: Tensor, lit: Tensor | None = None) -> Tensor:
-    """Compute the difference of phases, apart from a constant and a straight line.
-
-    Args:
-        a: Phases in rad, shape (..., pulse), float64.
-        b: Other phases in rad, shape (..., pulse), float64.
-        lit: Pulses that count, shape (..., pulse), bool; all by default.
-
-    Returns:
-        The rms difference in rad, shape (...,), at most the square root of 2.
-    """
-    turned = cis(a.detach() - b.detach())
-    if lit is not None:
-        turned = turned * lit
-    tone = turned * cis(-_slope(turned)[..., None] * torch.arange(a.shape[-1], device=a.device))
-    count = a.shape[-1] if lit is None else lit.sum(-1).clamp_min(1)
-    return (2 * (1 - tone.sum(-1).abs() / count)).clamp_min(0).sqrt()
 
 
 def _without_line(phase: Tensor) -> Tensor:

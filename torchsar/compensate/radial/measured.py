@@ -1,11 +1,11 @@
-"""Radial velocities measured in sweeps, with the SNR that the sweeps show once the motion is removed."""
+"""Radial velocities measured in sweeps, with the SNR of the sweeps."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,15 +15,15 @@ from torchsar.compensate.radial.trajectory import geometric_velocity_m_s
 from torchsar.core import Axis, Estimate, cis, power_of
 
 Intercept = Literal["known", "record", "free"]
-# SNR after the squaring loss in dB below which a period has faded: noise may exceed its peak
-_FADED_DB = 12.0
-# share of the mean power below which it has faded too: interference then spoils the phase
-_DEEP = 0.05
-# SNR after compression from which on the peaks of single sweeps exceed the noise: measured 1 slip
-# in 1000 periods at 13 dB, none from 14 dB on; the measured SNR has an error of a decibel or two
-_LEAST_SNR_DB = 16.0
-_LEAST_SQUARED_DB = 15.0  # the same for a product of sweeps, after the squaring loss, found by trial
-# mean of |sum of noise| over what is called chance, beyond which two sweeps have power in common
+TINY = torch.finfo(torch.float64).tiny
+# SNR after compression, 16 dB, from which on the peaks of single sweeps exceed the noise: measured
+# 1 slip in 1000 periods at 13 dB, none from 14 dB on; the measured SNR errs by a decibel or two.
+# The same for a product of sweeps, after the squaring loss, 15 dB, found by trial
+_LEAST_SNR, LEAST_SQUARED = 10**1.6, 10**1.5
+# SNR after the squaring loss, 12 dB, below which a period has faded, because noise may exceed its
+# peak; share of the mean power below which it has faded too, because interference spoils the phase
+_FADED, _DEEP = 10**1.2, 0.05
+# power in common over that of noise by chance, from which on there is a scene
 _BEYOND_CHANCE = 1.5
 
 
@@ -51,61 +51,39 @@ class Law:
     changes: Callable[[], Tensor] | None = None
 
 
-@dataclass(frozen=True)
-class Levels:
-    """Mean power per sample of scene and noise.
+class Levels(NamedTuple):
+    """Mean power of scene and noise in a record, shape (...,) each, float64.
 
     Args:
-        signal: Power that the up sweep and the mirrored down sweep have in common, shape (...,).
-        noise: The rest of the power, shape (...,).
-        noise_lines: Noise bandwidth in bins.
+        total: Mean power per sample of both.
+        share: Share of the power that the up sweep and the mirrored down sweep have in common.
+        noise: Mean power per sample of the rest.
+        after: Energy of a sweep over the noise variance of a sample, the SNR after compression.
+        squared: The same, less the loss of a product of two noisy sweeps.
     """
 
-    signal: Tensor
+    total: Tensor
+    share: Tensor
     noise: Tensor
-    noise_lines: float
+    after: Tensor
+    squared: Tensor
 
     @staticmethod
     def of(common: Tensor, bands: Bands) -> Levels:
         """Divide the mean power of the periods with an echo into scene and noise.
 
         Args:
-            common: Power in common in every period, shape (..., pulse), float64.
+            common: Power that both sweeps have in common in every period, shape (..., pulse).
             bands: Filtered sweeps.
         """
-        weight = bands.lit / bands.lit.sum(-1, keepdim=True).clamp_min(1).to(torch.float64)
-        shared = (common * weight).sum(-1)
         up, down = (power_of(x.detach()[..., bands.inner]).mean(-1).to(torch.float64) for x in (bands.up, bands.down))
-        total = ((up + down) * weight).sum(-1) / 2
-        # the magnitude of a mean of noise is not zero: what noise alone would give counts as no signal
+        shared, total = (mean_of(x, bands.lit)[..., 0] for x in (common, (up + down) / 2))
+        # the magnitude of a mean of noise is not zero: what noise alone would give is no scene
         chance = total / math.sqrt(min(len(bands.time_s[bands.inner]), 2 * bands.noise_lines))
-        signal = torch.where(shared > _BEYOND_CHANCE * chance, shared, 0).clamp_max(total)
-        return Levels(signal, total - signal, bands.noise_lines)
-
-    @property
-    def share(self) -> Tensor:
-        """Share of the scene in the power, 0..1, shape (...,)."""
-        return self.signal / (self.signal + self.noise).clamp_min(torch.finfo(torch.float64).tiny)
-
-    @property
-    def ratio(self) -> Tensor:
-        """Power of the scene over that of the noise, within the limits of numbers, shape (...,)."""
-        return _ratio(self.signal, self.noise)
-
-    @property
-    def after(self) -> Tensor:
-        """Energy of a sweep over the noise variance of a sample, the SNR after compression."""
-        return self.ratio * self.noise_lines
-
-    @property
-    def squared(self) -> Tensor:
-        """The SNR after compression, less the loss of a product of two noisy sweeps."""
-        return self.after / _loss(self.ratio)
-
-    @property
-    def squared_db(self) -> Tensor:
-        """The same in dB."""
-        return 10 * torch.log10(self.squared)
+        scene = torch.where(shared > _BEYOND_CHANCE * chance, shared, 0).clamp_max(total)
+        ratio = _ratio(scene, total - scene)
+        after = ratio * bands.noise_lines
+        return Levels(total, scene / total.clamp_min(TINY), total - scene, after, after / _loss(ratio))
 
 
 @dataclass(frozen=True)
@@ -120,6 +98,7 @@ class Measured:
         product: Sweeps filtered to the range window, with two samples per bin.
         still: Product of up and mirrored down sweeps with the phase of the velocities removed,
             without the ends of the sweeps, shape (..., pulse, m), complex.
+        common: Power that both sweeps have in common in every period, shape (..., pulse), float64.
         levels: Mean powers of scene and noise.
         lit: False for periods in which no scatterer is illuminated, shape (..., pulse), bool.
         clear: False also for periods that have faded, shape (..., pulse), bool.
@@ -131,6 +110,7 @@ class Measured:
     raw_m_s: Tensor
     product: Bands
     still: Tensor
+    common: Tensor
     levels: Levels
     lit: Tensor
     clear: Tensor
@@ -157,25 +137,15 @@ class Measured:
         counted = lit | ~lit.any(-1, keepdim=True)
         own = _ratio(common, levels.noise[..., None])
         clear = common > _DEEP * mean_of(common, counted)
-        clear = lit & clear & (own * product.noise_lines / _loss(own) >= 10 ** (_FADED_DB / 10))
-        return Measured(filled(raw, clear), raw, product, still, levels, lit, clear, law, info)
-
-    @property
-    def common(self) -> Tensor:
-        """Power that both sweeps have in common in every period, shape (..., pulse), float64."""
-        return self.still.mean(-1).abs().to(torch.float64)
+        clear = lit & clear & (own * product.noise_lines / _loss(own) >= _FADED)
+        return Measured(filled(raw, clear), raw, product, still, common, levels, lit, clear, law, info)
 
     @property
     def enough(self) -> Tensor:
         """Whether the SNR suffices for peaks that exceed the noise in all periods, shape (...,)."""
         if self.law.intercept:
-            return self.levels.squared >= 10 ** (_LEAST_SQUARED_DB / 10)
-        return self.levels.after >= 10 ** (_LEAST_SNR_DB / 10)
-
-    @property
-    def noise_m_s(self) -> Tensor:
-        """Standard deviation of the velocity in m/s that noise explains, shape (...,)."""
-        return torch.hypot(self.white_m_s, torch.full_like(self.white_m_s, self.law.floor_m_s))
+            return self.levels.squared >= LEAST_SQUARED
+        return self.levels.after >= _LEAST_SNR
 
     @property
     def white_m_s(self) -> Tensor:
@@ -201,7 +171,8 @@ class Measured:
         bands = self.product
         centre = (bands.first + bands.lines / 2) * bands.radar.range_step_m
         geometric = geometric_velocity_m_s(bands.radar, pulse, azimuth_m, centre, self.velocity_m_s.device)
-        shown = {"snr_db": 10 * torch.log10(self.levels.after), "noise_m_s": self.noise_m_s}
+        noise_m_s = (self.white_m_s.square() + self.law.floor_m_s**2).sqrt()
+        shown = {"snr_db": 10 * torch.log10(self.levels.after), "noise_m_s": noise_m_s}
         return Estimate(
             {"velocity_m_s": self.velocity_m_s - geometric},
             quality=self.levels.share,
@@ -232,7 +203,7 @@ def _without_motion(bands: Bands, residual_m_s: Tensor) -> Tensor:
 
 def _ratio(signal: Tensor, noise: Tensor) -> Tensor:
     """Signal over noise within the limits of numbers."""
-    return (signal / noise.clamp_min(torch.finfo(torch.float64).tiny)).clamp(1e-6, 1e18)
+    return (signal / noise.clamp_min(TINY)).clamp(1e-6, 1e18)
 
 
 def _loss(ratio: Tensor) -> Tensor:

@@ -27,6 +27,15 @@ def mirror_product(
 ) -> Estimate:
     """Estimate the radial velocity from the product of the up sweep and the mirrored down sweep.
 
+    >>> import torch
+    >>> from torchsar.compensate import mirror_product
+    >>> from torchsar.radar import TriangularLadar
+    >>> ladar = TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> sweeps = torch.ones(2, 64, 128, dtype=torch.complex64)  # a point at the reference range
+    >>> found = mirror_product(sweeps, ladar, ladar.sweep_axes(64)[1])
+    >>> bool(found["velocity_m_s"].abs().max() < 0.01)
+    True
+
     Let u be the time from the middle of a sweep, fc the carrier frequency and K the chirp rate. The
     product z(u) = up(u) conj(down(-u)) combines two samples of equal optical frequency fc + K u.
     Therefore z(u) = |scene(u)|^2 exp(-j 4 pi / c (fc + K u) (T - 2u) v), with the radial velocity
@@ -49,22 +58,24 @@ def mirror_product(
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,). The radial
             velocity that the straight flight causes there is subtracted, see
             `geometric_velocity_m_s`.
+        assess: False leaves out the standard deviation and the outcome.
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
         positive. In periods without an echo, or whose echo has faded, it is interpolated. The
         velocity is that of the centre of power of the echo: a centre at another azimuth than
         `azimuth_m` adds a nearly constant velocity, which displaces the image and is not part of
-        the standard deviation. The standard deviation is measured: noise and the interference of
-        scatterers of random phases change the power of the echo as much as its phase, so that the
-        changes of power between both sweeps give it. Where many scatterers have equal phases, the
-        error may be four times as large. `ok` is False where the SNR after
-        compression, less the squaring loss, is below 15 dB, where the standard deviation exceeds
-        0.035 lambda / T, where the peaks of the product over all velocities contradict the result,
-        or no scatterer is illuminated in any period. `info` holds "snr_db" (after compression) and
-        "noise_m_s" (standard deviation that noise explains), shape (...,); "shift" (Doppler shift
-        in whole bins) and "lit" (True in periods with an echo), shape (..., pulse); and, with
-        intercept "record", "intercept_rad", the estimated phase, shape (...,).
+        the standard deviation. Where many scatterers have equal phases, the error may be four times
+        the standard deviation.
+        `assess=True` adds the standard deviation and the outcome, see `assessed_velocity`:
+        `Outcome.INEXACT` where the SNR is too low or the standard deviation exceeds
+        0.035 lambda / T (T is the length of a sweep), `AMBIGUOUS` where both sweeps have more power
+        in common at another velocity, `NOISE` where they have no more in common than noise, and
+        `EMPTY` for samples of zero. `quality` is the share of the power in the window that both
+        sweeps have in common. `info` holds "snr_db" (after compression) and "noise_m_s" (standard deviation that
+        noise explains), shape (...,); "shift" (Doppler shift in whole bins) and "lit" (True in
+        periods with an echo), shape (..., pulse);
+        and, with intercept "record", "intercept_rad", the estimated phase, shape (...,).
 
     Raises:
         TypeError: If the sweeps are not complex.

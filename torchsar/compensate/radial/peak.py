@@ -31,6 +31,15 @@ def ml_peak(
 ) -> Estimate:
     """Estimate the radial velocity from the periodogram peaks of both sweeps.
 
+    >>> import torch
+    >>> from torchsar.compensate import ml_peak
+    >>> from torchsar.radar import TriangularLadar
+    >>> ladar = TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> sweeps = torch.ones(2, 64, 128, dtype=torch.complex64)  # a point at the reference range
+    >>> found = ml_peak(sweeps, ladar, ladar.sweep_axes(64)[1])
+    >>> bool(found["velocity_m_s"].abs().max() < 0.01)
+    True
+
     The Doppler shift is half the difference between the beat frequencies of the up sweep and of the
     mirrored down sweep. Each beat frequency is the peak of a periodogram, refined by Newton steps.
     For one scatterer this is the maximum-likelihood estimate if the phase of each sweep is unknown.
@@ -47,13 +56,19 @@ def ml_peak(
             the peak of the mean periodogram is searched; None for the whole band. The sweeps are
             not filtered.
         azimuth_m: Azimuth of the scatterer in metres, a number or shape (...,).
+        assess: False leaves out the standard deviation and the outcome.
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
-        positive, with its standard deviation, see `mirror_product`. `ok` is False where the SNR
-        after compression is below 16 dB, the standard deviation exceeds 0.035 lambda / T (T is the
-        length of a sweep), the product of up and mirrored down sweeps contradicts the velocities in
-        many periods, or no scatterer is illuminated in any period.
+        positive.
+        `assess=True` adds the standard deviation and the outcome, see `assessed_velocity`:
+        `Outcome.INEXACT` where the SNR is too low or the standard deviation exceeds
+        0.035 lambda / T (T is the length of a sweep), `AMBIGUOUS` where both sweeps have more power
+        in common at another velocity, `NOISE` where they have no more in common than noise, and
+        `EMPTY` for samples of zero. `quality` is the share of the power in the window that both
+        sweeps have in common. `info` holds "snr_db" (after compression) and "noise_m_s" (standard deviation that
+        noise explains), shape (...,); "shift" (Doppler shift in whole bins) and "lit" (True in
+        periods with an echo), shape (..., pulse).
 
     Raises:
         TypeError: If the sweeps are not complex.

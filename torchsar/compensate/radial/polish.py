@@ -16,7 +16,7 @@ from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, sta
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import Run, Wiener, bright, in_turn
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
-from torchsar.core import Estimate, power_of
+from torchsar.core import Estimate, Outcome, power_of
 
 # over-relaxation, found by trial: larger values converge faster, at 2 or more need not converge
 _RELAXATION = 1.7
@@ -25,7 +25,12 @@ _SCENE = Wiener(level=4.0, share=0.02)
 
 
 def phase_polish(
-    data: Tensor, *, start: Tensor | None = None, iterations: int = 80, tolerance_rad: float = 0.005
+    data: Tensor,
+    *,
+    start: Tensor | None = None,
+    iterations: int = 80,
+    tolerance_rad: float = 0.005,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the residual phase of each pulse relative to the scene that all pulses share.
 
@@ -58,14 +63,12 @@ def phase_polish(
         iterations: Largest number of iterations with Wiener weights.
         tolerance_rad: Phase step in rad, rms over the pulses, below which the steps with Wiener
             weights end; the last kind of steps ends below half of it.
+        assess: False leaves out the standard deviation and the outcome.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
-        halves of the range cells. `quality`, `ok` and `info` are those of `autofocus`: `ok` is
-        False unless the image is clearly sharper than autofocus can make pure noise, more than one
-        range cell or a single point makes the sharpness, the standard deviation is below 0.47 rad,
-        the pulses show one scene, and a homogeneous description of the scene is not
-        more likely, because sharpness does not find the phases of homogeneous clutter.
+        `phase_rad` of shape (..., pulse), to be removed. `assess=True` adds the standard deviation,
+        which follows from two halves of the range cells, and the outcome; `quality`, the outcomes
+        and `info` are those of `autofocus`.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -81,8 +84,12 @@ def phase_polish(
         again = [Run(_SCENE, AlongPulses(), 4, _RELAXATION, 0.0), Run(_near_peak, AlongPulses(2), 5, 1.0, 0.0)]
         return phase, taken, lambda some, _, here: in_turn(some, here, again)[0]
 
-    found = estimated(pulses, begin, find, at_rest=True)
-    return replace(found, value={"phase_rad": found["phase_rad"].to(torch.float64)})
+    if assess:
+        found = estimated(pulses, begin, find, at_rest=True)
+        return replace(found, value={"phase_rad": found["phase_rad"].to(torch.float64)})
+    phase = sharpened(pulses.rows, begin, iterations, tolerance_rad)[0]
+    phase = torch.where((pulses.present.sum(-1) >= 3)[:, None], phase, 0).reshape(*pulses.trials, pulses.n)
+    return Estimate({"phase_rad": phase.to(torch.float64)}, outcome=Outcome.NOT_ASSESSED.like(phase[..., 0]))
 
 
 def sharpened(rows: Tensor, start: Tensor | None, iterations: int, tolerance_rad: float) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ from torchsar.compensate.radial.bands import Bands, Spectra, filled, refuse_othe
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
 from torchsar.compensate.radial.dense import Walk, linked_walk
-from torchsar.compensate.radial.measured import Intercept, Measured
+from torchsar.compensate.radial.measured import Intercept
 from torchsar.compensate.radial.mirror import refuse_other_intercept
 from torchsar.compensate.radial.polish import scene_cells, sharpened
 from torchsar.compensate.radial.product import mirror_measured
@@ -55,6 +55,15 @@ def radial_motion(
 ) -> Estimate:
     """Estimate the radial motion from up and down sweeps; the recommended estimator.
 
+    >>> import torch
+    >>> from torchsar.compensate import radial_motion
+    >>> from torchsar.radar import TriangularLadar
+    >>> ladar = TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> sweeps = torch.ones(2, 64, 128, dtype=torch.complex64)  # a point at the reference range
+    >>> found = radial_motion(sweeps, ladar, ladar.sweep_axes(64)[1])
+    >>> bool(found["velocity_m_s"].abs().max() < 0.01)
+    True
+
     `mirror_product` estimates the velocities. The range cells of the window are compensated with
     the integral of the velocities and deramped in azimuth. `phase_polish` then estimates the
     residual phase of each pulse, so that the range error does not grow with the length of the
@@ -76,18 +85,20 @@ def radial_motion(
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
         iterations: Largest number of iterations, see `phase_polish`.
         tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.
+        assess: False leaves out the standard deviation and the outcome.
 
     Returns:
         `velocity_m_s` at the turning points (ends of the up sweeps), receding positive, and
-        `phase_rad` at the middles of the up sweeps, shape (..., pulse) each, with standard
-        deviations. The phase is to be removed after `compensate_motion` with the velocities.
-        `range_error` combines both to a range error. `quality` is that of the velocities. `ok` is
-        False where `ok` of `mirror_product` is False, the phase has a standard deviation of 0.5 rad
-        or more, or fewer than eight periods have an echo; the phase is then zero. From 32 periods
-        on, it is also False where linked phases of a dense scene are not confirmed; where the power
-        of the pulses is modulated or the phases exceed the random walk that noise explains by far,
-        and least entropy leads to other phases; and where a single range cell has a modulated
-        power, because the interference of scatterers then cannot be distinguished from motion.
+        `phase_rad` at the middles of the up sweeps, shape (..., pulse) each. The phase is to be
+        removed after `compensate_motion` with the velocities; it is zero where fewer than eight
+        periods have an echo. `range_error` combines both to a range error. `quality` is that of
+        the velocities. `assess=True` adds standard deviations and the outcome: that of
+        `mirror_product`, or that of the phases if it has a greater code. It is `Outcome.INEXACT`
+        where the standard deviation of the phases is 0.5 rad or more; `AMBIGUOUS` where no two
+        starts of the likelihood reach the same phases in a dense scene, or where scatterers
+        interfere and least entropy leads to other phases; and `TOO_FEW` for less than eight periods
+        with an echo, or where scatterers interfere in a single range cell, which cannot be
+        distinguished from motion.
 
     Raises:
         TypeError: If the sweeps are not complex.

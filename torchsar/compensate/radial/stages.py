@@ -278,14 +278,15 @@ class PhasePolish(Stage):
         iterations: Largest number of iterations with Wiener weights.
         tolerance_rad: Phase step in rad, rms over the pulses, below which the iterations of a trial
             end.
+        assess: False leaves out standard deviation and outcome.
     """
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
 
-    def __init__(self, iterations: int = 80, tolerance_rad: float = 0.005) -> None:
+    def __init__(self, iterations: int = 80, tolerance_rad: float = 0.005, assess: bool = True) -> None:
         super().__init__()
-        self.iterations, self.tolerance_rad = iterations, tolerance_rad
+        self.iterations, self.tolerance_rad, self.assess = iterations, tolerance_rad, assess
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the residual phase of every pulse of a signal of axes (pulse, range).
@@ -294,21 +295,30 @@ class PhasePolish(Stage):
             `Estimate` by the function `phase_polish` with `phase_rad` of shape (..., pulse), to be
             removed.
         """
-        return phase_polish(signal.data, iterations=self.iterations, tolerance_rad=self.tolerance_rad)
+        return phase_polish(
+            signal.data, iterations=self.iterations, tolerance_rad=self.tolerance_rad, assess=self.assess
+        )
 
 
 class PulseGain(Stage):
     """Amplitude of every pulse relative to steady scatterers; see `pulse_gain`.
 
     Provides `gain` of shape (..., pulse), by which `EqualisePulses` divides the pulses.
+
+    Args:
+        assess: False leaves out the outcome.
     """
 
     provides = ("gain",)
     neutral = {"gain": 1.0}
 
+    def __init__(self, assess: bool = True) -> None:
+        super().__init__()
+        self.assess = assess
+
     def forward(self, signal: Signal) -> Estimate:
         """Estimate `gain` of a signal of axes (pulse, range)."""
-        return pulse_gain(signal.data)
+        return pulse_gain(signal.data, assess=self.assess)
 
 
 class EqualisePulses(Stage):
