@@ -84,7 +84,7 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estim
         (Outcome.INEXACT, ~measured.enough | useless),
         (Outcome.AMBIGUOUS, (best.squared >= LEAST_SQUARED) & (elsewhere > _CHANCE)),
         (Outcome.NOISE, ~lit.any(-1) | (~measured.enough & (best.squared < _NOISE))),
-        (Outcome.EMPTY, measured.levels.total == 0),
+        (Outcome.EMPTY, (measured.common == 0).all(-1)),
     )
     return replace(found, std={**found.std, "velocity_m_s": square.sqrt()}, outcome=outcome)
 

@@ -233,19 +233,23 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     """
     n = blocks.shape[-1]
     blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
-    blocks = torch.fft.fftshift(blocks, dim=-1)
-    blocks = blocks - blocks.mean(-1, keepdim=True)
-    level = blocks.square().sum(-1).clamp_min(torch.finfo(blocks.dtype).tiny).sqrt()
-    blocks = blocks / level[..., None]
-    spectrum = torch.fft.rfft(blocks, 2 * n)
-    correlation = torch.fft.irfft(spectrum[..., 0, :, :] * spectrum[..., 1, :, :].conj(), 2 * n)
-    likeness, lag = correlation.max(-1)
-    lag = torch.where(lag >= n, lag - 2 * n, lag).to(torch.float64)
+    likeness, lag = _best_lag(torch.fft.fftshift(blocks, dim=-1), 2 * n)
     alike = likeness > _ALIKE
-    lag = filled(_median_of_three(filled(lag, alike)), alike)
-    return torch.round(_through_blocks(lag, pulses) / 2).to(torch.int64), alike.repeat_interleave(_BLOCK, -1)[
-        ..., :pulses
-    ]
+    lag = filled(_median_of_three(filled(lag.to(torch.float64), alike)), alike)
+    shift = torch.round(_through_blocks(lag, pulses) / 2).to(torch.int64)
+    return shift, alike.repeat_interleave(_BLOCK, -1)[..., :pulses]
+
+
+def _best_lag(power: Tensor, length: int) -> tuple[Tensor, Tensor]:
+    """Greatest correlation coefficient of up and mirrored down spectra, and its lag, (..., pulse).
+
+    power: (..., 2, pulse, bin); length: of the circular correlation.
+    """
+    power = power - power.mean(-1, keepdim=True)
+    level = power.square().sum(-1, keepdim=True).clamp_min(torch.finfo(power.dtype).tiny).sqrt()
+    transform = torch.fft.rfft(power / level, length)
+    likeness, lag = torch.fft.irfft(transform[..., 0, :, :] * transform[..., 1, :, :].conj(), length).max(-1)
+    return likeness, torch.where(lag >= length // 2, lag - length, lag)
 
 
 def filled(values: Tensor, known: Tensor) -> Tensor:
@@ -430,12 +434,7 @@ def _corrected_shift(smooth: Tensor, shift: Tensor, first: int, lines: int) -> t
     for the velocity reaches further than that.
     """
     power = power_of(_in_window(smooth, shift, first, lines))
-    power = power - power.mean(-1, keepdim=True)
-    power = power / power.square().sum(-1, keepdim=True).sqrt().clamp_min(torch.finfo(power.dtype).tiny)
-    length = 2 ** math.ceil(math.log2(2 * lines))
-    transform = torch.fft.rfft(power, length)
-    likeness, lag = torch.fft.irfft(transform[..., 0, :, :] * transform[..., 1, :, :].conj(), length).max(-1)
-    lag = torch.where(lag >= length // 2, lag - length, lag)
+    likeness, lag = _best_lag(power, 2 ** math.ceil(math.log2(2 * lines)))
     certain = (likeness > _SURELY_ALIKE) & (lag.abs() <= _FURTHEST)
     own = shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0)
     typical = _median_of_three(own)

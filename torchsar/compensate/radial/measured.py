@@ -52,17 +52,15 @@ class Law:
 
 
 class Levels(NamedTuple):
-    """Mean power of scene and noise in a record, shape (...,) each, float64.
+    """Scene and noise in a record, shape (...,) each, float64.
 
     Args:
-        total: Mean power per sample of both.
         share: Share of the power that the up sweep and the mirrored down sweep have in common.
         noise: Mean power per sample of the rest.
         after: Energy of a sweep over the noise variance of a sample, the SNR after compression.
         squared: The same, less the loss of a product of two noisy sweeps.
     """
 
-    total: Tensor
     share: Tensor
     noise: Tensor
     after: Tensor
@@ -83,7 +81,7 @@ class Levels(NamedTuple):
         scene = torch.where(shared > _BEYOND_CHANCE * chance, shared, 0).clamp_max(total)
         ratio = _ratio(scene, total - scene)
         after = ratio * bands.noise_lines
-        return Levels(total, scene / total.clamp_min(TINY), total - scene, after, after / _loss(ratio))
+        return Levels(scene / total.clamp_min(TINY), total - scene, after, after / _loss(ratio))
 
 
 @dataclass(frozen=True)
