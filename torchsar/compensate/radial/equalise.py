@@ -70,7 +70,7 @@ def pulse_gain(data: Tensor, *, assess: bool = True) -> Estimate:
     return Estimate(
         {"gain": gain.to(torch.float64).reshape(*shape, n)},
         quality=explained.to(torch.float64).reshape(shape),
-        outcome=Outcome.of(ok.reshape(shape), Outcome.MISFIT) if assess else None,
+        outcome=(Outcome.of(ok, Outcome.MISFIT) if assess else Outcome.NOT_ASSESSED.like(ok)).reshape(shape),
     )
 
 
