@@ -9,7 +9,6 @@ from torch import Tensor
 
 from tests.audit.frame import SNR_DB, Batch, Entry, Quantity, World, nothing, rms
 from tests.direct.triangular import Ladar
-from tests.repair.triangles import sweeps
 from torchsar.compensate import (
     MirrorProduct,
     MlPeak,
@@ -38,26 +37,7 @@ def own(
         scatterers = scene or Points([0.0, 0.03, -0.05], [0.4, 0.9, 1.3], [1.0, 0.7, 0.5], random_phase=True)
         world = LadarWorld(scatterers, motion=motion, snr_db=snr_db)
         recording, truth = simulate_ladar(RADAR, world, PERIODS, Draws(seed, trials=range(trials)))
-        found = {name: truth.values[name] for name in ("velocity_m_s", "range_error_up_m")}
-        named = {
-            "velocity_m_s": found["velocity_m_s"].expand(trials, PERIODS),
-            "displacement_m": found["range_error_up_m"].expand(trials, PERIODS),
-        }
-        return Batch(recording.signal, named)
-
-    return draw
-
-
-def direct(snr_db: float, scatterers=((0.5, 1.0), (0.9, 0.5))) -> Callable[[int, int], Batch]:
-    """Draw sweeps by direct evaluation of the beat, with its transients."""
-
-    def draw(trials: int, seed: int) -> Batch:
-        clean = sweeps(RADAR, PERIODS, motion=swing, scatterers=scatterers)
-        noise = Draws(seed, trials=range(trials)).normal("direct", tuple(clean.shape), torch.complex128)
-        data = clean + noise * (clean.abs().square().mean() * 10 ** (-snr_db / 10)).sqrt()
-        middle = torch.arange(PERIODS, dtype=F64) * RADAR.pulse_step_s + RADAR.sweep_s / 2
-        truth = {"displacement_m": swing(middle).expand(trials, -1)}
-        return Batch(signal(data), truth)
+        return Batch(recording.signal, {"velocity_m_s": truth.values["velocity_m_s"].expand(trials, PERIODS)})
 
     return draw
 
@@ -94,15 +74,6 @@ def swing(t: Tensor) -> Tensor:
 def signal(x: Tensor) -> Signal:
     """Sweeps with the axes of the ladar."""
     return Signal(x.to(torch.complex64), RADAR.sweep_axes(PERIODS))
-
-
-def detrended(found: Tensor, truth: Tensor) -> Tensor:
-    """Rms phase error in rad of a range without its straight line, which displaces the image."""
-    k = torch.arange(found.shape[-1], dtype=F64) - (found.shape[-1] - 1) / 2
-    x = found - truth
-    x = x - x.mean(-1, keepdim=True)
-    x = x - (x * k).sum(-1, keepdim=True) / k.square().sum() * k
-    return 4 * torch.pi / RADAR.wavelength_m * rms(x)
 
 
 def slow(found: Tensor, truth: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, seen
 from tests.echo.ladars import COMMON, table1
-from torchsar.compensate.radial.bands import bands_of, filled, window_lines
+from torchsar.compensate.radial.bands import Spectra, filled, window_lines
 from torchsar.radar import LIGHT_M_S
 from torchsar.scene import LinearInSweep, Points, Polynomial
 
@@ -41,7 +41,7 @@ def test_bands_are_the_tone_without_its_shift() -> None:
         n=9,
         scene=Points([0.0], [50 * RADAR.range_step_m], [0.7]),
     )
-    bands = bands_of(sweeps, table1(speed_m_s=0.0), GATE, taper=0.0, oversampling=2, video=True)
+    bands = Spectra.of(sweeps, table1(speed_m_s=0.0)).bands(GATE, taper=0.0, oversampling=2, video=True)
     assert bool((bands.shift == -7).all()) and bool(bands.lit.all()) and bands.up.shape == (9, 128)
     assert bands.noise_lines == 41
     middle = bands.time_s.abs() < 0.4 * RADAR.sweep_s

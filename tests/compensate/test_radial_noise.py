@@ -82,7 +82,7 @@ def test_error_of_integrated_velocities_grows_and_that_of_the_chain_does_not() -
     for n in (128, 1024):
         sweeps, pulse, truth = noisy(10, n=n, trials=8)
         found = radial_motion(sweeps, RADAR, pulse, window_m=GATE)
-        alone = type(found)({"velocity_m_s": found["velocity_m_s"]}, found.quality, found.ok)
+        alone = type(found)({"velocity_m_s": found["velocity_m_s"]}, quality=found.quality, outcome=found.outcome)
         rms[n] = [float(range_rms(e, truth, RADAR, pulse).square().mean().sqrt()) for e in (alone, found)]
         assert rms[n][0] == pytest.approx(
             float(integrated_range_detrended_bound_m(bound(10, known=True), pulse.step, n)), rel=0.35

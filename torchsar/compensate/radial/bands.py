@@ -41,9 +41,9 @@ class Bands:
     down(-u) exp(+2j pi s u / T). Both have the sign convention of Remote Sens. 2024, 16, 793
     (dechirp sign "lo_conj_echo"). A scatterer has the beat frequency of its range plus the
     remaining Doppler shift in `up`, and that of its range minus the remaining shift in `down`. The
-    remaining shift is about a bin or less. The residual video phase is removed unless `bands_of`
-    was asked to keep it. The samples of each trial are multiplied by a power of two that brings
-    them to about one.
+    remaining shift is about a bin or less. The residual video phase is removed unless
+    `Spectra.bands` was asked to keep it. The samples of each trial are multiplied by a power of two
+    that brings them to about one.
 
     Args:
         up: Up sweeps, shape (..., pulse, m), complex, sampled symmetrically about the middle of the
@@ -233,19 +233,23 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     """
     n = blocks.shape[-1]
     blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
-    blocks = torch.fft.fftshift(blocks, dim=-1)
-    blocks = blocks - blocks.mean(-1, keepdim=True)
-    level = blocks.square().sum(-1).clamp_min(torch.finfo(blocks.dtype).tiny).sqrt()
-    blocks = blocks / level[..., None]
-    spectrum = torch.fft.rfft(blocks, 2 * n)
-    correlation = torch.fft.irfft(spectrum[..., 0, :, :] * spectrum[..., 1, :, :].conj(), 2 * n)
-    likeness, lag = correlation.max(-1)
-    lag = torch.where(lag >= n, lag - 2 * n, lag).to(torch.float64)
+    likeness, lag = _best_lag(torch.fft.fftshift(blocks, dim=-1), 2 * n)
     alike = likeness > _ALIKE
-    lag = filled(_median_of_three(filled(lag, alike)), alike)
-    return torch.round(_through_blocks(lag, pulses) / 2).to(torch.int64), alike.repeat_interleave(_BLOCK, -1)[
-        ..., :pulses
-    ]
+    lag = filled(_median_of_three(filled(lag.to(torch.float64), alike)), alike)
+    shift = torch.round(_through_blocks(lag, pulses) / 2).to(torch.int64)
+    return shift, alike.repeat_interleave(_BLOCK, -1)[..., :pulses]
+
+
+def _best_lag(power: Tensor, length: int) -> tuple[Tensor, Tensor]:
+    """Greatest correlation coefficient of up and mirrored down spectra, and its lag, (..., pulse).
+
+    power: (..., 2, pulse, bin); length: of the circular correlation.
+    """
+    power = power - power.mean(-1, keepdim=True)
+    level = power.square().sum(-1, keepdim=True).clamp_min(torch.finfo(power.dtype).tiny).sqrt()
+    transform = torch.fft.rfft(power / level, length)
+    likeness, lag = torch.fft.irfft(transform[..., 0, :, :] * transform[..., 1, :, :].conj(), length).max(-1)
+    return likeness, torch.where(lag >= length // 2, lag - length, lag)
 
 
 def filled(values: Tensor, known: Tensor) -> Tensor:
@@ -294,76 +298,105 @@ def _through_blocks(values: Tensor, pulses: int) -> Tensor:
     return values[..., low] * (1 - share) + values[..., low + 1] * share
 
 
-def bands_of(
-    sweeps: Tensor,
-    radar: TriangularLadar,
-    window_m: tuple[float, float] | None = None,
-    taper: float = 1.0,
-    oversampling: int = 1,
-    video: bool = False,
-) -> Bands:
-    """Filter both sweeps of every period to a range window.
-
-    The down sweeps are mirrored in time, and the bulk of the Doppler shift (whole bins, estimated
-    from the data) is removed. Differentiable, except that the removed shift is held constant.
+@dataclass(frozen=True)
+class Spectra:
+    """Beat spectra of both sweeps of every period, and the bulk of the Doppler shift.
 
     Args:
-        sweeps: Up and down sweeps of N samples as recorded, shape (..., 2, pulse, N), complex.
+        data: Spectra of the sweeps in the sign convention of `canonical`, zero frequency first,
+            shape (..., 2, pulse, N), complex.
+        smooth: Spectra of Hann-windowed sweeps, times the scale, same shape.
+        scale: Power of two that brings the samples of a trial to about one, shape (..., 1, 1, 1).
+        shift: Doppler shift in whole bins, shape (..., pulse), int64, see `bulk_shift`.
+        alike: True where the spectra of both sweeps are similar, shape (..., pulse), bool.
         radar: Ladar parameters.
-        window_m: Lowest and highest range in metres, relative to the reference range; None for the
-            whole band.
-        taper: Share of the window that its raised-cosine edges take, 0..1. At 0 the window is cut
-            sharply; ringing at the ends of the sweep then limits the accuracy of `mirror_product`
-            at high SNR. At 1 the edges meet in the middle.
-        oversampling: Samples per bin; the number of samples is rounded up to a power of two.
-            Products of sweeps need 2.
-        video: True keeps the residual video phase. This suits methods that use single scatterers,
-            which that phase does not affect, because the filter that removes it rings at the ends
-            of the sweep.
-
-    Returns:
-        The filtered sweeps.
-
-    Raises:
-        ValueError: If the window is invalid, see `window_lines`.
     """
-    first, lines = window_lines(radar, window_m)
-    n = radar.sweep_samples
-    data = canonical(sweeps, radar)
-    spectrum, scale = torch.fft.fft(data), _scale(sweeps.detach())
-    shift, alike = bulk_shift(_block_power(spectrum.detach(), scale), sweeps.shape[-2])
-    shift, certain = _corrected_shift(spectrum.detach(), scale, shift, first, lines)
-    m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
-    line = torch.arange(lines, device=sweeps.device)
-    sides = torch.stack([shift, -shift], -2)
-    # a mirrored sweep has the mirrored spectrum
-    mirror = torch.arange(1, -2, -2, device=sweeps.device)[:, None, None]
-    kept = spectrum.gather(-1, mirror * (first + line + sides[..., None]) % n)
-    edges = taper if window_m is not None else 0.0
-    shape = _raised_cosine(line.to(torch.float64), lines, edges)
-    filters = torch.stack(
-        [shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)]
-    )
-    # phases refer to the middle of the sweep
-    middle = mirror[..., 0] * (first + sides).to(torch.float64)
-    turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
-    series = torch.fft.ifft(kept * filters[:, None, :] * (turned * scale[..., 0])[..., None], m) * (m / n)
-    beat = _beat_of_first(first, m, sweeps)
-    series = series * beat.to(series.dtype)
-    time_s = (torch.arange(m, dtype=torch.float64, device=sweeps.device) - (m - 1) / 2) * (radar.sweep_s / m)
-    up, down = series[..., 0, :, :], series[..., 1, :, :]
-    return Bands(
-        up,
-        down,
-        time_s,
-        shift,
-        alike & (certain | ~_without_echo(up, down, alike)),
-        lines,
-        first,
-        # computed on the host, for which the device need not be read
-        float(_raised_cosine(torch.arange(lines, dtype=torch.float64), lines, edges).square().sum()),
-        radar,
-    )
+
+    data: Tensor
+    smooth: Tensor
+    scale: Tensor
+    shift: Tensor
+    alike: Tensor
+    radar: TriangularLadar
+
+    @staticmethod
+    def of(sweeps: Tensor, radar: TriangularLadar) -> Spectra:
+        """Transform sweeps and find the bulk of their Doppler shift.
+
+        Args:
+            sweeps: Up and down sweeps of N samples as recorded, shape (..., 2, pulse, N), complex.
+            radar: Ladar parameters.
+
+        Returns:
+            The spectra.
+        """
+        spectrum, scale = torch.fft.fft(canonical(sweeps, radar)), _scale(sweeps.detach())
+        smooth = _smoothed(spectrum.detach(), scale)
+        blocks = torch.stack([power_of(part).mean(-2) for part in smooth.split(_BLOCK, -2)], -2)
+        return Spectra(spectrum, smooth, scale, *bulk_shift(blocks, sweeps.shape[-2]), radar)
+
+    def bands(
+        self,
+        window_m: tuple[float, float] | None = None,
+        taper: float = 1.0,
+        oversampling: int = 1,
+        video: bool = False,
+    ) -> Bands:
+        """Filter both sweeps of every period to a range window.
+
+        The down sweeps are mirrored in time, and the Doppler shift is removed in whole bins.
+        Differentiable, except that the removed shift is held constant.
+
+        Args:
+            window_m: Lowest and highest range in metres, relative to the reference range; None for
+                the whole band.
+            taper: Share of the window that its raised-cosine edges take, 0..1. At 0 the window is
+                cut sharply; ringing at the ends of the sweep then limits the accuracy of
+                `mirror_product` at high SNR. At 1 the edges meet in the middle.
+            oversampling: Samples per bin; the number of samples is rounded up to a power of two.
+                Products of sweeps need 2.
+            video: True keeps the residual video phase. This suits methods that use single
+                scatterers, which that phase does not affect, because the filter that removes it
+                rings at the ends of the sweep.
+
+        Returns:
+            The filtered sweeps.
+
+        Raises:
+            ValueError: If the window is invalid, see `window_lines`.
+        """
+        spectrum, radar = self.data, self.radar
+        first, lines = window_lines(radar, window_m)
+        n, device = radar.sweep_samples, spectrum.device
+        shift, certain = _corrected_shift(self.smooth, self.shift, first, lines)
+        m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
+        line = torch.arange(lines, device=device)
+        line = torch.arange(lines, device=device)
+        kept = _in_window(spectrum, shift, first, lines)
+        edges = taper if window_m is not None else 0.0
+        shape = _raised_cosine(line.to(torch.float64), lines, edges)
+        filters = torch.stack(
+            [shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)]
+        )
+        # phases refer to the middle of the sweep
+        middle = torch.stack([first + shift, shift - first], -2).to(torch.float64)
+        turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
+        series = torch.fft.ifft(kept * filters[:, None, :] * (turned * self.scale[..., 0])[..., None], m) * (m / n)
+        series = series * _beat_of_first(first, m, kept).to(series.dtype)
+        time_s = (torch.arange(m, dtype=torch.float64, device=device) - (m - 1) / 2) * (radar.sweep_s / m)
+        up, down = series[..., 0, :, :], series[..., 1, :, :]
+        return Bands(
+            up,
+            down,
+            time_s,
+            shift,
+            self.alike & (certain | ~_without_echo(up, down, self.alike)),
+            lines,
+            first,
+            # computed on the host, for which the device need not be read
+            float(_raised_cosine(torch.arange(lines, dtype=torch.float64), lines, edges).square().sum()),
+            radar,
+        )
 
 
 def _without_echo(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
@@ -382,28 +415,16 @@ def _scale(sweeps: Tensor) -> Tensor:
     return 1 / level_of(sweeps[..., middle - 4 : middle + 4], 3)
 
 
-def _block_power(spectrum: Tensor, scale: Tensor) -> Tensor:
-    """Power spectra of Hann-windowed sweeps, averaged over blocks of periods.
+def _smoothed(spectrum: Tensor, scale: Tensor) -> Tensor:
+    """Spectra of Hann-windowed sweeps, times a scale.
 
-    (..., 2, pulse, N) to (..., 2, block, N). With a rectangular window, a peak between two bins
-    would lose more than half of its power.
+    With a rectangular window, a peak between two bins would lose more than half of its power.
     """
-    # real and imaginary parts alternate; the window is the same for both
-    parts = torch.view_as_real(spectrum).flatten(-2)
-    inner = _windowed_power(parts[..., :-4], parts[..., 2:-2], parts[..., 4:], scale)
-    first, second, last_but_one, last = parts[..., :2], parts[..., 2:4], parts[..., -4:-2], parts[..., -2:]
-    ends = _windowed_power(last, first, second, scale), _windowed_power(last_but_one, last, first, scale)
-    return torch.cat([ends[0], inner, ends[1]], -1).unflatten(-1, (-1, 2)).sum(-1)
+    between = torch.cat([spectrum[..., -1:], spectrum, spectrum[..., :1]], -1)
+    return torch.sub(spectrum, between[..., :-2] + between[..., 2:], alpha=0.5).mul_(scale)
 
 
-def _windowed_power(before: Tensor, here: Tensor, after: Tensor, scale: Tensor) -> Tensor:
-    """Power of the Hann-windowed spectrum from three neighbouring bins, averaged over blocks."""
-    windowed = torch.sub(here, before + after, alpha=0.5).mul_(scale)
-    windowed = windowed.mul_(windowed)
-    return torch.stack([part.mean(-2) for part in windowed.split(_BLOCK, -2)], -2)
-
-
-def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines: int) -> tuple[Tensor, Tensor]:
+def _corrected_shift(smooth: Tensor, shift: Tensor, first: int, lines: int) -> tuple[Tensor, Tensor]:
     """The shift of every period, corrected by its own envelopes, and where it is certain.
 
     It is corrected where the envelopes are similar and their lag is two bins or more. Eight periods
@@ -412,23 +433,23 @@ def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int,
     scatterer that enters the beam between its two sweeps is seen in one of them only. The search
     for the velocity reaches further than that.
     """
-    n = spectrum.shape[-1]
-    sides = torch.stack([shift, -shift], -2)
-    mirror = torch.arange(1, -2, -2, device=spectrum.device)[:, None, None]
-    line = torch.arange(first - 1, first + lines + 1, device=spectrum.device)
-    kept = spectrum.gather(-1, mirror * (line + sides[..., None]) % n) * scale
-    smooth = kept[..., 1:-1] - (kept[..., :-2] + kept[..., 2:]) / 2
-    power = power_of(smooth)
-    power = power - power.mean(-1, keepdim=True)
-    power = power / power.square().sum(-1, keepdim=True).sqrt().clamp_min(torch.finfo(power.dtype).tiny)
-    length = 2 ** math.ceil(math.log2(2 * lines))
-    transform = torch.fft.rfft(power, length)
-    likeness, lag = torch.fft.irfft(transform[..., 0, :, :] * transform[..., 1, :, :].conj(), length).max(-1)
-    lag = torch.where(lag >= length // 2, lag - length, lag)
+    power = power_of(_in_window(smooth, shift, first, lines))
+    likeness, lag = _best_lag(power, 2 ** math.ceil(math.log2(2 * lines)))
     certain = (likeness > _SURELY_ALIKE) & (lag.abs() <= _FURTHEST)
     own = shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0)
     typical = _median_of_three(own)
     return torch.where((own - typical).abs() >= _ALONE, typical, own), certain
+
+
+def _in_window(spectrum: Tensor, shift: Tensor, first: int, lines: int) -> Tensor:
+    """Bins of a range window in the spectra of up sweeps and of mirrored down sweeps.
+
+    The Doppler shift (..., pulse) in bins moves the window. A mirrored sweep has the mirrored
+    spectrum.
+    """
+    line = torch.arange(first, first + lines, device=spectrum.device)
+    at = torch.stack([line + shift[..., None], shift[..., None] - line], -3)
+    return spectrum.gather(-1, at % spectrum.shape[-1])
 
 
 def _line_phase(

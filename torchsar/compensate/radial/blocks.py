@@ -7,13 +7,50 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, block_bytes_of, over_blocks, refuse_non_finite
+from torchsar.compensate.radial.assess import assessed_velocity
+from torchsar.compensate.radial.bands import Spectra
+from torchsar.compensate.radial.measured import Measured
+from torchsar.core import Axis, Estimate, block_bytes_of, over_blocks, refuse_non_finite
+from torchsar.radar import TriangularLadar
 
 # size of a block over the size that is best for one operation, found by trial: smaller blocks cost
 # more in calls than they gain in the cache
 _BLOCKS = 16
 
 Estimator = Callable[[Tensor, Tensor | float], Estimate]
+
+
+def velocities(
+    measure: Callable[[Spectra], Measured],
+    sweeps: Tensor,
+    radar: TriangularLadar,
+    pulse: Axis,
+    azimuth_m: Tensor | float,
+    assess: bool,
+) -> Estimate:
+    """Estimate radial velocities in blocks of trials, and assess them if asked to.
+
+    Args:
+        measure: Method that measures the velocities in the spectra of the sweeps.
+        sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
+        radar: Ladar parameters.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
+        azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
+        assess: Whether the estimate is assessed, see `assessed_velocity`.
+
+    Returns:
+        The estimate of `velocity_m_s`, see `Measured.estimate`.
+
+    Raises:
+        ValueError: If `azimuth_m` is not finite, or neither one number nor one per trial.
+    """
+
+    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
+        measured = measure(Spectra.of(sweeps, radar))
+        found = measured.estimate(pulse, azimuth_m)
+        return assessed_velocity(found, measured, pulse) if assess else found
+
+    return by_trials(estimator, sweeps, azimuth_m)
 
 
 def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:

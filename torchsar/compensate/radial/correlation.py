@@ -10,10 +10,10 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
-from torchsar.compensate.radial.blocks import by_trials
+from torchsar.compensate.radial.bands import Bands, Spectra, refuse_other_sweeps
+from torchsar.compensate.radial.blocks import velocities
+from torchsar.compensate.radial.measured import Law, Measured
 from torchsar.compensate.radial.peak import from_beats
-from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate
 from torchsar.radar import TriangularLadar
 
@@ -28,8 +28,18 @@ def spectrum_correlation(
     upsampling: int = 20,
     window_m: tuple[float, float] | None = None,
     azimuth_m: Tensor | float = 0.0,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the radial velocity from the lag between the range envelopes of both sweeps.
+
+    >>> import torch
+    >>> from torchsar.compensate import spectrum_correlation
+    >>> from torchsar.radar import TriangularLadar
+    >>> ladar = TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> sweeps = torch.ones(2, 64, 128, dtype=torch.complex64)  # a point at the reference range
+    >>> found = spectrum_correlation(sweeps, ladar, ladar.sweep_axes(64)[1])
+    >>> bool(found["velocity_m_s"].abs().max() < 0.01)
+    True
 
     The range envelopes are the magnitude spectra of the up sweep and of the mirrored down sweep.
     The lag that aligns them is twice the Doppler shift. It is found on a grid with the step
@@ -46,13 +56,19 @@ def spectrum_correlation(
         window_m: Lowest and highest range in metres, relative to the reference range; None for the
             whole band.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
+        assess: False leaves out the standard deviation and the outcome.
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
-        positive, with its standard deviation, see `mirror_product`. `ok` is False where the SNR
-        after compression is below 16 dB, the standard deviation exceeds 0.035 lambda / T, the
-        product of up and mirrored down sweeps contradicts the velocities in many periods, or no
-        scatterer is illuminated in any period.
+        positive.
+        `assess=True` adds the standard deviation and the outcome, see `assessed_velocity`:
+        `Outcome.INEXACT` where the SNR is too low or the standard deviation exceeds
+        0.035 lambda / T (T is the length of a sweep), `AMBIGUOUS` where both sweeps have more power
+        in common at another velocity, `NOISE` where they have no more in common than noise, and
+        `EMPTY` for samples of zero. `quality` is the share of the power in the window that both
+        sweeps have in common. `info` holds "snr_db" (after compression) and "noise_m_s"
+        (standard deviation that noise explains), shape (...,); "shift" (Doppler shift in whole
+        bins) and "lit" (True in periods with an echo), shape (..., pulse).
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -67,19 +83,13 @@ def spectrum_correlation(
 
     floor = radar.wavelength_m / (4 * upsampling * radar.sweep_s * math.sqrt(12))
 
-    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
-        bands = bands_of(sweeps, radar, window_m, taper=0.0)
+    def measure(spectra: Spectra) -> Measured:
+        bands = spectra.bands(window_m, taper=0.0)
         doppler = envelope_lag(bands, upsampling) / (2 * radar.sweep_s)
-        return velocity_estimate(
-            from_beats(doppler, -doppler, bands),
-            bands_of(sweeps, radar, window_m, taper=0.5, oversampling=2),
-            pulse,
-            factor=3.0,
-            azimuth_m=azimuth_m,
-            floor_m_s=floor,
-        )
+        product = spectra.bands(window_m, taper=0.5, oversampling=2)
+        return Measured.of(from_beats(doppler, -doppler, bands), product, Law(3.0, floor_m_s=floor))
 
-    return by_trials(estimator, sweeps, azimuth_m)
+    return velocities(measure, sweeps, radar, pulse, azimuth_m, assess)
 
 
 @torch.no_grad()

@@ -2,13 +2,15 @@
 
 Many scatterers in a range cell interfere, and sharpness then prefers wrong phases. The phases of
 greatest likelihood are the right ones, but a search that starts too far away ends in a local
-maximum. It is therefore started from two independent estimates, and if their results differ it is
-also made without a start. Only a result that was reached twice is reliable.
+maximum. It is therefore started from the phases that sharpen the image and from a smooth walk, and
+if the results differ it is also made without a start. Only a result that was reached twice is
+reliable.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,24 +18,41 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare
 from torchsar.compensate.pulse_phase.homogeneous import power_groups
 from torchsar.compensate.pulse_phase.linking import linked
-from torchsar.core import Estimate, Outcome, cis, power_of
+from torchsar.core import Estimate, cis, power_of
 from torchsar.core.spline import UniformSpline
+from torchsar.metrics.phase import phase_rmse
+from torchsar.optim import adam
 
 # Pulses are averaged to about so many blocks, over which the residual phase is smooth; it makes the
 # search fast, because its time grows with the cube of their number.
 _BLOCKS = 128
-_SAME_RAD = 0.1  # rms difference below which two results are the same
+SAME_RAD = 0.1  # rms difference below which two results are the same
 # Descent to a smooth walk of the phase: number of cosines, rms of the walk expected in rad, noise
 # floors relative to the mean power, steps for each, and length of a step. A high floor lets the
 # descent pass over local minima; the walks of velocities from dense scenes are 0.4 to 1.6 rad.
-_COSINES, _WALK_RAD, _FLOORS, _STEPS, _LENGTH = 60, 1.0, (1e-1, 1e-2, 1e-3, 1e-4), 40, 0.3
+_COSINES, _WALK_RAD, _FLOORS, _STEPS, _RATE = 60, 1.0, (1e-1, 1e-2, 1e-3, 1e-4), 40, 0.15
 # variance of a random walk about a spline through the means of blocks of n steps, over n times that
 # of a step; simulated for n = 2 to 16
 _WITHIN = 0.115
-_MEMORY = (0.9, 0.98)  # of the mean slope and of the mean squared slope
 
 
-def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estimate:
+class Walk(NamedTuple):
+    """Residual phases of dense scenes.
+
+    Args:
+        phase_rad: Phases in rad without steps of whole turns and without a straight line, shape
+            (trial, pulse), float64.
+        std_rad: Their standard deviation: that of the likelihood, of the walk within a block of
+            pulses, and that which the difference of the two nearest results shows, same shape.
+        apart_rad: Rms difference in rad of the nearest result from another start, shape (trial,).
+    """
+
+    phase_rad: Tensor
+    std_rad: Tensor
+    apart_rad: Tensor
+
+
+def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Walk:
     """Estimate the residual phase of each pulse of dense scenes by maximum likelihood.
 
     Args:
@@ -44,10 +63,7 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
             shape (trial,).
 
     Returns:
-        `phase_rad` of shape (trial, pulse), without steps of whole turns and without a straight
-        line. Its standard deviation is that of `link_phases`, of the walk within a block of pulses,
-        and that which the difference of the two nearest results shows. `ok` is False where no two
-        starts reach the same phases within 0.1 rad, or `link_phases` is not ok.
+        The most likely of the phases from two or three starts.
     """
     n = cells.shape[-2]
     size = max(1, n // _BLOCKS)
@@ -59,19 +75,19 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
 
     pulses = prepare(averaged(cells), "linked_walk", empty=False)
     start = torch.angle(averaged(cis(polished_rad.detach().to(torch.float64))))
-    results = [linked(pulses, start, still=True), linked(pulses, smooth_walk(pulses.rows.detach()), still=True)]
-    phase, gain, std, ok = (torch.stack(parts) for parts in zip(*map(_parts, results), strict=True))
-    differ = (phase_difference(phase[0], phase[1]) > _SAME_RAD).nonzero()[:, 0]
+    results = [linked(pulses, begin, still=True) for begin in (start, smooth_walk(pulses.rows.detach()))]
+    phase, gain, std = (torch.stack(parts) for parts in zip(*map(_parts, results), strict=True))
+    differ = (phase_rmse(phase[0], phase[1]) > SAME_RAD).nonzero()[:, 0]
     if len(differ):
         third = _parts(linked(Pulses(pulses.rows[differ], pulses.present[differ], differ.shape), still=True))
-        phase, gain, std, ok = (
+        phase, gain, std = (
             torch.cat([of_two, of_two[:1].index_copy(1, differ, of_third[None])])
-            for of_two, of_third in zip((phase, gain, std, ok), third, strict=True)
+            for of_two, of_third in zip((phase, gain, std), third, strict=True)
         )
     best = gain.argmax(0)
     trial = torch.arange(len(best), device=best.device)
     chosen = phase[best, trial]
-    apart = phase_difference(phase, chosen).index_put((best, trial), torch.full_like(gain[0], torch.inf)).amin(0)
+    apart = phase_rmse(phase, chosen).index_put((best, trial), torch.full_like(gain[0], torch.inf)).amin(0)
     walk = _without_line(chosen)
     within = step_rad.to(torch.float64).square() * size * _WITHIN
     # two results of the same deviation differ by the square root of two of it
@@ -79,37 +95,27 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Estima
     middle = first + (size - 1) / 2
     at = torch.arange(n, dtype=torch.float64, device=cells.device)
     block = ((at - first) / size).floor().clamp(0, count - 1).long()
-    return Estimate(
-        {"phase_rad": UniformSpline(walk, middle, size).at(at)},
-        {"phase_rad": spread[:, block]},
-        torch.exp(-spread.square().mean(-1)),
-        Outcome.of(ok[best, trial] & (apart < _SAME_RAD), Outcome.NOISE),
-    )
+    return Walk(UniformSpline(walk, middle, size).at(at), spread[:, block], apart)
 
 
-def _parts(found: Estimate) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Phase, likelihood, deviation and verdict; the first and third of shape (trial, pulse)."""
+def _parts(found: Estimate) -> tuple[Tensor, Tensor, Tensor]:
+    """Phase, likelihood and deviation; the first and third of shape (trial, pulse)."""
     double = torch.float64
-    return found["phase_rad"].to(double), found.info["fit_nats"], found.std["phase_rad"].to(double), found.ok
+    return found["phase_rad"].to(double), found.info["fit_nats"], found.std["phase_rad"].to(double)
 
 
-@torch.no_grad()
 def smooth_walk(rows: Tensor) -> Tensor:
     """Find the smooth walk of the phase that makes the spectra of the range cells most likely.
 
     The walk is a sum of cosines, whose amplitudes fall like those of a random walk. Range cells of
     similar power share a spectrum P. The sum of ln(P + floor) and of the squared amplitudes is
-    minimised, with four floors, from the highest to the lowest. Every trial takes its own steps
-    (Adam).
+    minimised, with four floors, from the highest to the lowest.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
 
     Returns:
         The phase in rad, shape (trial, pulse), float64.
-
-    Reference:
-        Kingma and Ba, Adam: a method for stochastic optimization, ICLR 2015.
     """
     n, real = rows.shape[-1], rows.real.dtype
     order = torch.arange(2, min(n // 2, _COSINES) + 2, dtype=real, device=rows.device)
@@ -119,55 +125,18 @@ def smooth_walk(rows: Tensor) -> Tensor:
     member = power_groups(power).to(real)
     cells = member.sum(-1)
     window = torch.hann_window(n + 2, periodic=False, dtype=real, device=rows.device)[1:-1]
-    level = power.mean(-1)[:, None, None].sqrt()
-    z = rows / or_one(level) * (window / window.norm())
+    z = rows / or_one(power.mean(-1))[:, None, None].sqrt() * (window / window.norm())
 
     def cost(amplitude: Tensor, floor: float) -> Tensor:
         image = torch.fft.fft(z * cis(-amplitude @ walks)[:, None])
-        spectra = torch.einsum("gtr,trk->gtk", member, power_of(image))
-        spectra = spectra / or_one(cells)[..., None]
+        spectra = torch.einsum("gtr,trk->gtk", member, power_of(image)) / or_one(cells)[..., None]
         raised = spectra + floor * spectra.mean(-1, keepdim=True) + torch.finfo(real).tiny
-        return (cells * raised.log().sum(-1)).sum() + amplitude.square().sum() / 2
+        return (cells * raised.log().sum(-1)).sum(0) + amplitude.square().sum(-1) / 2
 
     amplitude = torch.zeros(len(rows), len(order), dtype=real, device=rows.device)
     for floor in _FLOORS:
-        mean, square = torch.zeros_like(amplitude), torch.zeros_like(amplitude)
-        for step in range(_STEPS):
-            with torch.enable_grad():
-                (slope,) = torch.autograd.grad(cost(amplitude.requires_grad_(), floor), amplitude)
-            mean = _MEMORY[0] * mean + (1 - _MEMORY[0]) * slope
-            square = _MEMORY[1] * square + (1 - _MEMORY[1]) * slope.square()
-            unbiased = mean / (1 - _MEMORY[0] ** (step + 1))
-            size = (square / (1 - _MEMORY[1] ** (step + 1))).sqrt()
-            length = _LENGTH * (1 + math.cos(math.pi * step / _STEPS)) / 2
-            amplitude = amplitude.detach() - length * unbiased / or_one(size)
+        amplitude = adam(lambda x, floor=floor: cost(x, floor), amplitude, steps=_STEPS, rate=_RATE).x
     return (amplitude @ walks).to(torch.float64)
-
-
-def _slope(phasors: Tensor) -> Tensor:
-    """Slope in rad per pulse of the tone nearest to phasors (..., pulse), to 1/64 of a cell."""
-    n = phasors.shape[-1]
-    at = torch.fft.fft(phasors, 64 * n).abs().argmax(-1)
-    return at.to(torch.float64) * (2 * math.pi / (64 * n))
-
-
-def phase_difference(a: Tensor, b: Tensor, lit: Tensor | None = None) -> Tensor:
-    """Compute the difference of phases, apart from a constant and a straight line.
-
-    Args:
-        a: Phases in rad, shape (..., pulse), float64.
-        b: Other phases in rad, shape (..., pulse), float64.
-        lit: Pulses that count, shape (..., pulse), bool; all by default.
-
-    Returns:
-        The rms difference in rad, shape (...,), at most the square root of 2.
-    """
-    turned = cis(a.detach() - b.detach())
-    if lit is not None:
-        turned = turned * lit
-    tone = turned * cis(-_slope(turned)[..., None] * torch.arange(a.shape[-1], device=a.device))
-    count = a.shape[-1] if lit is None else lit.sum(-1).clamp_min(1)
-    return (2 * (1 - tone.sum(-1).abs() / count)).clamp_min(0).sqrt()
 
 
 def _without_line(phase: Tensor) -> Tensor:

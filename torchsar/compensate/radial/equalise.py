@@ -14,8 +14,15 @@ LEAST_GAIN = 0.05  # least gain of a pulse: a lost pulse is not amplified more t
 _PAD = 4  # zero-padding of the transform: a peak is then found to an eighth of a cell
 
 
-def pulse_gain(data: Tensor) -> Estimate:
+def pulse_gain(data: Tensor, *, assess: bool = True) -> Estimate:
     """Estimate the amplitude of every pulse from steady scatterers.
+
+    >>> import torch
+    >>> from torchsar.compensate import pulse_gain
+    >>> gain = torch.tensor([0.9, 1.0, 1.1, 1.0])
+    >>> pulses = gain[:, None] * torch.ones(4, 2, dtype=torch.complex64)
+    >>> pulse_gain(pulses)["gain"]
+    tensor([0.9000, 1.0000, 1.1000, 1.0000], dtype=torch.float64)
 
     Scintillation and pointing errors change the amplitude of the echo from pulse to pulse, which
     changes the side lobes in azimuth: a log-amplitude of 0.1 rms changes the first side lobe by a
@@ -27,12 +34,14 @@ def pulse_gain(data: Tensor) -> Estimate:
     Args:
         data: Range-compressed pulses after motion compensation, deramping and autofocus, of which
             only the amplitudes have errors, shape (..., pulse, range), complex.
+        assess: False leaves out the outcome.
 
     Returns:
         `gain` of shape (..., pulse), by which each pulse is to be divided. Its mean is about one,
         and it is never below 0.05, so that a lost pulse is not amplified more than 20 times.
-        `quality` is the share of the energy that the tones explain. `ok` is False where that share
-        is half or less; all gains of the trial are then one.
+        `quality` is the share of the energy that the tones explain. `assess=True` adds the outcome:
+        `Outcome.MISFIT` where that share is half or less, because there are no steady scatterers or
+        the noise is too strong; all gains of the trial are then one.
 
     Raises:
         TypeError: If the data are not complex.
@@ -61,7 +70,7 @@ def pulse_gain(data: Tensor) -> Estimate:
     return Estimate(
         {"gain": gain.to(torch.float64).reshape(*shape, n)},
         quality=explained.to(torch.float64).reshape(shape),
-        outcome=Outcome.of(ok.reshape(shape), Outcome.NOISE),
+        outcome=(Outcome.of(ok, Outcome.MISFIT) if assess else Outcome.NOT_ASSESSED.like(ok)).reshape(shape),
     )
 
 

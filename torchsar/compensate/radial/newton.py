@@ -5,30 +5,35 @@ Gradients pass through the steps, but not through the search.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
-from torchsar.core import cis, power_of
+from torchsar.core import linear_phasor, power_of
 
 
-def climbed(x: Tensor, weights: Tensor, value: Tensor, steps: int) -> Tensor:
-    """Refine, by Newton steps, the value v for which |sum_i x_i exp(-j w_i v)| is greatest.
+def climbed(x: Tensor, turns: float, value: Tensor, steps: int) -> Tensor:
+    """Refine, by Newton steps, the value v for which |sum_i x_i exp(-2j pi turns i v)| is greatest.
 
     Differentiable.
 
     Args:
         x: Samples x_i, shape (..., m), complex.
-        weights: w_i in rad per unit of v, shape (m,).
+        turns: Change of phase from sample to sample, in turns per unit of v.
         value: Values of v to start from, shape (...,).
         steps: Number of Newton steps.
 
     Returns:
         The refined values, shape (...,), float64.
     """
-    w = weights.to(x.real.dtype)
+    n = x.shape[-1]
+    middle = (n - 1) / 2
+    w = (torch.arange(n, dtype=torch.float64, device=x.device) - middle) * (2 * math.pi * turns)
+    powers = torch.stack([torch.ones_like(w), w, w * w], -1).to(x.dtype)
     for _ in range(steps):
-        turned = x * cis((-value[..., None] * weights).to(w.dtype))
-        s0, s1, s2 = turned.sum(-1), (turned * w).sum(-1), (turned * w * w).sum(-1)
+        turned = x * linear_phasor(-turns * value, -middle, n, x.dtype)
+        s0, s1, s2 = (turned @ powers).unbind(-1)
         gradient = 2 * (s0.conj() * s1).imag
         bend = 2 * (power_of(s1) - (s0.conj() * s2).real)
         value = value + step_uphill(gradient, bend)

@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_other_sweeps, window_lines
-from torchsar.compensate.radial.blocks import by_trials
+from torchsar.compensate.radial.bands import Bands, Spectra, inside, refuse_other_sweeps, window_lines
+from torchsar.compensate.radial.blocks import velocities
+from torchsar.compensate.radial.measured import Law, Measured
 from torchsar.compensate.radial.newton import climbed
-from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate, cis, power_of
 from torchsar.radar import TriangularLadar
 
@@ -27,8 +27,18 @@ def ml_peak(
     *,
     window_m: tuple[float, float] | None = None,
     azimuth_m: Tensor | float = 0.0,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the radial velocity from the periodogram peaks of both sweeps.
+
+    >>> import torch
+    >>> from torchsar.compensate import ml_peak
+    >>> from torchsar.radar import TriangularLadar
+    >>> ladar = TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> sweeps = torch.ones(2, 64, 128, dtype=torch.complex64)  # a point at the reference range
+    >>> found = ml_peak(sweeps, ladar, ladar.sweep_axes(64)[1])
+    >>> bool(found["velocity_m_s"].abs().max() < 0.01)
+    True
 
     The Doppler shift is half the difference between the beat frequencies of the up sweep and of the
     mirrored down sweep. Each beat frequency is the peak of a periodogram, refined by Newton steps.
@@ -46,13 +56,19 @@ def ml_peak(
             the peak of the mean periodogram is searched; None for the whole band. The sweeps are
             not filtered.
         azimuth_m: Azimuth of the scatterer in metres, a number or shape (...,).
+        assess: False leaves out the standard deviation and the outcome.
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
-        positive, with its standard deviation, see `mirror_product`. `ok` is False where the SNR
-        after compression is below 16 dB, the standard deviation exceeds 0.035 lambda / T (T is the
-        length of a sweep), the product of up and mirrored down sweeps contradicts the velocities in
-        many periods, or no scatterer is illuminated in any period.
+        positive.
+        `assess=True` adds the standard deviation and the outcome, see `assessed_velocity`:
+        `Outcome.INEXACT` where the SNR is too low or the standard deviation exceeds
+        0.035 lambda / T (T is the length of a sweep), `AMBIGUOUS` where both sweeps have more power
+        in common at another velocity, `NOISE` where they have no more in common than noise, and
+        `EMPTY` for samples of zero. `quality` is the share of the power in the window that both
+        sweeps have in common. `info` holds "snr_db" (after compression) and "noise_m_s"
+        (standard deviation that noise explains), shape (...,); "shift" (Doppler shift in whole
+        bins) and "lit" (True in periods with an echo), shape (..., pulse).
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -61,21 +77,18 @@ def ml_peak(
     refuse_other_sweeps(sweeps, radar, "ml_peak", pulse)
     window_lines(radar, window_m)
 
-    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
-        bands = bands_of(sweeps, radar, video=True)
+    def measure(spectra: Spectra) -> Measured:
+        bands = spectra.bands(video=True)
         up, down, lit = peak_frequencies(bands, window_m)
-        changes = [_amplitude_slope(x, hz.detach(), bands) for x, hz in ((bands.up, up), (bands.down, down))]
-        return velocity_estimate(
-            from_beats(up, down, bands),
-            bands_of(sweeps, radar, window_m, taper=0.5, oversampling=2),
-            pulse,
-            factor=3.0,
-            azimuth_m=azimuth_m,
-            spread_m_s=radar.wavelength_m / 2 * (changes[0] - changes[1]) / 2,
-            lit=bands.lit & lit,
-        )
 
-    return by_trials(estimator, sweeps, azimuth_m)
+        def changes() -> Tensor:
+            of_up, of_down = (_amplitude_slope(x, hz, bands) for x, hz in ((bands.up, up), (bands.down, down)))
+            return radar.wavelength_m / 2 * (of_up - of_down) / 2
+
+        product = spectra.bands(window_m, taper=0.5, oversampling=2)
+        return Measured.of(from_beats(up, down, bands), product, Law(3.0, changes=changes), bands.lit & lit)
+
+    return velocities(measure, sweeps, radar, pulse, azimuth_m, assess)
 
 
 def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:
@@ -146,5 +159,5 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
     peak, best = torch.where(distance.abs() <= round(_REACH * _PAD), power, -1).max(-1)
     best = torch.where(best >= _PAD * m // 2, best - _PAD * m, best)
     frequency = best.to(torch.float64) / (_PAD * bands.radar.sweep_s)
-    frequency = climbed(both, 2 * math.pi * bands.time_s, frequency, _NEWTON)
+    frequency = climbed(both, bands.radar.sweep_s / m, frequency, _NEWTON)
     return frequency[..., 0, :], frequency[..., 1, :], shining(peak[..., 0, :], peak[..., 1, :])

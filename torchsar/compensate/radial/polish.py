@@ -18,8 +18,6 @@ from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import Run, Wiener, bright, in_turn
 from torchsar.core import Estimate, power_of
 
-# standard deviation of the phase from which on it is not ok: a Strehl ratio of exp(-0.25) = 0.78
-ENOUGH_STD_RAD = 0.5
 # over-relaxation, found by trial: larger values converge faster, at 2 or more need not converge
 _RELAXATION = 1.7
 # found by trial: higher levels exclude weak scatterers, lower ones include noise
@@ -27,7 +25,12 @@ _SCENE = Wiener(level=4.0, share=0.02)
 
 
 def phase_polish(
-    data: Tensor, *, start: Tensor | None = None, iterations: int = 80, tolerance_rad: float = 0.005
+    data: Tensor,
+    *,
+    start: Tensor | None = None,
+    iterations: int = 80,
+    tolerance_rad: float = 0.005,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the residual phase of each pulse relative to the scene that all pulses share.
 
@@ -60,14 +63,12 @@ def phase_polish(
         iterations: Largest number of iterations with Wiener weights.
         tolerance_rad: Phase step in rad, rms over the pulses, below which the steps with Wiener
             weights end; the last kind of steps ends below half of it.
+        assess: False leaves out the standard deviation and the outcome.
 
     Returns:
-        `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
-        halves of the range cells. `quality`, `ok` and `info` are those of `autofocus`: `ok` is
-        False unless the image is clearly sharper than autofocus can make pure noise, more than one
-        range cell or a single point makes the sharpness, the standard deviation is below 0.47 rad,
-        the pulses show one scene, and a homogeneous description of the scene is not
-        more likely, because sharpness does not find the phases of homogeneous clutter.
+        `phase_rad` of shape (..., pulse), to be removed. `assess=True` adds the standard deviation,
+        which follows from two halves of the range cells, and the outcome; `quality`, the outcomes
+        and `info` are those of `autofocus`.
 
     Raises:
         TypeError: If the data are not complex or the start is not a tensor.
@@ -85,7 +86,7 @@ def phase_polish(
         runs = [Run(_SCENE, AlongPulses(), 4, _RELAXATION, 0.0), Run(_near_peak, AlongPulses(2), 5, 1.0, 0.0)]
         return in_turn(rows, at, runs)[0]
 
-    found = conclude(pulses, *find_phases(pulses, find, begin), True, again)
+    found = conclude(pulses, *find_phases(pulses, find, begin), assess, again)
     return replace(found, value={"phase_rad": found["phase_rad"].to(torch.float64)})
 
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_other_sweeps, window_lines
-from torchsar.compensate.radial.blocks import by_trials
+from torchsar.compensate.radial.bands import Bands, Spectra, inside, refuse_other_sweeps, window_lines
+from torchsar.compensate.radial.blocks import velocities
 from torchsar.compensate.radial.correlation import envelope_lag
+from torchsar.compensate.radial.measured import Law, Measured
 from torchsar.compensate.radial.peak import from_beats, shining
-from torchsar.compensate.radial.verdict import velocity_estimate
-from torchsar.core import Axis, Estimate, cis
+from torchsar.core import Axis, Estimate, cis, power_of
 from torchsar.radar import TriangularLadar
 
 Bins = Literal["peak", "sum"]
@@ -34,8 +35,18 @@ def segmented_interference(
     hann: bool = False,
     window_m: tuple[float, float] | None = None,
     azimuth_m: Tensor | float = 0.0,
+    assess: bool = True,
 ) -> Estimate:
     """Estimate the radial velocity from the phase between the halves of both sweeps.
+
+    >>> import torch
+    >>> from torchsar.compensate import segmented_interference
+    >>> from torchsar.radar import TriangularLadar
+    >>> ladar = TriangularLadar(1.934e14, 5e9, 16e-6, 16e6, 60.0, 3000.0)
+    >>> sweeps = torch.ones(2, 64, 128, dtype=torch.complex64)  # a point at the reference range
+    >>> found = segmented_interference(sweeps, ladar, ladar.sweep_axes(64)[1])
+    >>> bool(found["velocity_m_s"].abs().max() < 0.01)
+    True
 
     Let U1 and U2 be the spectra of the first and the second half of the up sweep, and D1 and D2
     those of the halves of the conjugated down sweep. The phase
@@ -67,21 +78,24 @@ def segmented_interference(
         window_m: Lowest and highest range in metres, relative to the reference range; None for the
             whole band.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
+        assess: False leaves out the standard deviation and the outcome.
 
     Returns:
         `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps), receding
-        positive, with its standard deviation, see `mirror_product`. `ok` is False where the SNR
-        after compression is below 16 dB, the standard deviation exceeds 0.035 lambda / T, the
-        product of up and mirrored down sweeps contradicts the velocities in many periods, or no
-        scatterer is illuminated in any period. `info` holds
+        positive.
+        `assess=True` adds the standard deviation and the outcome, see `assessed_velocity`:
+        `Outcome.INEXACT` where the SNR is too low or the standard deviation exceeds
+        0.035 lambda / T (T is the length of a sweep), `AMBIGUOUS` where both sweeps have more power
+        in common at another velocity, `NOISE` where they have no more in common than noise, and
+        `EMPTY` for samples of zero. `quality` is the share of the power in the window that both
+        sweeps have in common. `info` holds "snr_db" (after compression) and "noise_m_s"
+        (standard deviation that noise explains), shape (...,); "shift" (Doppler shift in whole
+        bins) and "lit" (True in periods with an echo), shape (..., pulse); and
 
         - "phase_rad" and "integer" (whole turns), shape (..., pulse);
         - "slips", the number of changes between periods in which "gradient" and "per_pulse" differ
           by a turn, shape (...,);
-        - "dispersion", the standard deviation of the amplitude over the periods divided by its
-          mean, shape (...,);
-        - "weights" of the scatterers, averaged over the periods, shape (..., scatterers);
-        - "snr_db", "shift" and "lit", as for `mirror_product`.
+        - "weights" of the scatterers, averaged over the periods, shape (..., scatterers).
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -103,37 +117,34 @@ def segmented_interference(
         )
     window_lines(radar, window_m)
 
-    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
-        bands = bands_of(sweeps, radar, video=bins == "peak")
-        windowed = bands_of(sweeps, radar, window_m, taper=0.0)
+    def measure(spectra: Spectra) -> Measured:
+        bands = spectra.bands(video=bins == "peak")
+        windowed = spectra.bands(window_m, taper=0.0)
         coarse = envelope_lag(windowed, _SUM_UPSAMPLING if bins == "sum" else 4) / 2 + (windowed.shift - bands.shift)
-        spectra = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
-        searched = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
-        phases, weights, changes = (
-            _summed(spectra, searched, coarse) if bins == "sum" else _at_peaks(spectra, searched, padding, scatterers)
+        halves = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
+        searched = inside(radar, window_m, halves[0].shape[-1], padding / 2, sweeps.device)
+        phases, weights, of_power = (
+            _summed(halves, searched, coarse) if bins == "sum" else _at_peaks(halves, searched, padding, scatterers)
         )
         bands = replace(bands, lit=bands.lit & (weights > 0).any(-2))
         phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
         doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
-        info = {
-            "phase_rad": phase,
-            "integer": integer + bands.shift,
-            "slips": slips,
-            "weights": weights.mean(-1),
-            "dispersion": _dispersion(bands),
-        }
-        return velocity_estimate(
+
+        def changes() -> Tensor:
+            return _weighted(of_power(), weights) * (radar.ambiguous_velocity_m_s / (2 * math.pi))
+
+        return Measured.of(
             from_beats(doppler, -doppler, bands),
-            bands_of(sweeps, radar, window_m, taper=0.5, oversampling=2),
-            pulse,
-            factor=4.0,
-            azimuth_m=azimuth_m,
-            spread_m_s=_weighted(changes, weights) * (radar.ambiguous_velocity_m_s / (2 * math.pi)),
-            lit=bands.lit,
-            info=info,
+            spectra.bands(window_m, taper=0.5, oversampling=2),
+            Law(4.0, changes=changes),
+            bands.lit,
+            phase_rad=phase,
+            integer=integer + bands.shift,
+            slips=slips,
+            weights=weights.mean(-1),
         )
 
-    return by_trials(estimator, sweeps, azimuth_m)
+    return velocities(measure, sweeps, radar, pulse, azimuth_m, assess)
 
 
 def _halves(bands: Bands, padding: int, hann: bool) -> tuple[Tensor, ...]:
@@ -150,14 +161,6 @@ def _halves(bands: Bands, padding: int, hann: bool) -> tuple[Tensor, ...]:
     return up1, up2, down2, down1
 
 
-def _power(*parts: Tensor) -> Tensor:
-    """Sum of the powers of several spectra."""
-    total = torch.zeros_like(parts[0].real)
-    for x in parts:
-        total = total + x.real.square() + x.imag.square()
-    return total
-
-
 def _shifted(bands: Bands, shift: Tensor) -> Bands:
     """The sweeps with a further Doppler shift in bins, (..., pulse), removed."""
     angle = 2 * math.pi * shift[..., None] * (bands.time_s / bands.radar.sweep_s)
@@ -165,10 +168,12 @@ def _shifted(bands: Bands, shift: Tensor) -> Bands:
     return replace(bands, up=bands.up * turn.conj(), down=bands.down * turn)
 
 
-def _summed(halves: tuple[Tensor, ...], searched: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _summed(
+    halves: tuple[Tensor, ...], searched: Tensor, coarse: Tensor
+) -> tuple[Tensor, Tensor, Callable[[], Tensor]]:
     """Phase (..., 1, pulse) between the halves from products summed over bins, and weights of one.
 
-    The third result is the phase that the changes of power would give, see `product_spread`.
+    The third result returns the phase that the changes of power would give, see `Law`.
 
     Up and down spectra are multiplied and summed before the halves are combined: each sum is then
     the power spectrum of the scene times one phasor, for any scene, after the Doppler shift
@@ -178,36 +183,49 @@ def _summed(halves: tuple[Tensor, ...], searched: Tensor, coarse: Tensor) -> tup
     up1, up2, down1, down2 = (x[..., searched] for x in halves)
     first, second = ((up * down.conj()).sum(-1) for up, down in ((up1, down2), (up2, down1)))
     phase = (torch.angle(first * second.conj()).to(torch.float64) - 2 * math.pi * coarse)[..., None, :]
-    changes = [
-        (_power(up).sum(-1) - _power(down).sum(-1)) / (2 * both.abs()).clamp_min(torch.finfo(up.real.dtype).tiny)
-        for up, down, both in ((up1, down2, first.detach()), (up2, down1, second.detach()))
-    ]
-    return phase, torch.ones_like(phase), (changes[0] - changes[1]).to(torch.float64)[..., None, :]
+
+    def changed(up: Tensor, down: Tensor, both: Tensor) -> Tensor:
+        return (power_of(up).sum(-1) - power_of(down).sum(-1)) / (2 * both.abs()).clamp_min(_tiny(both))
+
+    def changes() -> Tensor:
+        return (changed(up1, down2, first) - changed(up2, down1, second)).to(torch.float64)[..., None, :]
+
+    return phase, torch.ones_like(phase), changes
 
 
 def _at_peaks(
     halves: tuple[Tensor, ...], searched: Tensor, padding: int, scatterers: int
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Callable[[], Tensor]]:
     """Phases at the peaks of up and of down spectra, and the weights of Eq. (18).
 
-    The third result is the phase that the changes of power would give, see `product_spread`. All
-    are (..., scatterer, pulse). A weight is zero in periods where the scatterer is not illuminated.
+    The third result returns the phase that the changes of power would give, see `Law`. All are
+    (..., scatterer, pulse). A weight is zero in periods where the scatterer is not illuminated.
     """
-    up1, up2, down1, down2 = halves
-    up, down = _power(up1, up2), _power(down1, down2)
-    peaks = _strongest(torch.where(searched, (up + down).detach().mean(-2), -1), scatterers, padding)
-    reach, tiny = max(1, padding), torch.finfo(up.dtype).tiny
-    phases, weights, changes = [], [], []
+    up, down = (power_of(first) + power_of(second) for first, second in (halves[:2], halves[2:]))
+    both = (up + down).detach()
+    peaks = _strongest(torch.where(searched, both.mean(-2), -1), scatterers, padding)
+    reach = max(1, padding)
+    phases, weights, picked = [], [], []
     for peak in peaks.unbind(-1):
         at_up, at_down = (_own_peak(power.detach(), peak, reach) for power in (up, down))
-        turn = _picked(up1 * up2.conj(), at_up) * _picked(down1 * down2.conj(), at_down)
-        phases.append(torch.angle(turn).to(torch.float64))
-        levels = [_picked(_power(x), at) for x, at in ((up1, at_up), (up2, at_up), (down1, at_down), (down2, at_down))]
-        first, second, third, fourth = (x.to(torch.float64).clamp_min(tiny).log() / 2 for x in levels)
-        changes.append(first - second + third - fourth)
-        weight = _contrast_about((up + down).detach().sqrt(), peak, reach).to(torch.float64)
+        of_halves = [_picked(x, at) for x, at in zip(halves, (at_up, at_up, at_down, at_down), strict=True)]
+        up1, up2, down1, down2 = of_halves
+        phases.append(torch.angle(up1 * up2.conj() * down1 * down2.conj()).to(torch.float64))
+        picked.append(torch.stack(of_halves))
+        weight = _contrast_about(both, peak, reach).to(torch.float64)
         weights.append(weight[..., None] * shining(_picked(up, at_up), _picked(down, at_down)))
-    return torch.stack(phases, -2), torch.stack(weights, -2), torch.stack(changes, -2)
+
+    def changes() -> Tensor:
+        level = power_of(torch.stack(picked, -2)).to(torch.float64)
+        first, second, third, fourth = level.clamp_min(_tiny(both)).log() / 2
+        return first - second + third - fourth
+
+    return torch.stack(phases, -2), torch.stack(weights, -2), changes
+
+
+def _tiny(x: Tensor) -> float:
+    """Smallest normal number of the precision of x."""
+    return torch.finfo(x.dtype).tiny
 
 
 def _strongest(profile: Tensor, count: int, spacing: int) -> Tensor:
@@ -237,14 +255,14 @@ def _picked(x: Tensor, index: Tensor) -> Tensor:
     return x.gather(-1, index[..., None])[..., 0]
 
 
-def _contrast_about(amplitude: Tensor, peak: Tensor, reach: int) -> Tensor:
-    """Standard deviation over mean of amplitudes (..., pulse, n) in a window about a peak (...,).
+def _contrast_about(power: Tensor, peak: Tensor, reach: int) -> Tensor:
+    """Standard deviation over mean of amplitudes in a window about a peak (...,).
 
-    Eq. (18) of the paper, made independent of scale.
+    Eq. (18) of the paper, made independent of scale. power: (..., pulse, n).
     """
-    n = amplitude.shape[-1]
-    near = (peak[..., None] + torch.arange(-4 * reach, 4 * reach + 1, device=amplitude.device)) % n
-    part = amplitude.gather(-1, near[..., None, :].expand(*amplitude.shape[:-1], -1))
+    n = power.shape[-1]
+    near = (peak[..., None] + torch.arange(-4 * reach, 4 * reach + 1, device=power.device)) % n
+    part = power.gather(-1, near[..., None, :].expand(*power.shape[:-1], -1)).sqrt()
     mean = part.mean((-2, -1))
     spread = (part - mean[..., None, None]).square().mean((-2, -1)).sqrt()
     return torch.where(mean > 0, spread / torch.where(mean > 0, mean, 1), 0)
@@ -288,10 +306,3 @@ def _steps(x: Tensor) -> Tensor:
 def _wrapped(x: Tensor) -> Tensor:
     """Phases modulo 2 pi; the removed turns are detached."""
     return x - 2 * math.pi * torch.round(x.detach() / (2 * math.pi))
-
-
-def _dispersion(bands: Bands) -> Tensor:
-    """Standard deviation over mean, (...,), of the amplitude in the window over the periods."""
-    level = bands.up.detach().abs().mean(-1).to(torch.float64)
-    mean = level.mean(-1)
-    return torch.where(mean > 0, level.std(-1, correction=0) / torch.where(mean > 0, mean, 1), 0)

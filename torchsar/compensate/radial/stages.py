@@ -5,12 +5,16 @@ The estimators leave the sweeps unchanged.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from torch import Tensor
 
 from torchsar.compensate.radial.compensate import compensate_motion
 from torchsar.compensate.radial.correlation import spectrum_correlation
 from torchsar.compensate.radial.equalise import equalise_pulses, pulse_gain
-from torchsar.compensate.radial.mirror import Intercept, mirror_product
+from torchsar.compensate.radial.measured import Intercept
+from torchsar.compensate.radial.mirror import mirror_product
 from torchsar.compensate.radial.peak import ml_peak
 from torchsar.compensate.radial.polish import phase_polish
 from torchsar.compensate.radial.recommended import radial_motion
@@ -22,29 +26,45 @@ Window = tuple[float, float] | list[float] | None
 SWEEPS = ("ramp", "pulse", "fast_time")  # axes of the signals of these stages
 
 
-def _window(window_m: Window) -> tuple[float, float] | None:
-    """A window as two floats; raises ValueError if it does not have two values."""
-    if window_m is None:
-        return None
-    if len(window_m) != 2:
-        raise ValueError(
-            f"window_m must be two ranges (low, high) in metres relative to the reference range, got {list(window_m)}"
-        )
-    return float(window_m[0]), float(window_m[1])
-
-
 class _OfSweeps(Stage):
     """An estimator of the radial velocity from both sweeps of a range window."""
 
     works_on = SWEEPS
     provides = ("velocity_m_s",)
     neutral = {"velocity_m_s": 0.0}
+    estimator: Callable[..., Estimate]
     azimuth_m: Tensor
 
-    def __init__(self, radar: TriangularLadar, window_m: Window, azimuth_m: float) -> None:
+    def __init__(
+        self, radar: TriangularLadar, window_m: Window, azimuth_m: float, assess: bool, **options: Any
+    ) -> None:
         super().__init__()
-        self.radar, self.window_m = radar, _window(window_m)
+        if window_m is not None and len(window_m) != 2:
+            raise ValueError(
+                "window_m must be two ranges (low, high) in metres relative to the reference range, got "
+                f"{list(window_m)}"
+            )
+        self.radar, self.window_m = radar, None if window_m is None else (float(window_m[0]), float(window_m[1]))
+        self.assess, self.options = assess, options
         self.hold("azimuth_m", azimuth_m)
+
+    def forward(self, signal: Signal) -> Estimate:
+        """Estimate the radial motion from up and down sweeps of axes (ramp, pulse, fast_time).
+
+        Returns:
+            The values that the stage provides, shape (..., pulse) each: `velocity_m_s` at the
+            turning points (ends of the up sweeps), receding positive, and for `RadialMotion` the
+            residual `phase_rad` of the up sweeps.
+        """
+        return self.estimator(
+            signal.data,
+            self.radar,
+            signal.axis("pulse"),
+            window_m=self.window_m,
+            azimuth_m=self.azimuth_m,
+            assess=self.assess,
+            **self.options,
+        )
 
 
 class MirrorProduct(_OfSweeps):
@@ -59,12 +79,15 @@ class MirrorProduct(_OfSweeps):
             whole band.
         intercept: What is assumed of the phase of the product of up and mirrored down sweep at the
             turning point: "known", "record" or "free", see `mirror_product`.
-        taper: Share of the window that its edges take, see `bands_of`.
+        taper: Share of the window that its edges take, see `Spectra.bands`.
         azimuth_m: Azimuth of the scene centre in metres.
+        assess: False leaves out standard deviation and outcome.
 
     Raises:
         ValueError: If the window does not have two values.
     """
+
+    estimator = staticmethod(mirror_product)
 
     def __init__(
         self,
@@ -73,30 +96,12 @@ class MirrorProduct(_OfSweeps):
         intercept: Intercept = "known",
         taper: float = 1.0,
         azimuth_m: float = 0.0,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, window_m, azimuth_m)
-        self.intercept: Intercept = intercept
-        self.taper = taper
-
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate the radial velocity from up and down sweeps of axes (ramp, pulse, fast_time).
-
-        Returns:
-            `velocity_m_s` at the turning points (ends of the up sweeps), shape (..., pulse),
-            receding positive.
-        """
-        return mirror_product(
-            signal.data,
-            self.radar,
-            signal.axis("pulse"),
-            window_m=self.window_m,
-            intercept=self.intercept,
-            taper=self.taper,
-            azimuth_m=self.azimuth_m,
-        )
+        super().__init__(radar, window_m, azimuth_m, assess, intercept=intercept, taper=taper)
 
 
-class RadialMotion(MirrorProduct):
+class RadialMotion(_OfSweeps):
     """Radial motion by the recommended estimator; see `radial_motion`.
 
     Provides `velocity_m_s`, which `CompensateMotion` can compensate, and the residual `phase_rad`,
@@ -108,10 +113,11 @@ class RadialMotion(MirrorProduct):
             whole band.
         intercept: What is assumed of the phase of the product of up and mirrored down sweep at the
             turning point: "known", "record" or "free", see `mirror_product`.
-        taper: Share of the window that its edges take, see `bands_of`.
+        taper: Share of the window that its edges take, see `Spectra.bands`.
         azimuth_m: Azimuth of the scene centre in metres.
         iterations: Largest number of iterations, see `phase_polish`.
         tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.
+        assess: False leaves out standard deviation and outcome.
 
     Raises:
         ValueError: If the window does not have two values.
@@ -119,6 +125,7 @@ class RadialMotion(MirrorProduct):
 
     provides = ("velocity_m_s", "phase_rad")
     neutral = {"velocity_m_s": 0.0, "phase_rad": 0.0}
+    estimator = staticmethod(radial_motion)
 
     def __init__(
         self,
@@ -129,29 +136,10 @@ class RadialMotion(MirrorProduct):
         azimuth_m: float = 0.0,
         iterations: int = 80,
         tolerance_rad: float = 0.005,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, window_m, intercept, taper, azimuth_m)
-        self.iterations, self.tolerance_rad = iterations, tolerance_rad
-
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate the radial motion from sweeps of axes (ramp, pulse, fast_time).
-
-        Returns:
-            `Estimate` by the function `radial_motion` with `velocity_m_s` at the turning points
-            (ends of the up sweeps), receding positive, and the residual `phase_rad` of the up
-            sweeps, each of shape (..., pulse).
-        """
-        return radial_motion(
-            signal.data,
-            self.radar,
-            signal.axis("pulse"),
-            window_m=self.window_m,
-            intercept=self.intercept,
-            taper=self.taper,
-            azimuth_m=self.azimuth_m,
-            iterations=self.iterations,
-            tolerance_rad=self.tolerance_rad,
-        )
+        options = {"iterations": iterations, "tolerance_rad": tolerance_rad}
+        super().__init__(radar, window_m, azimuth_m, assess, intercept=intercept, taper=taper, **options)
 
 
 class MlPeak(_OfSweeps):
@@ -162,22 +150,22 @@ class MlPeak(_OfSweeps):
         window_m: Lowest and highest range in metres, relative to the reference range; None for the
             whole band.
         azimuth_m: Azimuth of the scatterer in metres.
+        assess: False leaves out standard deviation and outcome.
 
     Raises:
         ValueError: If the window does not have two values.
     """
 
-    def __init__(self, radar: TriangularLadar, window_m: Window = None, azimuth_m: float = 0.0) -> None:
-        super().__init__(radar, window_m, azimuth_m)
+    estimator = staticmethod(ml_peak)
 
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate the radial velocity from up and down sweeps of axes (ramp, pulse, fast_time).
-
-        Returns:
-            `velocity_m_s` at the turning points (ends of the up sweeps), shape (..., pulse),
-            receding positive.
-        """
-        return ml_peak(signal.data, self.radar, signal.axis("pulse"), window_m=self.window_m, azimuth_m=self.azimuth_m)
+    def __init__(
+        self,
+        radar: TriangularLadar,
+        window_m: Window = None,
+        azimuth_m: float = 0.0,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(radar, window_m, azimuth_m, assess)
 
 
 class SpectrumCorrelation(_OfSweeps):
@@ -189,32 +177,24 @@ class SpectrumCorrelation(_OfSweeps):
         window_m: Lowest and highest range in metres, relative to the reference range; None for the
             whole band.
         azimuth_m: Azimuth of the scene centre in metres.
+        assess: False leaves out standard deviation and outcome.
 
     Raises:
         ValueError: If the window does not have two values.
     """
 
+    estimator = staticmethod(spectrum_correlation)
+
     def __init__(
-        self, radar: TriangularLadar, upsampling: int = 20, window_m: Window = None, azimuth_m: float = 0.0
+        self,
+        radar: TriangularLadar,
+        upsampling: int = 20,
+        window_m: Window = None,
+        azimuth_m: float = 0.0,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, window_m, azimuth_m)
+        super().__init__(radar, window_m, azimuth_m, assess, upsampling=upsampling)
         self.upsampling = upsampling
-
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate the radial velocity from up and down sweeps of axes (ramp, pulse, fast_time).
-
-        Returns:
-            `velocity_m_s` at the turning points (ends of the up sweeps), shape (..., pulse),
-            receding positive.
-        """
-        return spectrum_correlation(
-            signal.data,
-            self.radar,
-            signal.axis("pulse"),
-            upsampling=self.upsampling,
-            window_m=self.window_m,
-            azimuth_m=self.azimuth_m,
-        )
 
 
 class SegmentedInterference(_OfSweeps):
@@ -232,10 +212,13 @@ class SegmentedInterference(_OfSweeps):
         window_m: Lowest and highest range in metres, relative to the reference range; None for the
             whole band.
         azimuth_m: Azimuth of the scene centre in metres.
+        assess: False leaves out standard deviation and outcome.
 
     Raises:
         ValueError: If the window does not have two values.
     """
+
+    estimator = staticmethod(segmented_interference)
 
     def __init__(
         self,
@@ -247,31 +230,10 @@ class SegmentedInterference(_OfSweeps):
         hann: bool = False,
         window_m: Window = None,
         azimuth_m: float = 0.0,
+        assess: bool = True,
     ) -> None:
-        super().__init__(radar, window_m, azimuth_m)
-        self.bins: Bins = bins
-        self.unwrap: Unwrap = unwrap
-        self.scatterers, self.padding, self.hann = scatterers, padding, hann
-
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate the radial velocity from up and down sweeps of axes (ramp, pulse, fast_time).
-
-        Returns:
-            `velocity_m_s` at the turning points (ends of the up sweeps), shape (..., pulse),
-            receding positive.
-        """
-        return segmented_interference(
-            signal.data,
-            self.radar,
-            signal.axis("pulse"),
-            bins=self.bins,
-            unwrap=self.unwrap,
-            scatterers=self.scatterers,
-            padding=self.padding,
-            hann=self.hann,
-            window_m=self.window_m,
-            azimuth_m=self.azimuth_m,
-        )
+        options = {"bins": bins, "unwrap": unwrap, "scatterers": scatterers, "padding": padding, "hann": hann}
+        super().__init__(radar, window_m, azimuth_m, assess, **options)
 
 
 class CompensateMotion(Stage):
@@ -316,14 +278,15 @@ class PhasePolish(Stage):
         iterations: Largest number of iterations with Wiener weights.
         tolerance_rad: Phase step in rad, rms over the pulses, below which the iterations of a trial
             end.
+        assess: False leaves out standard deviation and outcome.
     """
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
 
-    def __init__(self, iterations: int = 80, tolerance_rad: float = 0.005) -> None:
+    def __init__(self, iterations: int = 80, tolerance_rad: float = 0.005, assess: bool = True) -> None:
         super().__init__()
-        self.iterations, self.tolerance_rad = iterations, tolerance_rad
+        self.iterations, self.tolerance_rad, self.assess = iterations, tolerance_rad, assess
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the residual phase of every pulse of a signal of axes (pulse, range).
@@ -332,21 +295,30 @@ class PhasePolish(Stage):
             `Estimate` by the function `phase_polish` with `phase_rad` of shape (..., pulse), to be
             removed.
         """
-        return phase_polish(signal.data, iterations=self.iterations, tolerance_rad=self.tolerance_rad)
+        return phase_polish(
+            signal.data, iterations=self.iterations, tolerance_rad=self.tolerance_rad, assess=self.assess
+        )
 
 
 class PulseGain(Stage):
     """Amplitude of every pulse relative to steady scatterers; see `pulse_gain`.
 
     Provides `gain` of shape (..., pulse), by which `EqualisePulses` divides the pulses.
+
+    Args:
+        assess: False leaves out the outcome.
     """
 
     provides = ("gain",)
     neutral = {"gain": 1.0}
 
+    def __init__(self, assess: bool = True) -> None:
+        super().__init__()
+        self.assess = assess
+
     def forward(self, signal: Signal) -> Estimate:
         """Estimate `gain` of a signal of axes (pulse, range)."""
-        return pulse_gain(signal.data)
+        return pulse_gain(signal.data, assess=self.assess)
 
 
 class EqualisePulses(Stage):

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, Literal
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchsar.compensate import EffectiveVelocity, RotationAutofocus, UnevenRotation
 from torchsar.compensate.pulse_phase import CorrectPulsePhase
@@ -22,42 +22,9 @@ from torchsar.radar import LIGHT_M_S, InverseRadar, StripmapRadar
 from torchsar.repair import BandLimited, CorrectJitter, Lagrange
 from torchsar.scene import Dechirped, ImageReflectivity, KSea, Polynomial
 
-
-def with_assess(make: Callable[..., nn.Module]) -> Callable[..., Any]:
-    """Return a factory with the parameter `assess`, which it sets on the estimators of its stage.
-
-    Args:
-        make: Factory of a stage that estimates, or of one that has such stages as parts.
-
-    Returns:
-        A function with the signature of the factory and the parameter `assess`.
-    """
-
-    @wraps(make)
-    def made(*args: Any, assess: bool = True, **keys: Any) -> nn.Module:
-        stage = make(*args, **keys)
-        estimators = [part for part in stage.modules() if hasattr(part, "assess")]
-        if not (assess or estimators):
-            raise ValueError(f"the outcome of {type(stage).__name__} cannot be left out; leave assess at true")
-        for part in estimators:
-            part.assess = assess  # pyright: ignore[reportArgumentType]
-        return stage
-
-    signature, hints = inspect.signature(make), {**typing.get_type_hints(make), "assess": bool}
-    parameter = inspect.Parameter("assess", inspect.Parameter.KEYWORD_ONLY, default=True, annotation=bool)
-    added = "Args:\n    assess: Whether the outcome and the standard deviations are determined as well."
-    made.__doc__ = inspect.cleandoc(make.__doc__ or "").replace("Args:", added, 1)
-    made.__signature__, made.__annotations__ = (  # pyright: ignore[reportAttributeAccessIssue]
-        signature.replace(parameters=[*signature.parameters.values(), parameter]),
-        hints,
-    )
-    return made
-
-
 _REFINE = {"gradient": gradient_minimum, "parabola": parabola_minimum}
 
 
-@with_assess
 def effective_velocity(
     radar: StripmapRadar,
     reference: Literal["matched", "flat", "phase"] | None = "matched",
@@ -65,6 +32,7 @@ def effective_velocity(
     lines: int = 512,
     refine: Literal["gradient", "parabola"] = "parabola",
     tolerance_m_s: float = 0.01,
+    assess: bool = True,
 ) -> EffectiveVelocity:
     """Estimator of the effective velocity, as the velocity that gives the least image entropy.
 
@@ -74,8 +42,9 @@ def effective_velocity(
         lines: Number of range cells that are used, at least 16.
         refine: Method that refines the minimum.
         tolerance_m_s: Tolerance of the refinement in m/s.
+        assess: Whether to add the standard deviation and the outcome.
     """
-    return EffectiveVelocity(OmegaK(radar, reference), reach_m_s, lines, _REFINE[refine], tolerance_m_s)
+    return EffectiveVelocity(OmegaK(radar, reference), reach_m_s, lines, _REFINE[refine], tolerance_m_s, assess=assess)
 
 
 def omega_k_padded(
@@ -97,7 +66,6 @@ def omega_k_padded(
     return PaddedLines(OmegaK(radar, reference, velocity_m_s, doppler_hz), lines)
 
 
-@with_assess
 def rotation_and_phase(
     radar: InverseRadar,
     order: int = 3,
@@ -106,6 +74,7 @@ def rotation_and_phase(
     scatterers: int | None = None,
     search: int = 60,
     polish: int = 20,
+    assess: bool = True,
 ) -> Alternate:
     """Alternate estimation of a phase error per pulse (`RotationAutofocus`) and of the non-uniform
     rotation (`UnevenRotation`) of a target, each from the data after correction of the other.
@@ -119,11 +88,12 @@ def rotation_and_phase(
         search: Largest number of fixed-point iterations for the phase of least image entropy.
         polish: Largest number of further iterations for the phase, which compare each pulse with a
             Wiener estimate of the scene.
+        assess: Whether to add the standard deviations and the outcome.
     """
     return Alternate(
         rounds,
-        phase=Turn(RotationAutofocus(radar, search, polish), CorrectPulsePhase()),
-        rotation=Turn(UnevenRotation(radar, order, yc_m, scatterers)),
+        phase=Turn(RotationAutofocus(radar, search, polish, assess=assess), CorrectPulsePhase()),
+        rotation=Turn(UnevenRotation(radar, order, yc_m, scatterers, assess=assess)),
     )
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.radial import mirror_product, radial_motion, segmented_interference, spectrum_correlation
-from torchsar.compensate.radial.mirror import Intercept
+from torchsar.compensate.radial.measured import Intercept
 from torchsar.core import Draws, Estimate
 from torchsar.echo import range_model_error_db
 from torchsar.focus import AzimuthMatchedFilter

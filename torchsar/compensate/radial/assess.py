@@ -1,0 +1,222 @@
+"""Accuracy and outcome of estimated radial velocities and of the phases that remain after them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.pulse_phase.data import prepare
+from torchsar.compensate.pulse_phase.imaging import AlongPulses
+from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
+from torchsar.compensate.radial.bands import filled
+from torchsar.compensate.radial.dense import SAME_RAD, Walk
+from torchsar.compensate.radial.measured import LEAST_SQUARED, TINY, Intercept, Levels, Measured, mean_of
+from torchsar.compensate.radial.product import mirror_velocity
+from torchsar.core import Axis, Estimate, Outcome, cis, host_value, power_of, true_positions, worst
+from torchsar.metrics.phase import phase_rmse
+
+# SNR of the product of both sweeps, 9 dB, below which noise alone may make its peak, by trial
+_NOISE = 10**0.9
+# a velocity at which both sweeps have so much more power in common, in more than so many periods
+_HIGHER, _CHANCE = 1.1, 0.05
+# bias of the product that the edges of the window leave, in halves of wavelength over sweep length
+_BIAS = 5e-4
+# periods for which the deviation that white noise explains counts beside the measured one
+_EXPECTED = 4.0
+# mean of the square of the time between two samples of a product over 24 squared periods
+_JERK = 1 / 32
+# standard deviation, in halves of wavelength over sweep length, beyond which a velocity is of no
+# use; noise alone gives 0.05 where the SNR is just enough
+_USELESS = 0.07
+# Phases: least number of periods with an echo; number of periods from which on their power tells
+# whether scatterers interfere; largest standard deviation, a Strehl ratio of exp(-0.25) = 0.78
+LEAST_PERIODS, _FEW, ENOUGH_STD_RAD = 8, 32, 0.5
+# effective range cells below which a scene is a single range cell, and relative modulation of the
+# power of its pulses, besides so many standard deviations of noise, that shows several scatterers
+_ONE_CELL, _MODULATION, _SURE = 1.5, 0.1, 4.0
+# least entropy, as in `autofocus`; twice its rms difference from right phases was 0.11 to 0.15 rad,
+# and 0.43 and more where both were wrong at -10 dB
+_SHARPEN, _ENOUGH_APART_RAD = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01), 0.35
+
+
+@torch.no_grad()
+def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estimate:
+    """Add standard deviation and outcome to an estimate of radial velocities.
+
+    Noise, and the interference of scatterers of random phases, disturb the power of the echo as
+    much as its phase, and independently: for a complex amplitude s that changes by ds, the real and
+    the imaginary part of conj(s) ds have equal variances. Motion changes the phase only. The
+    changes of power between both sweeps, taken as changes of phase, therefore show the deviation,
+    whatever the scene. Added are the effect of jerk and the error of interpolation in periods
+    without a clear echo. The deviation of a method that does not use the product of up and mirrored
+    down sweeps is also no less than the difference from the velocities of that product, less their
+    own deviation: the scatterer that it follows may have another velocity than the scene, and
+    where scatterers have equal phases, their interference changes the power less than the phase.
+
+    Args:
+        found: Estimate of the velocities.
+        measured: What the method measured.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
+
+    Returns:
+        The estimate with its standard deviation, and with the outcome
+
+        - INEXACT where the SNR after compression is too low for peaks that exceed the noise in all
+          periods, or the standard deviation exceeds 0.035 lambda / T (T is the length of a sweep);
+        - AMBIGUOUS where both sweeps have more power in common at another velocity, in more than
+          one period of 20;
+        - NOISE where they have no more in common than noise at any velocity;
+        - EMPTY where all samples are zero.
+    """
+    product, lit = measured.product, measured.lit
+    bin_m_s = product.radar.ambiguous_velocity_m_s
+    square = _variance(measured, pulse)
+    m = measured.still.shape[-1]
+    highest = torch.fft.fft(measured.still, 2 * m).abs().amax(-1).to(torch.float64) / m
+    best = Levels.of(highest, product)
+    elsewhere = mean_of((highest > _HIGHER * measured.common).to(torch.float64), lit)[..., 0]
+    useless = mean_of(square, product.lit)[..., 0] >= (_USELESS * bin_m_s) ** 2
+    outcome = worst(
+        (Outcome.INEXACT, ~measured.enough | useless),
+        (Outcome.AMBIGUOUS, (best.squared >= LEAST_SQUARED) & (elsewhere > _CHANCE)),
+        (Outcome.NOISE, ~lit.any(-1) | (~measured.enough & (best.squared < _NOISE))),
+        (Outcome.EMPTY, (measured.common == 0).all(-1)),
+    )
+    return replace(found, std={**found.std, "velocity_m_s": square.sqrt()}, outcome=outcome)
+
+
+def _variance(measured: Measured, pulse: Axis) -> Tensor:
+    """Variance (..., pulse) of the velocities, see `assessed_velocity`."""
+    law, lit, clear, common = measured.law, measured.lit, measured.clear, measured.common
+    share = (common / mean_of(common, lit | ~lit.any(-1, keepdim=True)).clamp_min(TINY)).clamp_min(1e-6)
+    white, count = measured.white_m_s.square()[..., None], clear.sum(-1, keepdim=True)
+    weight = mean_of(share, clear).clamp_min(TINY)
+
+    def variance(changes: Tensor) -> Tensor:
+        # a constant part is that of the detector or of the laser: sweeps that differ in power
+        changes = changes - mean_of(changes * share, clear) / weight
+        counted = count * mean_of(changes.square() * share, clear) + _EXPECTED * white
+        return counted / ((count - 1).clamp_min(0) + _EXPECTED)
+
+    changes = _changes_of_product(measured, law.intercept or "free") if law.changes is None else law.changes()
+    square = filled(variance(changes) / share, clear)
+    slope, bend = (_rms_difference(measured.raw_m_s, clear, order) for order in (1, 2))
+    jerk = _JERK * bend * (measured.product.radar.period_s / pulse.step) ** 2
+    square = square + _interpolated(clear, slope, bend).square() + jerk.square() + law.floor_m_s**2
+    if law.intercept:
+        return square
+    away = measured.velocity_m_s - mirror_velocity(measured.product, "free")[0]
+    own = variance(changes if law.changes is None else _changes_of_product(measured, "free"))
+    bias = _BIAS * measured.product.radar.ambiguous_velocity_m_s
+    apart = mean_of(away.square() - own / share, clear) - bias**2
+    judged = (measured.levels.squared >= LEAST_SQUARED)[..., None]
+    return torch.where(judged, torch.maximum(square, apart), square)
+
+
+def _changes_of_product(measured: Measured, intercept: Intercept) -> Tensor:
+    """Velocities (..., pulse) in m/s that the changes of power give, taken as changes of phase."""
+    bands = measured.product
+    inner, radar = bands.inner, bands.radar
+    per_s = 4 * math.pi * radar.carrier_hz / radar.wave_speed_m_s
+    constant = cis(per_s * radar.sweep_s * (measured.raw_m_s - bands.shift_m_s))[..., None]
+    power = (measured.still * constant.to(measured.still.dtype)).real
+    w = (per_s * (2 * bands.time_s[inner] - radar.sweep_s)).to(power.dtype)
+    phase = (power_of(bands.up[..., inner]) - power_of(bands.down[..., inner])) / 2
+    total = power.sum(-1, keepdim=True)
+    total = torch.where(total.abs() > torch.finfo(power.dtype).tiny, total, 1)
+    centred = w - (w * power).sum(-1, keepdim=True) / total
+    free = _quotient((centred * phase).sum(-1), (centred.square() * power).sum(-1))
+    if intercept == "free":
+        return free
+    if intercept == "record":
+        rest = (phase - w * free[..., None].to(power.dtype) * power).sum((-2, -1), keepdim=True)
+        phase = phase - power * rest / total.sum(-2, keepdim=True)
+    return _quotient((w * phase).sum(-1), (w.square() * power).sum(-1))
+
+
+def _quotient(a: Tensor, b: Tensor) -> Tensor:
+    """a / b in float64, zero where b is not positive."""
+    return torch.where(b > 0, a / torch.where(b > 0, b, 1), 0).to(torch.float64)
+
+
+def _rms_difference(velocity: Tensor, known: Tensor, order: int) -> Tensor:
+    """Rms first or second difference of velocities (..., pulse) in known periods, (..., 1)."""
+    if velocity.shape[-1] <= order:
+        return torch.zeros_like(velocity[..., :1])
+    return mean_of(velocity.diff(n=order).square(), known.unfold(-1, order + 1, 1).all(-1)).sqrt()
+
+
+def _interpolated(known: Tensor, slope: Tensor, bend: Tensor) -> Tensor:
+    """Error (..., pulse) of `filled` in the periods that are not known; zero elsewhere.
+
+    slope, bend: rms first and second difference of the values, (..., 1).
+    """
+    at = torch.arange(known.shape[-1], device=known.device).expand(known.shape)
+    before = at - torch.where(known, at, -1).cummax(-1).values
+    after = torch.where(known, at, 2 * at.shape[-1]).flip(-1).cummin(-1).values.flip(-1) - at
+    inside = (before <= at) & (after < at.shape[-1])
+    return torch.where(inside, bend * before * after / 2, slope * torch.minimum(before, after))
+
+
+@torch.no_grad()
+def assessed_motion(found: Estimate, cells: Tensor, walk: Walk) -> Estimate:
+    """Add standard deviation and outcome of the phases to an estimate of the radial motion.
+
+    In a dense scene, they are those of `linked_walk`. In other scenes noise gives the deviation,
+    and where the power of the pulses is modulated, because several scatterers interfere, also the
+    difference from the phases of least entropy.
+
+    Args:
+        found: Estimate whose velocities were assessed.
+        cells: Range cells after motion compensation and azimuth deramping, shape (..., pulse,
+            range), complex.
+        walk: Deviation and agreement of the phases.
+
+    Returns:
+        The estimate with the greater of both outcomes. That of the phases is
+
+        - INEXACT where their standard deviation is 0.5 rad or more;
+        - AMBIGUOUS where no two starts reach the same phases in a dense scene, or least entropy
+          leads to other phases;
+        - TOO_FEW where less than eight periods have an echo, or the power of the pulses is
+          modulated in a single range cell, because the interference of scatterers cannot be
+          distinguished from motion there.
+    """
+    n, lines = cells.shape[-2], cells.reshape(-1, *cells.shape[-2:])
+    lit, range_cells = found.info["lit"].reshape(-1, n), found.info["range_cells"].flatten()
+    modulated = (_modulation(lines, lit) > _MODULATION + _SURE * math.sqrt(2) * walk.std_rad[:, 0]) & (n >= _FEW)
+    sparse = walk.apart_rad.isnan()
+    one_cell = modulated & sparse & (range_cells < _ONE_CELL)
+    compared = modulated & sparse & ~one_cell & found.ok.flatten()
+    std, apart = walk.std_rad, torch.zeros_like(walk.apart_rad)
+    count = host_value(compared.sum(), 0)
+    if count:
+        at = true_positions(compared, count)
+        pulses = prepare(lines[at], "radial_motion")
+        other = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
+        apart = apart.index_put((at,), 2 * phase_rmse(walk.phase_rad[at], other, lit[at]))
+        std = (std.square() + apart[:, None].square()).sqrt()
+    reasons = worst(
+        (Outcome.INEXACT, mean_of(std.square(), lit)[:, 0] >= ENOUGH_STD_RAD**2),
+        (Outcome.AMBIGUOUS, (walk.apart_rad >= SAME_RAD) | (apart >= _ENOUGH_APART_RAD)),
+        (Outcome.TOO_FEW, one_cell | ((lines != 0).any(-1).sum(-1) < LEAST_PERIODS)),
+    )
+    shape = found.outcome.shape
+    return replace(
+        found,
+        std={**found.std, "phase_rad": std.reshape(*shape, n)},
+        outcome=torch.maximum(found.outcome, reasons.reshape(shape)),
+    )
+
+
+def _modulation(lines: Tensor, lit: Tensor) -> Tensor:
+    """Standard deviation over mean of the power of the lit pulses, (trial,).
+
+    lines: (trial, pulse, range); lit: (trial, pulse), bool.
+    """
+    power = power_of(lines).sum(-1, dtype=torch.float64)
+    return mean_of((power / mean_of(power, lit).clamp_min(TINY) - 1).square(), lit)[:, 0].sqrt()
