@@ -188,8 +188,12 @@ class Geo(System):
         table: dict[str, Found] = {}
         for i, target in enumerate(bench.world().targets):
             for key, value in motion.value.items():
-                parts = (value, motion.std.get(key), motion.outcome[key].expand(value.shape))
-                table[f"{target}.{key}"] = Found(*(None if x is None else x.reshape(n, -1)[:, i] for x in parts))
+                value, std, outcome = (
+                    None if x is None else x.expand(value.shape).reshape(n, -1)[:, i]
+                    for x in (value, motion.std.get(key), motion.outcome[key])
+                )
+                assert value is not None
+                table[f"{target}.{key}"] = Found(value, std, outcome)
         return table
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
