@@ -188,12 +188,9 @@ class Geo(System):
         table: dict[str, Found] = {}
         for i, target in enumerate(bench.world().targets):
             for key, value in motion.value.items():
-                value, std, outcome = (
-                    None if x is None else x.expand(value.shape).reshape(n, -1)[:, i]
-                    for x in (value, motion.std.get(key), motion.outcome[key])
-                )
-                assert value is not None
-                table[f"{target}.{key}"] = Found(value, std, outcome)
+                std, codes = motion.std.get(key), motion.outcome[key].expand(value.shape)
+                spread = None if std is None else std.reshape(n, -1)[:, i]
+                table[f"{target}.{key}"] = Found(value.reshape(n, -1)[:, i], spread, codes.reshape(n, -1)[:, i])
         return table
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
