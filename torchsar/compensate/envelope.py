@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -192,28 +192,6 @@ def _aligned(data: Tensor, find: Callable[[Envelopes], Course], assess: bool) ->
     return envelope_assess.assessed(found, std, agree, data.shape[-1])
 
 
-def drift_cells(shift_cells: Tensor) -> Tensor:
-    """Compute the mean drift of shifts: the slope of the straight line fitted by least squares.
-
-    Args:
-        shift_cells: Shifts in cells, shape (..., pulse).
-
-    Returns:
-        The drift in cells per pulse, shape (...,); 0 for a single pulse.
-
-    Raises:
-        ValueError: If the shifts are not real floating-point numbers, or there are none.
-    """
-    if not shift_cells.is_floating_point() or not shift_cells.ndim or not shift_cells.shape[-1]:
-        raise ValueError(
-            f"drift_cells needs shifts (..., pulse) in real numbers, got {shift_cells.dtype} of shape "
-            f"{tuple(shift_cells.shape)}"
-        )
-    n = shift_cells.shape[-1]
-    k = torch.arange(n, dtype=shift_cells.dtype, device=shift_cells.device) - (n - 1) / 2
-    return (shift_cells * k).sum(-1) / k.square().sum().clamp_min(1)
-
-
 class AlignEnvelopes(Stage):
     """Stage that estimates the range shift of every pulse and the mean range rate.
 
@@ -246,8 +224,8 @@ class AlignEnvelopes(Stage):
         assess: bool = True,
     ) -> None:
         super().__init__()
-        self.method: Method = method
-        self.degree, self.tones, self.passes, self.blocks, self.assess = degree, tones, passes, blocks, assess
+        self.options: dict[str, Any] = {"method": method, "degree": degree, "tones": tones, "passes": passes}
+        self.options |= {"blocks": blocks, "assess": assess}
 
     def forward(self, signal: Signal, velocity_m_s: Tensor | None = None) -> Estimate:
         """Estimate the shifts of a signal of axes (pulse, range).
@@ -262,21 +240,13 @@ class AlignEnvelopes(Stage):
             value to give to `torchsar.focus.CompressDechirped`. `quality`, outcome and `info` are
             those of `align_envelopes`.
         """
-        found = align_envelopes(
-            signal.data,
-            method=self.method,
-            degree=self.degree,
-            tones=self.tones,
-            passes=self.passes,
-            blocks=self.blocks,
-            assess=self.assess,
-        )
-        cell_m, per_s = signal.axis("range").step, 1 / signal.axis("pulse").step
-        velocity = drift_cells(found["shift_cells"]) * (cell_m * per_s)
-        value = {
-            "shift_m": found["shift_cells"] * cell_m,
-            "velocity_m_s": velocity if velocity_m_s is None else velocity + velocity_m_s,
-        }
+        found = align_envelopes(signal.data, **self.options)
+        cells, cell_m = found["shift_cells"], signal.axis("range").step
+        # slope of the line fitted by least squares; 0 for a single pulse
+        k = torch.arange(cells.shape[-1], dtype=cells.dtype, device=cells.device) - (cells.shape[-1] - 1) / 2
+        drift = (cells * k).sum(-1) / k.square().sum().clamp_min(1)
+        velocity = drift * (cell_m / signal.axis("pulse").step) + (0 if velocity_m_s is None else velocity_m_s)
+        value = {"shift_m": cells * cell_m, "velocity_m_s": velocity}
         std = {"shift_m": found.std["shift_cells"] * cell_m} if found.std else {}
         return replace(found, value=value, std=std)
 
