@@ -27,7 +27,7 @@ from torch import Tensor
 
 from torchsar.compensate import doppler_assess
 from torchsar.compensate.aperture import complete_aperture_centroid, reference_spectrum
-from torchsar.compensate.doppler import lag_products, nominal_doppler, swept_band, wrap_hz
+from torchsar.compensate.doppler import lag_products, nominal_doppler, swept_band
 from torchsar.compensate.group import (
     BeamSpectrum,
     RangeGroup,
@@ -48,6 +48,7 @@ from torchsar.core import (
     settle,
     take,
     unit_level,
+    wrapped,
 )
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
@@ -316,7 +317,7 @@ class DopplerCentroid(Stage):
         radar, raw = self.radar, checked_samples(signal.data, "DopplerCentroid", "pulse, range")
         n, prf = raw.shape[-1], radar.prf_hz
         products, power = lag_products(raw, self.blocks)
-        base = wrap_hz(prf / (2 * math.pi) * torch.angle(products.sum((-2, -1))), prf)
+        base = wrapped(prf / (2 * math.pi) * torch.angle(products.sum((-2, -1))), prf)
         turns = torch.arange(-self.reach, self.reach + 1, dtype=torch.float64, device=raw.device)
         evidence = ambiguity_evidence(raw, radar, base, reference_spectrum(radar, self.reference, raw), turns)
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
@@ -334,7 +335,7 @@ class DopplerCentroid(Stage):
 
     def _values(self, doppler_hz: Tensor) -> dict[str, Tensor]:
         """All values that an absolute Doppler centroid in Hz determines."""
-        baseband = wrap_hz(doppler_hz, self.radar.prf_hz)
+        baseband = wrapped(doppler_hz, self.radar.prf_hz)
         return {
             "doppler_hz": doppler_hz,
             "doppler_baseband_hz": baseband,

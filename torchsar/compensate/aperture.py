@@ -16,10 +16,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchsar.compensate.doppler import lag_products, wrap_hz
+from torchsar.compensate.doppler import lag_products
 from torchsar.compensate.group import RangeGroup, compress, full_columns, full_spectrum, stays_inside
 from torchsar.compensate.pulse_phase.data import or_one
-from torchsar.core import cis, settle, unit_level
+from torchsar.core import cis, settle, unit_level, wrapped
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -91,7 +91,7 @@ def _refined(
         whole = _whole(line[:, None] - shift, raw.shape[-2], dwell)
         chosen = (products * whole).sum((-2, -1))
         phase = torch.angle(chosen)
-        total = torch.where(chosen.abs() > 0, total + wrap_hz(scale * phase - total, radar.prf_hz), total)
+        total = torch.where(chosen.abs() > 0, total + wrapped(scale * phase - total, radar.prf_hz), total)
     kept, energy = (products * whole).abs().sum((-2, -1)), products.abs().sum((-2, -1))
     half_way = math.pi / 2 * parts[0][2] * dwell / radar.prf_hz**2  # rad, between centre and edge of the beam
     noise = ((weight * whole).square() * _noise_variance(power, radar)).sum((-2, -1))

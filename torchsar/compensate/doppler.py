@@ -27,21 +27,9 @@ from torchsar.core import (
     fft_lines,
     power_of,
     unit_level,
+    wrapped,
 )
 from torchsar.radar import StripmapRadar
-
-
-def wrap_hz(frequency_hz: Tensor, prf_hz: float) -> Tensor:
-    """Wrap frequencies into the interval -PRF/2 .. PRF/2.
-
-    Args:
-        frequency_hz: Frequencies in Hz, any shape.
-        prf_hz: Pulse repetition frequency in Hz.
-
-    Returns:
-        The wrapped frequencies in Hz, same shape.
-    """
-    return frequency_hz - prf_hz * torch.round(frequency_hz / prf_hz)
 
 
 def _bounds(n: int, parts: int, what: str) -> list[tuple[int, int]]:
@@ -143,7 +131,7 @@ def phase_increment(
     products, power = lag_products(x, blocks)
     scale = prf_hz / (2 * math.pi)
     info = {"block_hz": scale * torch.angle(products), "block_power": power}
-    value = wrap_hz(scale * torch.angle(products.sum((-2, -1))), prf_hz)
+    value = wrapped(scale * torch.angle(products.sum((-2, -1))), prf_hz)
     found = Estimate({"doppler_baseband_hz": value}, info=info)
     if not assess:
         return found
@@ -203,7 +191,7 @@ def energy_centre(
     # first Fourier coefficient
     turn = 2 * math.pi / n * torch.arange(n, dtype=torch.float64, device=x.device)
     phase = torch.atan2((spectrum * torch.sin(turn)).sum(-1), (spectrum * torch.cos(turn)).sum(-1))
-    value = {"doppler_baseband_hz": wrap_hz(prf_hz / (2 * math.pi) * phase, prf_hz)}
+    value = {"doppler_baseband_hz": wrapped(prf_hz / (2 * math.pi) * phase, prf_hz)}
     found = Estimate(value, info={"spectrum": spectrum})
     if not assess:
         return found
@@ -222,8 +210,8 @@ def nominal_doppler(radar: StripmapRadar) -> dict[str, float]:
         `doppler_baseband_hz`, the same wrapped into the interval -PRF/2 .. PRF/2.
     """
     nominal = radar.pointing_doppler_hz or 0.0
-    wrapped = wrap_hz(torch.tensor(nominal, dtype=torch.float64), radar.prf_hz)
-    return {"doppler_hz": nominal, "doppler_baseband_hz": float(wrapped)}
+    baseband = wrapped(torch.tensor(nominal, dtype=torch.float64), radar.prf_hz)
+    return {"doppler_hz": nominal, "doppler_baseband_hz": float(baseband)}
 
 
 def swept_band(radar: StripmapRadar, n_range: int) -> tuple[float, float | None]:
@@ -338,4 +326,4 @@ def point_doppler(
         step = torch.where(bend < 0, -slope / torch.where(bend < 0, bend, -1), 0)
         frequency = frequency + step.clamp(-prf_hz / size, prf_hz / size)
     centre = torch.as_tensor(centre_hz, dtype=torch.float64, device=x.device)
-    return centre + wrap_hz(frequency - centre, prf_hz)
+    return centre + wrapped(frequency - centre, prf_hz)

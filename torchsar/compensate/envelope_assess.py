@@ -15,8 +15,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.envelope_fit import Course, Envelopes, refined_shifts, robust_std, single_shifts, wrapped
-from torchsar.core import Estimate, Outcome, worst
+from torchsar.compensate.envelope_fit import Course, Envelopes, refined_shifts, robust_std, single_shifts
+from torchsar.core import Estimate, Outcome, worst, wrapped
 
 # standard deviation of a shift in cells from which on an alignment is not ok: a convention
 GOOD_CELLS = 0.5

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import legendre, linear_phasor, linear_solve, unit_level
+from torchsar.core import legendre, linear_phasor, linear_solve, unit_level, wrapped
 
 Match = Literal["likelihood", "amplitude"]
 
@@ -485,19 +485,6 @@ def centred(shift: Tensor, present: Tensor) -> Tensor:
         The shifts in cells, shape (trial, pulse).
     """
     return shift - (shift * present).sum(-1, keepdim=True) / present.sum(-1, keepdim=True).clamp_min(1)
-
-
-def wrapped(cells: Tensor, n: int) -> Tensor:
-    """Wrap shifts into the window, to -n/2..n/2.
-
-    Args:
-        cells: Shifts in cells, any shape.
-        n: Number of cells of the window.
-
-    Returns:
-        The wrapped shifts, same shape.
-    """
-    return cells - n * torch.round(cells / n)
 
 
 def unit_time(n: int, device: torch.device) -> Tensor:
