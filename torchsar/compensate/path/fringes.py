@@ -9,8 +9,6 @@ from torch import Tensor
 
 from torchsar.core import wrapped
 
-# pulses whose median replaces wrong envelopes: at the ends of recordings ten in a row were wrong
-_NEIGHBOURS = 25
 # by choice: most standard deviations by which a measurement of a smooth line of sight counts; one
 # of a rough line is wrong if its distance from the median exceeds 6 times the median distance and 2
 # fringes
@@ -88,9 +86,8 @@ def smooth_near(
         total, chosen = (cost[..., None] + weight * bend.square()).min(1)
         cost = total + far[:, p, None, :]
         back.append(chosen)
-    size = len(n)
     best = cost.flatten(1).argmin(-1)
-    path = [best % size, best // size]
+    path = [best % len(n), best // len(n)]
     rows = torch.arange(len(cost), device=cost.device)
     for chosen in reversed(back):
         path.append(chosen[rows, path[-1], path[-2]])
@@ -118,9 +115,12 @@ def rough_near(carrier_m: Tensor, near_m: Tensor, before_m: Tensor, fringe_m: fl
 
 
 def _local_median(x: Tensor) -> Tensor:
-    """Median of each value (trial, pulse) and its neighbours; at the ends of the nearest ones."""
+    """Median of each value (trial, pulse) and its neighbours; at the ends of the nearest ones.
+
+    There are 25 of them: at the ends of recordings ten envelopes in a row were wrong.
+    """
     pulses = x.shape[-1]
-    width = min(_NEIGHBOURS, pulses)
+    width = min(25, pulses)
     medians = x.unfold(-1, width, 1).median(-1).values
     at = torch.arange(pulses, device=x.device) - width // 2
     return medians[..., at.clamp(0, pulses - width)]

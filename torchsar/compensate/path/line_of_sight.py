@@ -12,15 +12,12 @@ from torch import Tensor
 
 from torchsar.compensate.path import assess as assessment
 from torchsar.compensate.path.axes import three_axes
-from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, trials_of
+from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, nothing, trials_of
 from torchsar.compensate.path.search import Search, found_from_starts
-from torchsar.core import Estimate, Outcome, checked_samples
+from torchsar.core import Estimate, Outcome
 from torchsar.metrics import entropy
 from torchsar.radar import AntennaPath
-from torchsar.radar.antenna_path import refuse_unusable
 
-# fewest pulses
-_LEAST_PULSES = 8
 # noise as a share of the mean power of the samples below which the last rounds take finer cells,
 # their spacing in resolution cells, and most rounds, by trial: at 20 dB and errors of 5 cm the
 # error of the line of sight fell from 1.66 to 1.50 bounds, at 10 dB it did not change
@@ -107,8 +104,6 @@ def path_autofocus(
         ValueError: If sizes do not match, values are not finite, the line of sight does not turn,
             the extent is not positive, or there is no round.
     """
-    profiles = checked_samples(profiles, "path_autofocus", "pulse, range")
-    refuse_unusable(frequency_hz=frequency_hz)
     trials = trials_of("path_autofocus", profiles, frequency_hz, antennas)
     if extent_m is not None and not 0 < extent_m < math.inf:
         raise ValueError(f"extent_m must be positive and finite, got {extent_m}")
@@ -118,11 +113,15 @@ def path_autofocus(
     @torch.no_grad()
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
         present = (rows != 0).any(-1)
-        few = int(present.sum()) < _LEAST_PULSES
-        seen = one if few or bool(present.all()) else _only(one, present)
+        few = int(present.sum()) < 8
+        seen = one
+        if not (few or bool(present.all())):
+            receiver = None if one.receiver_m is None else one.receiver_m[present]
+            seen = AntennaPath(one.transmitter_m[present], receiver, one.reference_m[present])
         coarse = ground_image(frequency_hz, seen, height_m, extent_m)
         if few:
-            return _nothing(rows, present, assess)
+            outcome = Outcome.TOO_FEW if bool(present.any()) else Outcome.EMPTY
+            return nothing(present, {"roughness": 1.0, "entropy_nats": 0.0}, outcome if assess else None)
         imaging = partial(ground_image, frequency_hz, seen, height_m, extent_m)
         some = rows[present]
         some = some / some.abs().amax()
@@ -133,30 +132,12 @@ def path_autofocus(
             last = three_axes(some, imaging(_FINEST_STEP), best.motion_m, present, _LAST_ROUNDS, exact=True)
             if last.noise <= best.noise and last.restless <= assessment.RESTLESS:
                 best = replace(best, motion_m=last.motion_m, offset_m=last.offset_m)
-        value = {"line_of_sight_m": best.line_of_sight_m, "offset_m": best.offset_m}
+        value = {"line_of_sight_m": best.motion_m[:, 0], "offset_m": best.offset_m}
         info = {"roughness": results.roughness, "entropy_nats": entropy(best.image).double()}
         found = Estimate(value, quality=torch.ones_like(best.noise), info=info)
         return _spread(assessment.of_path(found, results, search) if assess else found, present)
 
     return for_each(find, profiles, antennas, trials)
-
-
-def _only(antennas: AntennaPath, present: Tensor) -> AntennaPath:
-    """The path of the pulses that are present."""
-    receiver = None if antennas.receiver_m is None else antennas.receiver_m[present]
-    return AntennaPath(antennas.transmitter_m[present], receiver, antennas.reference_m[present])
-
-
-def _nothing(rows: Tensor, present: Tensor, assess: bool) -> Estimate:
-    """The estimate of a trial with too few pulses."""
-    zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
-    none = zero.new_zeros(())
-    value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
-    found = Estimate(value, quality=none + 1, info={"roughness": none + 1, "entropy_nats": none})
-    if not assess:
-        return found
-    outcome = (Outcome.TOO_FEW if bool(present.any()) else Outcome.EMPTY).like(none)
-    return replace(found, std={"line_of_sight_m": zero + 1}, quality=none, outcome=outcome)
 
 
 def _spread(found: Estimate, present: Tensor) -> Estimate:

@@ -6,9 +6,8 @@ from torch import Tensor
 
 from torchsar.compensate.path.ground import for_each, ground_image, trials_of
 from torchsar.compensate.pulse_phase.recommended import autofocus
-from torchsar.core import Estimate, checked_samples
+from torchsar.core import Estimate
 from torchsar.radar import AntennaPath
-from torchsar.radar.antenna_path import refuse_unusable
 
 
 def path_phase(
@@ -49,8 +48,6 @@ def path_phase(
         ValueError: If sizes do not match, values are not finite, or the line of sight does not
             turn.
     """
-    profiles = checked_samples(profiles, "path_phase", "pulse, range")
-    refuse_unusable(frequency_hz=frequency_hz)
     trials = trials_of("path_phase", profiles, frequency_hz, antennas)
 
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
