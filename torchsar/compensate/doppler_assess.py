@@ -30,9 +30,6 @@ _LEAST_EXTENT = 0.3
 # Least power of a sum of products over the sum of their powers. It is exponentially distributed
 # with mean 1 in noise; more than 9 then occurs once in 8000 records.
 _LEAST_COHERENCE = 9.0
-# Relative scatter of the first moment of a cut target about its mean over targets of even density,
-# for a beam of constant gain: sqrt(1/5).
-_UNEVEN = 0.45
 # Power of the brightest point over that of any other, beyond the peaks of noise. Among equal points
 # or speckle nothing shows which point the beam centre crosses at the given time. Resolution cells
 # to each side of a point that belong to its response.
@@ -128,9 +125,10 @@ def baseband(found: Estimate, lines: Increments) -> Estimate:
         along = torch.nn.functional.pad((power[..., 1:] * power[..., :-1]).sqrt(), (1, 1)).diff(dim=-1)
         slope = (terms * along).sum(-1, keepdim=True) / or_one(along.square().sum(-1, keepdim=True))
         terms = (terms - slope * along) * math.sqrt(terms.shape[-1] / (terms.shape[-1] - 2))
-    # where few blocks hold most of the energy, few targets are cut, which are not of even density
+    # Where few blocks hold most of the energy, few targets are cut, which are not of even density:
+    # for a beam of constant gain, the first moment of a cut target scatters by sqrt(1/5).
     share = blocks.real.clamp(0, 1).square().sum(-1)
-    scatter = (terms.square() + (_UNEVEN * share[..., None] * cuts.sum(-2)).square()).sum(-1).sqrt().clamp_max(math.pi)
+    scatter = (terms.square() + (0.45 * share[..., None] * cuts.sum(-2)).square()).sum(-1).sqrt().clamp_max(math.pi)
     scatter, shift = torch.where(some, scatter, math.pi), cuts.sum((-2, -1)).clamp(-1, 1)
     power = lines.power.sum((-2, -1))
     along = (lines.products.sum(-1) * cis(-phase)[..., None]).real.clamp_min(0)

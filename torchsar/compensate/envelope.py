@@ -15,9 +15,8 @@ a shift is then the correlation of |s|^2 with -1 / T. On a simulated aircraft (a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -78,6 +77,7 @@ def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
     return torch.fft.ifft(torch.fft.fft(data) * phasor)
 
 
+@torch.no_grad()
 def align_envelopes(
     data: Tensor,
     *,
@@ -147,35 +147,20 @@ def align_envelopes(
             f"got degree {degree!r}, tones {tones!r}, passes {passes!r} and blocks {blocks!r}"
         )
 
-    def polynomial(pulses: Envelopes) -> Course:
-        smooth, std = smooth_shifts(pulses, degree, passes, blocks)
-        return with_tones(pulses, smooth, tones, degree), std
-
-    def single(pulses: Envelopes) -> Course:
-        return refined_shifts(pulses, single_shifts(pulses, running_shifts(pulses, 0.1), "likelihood", 4)), None
-
-    def amplitude(pulses: Envelopes) -> Course:
-        return single_shifts(pulses, running_shifts(pulses, 0.1), "amplitude", 4), None
-
-    def running(pulses: Envelopes) -> Course:
-        return running_shifts(pulses, 0.1), None
-
-    methods: dict[str, Callable[[Envelopes], Course]] = {
-        "polynomial": polynomial,
-        "single": single,
-        "amplitude": amplitude,
-        "running": running,
-    }
-    if method not in methods:
-        raise ValueError(f"align_envelopes: method must be one of {list(methods)}, got {method!r}")
+    if method not in get_args(Method):
+        raise ValueError(f"align_envelopes: method must be one of {list(get_args(Method))}, got {method!r}")
     if tones and method != "polynomial":
         raise ValueError(f"align_envelopes: tones belong to the method 'polynomial', got method {method!r}")
-    return _aligned(data, methods[method], assess)
 
+    def find(pulses: Envelopes) -> Course:
+        if method == "polynomial":
+            smooth, std = smooth_shifts(pulses, degree, passes, blocks)
+            return with_tones(pulses, smooth, tones, degree), std
+        shift = running_shifts(pulses, 0.1)
+        if method != "running":
+            shift = single_shifts(pulses, shift, "amplitude" if method == "amplitude" else "likelihood", 4)
+        return refined_shifts(pulses, shift) if method == "single" else shift, None
 
-@torch.no_grad()
-def _aligned(data: Tensor, find: Callable[[Envelopes], Course], assess: bool) -> Estimate:
-    """Estimate of shifts by `find`, in blocks of trials that fit into memory."""
     flat, present = checked(data, "align_envelopes")
     flat, shape = flat.detach(), data.shape[:-2]
     size = flat.shape[1] * flat.shape[2] * flat.element_size()

@@ -26,9 +26,6 @@ _NEAR, _FAR = 2.0, 8.0
 # phase. It is a share of width^2 / velocity, or of the same with the step of the grid as the width.
 # Measured at time-bandwidth products of 19 to 374.
 _REST, _REST_STEP = 0.45, 0.11
-# Largest standard deviation of an estimate that is ok, over the width of the minimum: an eighth
-# of a cycle of phase at the ends of the aperture.
-_MOST_WIDTHS = 0.27
 _COMBS = 4  # interleaved sets of Doppler rows, of independent noise
 
 
@@ -87,7 +84,8 @@ def assessed(
     by_combs = quotient(((sets[2] - sets[0]) / (2 * half_m_s)).std(-1) / math.sqrt(_COMBS), bend)
     std = torch.hypot(torch.maximum(by_parts, by_combs), rest).clamp_max(1e6)
     known = radar.integration_s
-    most = _MOST_WIDTHS * width if known is None else torch.full_like(width, step / 8)
+    # an eighth of a cycle of phase at the ends of the aperture
+    most = 0.27 * width if known is None else torch.full_like(width, step / 8)
     short = known is not None and group.data.shape[-2] < known * radar.prf_hz
     outcome = worst(
         (Outcome.INEXACT, std >= most),
