@@ -154,10 +154,6 @@ class Envelopes:
 Course = tuple[Tensor, Tensor | None]
 
 
-# shifts (trial, pulse), and their standard deviation (trial,) if the method predicts one
-Course = tuple[Tensor, Tensor | None]
-
-
 def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
     """Find the shift of each pulse against an exponentially running mean of the pulses before it.
 
