@@ -143,7 +143,16 @@ def _tiles(
 
 
 def reference_spectrum(radar: StripmapRadar, reference: str | None, raw: Tensor) -> Tensor | None:
-    """Return the range reference of a name for lines (..., pulse, range); None without a name."""
+    """Return the range reference of a name.
+
+    Args:
+        radar: Radar parameters.
+        reference: Name in `torchsar.focus.reference`, or None for range-compressed lines.
+        raw: Lines that it is for, shape (..., pulse, range).
+
+    Returns:
+        The spectrum, shape (range,); None without a name.
+    """
     if reference is None:
         return None
     return REFERENCES[reference](radar.pulse, raw.shape[-1], radar.sampling_hz, raw.device)

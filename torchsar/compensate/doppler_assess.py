@@ -109,7 +109,15 @@ def _adds_up(products: Tensor) -> Tensor:
 
 
 def baseband(found: Estimate, lines: Increments) -> Estimate:
-    """Assess a centroid that follows from the sum of the products of all blocks."""
+    """Assess a centroid that follows from the sum of the products of all blocks.
+
+    Args:
+        found: The estimate of `doppler_baseband_hz`.
+        lines: Products of adjacent lines.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
+    """
     phase = found["doppler_baseband_hz"] / lines.scale
     total = (lines.products.sum((-2, -1)) * cis(-phase)).real
     some = total > 0
@@ -161,6 +169,9 @@ def absolute(
             record, shape (...,); infinite where there are none.
         log_likelihood: Of the candidates for the ambiguity, shape (..., candidate).
         sure: Probability above which the ambiguity is known.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
     plain = baseband(replace(found, value={"doppler_baseband_hz": base_hz}), lines)
     turned = cis((found["doppler_hz"] - base_hz) / lines.scale)
@@ -206,6 +217,9 @@ def of_point(
         history: Azimuth history of the point, and the phasor of its Doppler, see `point_history`.
         visible_s: Time for which the point is observed, in seconds.
         sees: True where the record holds the time at which the beam centre crosses the point.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
     power = power_of(image)
     ordered = power.flatten(-2)

@@ -79,6 +79,9 @@ def assessed(found: Estimate, std: Tensor, agree: Tensor, cells: int) -> Estimat
         std: Standard deviation in cells, shape (...,).
         agree: Whether halves of the band confirm the shifts, bool, shape (...,).
         cells: Number of range cells.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
     count, random = found.info["present"].sum(-1), cells / math.sqrt(12)
     std = torch.where(count < 2, random, std)

@@ -375,21 +375,21 @@ def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Te
         frequency, stands_out = strongest_tone(rest(course), pulses.present)
         parts, base, now = torch.zeros_like(terms[:, 0, :1]).expand(-1, 2), course, course
         for _ in range(5):  # found by trial: enough Gauss-Newton steps to converge
-            wave = waves(frequency, time)
+            wave = _waves(frequency, time)
             turned = (parts[:, None, 1] * wave[..., 0] - parts[:, None, 0] * wave[..., 1]) * (
                 2 * math.pi * (time - time.mean())
             )
             step = robust_fit(rest(now), torch.cat([terms, wave, turned[..., None]], -1), weight)
             frequency, parts = frequency + step[:, -1].clamp(-0.5 / k, 0.5 / k), parts + step[:, -3:-1]
             base = base + (terms @ step[:, :-3, None]).squeeze(-1)
-            now = base + (waves(frequency, time) @ parts[..., None]).squeeze(-1)
+            now = base + (_waves(frequency, time) @ parts[..., None]).squeeze(-1)
         gain = log_likelihood(pulses, now) - log_likelihood(pulses, course)
         kept = stands_out & (parts.square().sum(-1).sqrt() > _LEAST_TONE_CELLS) & (gain > math.log(k) + _STANDS_OUT)
         course = centred(torch.where(kept[:, None], now, course), torch.ones_like(pulses.present))
     return course
 
 
-def waves(frequency: Tensor, time: Tensor) -> Tensor:
+def _waves(frequency: Tensor, time: Tensor) -> Tensor:
     """Cosine and sine (trial, pulse, 2) of frequencies (trial,) in cycles per pulse."""
     angle = 2 * math.pi * frequency[:, None] * time
     return torch.stack([torch.cos(angle), torch.sin(angle)], -1)

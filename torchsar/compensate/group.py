@@ -335,6 +335,14 @@ def student_log_likelihood(t: Tensor, degrees: Tensor | int) -> Tensor:
 
 
 def quotient(value: Tensor, curvature: Tensor) -> Tensor:
-    """Return the quotient, 1e6 at most and where the curvature is not positive."""
+    """Divide by a curvature that may not be positive.
+
+    Args:
+        value: Values, any shape.
+        curvature: Curvatures, same shape.
+
+    Returns:
+        The quotient, 1e6 at most and where the curvature is not positive.
+    """
     good = curvature > 0
     return torch.where(good, value / torch.where(good, curvature, 1), 1e6).clamp_max(1e6)

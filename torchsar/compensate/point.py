@@ -107,8 +107,20 @@ def point_history(
     doppler_hz: Tensor,
     start_s: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the azimuth history of a point without its Doppler rate, (..., azimuth), zero where it
-    was not observed; and the phasor of its Doppler. The arguments are those of `peak_time_s`.
+    """Cut out the azimuth history of a point in an image.
+
+    Args:
+        image: As for `peak_time_s`, like the following arguments.
+        prf_hz: Pulse repetition frequency in Hz.
+        sample: Range position of the peak in samples.
+        rate_hz_s: Magnitude of the Doppler rate in Hz/s.
+        seen_s: First and last time at which the record observed the point.
+        doppler_hz: Doppler of the point in Hz.
+        start_s: Slow time of the peak in seconds.
+
+    Returns:
+        The history without its Doppler rate, shape (..., azimuth), zero where the point was not
+        observed; and the phasor of its Doppler.
     """
     n = image.shape[-2]
     columns = image.shape[-1]

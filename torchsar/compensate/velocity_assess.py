@@ -58,6 +58,9 @@ def assessed(
         half_m_s: That tenth of a step.
         slope: Slopes of the summands of the entropy over the velocity, (..., block, part).
         curvature: Curvature of the entropy, (...,).
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
     radar, (objective, weight, inside, step) = group.radar, minimum
 

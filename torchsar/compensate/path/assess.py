@@ -28,7 +28,16 @@ LEAST_SCATTERERS, _LEAST_SEEN = 3, 0.95
 
 
 def strehl(square_m2: Tensor, fringe_m: float, spread: float = 1.0) -> Tensor:
-    """Return the Strehl ratio for a mean square error of the line of sight, times a factor."""
+    """Predict the Strehl ratio of an image.
+
+    Args:
+        square_m2: Mean square error of the line of sight in square metres.
+        fringe_m: Half a wavelength in metres.
+        spread: Factor of the error.
+
+    Returns:
+        The Strehl ratio.
+    """
     return torch.exp(-square_m2 * (spread * 2 * math.pi / fringe_m) ** 2)
 
 
@@ -41,6 +50,14 @@ def of_path(found: Estimate, starts: Starts, search: Search) -> Estimate:
     leaves of the samples: half the power of the difference comes from one that is as good, little
     from one that is lost. The doubt takes half the power in any case: a wrong motion can explain
     the samples as well as the true one, with more scatterers.
+
+    Args:
+        found: The estimate.
+        starts: Results of the search from several starts.
+        search: The search.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
     best = starts.best
     other = torch.stack([one.noise for one in starts.others])
@@ -71,6 +88,9 @@ def of_strip(
         pulses: Numbers of the pulses that see a scatterer, int64.
         std_m: Standard deviation of the line of sight in metres, float64 (pulse,).
         change_m2: Mean square by which the last round changed the line of sight.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
     seen = torch.zeros_like(judged)
     seen[pulses] = True

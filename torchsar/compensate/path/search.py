@@ -236,6 +236,13 @@ def found_from_starts(search: Search, fine: TileOperator, rounds: int) -> Starts
 
 
 def sharpness(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the sharpness of an image (azimuth, range) in nats, and that of noise."""
+    """Measure the sharpness of an image with pixels of `FINE_STEP`.
+
+    Args:
+        image: Image, shape (azimuth, range), complex.
+
+    Returns:
+        The sharpness in nats, and that of noise.
+    """
     sharp, rows, _ = sharpness_beyond_speckle(image.mT)
     return sharp, sharpness_of_noise((rows * FINE_STEP).clamp_min(1))

@@ -160,9 +160,19 @@ def strip_autofocus(
 class Strip:
     """One trial.
 
-    axes: along the line of sight abeam, scaled so that a unit changes half the path by one, and
-    across it and the track, (pulse, 2, 3). grid: pixels of the image in which scatterers are found.
-    judged: pulses that see the strip. motion_m: errors found so far, (pulse, 2).
+    Args:
+        history: Phase history, complex (pulse, frequency).
+        frequency_hz: Frequencies in Hz, float64 (frequency,).
+        weights: Weights of the frequencies, whose sum is 1, float64 (frequency,).
+        recorded: Recorded path.
+        beam: The beam.
+        axes: Along the line of sight abeam, scaled so that a unit changes half the path by one, and
+            across it and the track, (pulse, 2, 3).
+        grid: Pixels of the image in which scatterers are found.
+        cells: Pixels of a resolution cell along either axis.
+        judged: True for the pulses that see the strip and hold samples, (pulse,).
+        basis: Cosines of which motions consist, float64 (pulse, cosine).
+        motion_m: Errors found so far along the axes in metres, float64 (pulse, 2).
     """
 
     history: Tensor
