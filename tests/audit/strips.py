@@ -16,7 +16,6 @@ from torchsar.compensate import (
     EnergyCentre,
     PhaseIncrement,
     PointDoppler,
-    RangeDependentCentroid,
 )
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate, simulate_turntable
@@ -212,12 +211,6 @@ def entries() -> list[Entry]:
     return [
         Entry("compensate.PhaseIncrement", PhaseIncrement(RADAR), (*NOTHING, *SCENES, ALIASED), BASEBAND),
         Entry("compensate.EnergyCentre", EnergyCentre(RADAR), (*NOTHING, *SCENES, ALIASED), BASEBAND),
-        Entry(
-            "compensate.RangeDependentCentroid",
-            RangeDependentCentroid(RADAR),
-            (*NOTHING, *SCENES),
-            [Quantity("doppler_baseband_hz", DOPPLER_HZ, circular_hz, 0.5)],
-        ),
         Entry(
             "compensate.DopplerCentroid",
             dop,

@@ -50,8 +50,6 @@ CELLS = [
     ("compensate.PhaseIncrement", "own", -20.0, 0.0),
     ("compensate.PhaseIncrement", "partly lit", 10.0, 0.0),
     ("compensate.PhaseIncrement", "own", 10.0, 1.0),
-    ("compensate.RangeDependentCentroid", "noise", None, 0.0),
-    ("compensate.RangeDependentCentroid", "own", 60.0, 1.0),
     ("compensate.DopplerCentroid", "partly lit", 10.0, 0.0),
     ("compensate.EffectiveVelocity", "noise", None, 0.0),
     ("compensate.EffectiveVelocity", "partly lit", 10.0, 0.0),

@@ -242,7 +242,7 @@ def test_a_start_that_explains_the_samples_worse_widens_the_doubt_and_not_the_de
     for others, std_m, doubt_m in cases:
         starts = Starts.of([*others, best], search, best.noise)
         assert starts.best is best
-        known = Estimate({"line_of_sight_m": best.line_of_sight_m}, quality=best.noise)
+        known = Estimate({"line_of_sight_m": best.motion_m[:, 0]}, quality=best.noise)
         judged = assess.of_path(known, starts, search)
         doubt = (best.std_m.square().mean() + starts.square_m2.amin() / 2).sqrt()
         assert float(judged.std["line_of_sight_m"].square().mean().sqrt()) == pytest.approx(std_m, rel=0.2)

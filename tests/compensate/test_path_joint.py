@@ -148,7 +148,7 @@ def test_errors_across_the_line_of_sight_are_found_in_two_rounds() -> None:
     found = three_axes(rows, fine, start, present, 2)
     true, left = ((x * level).sum(-1) for x in (error, error - found.offset_m))
     assert line_free(left, present).square().mean() < 0.1 * line_free(true, present).square().mean()
-    assert phase_rmse(found.line_of_sight_m * RADIANS, start * RADIANS) < 0.1
+    assert phase_rmse(found.motion_m[:, 0] * RADIANS, start * RADIANS) < 0.1
 
 
 @pytest.mark.parametrize("fringes", [1, -2])
@@ -158,7 +158,7 @@ def test_whole_fringes_of_a_pulse_are_found_by_its_envelope(fringes: int) -> Non
     fine = ground_image(frequency, path, 0.0, None, FINE_STEP)
     error = torch.zeros(PULSES, dtype=F64)
     error[PULSES // 3] = fringes * RADAR.wavelength_m / 2
-    found = three_axes(rows, fine, error, present).line_of_sight_m
+    found = three_axes(rows, fine, error, present).motion_m[:, 0]
     assert found.abs().max() < 0.02 * RADAR.wavelength_m
 
 
@@ -171,7 +171,7 @@ def test_errors_across_are_not_taken_for_fringes() -> None:
     sight = path.transmitter_m / torch.linalg.vector_norm(path.transmitter_m, dim=-1, keepdim=True)
     start = line_free((error * sight).sum(-1), present)
     fine = ground_image(frequency, recorded(path, error), 0.0, None, FINE_STEP)
-    found = three_axes(rows, fine, start, present).line_of_sight_m
+    found = three_axes(rows, fine, start, present).motion_m[:, 0]
     assert (found - start).abs().max() < RADAR.wavelength_m / 4
 
 

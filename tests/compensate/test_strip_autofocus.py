@@ -108,7 +108,7 @@ def test_a_curve_is_that_of_dense_least_squares() -> None:
     phase, weight = normal(scatterers, seen), normal(scatterers, seen).square()
     weight[0] = 0  # nothing is known of the first
     power, known = normal(2, count).square(), normal(scatterers, 3).square()
-    solution = curve.solved(phase, weight, power, known)
+    coefficient, covariance, added = curve.solved(phase, weight, power, known)
     columns = torch.zeros(scatterers, seen, 2 * count + 3 * scatterers, dtype=F64)
     for axis in range(2):
         columns[..., axis * count : (axis + 1) * count] = curve.lever[..., axis, None] * basis[at]
@@ -117,12 +117,10 @@ def test_a_curve_is_that_of_dense_least_squares() -> None:
     rows, prior = columns.flatten(0, 1), torch.cat([1 / power.flatten(), known.flatten()])
     whole = rows.mT @ (weight.reshape(-1, 1) * rows) + torch.diag(prior)
     wanted = torch.linalg.solve(whole, rows.mT @ (weight * phase).flatten())
-    torch.testing.assert_close(solution.coefficient.flatten(), wanted[: 2 * count], rtol=1e-6, atol=1e-9)
-    torch.testing.assert_close(
-        solution.covariance, torch.linalg.inv(whole)[: 2 * count, : 2 * count], rtol=1e-6, atol=1e-9
-    )
+    torch.testing.assert_close(coefficient.flatten(), wanted[: 2 * count], rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(covariance, torch.linalg.inv(whole)[: 2 * count, : 2 * count], rtol=1e-6, atol=1e-9)
     own = (rows[:, 2 * count :] @ wanted[2 * count :]).reshape(scatterers, seen)
-    torch.testing.assert_close(solution.own[1:], own[1:], rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(added[1:], own[1:], rtol=1e-6, atol=1e-8)
 
 
 def test_echoes_are_direct_sums_and_hold_those_of_others_at_their_range() -> None:

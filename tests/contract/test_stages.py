@@ -55,7 +55,6 @@ from torchsar.compensate import (
     PointDoppler,
     PulseGain,
     RadialMotion,
-    RangeDependentCentroid,
     RotationAutofocus,
     RotationDescent,
     RotationEvolution,
@@ -296,7 +295,6 @@ CASES = [
     Case("detect", lambda: Detect(), image=True, keeps_complex=False),
     Case("phase_increment", lambda: PhaseIncrement(RADAR, (2, 2))),
     Case("energy_centre", lambda: EnergyCentre(RADAR, (2, 2))),
-    Case("range_dependent_centroid", lambda: RangeDependentCentroid(RADAR, 1, (2, 4)), differentiable=False),
     Case("doppler_centroid", lambda: DopplerCentroid(RADAR), differentiable=False, vmap=False),
     Case(
         "effective_velocity",

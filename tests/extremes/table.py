@@ -318,7 +318,6 @@ FUNCTIONS = [
     _entry("compensate.shift_range", "raw", lambda x: compensate.shift_range(x, ramp(x.shape[-2]))),
     _entry("compensate.pulse_gain", "raw", compensate.pulse_gain),
     _entry("compensate.equalise_pulses", "raw", lambda x: compensate.equalise_pulses(x, 1 + ramp(x.shape[-2]))),
-    _entry("compensate.drift_cells", "raw", lambda x: compensate.drift_cells(x.real.flatten(-2)), 1),
     _entry("compensate.autofocus", "raw", compensate.autofocus),
     _entry("compensate.sca", "raw", compensate.sca),
     _entry("compensate.pga", "raw", compensate.pga),
@@ -395,27 +394,7 @@ FUNCTIONS = [
     _entry("compensate.phase_increment", "raw", lambda x: compensate.phase_increment(x, 400.0, (2, 2))),
     _entry("compensate.energy_centre", "raw", lambda x: compensate.energy_centre(x, 400.0, (2, 2))),
     _entry("compensate.lag_products", "raw", lambda x: compensate.lag_products(x, (2, 2)), 0),
-    _entry(
-        "compensate.fit_over_range",
-        "raw",
-        lambda x: compensate.fit_over_range(x.flatten(-2), size(x.flatten(-2)), 1),
-        0,
-    ),
-    _entry(
-        "compensate.plain_energy_centre", "raw", lambda x: compensate.plain_energy_centre(size(x.flatten(-2)), 400.0), 0
-    ),
     _entry("compensate.point_doppler", "row", lambda x: compensate.point_doppler(x, 400.0, 20.0), 0),
-    _entry("compensate.line_doppler", "raw", lambda x: compensate.line_doppler(x, RADAR), {"0": 0, "1": 0}),
-    _entry(
-        "compensate.ambiguity_evidence",
-        "raw",
-        lambda x: compensate.ambiguity_evidence(x, RADAR, torch.full(x.shape[:-2], 5.0, dtype=F64), None, 3),
-    ),
-    _entry(
-        "compensate.complete_aperture_centroid",
-        "raw",
-        lambda x: compensate.complete_aperture_centroid(x, RADAR, torch.full(x.shape[:-2], 5.0, dtype=F64), None),
-    ),
     _entry(
         "compensate.minimum_entropy_velocity",
         "raw",
@@ -427,14 +406,6 @@ FUNCTIONS = [
             parabola_minimum,
             0.1,
         ),
-    ),
-    _entry(
-        "compensate.velocity_objective",
-        "raw",
-        lambda x: compensate.velocity_objective(group(x), torch.zeros(x.shape[:-2], dtype=F64), 0.1)(
-            torch.full(x.shape[:-2], 120.0, dtype=F64)
-        ),
-        0,
     ),
     _entry(
         "compensate.peak_time_s",
@@ -896,6 +867,7 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
         {"turns": 0.1 * ONES, "start": -2.0},
     ),
     "core.reduced_turns": (core.reduced_turns, {"turns": ONES}),
+    "core.wrapped": (lambda x: core.wrapped(x, 3.0), {"x": ONES}),
     "core.unit_phasor": (lambda turns: core.unit_phasor(turns, torch.complex64), {"turns": ONES}),
     "core.settle": (core.settle, {"value": ONES, "fallback": 0.0}),
     "core.power_of": (core.power_of, {"x": torch.ones(4, 4, dtype=torch.complex64)}),

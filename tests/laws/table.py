@@ -69,15 +69,12 @@ NOT_LINEAR = {
     "SparseFill:sparse_fill": "the strong scatterers that fill a gap are selected from the lines",
     "repair.sparse_fill": "the strong scatterers that fill a gap are selected from the lines",
     "ChirpletClean:chirplet_clean": "the strongest chirps are selected one after the other",
-    "compensate.drift_cells": "a polynomial over a circle",
     "StoredOmegaK": "works on complex64 with its own axes only; OmegaK, which it stores, is in the table",
 }
 LINEAR = [entry for entry in TO_SAMPLES if entry.name not in NOT_LINEAR]
 
 # entries whose results do not follow the phase of the samples; why
 NO_PHASE = {
-    "compensate.drift_cells": "works on real shifts",
-    "compensate.fit_over_range": "fits real values over range",
     "metrics.phase_rmse": "works on real phases",
     "metrics.residual_phase": "works on real phases",
     "metrics.strehl": "works on real phases",
@@ -207,7 +204,7 @@ RANGE_FREE = (
     "compensate.pulse_gain",
     *("compensate.autofocus", "compensate.sca", "compensate.pga", "compensate.pga_sca", "compensate.link_phases"),
     *("compensate.entropy_fixed_point", "compensate.maximum_contrast", "compensate.minimum_entropy"),
-    *("compensate.sharpest_phase", "compensate.phase_polish", "compensate.line_doppler", "metrics.entropy"),
+    *("compensate.sharpest_phase", "compensate.phase_polish", "metrics.entropy"),
     *("metrics.contrast", "metrics.correlation", "metrics.error_db"),
 )
 

@@ -1,23 +1,18 @@
 """Estimators of motion, pointing and phase errors, and the stages that correct data with them."""
 
-from torchsar.compensate.ambiguity import DopplerCentroid, ambiguity_evidence, line_doppler
-from torchsar.compensate.aperture import complete_aperture_centroid
+from torchsar.compensate.ambiguity import DopplerCentroid
 from torchsar.compensate.doppler import (
     EnergyCentre,
     PhaseIncrement,
-    RangeDependentCentroid,
     energy_centre,
-    fit_over_range,
     lag_products,
     phase_increment,
-    plain_energy_centre,
     point_doppler,
 )
 from torchsar.compensate.envelope import (
     AlignEnvelopes,
     ShiftRange,
     align_envelopes,
-    drift_cells,
     shift_range,
 )
 from torchsar.compensate.path import (
@@ -106,7 +101,6 @@ from torchsar.compensate.rotation import (
 from torchsar.compensate.velocity import (
     EffectiveVelocity,
     minimum_entropy_velocity,
-    velocity_objective,
 )
 
 __all__ = [
@@ -140,7 +134,6 @@ __all__ = [
     "PointDoppler",
     "PulseGain",
     "RadialMotion",
-    "RangeDependentCentroid",
     "RotationAutofocus",
     "RotationDescent",
     "RotationEvolution",
@@ -157,26 +150,21 @@ __all__ = [
     "TargetAutofocus",
     "UnevenRotation",
     "align_envelopes",
-    "ambiguity_evidence",
     "autofocus",
     "chirplet_clean",
     "coarse_rotation",
     "compensate_motion",
-    "complete_aperture_centroid",
     "correct_pulse_phase",
     "descend_rotation",
     "doppler_at",
-    "drift_cells",
     "energy_centre",
     "entropy_fixed_point",
     "equalise_pulses",
     "evolve_rotation",
-    "fit_over_range",
     "genetic_rotation",
     "geometric_velocity_m_s",
     "integrated_range",
     "lag_products",
-    "line_doppler",
     "link_phases",
     "maximum_contrast",
     "minimum_entropy",
@@ -192,7 +180,6 @@ __all__ = [
     "phase_fit_rotation",
     "phase_increment",
     "phase_polish",
-    "plain_energy_centre",
     "point_doppler",
     "pulse_gain",
     "radial_motion",
@@ -207,5 +194,4 @@ __all__ = [
     "strip_autofocus",
     "turning_points",
     "uneven_rotation",
-    "velocity_objective",
 ]

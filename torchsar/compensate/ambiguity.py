@@ -26,17 +26,15 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate import doppler_assess
-from torchsar.compensate.aperture import complete_aperture_centroid
-from torchsar.compensate.doppler import combine_blocks, lag_products, nominal_doppler, swept_band, wrap_hz
+from torchsar.compensate.aperture import complete_aperture_centroid, reference_spectrum
+from torchsar.compensate.doppler import lag_products, nominal_doppler, swept_band
 from torchsar.compensate.group import (
+    BeamSpectrum,
     RangeGroup,
-    aperture_s,
+    aperture_lines,
     beam_spectrum,
     block_entropy,
     block_weights,
-    central_lines,
-    compress,
-    jackknife_std,
     pick_group,
     student_log_likelihood,
 )
@@ -50,6 +48,7 @@ from torchsar.core import (
     settle,
     take,
     unit_level,
+    wrapped,
 )
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
@@ -58,24 +57,6 @@ from torchsar.radar import StripmapRadar
 # the nominal pointing.
 SURE = 0.9
 _BLOCKS = 8  # independent parts of the data; more give more degrees of freedom, each of less contrast
-
-
-def candidate_turns(reach: int, device: torch.device | None = None) -> Tensor:
-    """List the candidates for the Doppler ambiguity: the whole numbers from -reach to reach.
-
-    Args:
-        reach: Largest candidate in PRFs; 0 leaves only the candidate 0.
-        device: Device of the result.
-
-    Returns:
-        The candidates in PRFs in rising order, shape (2 reach + 1,), float64.
-
-    Raises:
-        ValueError: If `reach` is negative.
-    """
-    if reach < 0:
-        raise ValueError(f"reach must be 0 or more (largest Doppler ambiguity to search, in PRFs), got {reach}")
-    return torch.arange(-reach, reach + 1, dtype=torch.float64, device=device)
 
 
 def _evidence(scores: Tensor, weight: Tensor | None = None) -> Tensor:
@@ -156,12 +137,8 @@ def line_doppler(lines: Tensor, radar: StripmapRadar) -> tuple[Tensor, Tensor]:
     Returns:
         The Doppler, positive when closing, and its predicted standard deviation (jackknife over
         blocks of lines), both in Hz, shape (...,).
-
-    Raises:
-        TypeError: If the samples are not complex64 or complex128.
-        ValueError: If there are no samples or a sample is not finite.
     """
-    lines = unit_level(checked_samples(lines, "line_doppler", "pulse, range"))
+    lines = unit_level(lines)
     modulus = lines.abs()
     level = 3 * modulus.mean((-2, -1), keepdim=True)
     limited = lines * (level / torch.where(modulus > 0, modulus, 1)).clamp_max(1)
@@ -179,9 +156,9 @@ def line_doppler(lines: Tensor, radar: StripmapRadar) -> tuple[Tensor, Tensor]:
     total = blocks.sum(-2, keepdim=True)
     scale = radar.prf_hz * radar.carrier_hz / (2 * math.pi)
     frequency = band(radar.range_frequency_hz(n, lines.device))
-    value = scale * _phase_slope(total, frequency)[..., 0]
-    left_out = scale * _phase_slope(total - blocks, frequency)
-    return settle(value, 0.0)[0], settle(jackknife_std(left_out), 1e9)[0]
+    value, left_out = scale * _phase_slope(total, frequency)[..., 0], scale * _phase_slope(total - blocks, frequency)
+    jackknife = left_out.std(-1, correction=0) * math.sqrt(_BLOCKS - 1)
+    return settle(value, 0.0)[0], settle(jackknife, 1e9)[0]
 
 
 def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
@@ -213,16 +190,15 @@ def entropy_scores(
         blocks, shape (..., block), with sum 1. A block consists of about 32 neighbouring range
         cells.
     """
-    spectrum, weight = beam_spectrum(group, doppler_hz), block_weights(group.data, group.radar, doppler_hz, dwell_s)
-    scores = []
-    for k in turns:
-        shift = k * group.radar.prf_hz
-        scores.append(-block_entropy(spectrum.moved(shift).image(doppler_hz + shift, velocity_m_s)))
-    return torch.stack(scores, -1), weight
+    spectrum, scores = beam_spectrum(group, doppler_hz), []
+    for shift in turns * group.radar.prf_hz:
+        at = BeamSpectrum(group, spectrum.data, spectrum.doppler_hz + shift)
+        scores.append(-block_entropy(at.image(doppler_hz + shift, velocity_m_s)))
+    return torch.stack(scores, -1), block_weights(group.data, group.radar, doppler_hz, dwell_s)
 
 
 def ambiguity_evidence(
-    raw: Tensor, radar: StripmapRadar, doppler_baseband_hz: Tensor, reference: Tensor | None, reach: int = 12
+    raw: Tensor, radar: StripmapRadar, doppler_baseband_hz: Tensor, reference: Tensor | None, turns: Tensor
 ) -> dict[str, Tensor]:
     """Compute the log-likelihood of every candidate ambiguity from each kind of evidence.
 
@@ -238,23 +214,15 @@ def ambiguity_evidence(
         doppler_baseband_hz: Baseband centroid in Hz, shape (...,), positive when closing.
         reference: Range reference spectrum, shape (range,); None if `raw` is already
             range-compressed.
-        reach: Largest candidate in PRFs; the candidates are -reach..reach.
+        turns: Candidates for the ambiguity in PRFs, shape (candidate,), float64.
 
     Returns:
         A dictionary. "looks", "lines" and "entropy" hold the log-likelihoods of the candidates,
         shape (..., candidate), each up to a constant. "line_doppler_hz" and "line_doppler_std_hz",
         shape (...,), hold the two results of `line_doppler`.
-
-    Raises:
-        TypeError: If the samples are not complex64 or complex128.
-        ValueError: If there are no samples or a sample is not finite, or if `reach` is negative.
     """
-    raw = checked_samples(raw, "ambiguity_evidence", "pulse, range")
-    turns = candidate_turns(reach, raw.device)
-    dwell = aperture_s(radar, raw.shape[-1])
-    lines = compress(unit_level(central_lines(raw, max(1024, round(4 * dwell * radar.prf_hz)))), radar, reference)
-    wide = pick_group(lines, radar, 4096)
-    narrow = pick_group(lines, radar, 512)
+    lines, dwell = aperture_lines(raw, radar, reference)
+    wide, narrow = pick_group(lines, radar, 4096), pick_group(lines, radar, 512)
     value, std = line_doppler(lines, radar)
     base = doppler_baseband_hz
     miss = (base[..., None] + turns * radar.prf_hz - value[..., None]) / std.clamp_min(1e-3 * radar.prf_hz)[..., None]
@@ -265,21 +233,6 @@ def ambiguity_evidence(
         "line_doppler_hz": value,
         "line_doppler_std_hz": std,
     }
-
-
-def possible_reach(radar: StripmapRadar, reach: int) -> int:
-    """Limit the search for the Doppler ambiguity to squints of up to about 70 degrees.
-
-    The absolute Doppler is then at most 0.94 * 2 v / lambda, with the nominal velocity v.
-
-    Args:
-        radar: Radar parameters.
-        reach: Largest ambiguity that the caller wants to search, in PRFs.
-
-    Returns:
-        The largest ambiguity to search, in PRFs: `reach` or less.
-    """
-    return max(0, min(reach, math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)))
 
 
 class DopplerCentroid(Stage):
@@ -330,7 +283,9 @@ class DopplerCentroid(Stage):
             )
         if reach < 1:
             raise ValueError(f"reach must be 1 or more (largest Doppler ambiguity to search, in PRFs), got {reach}")
-        self.radar, self.reference, self.reach = radar, reference, possible_reach(radar, reach)
+        # up to 70 degrees of squint: the absolute Doppler is then at most 0.94 * 2 v / lambda
+        most = math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)
+        self.radar, self.reference, self.reach = radar, reference, max(0, min(reach, most))
         self.blocks, self.assess = blocks, assess
         nominal = torch.tensor(nominal_doppler(radar)["doppler_hz"], dtype=torch.float64)
         self.neutral = {name: float(value) for name, value in self._values(nominal).items()}
@@ -359,15 +314,12 @@ class DopplerCentroid(Stage):
             apertures that the ends of the record cut shift the centroid by an eighth of the band of
             the beam or more, and INEXACT from a standard deviation of 1.5 % of the PRF on.
         """
-        raw, radar = signal.data, self.radar
+        radar, raw = self.radar, checked_samples(signal.data, "DopplerCentroid", "pulse, range")
         n, prf = raw.shape[-1], radar.prf_hz
         products, power = lag_products(raw, self.blocks)
-        base = wrap_hz(prf / (2 * math.pi) * combine_blocks(products), prf)
-        spectrum = None
-        if self.reference is not None:
-            spectrum = REFERENCES[self.reference](radar.pulse, n, radar.sampling_hz, raw.device)
-        evidence = ambiguity_evidence(raw, radar, base, spectrum, self.reach)
-        turns = candidate_turns(self.reach, raw.device)
+        base = wrapped(prf / (2 * math.pi) * torch.angle(products.sum((-2, -1))), prf)
+        turns = torch.arange(-self.reach, self.reach + 1, dtype=torch.float64, device=raw.device)
+        evidence = ambiguity_evidence(raw, radar, base, reference_spectrum(radar, self.reference, raw), turns)
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
         best, nominal = turns[joint.argmax(-1)], radar.pointing_doppler_hz
         if nominal is not None:
@@ -383,7 +335,7 @@ class DopplerCentroid(Stage):
 
     def _values(self, doppler_hz: Tensor) -> dict[str, Tensor]:
         """All values that an absolute Doppler centroid in Hz determines."""
-        baseband = wrap_hz(doppler_hz, self.radar.prf_hz)
+        baseband = wrapped(doppler_hz, self.radar.prf_hz)
         return {
             "doppler_hz": doppler_hz,
             "doppler_baseband_hz": baseband,

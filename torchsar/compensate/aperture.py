@@ -16,23 +16,20 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchsar.compensate.doppler import lag_products, wrap_hz
+from torchsar.compensate.doppler import lag_products
 from torchsar.compensate.group import RangeGroup, compress, full_columns, full_spectrum, stays_inside
-from torchsar.core import checked_samples, cis, settle, unit_level
+from torchsar.compensate.pulse_phase.data import or_one
+from torchsar.core import cis, settle, unit_level, wrapped
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
 # size of a tile, found by trial: larger tiles measure their coherence better, smaller ones resolve
 # the end of the complete lines
 _TILE_LINES, _TILE_COLUMNS = 16, 32
-_CHUNK_COLUMNS = 2048  # bounds the memory of an image on wide swaths
 # Share of the energy of targets that are left out that leaks into the chosen tiles. Its Doppler is
-# half way to the edge of the beam.
-_LEAK = 0.005
-# Least share of the energy in lines whose targets have complete apertures; what is less may be
-# nothing but the sidelobes of other targets.
-_LEAST_SHARE = 0.1
-_GUARD = 0.02  # share of the dwell by which it is widened at each end, found by trial
+# half way to the edge of the beam. Least share of the energy in lines whose targets have complete
+# apertures; what is less may be nothing but the sidelobes of other targets.
+_LEAK, _LEAST_SHARE = 0.005, 0.1
 
 
 def complete_aperture_centroid(
@@ -58,15 +55,11 @@ def complete_aperture_centroid(
         trials where the targets migrate out of the swath in more than half of the range cells or
         less than a tenth of the energy is that of such targets.
 
-    Raises:
-        TypeError: If the samples are not complex64 or complex128.
-        ValueError: If there are no samples or a sample is not finite.
     """
-    raw = checked_samples(raw, "complete_aperture_centroid", "pulse, range")
     std = torch.full_like(doppler_hz, math.inf)
     if radar.integration_s is None:
         return doppler_hz, std
-    dwell = math.ceil((1 + 2 * _GUARD) * radar.integration_s * radar.prf_hz)
+    dwell = math.ceil(1.04 * radar.integration_s * radar.prf_hz)  # with a guard of 2 % at each end, by trial
     if raw.shape[-2] < 1.1 * dwell:
         return doppler_hz, std
     raw, value = unit_level(raw), doppler_hz
@@ -84,7 +77,9 @@ def _refined(
     products = torch.cat([p for p, _, _ in parts], -1)
     rate = torch.cat([torch.full(p.shape[-1:], r, dtype=torch.float64, device=raw.device) for p, _, r in parts])
     power = torch.cat([q for _, q, _ in parts], -1)
-    weight = _above_noise(products, power)
+    # how far the coherence of a tile exceeds that of white noise, 0..1
+    coherence = products.abs() / or_one(power)
+    weight = (1 - 6 / (_TILE_LINES * _TILE_COLUMNS * coherence.square()).clamp_min(1e-9)).clamp_min(0)
     products = products * weight
     tile = raw.shape[-2] / products.shape[-2]
     line = (torch.arange(products.shape[-2], dtype=torch.float64, device=raw.device) + 0.5) * tile
@@ -96,7 +91,7 @@ def _refined(
         whole = _whole(line[:, None] - shift, raw.shape[-2], dwell)
         chosen = (products * whole).sum((-2, -1))
         phase = torch.angle(chosen)
-        total = torch.where(chosen.abs() > 0, total + wrap_hz(scale * phase - total, radar.prf_hz), total)
+        total = torch.where(chosen.abs() > 0, total + wrapped(scale * phase - total, radar.prf_hz), total)
     kept, energy = (products * whole).abs().sum((-2, -1)), products.abs().sum((-2, -1))
     half_way = math.pi / 2 * parts[0][2] * dwell / radar.prf_hz**2  # rad, between centre and edge of the beam
     noise = ((weight * whole).square() * _noise_variance(power, radar)).sum((-2, -1))
@@ -119,7 +114,7 @@ def _chunks(raw: Tensor, radar: StripmapRadar, reference: str | None) -> list[tu
     """Range chunks that overlap by a pulse length, so that memory stays bounded on wide swaths."""
     extra = 0 if reference is None else raw.shape[-1] - full_columns(raw.shape[-1], radar.pulse_samples)
     columns = raw.shape[-1] - extra
-    count = max(1, round(columns / _CHUNK_COLUMNS))
+    count = max(1, round(columns / 2048))
     edges = [round(i * columns / count) for i in range(count + 1)]
     return [
         (raw[..., a : b + extra], replace(radar, near_range_m=radar.near_range_m + a * radar.range_step_m))
@@ -134,22 +129,33 @@ def _tiles(
 
     The products and powers have shape (..., a, b), the rate is in Hz/s.
     """
-    spectrum = (
-        None if reference is None else REFERENCES[reference](radar.pulse, raw.shape[-1], radar.sampling_hz, raw.device)
-    )
-    lines = compress(raw, radar, spectrum)
+    lines = compress(raw, radar, reference_spectrum(radar, reference, raw))
     group = RangeGroup(lines, torch.zeros(lines.shape[:-2], device=raw.device), radar)
     image = full_spectrum(group, doppler_hz).image(doppler_hz, radar.velocity_m_s)
     tiles = (max(1, image.shape[-2] // _TILE_LINES), max(1, image.shape[-1] // _TILE_COLUMNS))
-    image = image * stays_inside(image.shape[-1], radar, doppler_hz, radar.integration_s or 0.0, always=False)[
-        ..., None, :
-    ].to(image.real.dtype)
+    inside = stays_inside(image.shape[-1], radar, doppler_hz, radar.integration_s or 0.0, always=False)
+    image = image * inside[..., None, :].to(image.real.dtype)
     products, power = lag_products(image, tiles)
-    scale = (
-        image.abs().amax((-2, -1)).to(torch.float64).square()[..., None, None]
-    )  # lag_products is scale free, chunks must stay comparable
+    # lag_products is scale free, chunks must stay comparable
+    scale = image.abs().amax((-2, -1)).to(torch.float64).square()[..., None, None]
     rate = radar.azimuth_rate_hz_s(radar.near_range_m + image.shape[-1] / 2 * radar.range_step_m)
     return products * scale, power * scale, float(rate)
+
+
+def reference_spectrum(radar: StripmapRadar, reference: str | None, raw: Tensor) -> Tensor | None:
+    """Return the range reference of a name.
+
+    Args:
+        radar: Radar parameters.
+        reference: Name in `torchsar.focus.reference`, or None for range-compressed lines.
+        raw: Lines that it is for, shape (..., pulse, range).
+
+    Returns:
+        The spectrum, shape (range,); None without a name.
+    """
+    if reference is None:
+        return None
+    return REFERENCES[reference](radar.pulse, raw.shape[-1], radar.sampling_hz, raw.device)
 
 
 def _noise_variance(power: Tensor, radar: StripmapRadar) -> Tensor:
@@ -180,9 +186,3 @@ def _std_rad(products: Tensor, noise: Tensor, phase_rad: Tensor, leak: Tensor) -
     share = (columns.real / total[..., None]).clamp(0, 0.9)
     scatter = 0.5 * (columns.imag.square() / (1 - share)).sum(-1) + 0.25 * parts.imag.square().sum((-2, -1))
     return torch.hypot(torch.maximum(scatter, noise).sqrt() / total, leak / total)
-
-
-def _above_noise(products: Tensor, power: Tensor) -> Tensor:
-    """Weight 0..1 of a tile: how far its coherence exceeds that of white noise."""
-    coherence = products.abs() / torch.where(power > 0, power, 1)
-    return (1 - 6 / (_TILE_LINES * _TILE_COLUMNS * coherence.square()).clamp_min(1e-9)).clamp_min(0)

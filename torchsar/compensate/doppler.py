@@ -12,6 +12,7 @@ neither estimator.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -24,31 +25,11 @@ from torchsar.core import (
     Stage,
     checked_samples,
     fft_lines,
-    legendre,
-    linear_solve,
     power_of,
-    settle,
     unit_level,
+    wrapped,
 )
 from torchsar.radar import StripmapRadar
-
-OVER = ("mean", "median")  # how `combine_blocks` combines the blocks
-# Energy at which the weight of a range block in a fit is halved, over the energy that three
-# quarters of the blocks do not exceed.
-_FAINT = 0.1
-
-
-def wrap_hz(frequency_hz: Tensor, prf_hz: float) -> Tensor:
-    """Wrap frequencies into the interval -PRF/2 .. PRF/2.
-
-    Args:
-        frequency_hz: Frequencies in Hz, any shape.
-        prf_hz: Pulse repetition frequency in Hz.
-
-    Returns:
-        The wrapped frequencies in Hz, same shape.
-    """
-    return frequency_hz - prf_hz * torch.round(frequency_hz / prf_hz)
 
 
 def _bounds(n: int, parts: int, what: str) -> list[tuple[int, int]]:
@@ -97,81 +78,10 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
     return torch.stack(products, -2), torch.stack(powers, -2)
 
 
-def azimuth_spectrum(x: Tensor, segments: int) -> Tensor:
-    """Average the azimuth power spectrum over range cells and over segments of the lines.
-
-    Each segment shares one line with the next and is padded with zeros to an even number of lines.
-    If its number of pairs is even, the first Fourier coefficient of its spectrum is the sum of the
-    products of its adjacent lines; otherwise it may also contain the product of its last and first
-    line.
-
-    Args:
-        x: Lines, shape (..., pulse, range), complex.
-        segments: Number of segments.
-
-    Returns:
-        Power spectrum in FFT order, shape (..., n) for n Doppler bins, float64.
-
-    Raises:
-        ValueError: If there are fewer pairs of lines than segments.
-    """
-    x, bounds = unit_level(x), _bounds(x.shape[-2] - 1, segments, "pairs of lines")
-    n = 2 * (max(last - first for first, last in bounds) // 2 + 1)
-    spectra = [power_of(fft_lines(x[..., first : last + 1, :], n=n)) for first, last in bounds]
-    return torch.stack([power.to(torch.float64).sum(-1) for power in spectra]).sum(0)
-
-
-def plain_energy_centre(spectrum: Tensor, prf_hz: float) -> Tensor:
-    """Compute the ordinary, non-circular centre of mass of a power spectrum.
-
-    It serves for comparison only, because it is wrong wherever the spectrum wraps at half the PRF.
-    Use `energy_centre` instead.
-
-    Args:
-        spectrum: Power spectrum in FFT order, shape (..., n).
-        prf_hz: Pulse repetition frequency in Hz.
-
-    Returns:
-        The centre of mass in Hz, shape (...,), float64; 0 for an empty spectrum.
-    """
-    spectrum = spectrum.to(torch.float64)
-    frequency = torch.fft.fftfreq(spectrum.shape[-1], 1 / prf_hz, dtype=torch.float64, device=spectrum.device)
-    total = spectrum.sum(-1)
-    return (spectrum * frequency).sum(-1) / torch.where(total > 0, total, 1)
-
-
-def combine_blocks(products: Tensor, over: str = "mean") -> Tensor:
-    """Combine the products of all blocks into one phase increment per trial.
-
-    Args:
-        products: Block products, shape (..., a, b), complex.
-        over: "mean" takes the phase of the sum of all products, which weights blocks by their
-            energy. "median" takes the median of the phases of the products, measured from the phase
-            of that sum so that they do not wrap. Each block with energy then has equal weight, so
-            that one bright block cannot dominate.
-
-    Returns:
-        The phase increment from line to line in rad, shape (...,).
-
-    Raises:
-        ValueError: If `over` is neither "mean" nor "median".
-    """
-    if over not in OVER:
-        raise ValueError(f"over must be one of {OVER} (how blocks are combined), got {over!r}")
-    flat = products.flatten(-2)
-    mean = torch.angle(flat.sum(-1))
-    if over == "mean":
-        return mean
-    offset = torch.angle(flat * torch.polar(torch.ones_like(mean), -mean)[..., None])
-    offset = torch.where(flat.abs() > 0, offset, torch.nan)
-    return mean + settle(torch.nanquantile(offset, 0.5, dim=-1), 0.0)[0]
-
-
 def phase_increment(
     x: Tensor,
     prf_hz: float,
     blocks: tuple[int, int] = (8, 8),
-    over: str = "mean",
     rate_hz_s: float | None = None,
     dwell_s: float | None = None,
     *,
@@ -191,7 +101,6 @@ def phase_increment(
         x: Lines, shape (..., pulse, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
         blocks: Number of blocks along pulses and along range.
-        over: "mean" or "median" over the blocks, see `combine_blocks`.
         rate_hz_s: Magnitude of the Doppler rate of the targets in Hz/s, for the assessment. If it
             is None, targets are assumed to be seen for half of the record.
         dwell_s: Time that a target stays in the beam, in seconds, for the assessment. If it is
@@ -213,16 +122,17 @@ def phase_increment(
     Raises:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples or a sample is not finite, or if there are fewer pairs
-            of lines or range cells than blocks, or `over` is unknown.
+            of lines or range cells than blocks.
 
     Reference:
         Tsvetkov 2017, text before Fig. 5.
     """
     x = checked_samples(x, "phase_increment", "pulse, range")
     products, power = lag_products(x, blocks)
-    phase = combine_blocks(products, over)
-    info = {"block_hz": prf_hz / (2 * math.pi) * torch.angle(products), "block_power": power}
-    found = Estimate({"doppler_baseband_hz": wrap_hz(prf_hz / (2 * math.pi) * phase, prf_hz)}, info=info)
+    scale = prf_hz / (2 * math.pi)
+    info = {"block_hz": scale * torch.angle(products), "block_power": power}
+    value = wrapped(scale * torch.angle(products.sum((-2, -1))), prf_hz)
+    found = Estimate({"doppler_baseband_hz": value}, info=info)
     if not assess:
         return found
     return doppler_assess.baseband(found, doppler_assess.Increments.of(x, products, power, prf_hz, rate_hz_s, dwell_s))
@@ -245,21 +155,25 @@ def energy_centre(
     100.0
 
     The power spectrum is averaged over range. The result agrees with `phase_increment` to
-    rounding if the blocks hold an even number of pairs of lines; see `azimuth_spectrum`.
+    rounding if the blocks hold an even number of pairs of lines.
+
+    Each of the segments of the lines, of which the spectra are averaged, shares one line with the
+    next and is padded with zeros to an even number of lines. If its number of pairs is even, the
+    first Fourier coefficient of its spectrum is the sum of the products of its adjacent lines;
+    otherwise it may also contain the product of its last and first line.
 
     Args:
         x: Lines, shape (..., pulse, range), complex.
         prf_hz: Pulse repetition frequency in Hz.
-        blocks: Number of blocks along pulses and, for the assessment, along range.
+        blocks: Number of segments along pulses and, for the assessment, of blocks along range.
         rate_hz_s: As for `phase_increment`.
         dwell_s: As for `phase_increment`.
         assess: Whether to add the standard deviation, the quality and the outcome.
 
     Returns:
         `doppler_baseband_hz` in Hz, shape (...,), positive when closing. `info` holds "spectrum",
-        the azimuth power spectrum in FFT order, shape (..., n) for n Doppler bins, and
-        "plain_baseband_hz", its non-circular centre of mass, shape (...,), which is wrong where the
-        spectrum wraps. The assessment, with its outcomes, is that of `phase_increment`.
+        the azimuth power spectrum in FFT order, shape (..., n) for n Doppler bins. The
+        assessment, with its outcomes, is that of `phase_increment`.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -270,88 +184,19 @@ def energy_centre(
         Tsvetkov 2017, energy centre of the azimuth spectrum.
     """
     x = checked_samples(x, "energy_centre", "pulse, range")
-    spectrum = azimuth_spectrum(x, blocks[0])
-    n = spectrum.shape[-1]
+    lines, bounds = unit_level(x), _bounds(x.shape[-2] - 1, blocks[0], "pairs of lines")
+    n = 2 * (max(last - first for first, last in bounds) // 2 + 1)
+    spectra = [power_of(fft_lines(lines[..., first : last + 1, :], n=n)) for first, last in bounds]
+    spectrum = torch.stack([power.to(torch.float64).sum(-1) for power in spectra]).sum(0)
     # first Fourier coefficient
     turn = 2 * math.pi / n * torch.arange(n, dtype=torch.float64, device=x.device)
     phase = torch.atan2((spectrum * torch.sin(turn)).sum(-1), (spectrum * torch.cos(turn)).sum(-1))
-    info = {"spectrum": spectrum, "plain_baseband_hz": plain_energy_centre(spectrum, prf_hz)}
-    found = Estimate({"doppler_baseband_hz": wrap_hz(prf_hz / (2 * math.pi) * phase, prf_hz)}, info=info)
+    value = {"doppler_baseband_hz": wrapped(prf_hz / (2 * math.pi) * phase, prf_hz)}
+    found = Estimate(value, info={"spectrum": spectrum})
     if not assess:
         return found
-    products = lag_products(x, blocks)
-    return doppler_assess.baseband(found, doppler_assess.Increments.of(x, *products, prf_hz, rate_hz_s, dwell_s))
-
-
-def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit a robust polynomial to the phase increment over range blocks.
-
-    The polynomial is a sum of Legendre polynomials of the position of the block, which runs from -1
-    to 1 across the swath. Blocks are weighted with the square of their coherence, and those of much
-    less energy than most, such as the sidelobes of others, count less. Blocks whose residuals are
-    large compared with the median residual are weighted down (Cauchy weights), so that a few very
-    bright targets do not bend the curve.
-
-    Args:
-        products: Block products, shape (..., b), complex.
-        power: Mean power of the same pairs of lines, shape (..., b).
-        order: Order of the polynomial.
-        rounds: Number of reweighted least-squares rounds.
-
-    Returns:
-        The coefficients of the Legendre polynomials in rad, shape (..., order + 1); the residuals
-        in rad, shape (..., b); and the weights, shape (..., b).
-
-    Raises:
-        TypeError: If the samples are not complex64 or complex128.
-        ValueError: If there are no samples or a sample is not finite, or if the order is negative
-            or not below the number of range blocks.
-    """
-    products = checked_samples(products, "fit_over_range", "block")
-    count = products.shape[-1]
-    if not 0 <= order < count:
-        raise ValueError(f"order of the polynomial must be 0 or more and below the {count} range blocks, got {order}")
-    mean = torch.angle(products.sum(-1))
-    angle = torch.angle(products * torch.polar(torch.ones_like(mean), -mean)[..., None])
-    basis = legendre(block_centres(count, products.device), order)
-    energy = products.abs()
-    coherence = energy / torch.where(power > 0, power, 1)
-    usual = energy.quantile(0.75, dim=-1, keepdim=True)
-    floor = energy + _FAINT * usual
-    weight = coherence.square() * energy / torch.where(floor > 0, floor, 1)
-    coefficients, residual = weighted_fit(basis, angle, weight)
-    final = weight
-    for _ in range(rounds):
-        scale = 1.5 * residual.abs().median(-1, keepdim=True).values.clamp_min(1e-6)
-        final = weight / (1 + (residual / (2 * scale)).square())
-        coefficients, residual = weighted_fit(basis, angle, final)
-    constant = torch.zeros_like(coefficients)
-    constant[..., 0] = mean
-    return coefficients + constant, residual, final
-
-
-def weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Fit values by functions in the sense of weighted least squares.
-
-    Args:
-        basis: Functions, shape (b, n).
-        y: Values, shape (..., b).
-        weight: Weights, shape (..., b).
-
-    Returns:
-        The coefficients, shape (..., n), and the residuals, shape (..., b).
-    """
-    weighted = basis * weight[..., None]
-    normal = weighted.mT @ basis
-    ridge = 1e-12 * (normal.diagonal(dim1=-2, dim2=-1).amax(-1) + 1e-30)
-    eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
-    coefficients = linear_solve(normal + ridge[..., None, None] * eye, (weighted * y[..., None]).sum(-2))
-    return coefficients, y - coefficients @ basis.mT
-
-
-def block_centres(count: int, device: torch.device | None = None) -> Tensor:
-    """Return the centres of equal blocks of the interval -1..1, shape (count,), float64."""
-    return (2 * torch.arange(count, dtype=torch.float64, device=device) + 1) / count - 1
+    lines = doppler_assess.Increments.of(x, *lag_products(x, blocks), prf_hz, rate_hz_s, dwell_s)
+    return doppler_assess.baseband(found, lines)
 
 
 def nominal_doppler(radar: StripmapRadar) -> dict[str, float]:
@@ -365,8 +210,8 @@ def nominal_doppler(radar: StripmapRadar) -> dict[str, float]:
         `doppler_baseband_hz`, the same wrapped into the interval -PRF/2 .. PRF/2.
     """
     nominal = radar.pointing_doppler_hz or 0.0
-    wrapped = wrap_hz(torch.tensor(nominal, dtype=torch.float64), radar.prf_hz)
-    return {"doppler_hz": nominal, "doppler_baseband_hz": float(wrapped)}
+    baseband = wrapped(torch.tensor(nominal, dtype=torch.float64), radar.prf_hz)
+    return {"doppler_hz": nominal, "doppler_baseband_hz": float(baseband)}
 
 
 def swept_band(radar: StripmapRadar, n_range: int) -> tuple[float, float | None]:
@@ -385,56 +230,12 @@ def swept_band(radar: StripmapRadar, n_range: int) -> tuple[float, float | None]
     return float(radar.azimuth_rate_hz_s(middle)) * max(cos_square, 1e-6), radar.integration_s
 
 
-class PhaseIncrement(Stage):
-    """Baseband Doppler centroid from the phase increment between lines.
-
-    Provides `doppler_baseband_hz` and leaves the signal unchanged. See `phase_increment`.
-
-    Args:
-        radar: Radar parameters. The value depends on the PRF only.
-        blocks: Number of blocks along pulses and along range.
-        over: How the phase increments of the blocks are combined: "mean" (weighted by energy) or
-            "median" (robust against bright blocks).
-        assess: Whether to add the standard deviation, the quality and the outcome.
-
-    Raises:
-        ValueError: If `over` is neither "mean" nor "median".
-    """
+class _Baseband(Stage):
+    """Base class of the stages that estimate the baseband Doppler centroid of lines."""
 
     provides = ("doppler_baseband_hz",)
-
-    def __init__(
-        self, radar: StripmapRadar, blocks: tuple[int, int] = (8, 8), over: str = "mean", assess: bool = True
-    ) -> None:
-        super().__init__()
-        if over not in OVER:
-            raise ValueError(f"over must be one of {OVER} (how blocks are combined), got {over!r}")
-        self.radar, self.blocks, self.over, self.assess = radar, blocks, over, assess
-        self.neutral = {name: nominal_doppler(radar)["doppler_baseband_hz"] for name in self.provides}
-
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate the baseband Doppler centroid of a signal of axes (pulse, range).
-
-        Returns:
-            `Estimate` by the function `phase_increment` with `doppler_baseband_hz` in Hz, shape
-            (...,).
-        """
-        swept = swept_band(self.radar, signal.data.shape[-1])
-        return phase_increment(signal.data, self.radar.prf_hz, self.blocks, self.over, *swept, assess=self.assess)
-
-
-class EnergyCentre(Stage):
-    """Baseband Doppler centroid as the circular energy centre of the spectrum.
-
-    Provides `doppler_baseband_hz` and leaves the signal unchanged. See `energy_centre`.
-
-    Args:
-        radar: Radar parameters. The value depends on the PRF only.
-        blocks: Number of blocks along pulses and along range.
-        assess: Whether to add the standard deviation, the quality and the outcome.
-    """
-
-    provides = ("doppler_baseband_hz",)
+    # function of lines, PRF, blocks, rate and dwell
+    find: Callable[..., Estimate]
 
     def __init__(self, radar: StripmapRadar, blocks: tuple[int, int] = (8, 8), assess: bool = True) -> None:
         super().__init__()
@@ -445,80 +246,38 @@ class EnergyCentre(Stage):
         """Estimate the baseband Doppler centroid of a signal of axes (pulse, range).
 
         Returns:
-            `Estimate` by the function `energy_centre` with `doppler_baseband_hz` in Hz, shape
-            (...,).
+            `Estimate` with `doppler_baseband_hz` in Hz, shape (...,).
         """
         swept = swept_band(self.radar, signal.data.shape[-1])
-        return energy_centre(signal.data, self.radar.prf_hz, self.blocks, *swept, assess=self.assess)
+        return type(self).find(signal.data, self.radar.prf_hz, self.blocks, *swept, assess=self.assess)
 
 
-class RangeDependentCentroid(Stage):
-    """Doppler centroid of every range cell, by a robust polynomial over range.
+class PhaseIncrement(_Baseband):
+    """Baseband Doppler centroid from the phase increment between lines.
 
-    Provides `doppler_range_hz` of shape (..., range), and `doppler_baseband_hz` of shape (...,) in
-    the middle of the swath; leaves the signal unchanged. If an absolute `doppler_hz` is connected,
-    `doppler_range_hz` is absolute too: it is raised by the multiple of the PRF that brings it
-    nearest to `doppler_hz` in the middle of the swath. Otherwise it is baseband.
+    Provides `doppler_baseband_hz` and leaves the signal unchanged. See `phase_increment`.
 
     Args:
-        radar: Radar parameters. The values depend on the PRF only.
-        order: Order of the polynomial over range, see `fit_over_range`.
+        radar: Radar parameters. The value depends on the PRF only.
         blocks: Number of blocks along pulses and along range.
         assess: Whether to add the standard deviation, the quality and the outcome.
     """
 
-    provides = ("doppler_range_hz", "doppler_baseband_hz")
+    find = staticmethod(phase_increment)
 
-    def __init__(
-        self, radar: StripmapRadar, order: int = 1, blocks: tuple[int, int] = (8, 16), assess: bool = True
-    ) -> None:
-        super().__init__()
-        self.radar, self.order, self.blocks, self.assess = radar, order, blocks, assess
-        self.neutral = {name: nominal_doppler(radar)["doppler_baseband_hz"] for name in self.provides}
 
-    def forward(self, signal: Signal, doppler_hz: Tensor | None = None) -> Estimate:
-        """Estimate the centroid of every range cell of a signal of axes (pulse, range).
+class EnergyCentre(_Baseband):
+    """Baseband Doppler centroid as the circular energy centre of the spectrum.
 
-        Args:
-            signal: Lines, shape (..., pulse, range), complex.
-            doppler_hz: Absolute centroid in Hz, shape (...,), positive when closing. Without it,
-                the result is baseband.
+    Provides `doppler_baseband_hz` and leaves the signal unchanged. See `energy_centre`.
 
-        Returns:
-            `doppler_range_hz` of every range cell, shape (..., range), and `doppler_baseband_hz` in
-            the middle of the swath, shape (...,), in Hz. `info` holds "block_hz" (centroid of each
-            of the b range blocks), shape (..., b), and "coefficients_hz" (of the Legendre
-            polynomials), shape (..., order + 1).
-            The assessment adds a standard deviation of `doppler_baseband_hz`, which includes the
-            shift by apertures that the ends of the record cut. The outcomes are those of
-            `phase_increment`, and TOO_FEW where fewer than order + 2 range blocks hold most of the
-            energy: one target alone shows no slope over range.
+    Args:
+        radar: Radar parameters. The value depends on the PRF only.
+        blocks: Number of blocks along pulses and along range.
+        assess: Whether to add the standard deviation, the quality and the outcome.
+    """
 
-        Raises:
-            ValueError: If there are too few lines or range cells for the blocks, or too few blocks
-                for the order.
-        """
-        prf_hz, scale = self.radar.prf_hz, self.radar.prf_hz / (2 * math.pi)
-        products, power = lag_products(signal.data, self.blocks)
-        fit = fit_over_range(products.sum(-2), power.sum(-2), self.order)
-        coefficients, device = fit[0], signal.data.device
-        at_middle = legendre(torch.zeros(1, dtype=torch.float64, device=device), self.order)[0]
-        middle = scale * (coefficients @ at_middle)
-        curve = scale * coefficients @ legendre(block_centres(signal.data.shape[-1], device), self.order).mT
-        if doppler_hz is not None:
-            curve = curve + (prf_hz * torch.round((doppler_hz - middle) / prf_hz))[..., None]
-        found = Estimate(
-            {"doppler_range_hz": curve, "doppler_baseband_hz": wrap_hz(middle, prf_hz)},
-            quality=torch.ones_like(middle),
-            info={"block_hz": scale * torch.angle(products.sum(-2)), "coefficients_hz": scale * coefficients},
-            neutral={} if doppler_hz is None else {"doppler_range_hz": doppler_hz[..., None]},
-        )
-        if not self.assess:
-            return found
-        swept = swept_band(self.radar, signal.data.shape[-1])
-        lines = doppler_assess.Increments.of(signal.data, products, power, prf_hz, *swept)
-        basis = legendre(block_centres(self.blocks[1], device), self.order)
-        return doppler_assess.over_range(found, lines, basis, at_middle, *fit[1:])
+    find = staticmethod(energy_centre)
 
 
 def point_doppler(
@@ -567,4 +326,4 @@ def point_doppler(
         step = torch.where(bend < 0, -slope / torch.where(bend < 0, bend, -1), 0)
         frequency = frequency + step.clamp(-prf_hz / size, prf_hz / size)
     centre = torch.as_tensor(centre_hz, dtype=torch.float64, device=x.device)
-    return centre + wrap_hz(frequency - centre, prf_hz)
+    return centre + wrapped(frequency - centre, prf_hz)

@@ -15,32 +15,25 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, cis, matrix_inverse, power_of, unit_level, worst
+from torchsar.compensate.pulse_phase.data import or_one
+from torchsar.core import Estimate, Outcome, cis, power_of, unit_level, worst
 from torchsar.metrics.bounds import tone_frequency_bound_hz
 
 # Largest standard deviation of an estimate that is ok, in PRF. Noise alone has a predicted standard
 # deviation about ten times as large, since the sum of its products is no larger than their scatter.
-MOST_STD = 0.015
 # Standard deviation from which on the centroid of incoherent lines is that of noise, in PRF, by
 # choice: a third of that of random frequencies.
-_NOISE_STD = 0.1
+MOST_STD, _NOISE_STD = 0.015, 0.1
 # Least extent of the energy along the record, as a share of its length: targets seen for less are
 # cut by the end of the record, or nearly as short as their own drift of Doppler.
 _LEAST_EXTENT = 0.3
 # Least power of a sum of products over the sum of their powers. It is exponentially distributed
 # with mean 1 in noise; more than 9 then occurs once in 8000 records.
 _LEAST_COHERENCE = 9.0
-_LEAST_BLOCKS = 4  # range blocks from which on their scatter has a trend over range removed
-# Relative scatter of the first moment of a cut target about its mean over targets of even density,
-# for a beam of constant gain: sqrt(1/5).
-_UNEVEN = 0.45
-# What remains of the Doppler of a point without noise, from the interpolation of the response, in
-# cycles per dwell.
-_REST_CYCLES = 2.5e-4
 # Power of the brightest point over that of any other, beyond the peaks of noise. Among equal points
-# or speckle nothing shows which point the beam centre crosses at the given time.
-_LEAST_LEAD = 4.0
-_POINT_CELLS = 4  # resolution cells to each side of a point that belong to its response
+# or speckle nothing shows which point the beam centre crosses at the given time. Resolution cells
+# to each side of a point that belong to its response.
+_LEAST_LEAD, _POINT_CELLS = 4.0, 4
 
 
 class Increments(NamedTuple):
@@ -52,10 +45,16 @@ class Increments(NamedTuple):
         half_band_rad: Half of the band that a target sweeps in the beam, as a phase increment in
             rad, shape (...,).
         ends: What the mean product of a pair of lines at the first and at the last line adds to the
-            sum of the phase increments, see `cut_lines`, shape (..., 2, b), complex128.
+            sum of the phase increments, shape (..., 2, b), complex128, see below.
         coherent: True where the products of adjacent lines, or the changes of these products, add
             up to more than in noise, shape (...,).
         scale: Frequency of a phase increment of 1 rad, in Hz.
+
+    A target whose aperture is cut by an end of the record shows only a part of its band. For
+    targets of even density on both sides of the end, which cross a beam of constant gain in N lines
+    with phase increments up to b rad from the centroid, the imaginary part of the products of
+    adjacent lines, turned by the centroid and summed over the record, is (1 - b cot b) N / (2 b)
+    times the real part of one pair of lines at the last line, and minus this at the first line.
     """
 
     products: Tensor
@@ -82,48 +81,26 @@ class Increments(NamedTuple):
                 the band is measured from the products of lines two apart: cos b over their ratio.
         """
         x = unit_level(x)
-        x = x / _positive(x.abs().amax((-2, -1), keepdim=True))  # as in the products
+        x = x / or_one(x.abs().amax((-2, -1), keepdim=True))  # as in the products
         step = torch.linalg.vecdot(x[..., :-1, :], x[..., 1:, :]).to(torch.complex128)
         coherent = _adds_up(step) | _adds_up(step[..., :-1].conj() * step[..., 1:])
         pairs = x.shape[-2] - 1
         if rate_hz_s is None or dwell_s is None:
             total = step.sum(-1)
             two_apart = torch.linalg.vecdot(x[..., :-2, :].flatten(-2), x[..., 2:, :].flatten(-2))
-            ratio = (two_apart.to(total.dtype) * total.conj().square()).real / _positive(total.abs() ** 3)
+            ratio = (two_apart.to(total.dtype) * total.conj().square()).real / or_one(total.abs() ** 3)
             half_band = torch.acos(ratio.clamp(-1, 1))
         else:
             half_band = torch.full_like(step[..., 0].real, math.pi * rate_hz_s * dwell_s / prf_hz)
         half_band = half_band.clamp(1e-3, 0.95 * math.pi)
         dwell = pairs / 2 if rate_hz_s is None else half_band * prf_hz**2 / (math.pi * rate_hz_s)
         last = max(1, pairs // (2 * products.shape[-2]))  # half of a block
-        parts = [x[..., : last + 1, :], x[..., -last - 1 :, :]]
-        mean = [(part[..., :-1, :].conj() * part[..., 1:, :]).sum(-2) / last for part in parts]
+        parts = (-1, x[..., : last + 1, :]), (1, x[..., -last - 1 :, :])
+        mean = [sign * (part[..., :-1, :].conj() * part[..., 1:, :]).sum(-2) / last for sign, part in parts]
         ends = torch.stack(mean, -2).to(torch.complex128).tensor_split(products.shape[-1], -1)
-        ends = torch.stack([some.sum(-1) for some in ends], -1) * cut_lines(half_band, dwell)[..., None, None]
+        lines = (1 - half_band / torch.tan(half_band)) * dwell / (2 * half_band)  # about half_band * dwell / 6
+        ends = torch.stack([some.sum(-1) for some in ends], -1) * lines[..., None, None]
         return Increments(products, power, half_band, ends, coherent, prf_hz / (2 * math.pi))
-
-    def cut(self, turn: Tensor) -> Tensor:
-        """What cut apertures add to the sum of the phase increments, (..., 2, b); turn: phasor of
-        the negative phase increment, shape (...,).
-        """
-        first, last = (self.ends * turn[..., None, None]).real.unbind(-2)
-        return torch.stack([-first, last], -2)
-
-    def outcome(self, turn: Tensor, scatter: Tensor, shift: Tensor) -> Tensor:
-        """Outcome (...,) for a standard deviation and a shift by cut apertures in rad."""
-        along = (self.products.sum(-1) * turn[..., None]).real.clamp_min(0)
-        extent = along.sum(-1).square() / _positive(along.square().sum(-1)) / along.shape[-1]
-        short = (extent < _LEAST_EXTENT) & (along.shape[-1] >= 4)
-        return worst(
-            (Outcome.INEXACT, scatter >= 2 * math.pi * MOST_STD),
-            (Outcome.MISFIT, short | (shift.abs() >= self.half_band_rad / 4)),
-            (Outcome.NOISE, ~self.coherent),
-            (Outcome.EMPTY, self.power.sum((-2, -1)) == 0),
-        )
-
-    def coherence(self) -> Tensor:
-        """Coherence of adjacent lines over all blocks, 0..1, shape (...,)."""
-        return (self.products.sum((-2, -1)).abs() / _positive(self.power.sum((-2, -1)))).clamp(0, 1)
 
 
 def _adds_up(products: Tensor) -> Tensor:
@@ -131,109 +108,51 @@ def _adds_up(products: Tensor) -> Tensor:
     return products.sum(-1).abs().square() > _LEAST_COHERENCE * products.abs().square().sum(-1)
 
 
-def _positive(x: Tensor) -> Tensor:
-    """The values, and 1 where they are not positive."""
-    return torch.where(x > 0, x, 1)
-
-
-def cut_lines(half_band_rad: Tensor, dwell_lines: Tensor | float) -> Tensor:
-    """Compute how strongly apertures cut by an end of a record shift the sum of phase increments.
-
-    A target whose aperture is cut shows only a part of its band. For targets of even density on
-    both sides of an end of the record, which cross a beam of constant gain in N lines with phase
-    increments up to b rad from the centroid, the imaginary part of the products of adjacent lines,
-    turned by the centroid and summed over the record, is (1 - b cot b) N / (2 b) times the real
-    part of one pair of lines at the last line, and minus this at the first line.
-
-    Args:
-        half_band_rad: b in rad, shape (...,).
-        dwell_lines: N in lines, shape (...,) or a number.
-
-    Returns:
-        The factor in lines, shape (...,); b N / 6 for a small band.
-    """
-    return (1 - half_band_rad / torch.tan(half_band_rad)) * dwell_lines / (2 * half_band_rad)
-
-
-def deviation(terms: Tensor, cuts: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
-    """Predict the scatter of a phase increment over range blocks, and its shift by cut apertures.
-
-    Args:
-        terms: What each block adds to the error of the increment, without the cut apertures, in
-            rad, shape (..., b).
-        cuts: What the apertures cut at the first and last line of each block add, (..., 2, b).
-        share: Share of each block in the increment, shape (..., b). Where few blocks hold most of
-            the energy, few targets are cut, and these differ from an even density.
-
-    Returns:
-        The standard deviation by the scatter and the shift in rad, shape (...,) each.
-    """
-    uneven = (_UNEVEN * share.square().sum(-1, keepdim=True)).square() * cuts.sum(-2).square()
-    return (terms.square().sum(-1) + uneven.sum(-1)).sqrt().clamp_max(math.pi), cuts.sum((-2, -1)).clamp(-1, 1)
-
-
 def baseband(found: Estimate, lines: Increments) -> Estimate:
-    """Assess a centroid that follows from the sum of the products of all blocks."""
+    """Assess a centroid that follows from the sum of the products of all blocks.
+
+    Args:
+        found: The estimate of `doppler_baseband_hz`.
+        lines: Products of adjacent lines.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
+    """
     phase = found["doppler_baseband_hz"] / lines.scale
     total = (lines.products.sum((-2, -1)) * cis(-phase)).real
     some = total > 0
     total = torch.where(some, total, 1)[..., None]
-    shift = (lines.cut(cis(-phase)).sum((-2, -1)) / total[..., 0]).clamp(-1, 1)
+    shift = ((lines.ends * cis(-phase)[..., None, None]).real.sum((-2, -1)) / total[..., 0]).clamp(-1, 1)
     turn = cis(shift - phase)
-    cuts = lines.cut(turn) / total[..., None]
+    cuts = (lines.ends * turn[..., None, None]).real / total[..., None]
     blocks = lines.products.sum(-2) * turn[..., None] / total
     terms = blocks.imag - cuts.sum(-2)
-    if terms.shape[-1] >= _LEAST_BLOCKS:
+    if terms.shape[-1] >= 4:
         # range walk, and the change of Doppler along a pulse, add to a block and take from the next
         power = blocks.real.clamp_min(0)
         along = torch.nn.functional.pad((power[..., 1:] * power[..., :-1]).sqrt(), (1, 1)).diff(dim=-1)
-        slope = (terms * along).sum(-1, keepdim=True) / _positive(along.square().sum(-1, keepdim=True))
+        slope = (terms * along).sum(-1, keepdim=True) / or_one(along.square().sum(-1, keepdim=True))
         terms = (terms - slope * along) * math.sqrt(terms.shape[-1] / (terms.shape[-1] - 2))
-    scatter, shift = deviation(terms, cuts, blocks.real.clamp(0, 1))
-    scatter = torch.where(some, scatter, math.pi)
+    # Where few blocks hold most of the energy, few targets are cut, which are not of even density:
+    # for a beam of constant gain, the first moment of a cut target scatters by sqrt(1/5).
+    share = blocks.real.clamp(0, 1).square().sum(-1)
+    scatter = (terms.square() + (0.45 * share[..., None] * cuts.sum(-2)).square()).sum(-1).sqrt().clamp_max(math.pi)
+    scatter, shift = torch.where(some, scatter, math.pi), cuts.sum((-2, -1)).clamp(-1, 1)
+    power = lines.power.sum((-2, -1))
+    along = (lines.products.sum(-1) * cis(-phase)[..., None]).real.clamp_min(0)
+    extent = along.sum(-1).square() / or_one(along.square().sum(-1)) / along.shape[-1]
+    short = (extent < _LEAST_EXTENT) & (along.shape[-1] >= 4)
     return replace(
         found,
         std={"doppler_baseband_hz": lines.scale * torch.hypot(scatter, shift)},
-        quality=lines.coherence(),
-        outcome=lines.outcome(cis(-phase), scatter, shift),
+        quality=(lines.products.sum((-2, -1)).abs() / or_one(power)).clamp(0, 1),
+        outcome=worst(
+            (Outcome.INEXACT, scatter >= 2 * math.pi * MOST_STD),
+            (Outcome.MISFIT, short | (shift.abs() >= lines.half_band_rad / 4)),
+            (Outcome.NOISE, ~lines.coherent),
+            (Outcome.EMPTY, power == 0),
+        ),
         info={**found.info, "cut_hz": lines.scale * shift},
-    )
-
-
-def over_range(
-    found: Estimate, lines: Increments, basis: Tensor, at: Tensor, residual: Tensor, weight: Tensor
-) -> Estimate:
-    """Assess a centroid over range in the middle of the swath; see `RangeDependentCentroid`.
-
-    Args:
-        found: The estimate.
-        lines: Products of adjacent lines.
-        basis: Polynomials at the range blocks, shape (b, n).
-        at: The same in the middle of the swath, shape (n,).
-        residual: Residuals of the fit in rad, shape (..., b).
-        weight: Its weights, shape (..., b).
-    """
-    turn = cis(-found["doppler_baseband_hz"] / lines.scale)
-    normal = (basis * weight[..., None]).mT @ basis
-    size = normal.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None] + 1e-30
-    eye = torch.eye(len(at), dtype=basis.dtype, device=basis.device)
-    # derivatives of the coefficients by the values of the blocks
-    influence = basis @ matrix_inverse(normal / size + 1e-12 * eye) * weight[..., None] / size
-    energy = lines.products.sum(-2)
-    total = (energy * turn[..., None]).real[..., None, :]
-    cuts = torch.where(total > 0, lines.cut(turn) / _positive(total), 0).clamp(-1, 1)
-    rest = residual - cuts.sum(-2)
-    rest = rest - (influence * rest[..., None]).sum(-2) @ basis.mT
-    middle, leverage = influence @ at, (influence * basis).sum(-1)
-    rest = rest / (1 - leverage).clamp_min(0.1).sqrt()
-    scatter, shift = deviation(middle * rest, middle[..., None, :] * cuts, leverage)
-    count = energy.abs().sum(-1).square() / _positive(energy.abs().square().sum(-1))
-    few = Outcome.TOO_FEW.like(count) * (count < len(at) + 1)
-    return replace(
-        found,
-        std={"doppler_baseband_hz": lines.scale * torch.hypot(scatter, shift)},
-        quality=(energy.abs().sum(-1) / _positive(lines.power.sum((-2, -1)))).clamp(0, 1),
-        outcome=torch.maximum(lines.outcome(turn, scatter, shift), few),
     )
 
 
@@ -250,6 +169,9 @@ def absolute(
             record, shape (...,); infinite where there are none.
         log_likelihood: Of the candidates for the ambiguity, shape (..., candidate).
         sure: Probability above which the ambiguity is known.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
     plain = baseband(replace(found, value={"doppler_baseband_hz": base_hz}), lines)
     turned = cis((found["doppler_hz"] - base_hz) / lines.scale)
@@ -295,6 +217,9 @@ def of_point(
         history: Azimuth history of the point, and the phasor of its Doppler, see `point_history`.
         visible_s: Time for which the point is observed, in seconds.
         sees: True where the record holds the time at which the beam centre crosses the point.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
     power = power_of(image)
     ordered = power.flatten(-2)
@@ -315,8 +240,9 @@ def of_point(
     # has that of its own band. Noise alone gives it a power of 1.
     tone, phasor = history
     total = (tone * phasor.conj()).sum(-1).abs().square()
-    q = (total / ((tone != 0).sum(-1).clamp_min(1) * _positive(floor)) - 1).clamp_min(0)
-    std = torch.hypot(tone_frequency_bound_hz(q.clamp_min(1e-12), visible_s), q.new_tensor(_REST_CYCLES / visible_s))
+    q = (total / ((tone != 0).sum(-1).clamp_min(1) * or_one(floor)) - 1).clamp_min(0)
+    # without noise, the interpolation of the response leaves 2.5e-4 cycles per dwell
+    std = torch.hypot(tone_frequency_bound_hz(q.clamp_min(1e-12), visible_s), q.new_tensor(2.5e-4 / visible_s))
     outcome = worst(
         (Outcome.AMBIGUOUS, peak <= _LEAST_LEAD * (rival - highest * floor)),
         (Outcome.MISFIT, ~sees),

@@ -15,9 +15,8 @@ a shift is then the correlation of |s|^2 with -1 / T. On a simulated aircraft (a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -78,6 +77,7 @@ def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
     return torch.fft.ifft(torch.fft.fft(data) * phasor)
 
 
+@torch.no_grad()
 def align_envelopes(
     data: Tensor,
     *,
@@ -147,35 +147,20 @@ def align_envelopes(
             f"got degree {degree!r}, tones {tones!r}, passes {passes!r} and blocks {blocks!r}"
         )
 
-    def polynomial(pulses: Envelopes) -> Course:
-        smooth, std = smooth_shifts(pulses, degree, passes, blocks)
-        return with_tones(pulses, smooth, tones, degree), std
-
-    def single(pulses: Envelopes) -> Course:
-        return refined_shifts(pulses, single_shifts(pulses, running_shifts(pulses, 0.1), "likelihood", 4)), None
-
-    def amplitude(pulses: Envelopes) -> Course:
-        return single_shifts(pulses, running_shifts(pulses, 0.1), "amplitude", 4), None
-
-    def running(pulses: Envelopes) -> Course:
-        return running_shifts(pulses, 0.1), None
-
-    methods: dict[str, Callable[[Envelopes], Course]] = {
-        "polynomial": polynomial,
-        "single": single,
-        "amplitude": amplitude,
-        "running": running,
-    }
-    if method not in methods:
-        raise ValueError(f"align_envelopes: method must be one of {list(methods)}, got {method!r}")
+    if method not in get_args(Method):
+        raise ValueError(f"align_envelopes: method must be one of {list(get_args(Method))}, got {method!r}")
     if tones and method != "polynomial":
         raise ValueError(f"align_envelopes: tones belong to the method 'polynomial', got method {method!r}")
-    return _aligned(data, methods[method], assess)
 
+    def find(pulses: Envelopes) -> Course:
+        if method == "polynomial":
+            smooth, std = smooth_shifts(pulses, degree, passes, blocks)
+            return with_tones(pulses, smooth, tones, degree), std
+        shift = running_shifts(pulses, 0.1)
+        if method != "running":
+            shift = single_shifts(pulses, shift, "amplitude" if method == "amplitude" else "likelihood", 4)
+        return refined_shifts(pulses, shift) if method == "single" else shift, None
 
-@torch.no_grad()
-def _aligned(data: Tensor, find: Callable[[Envelopes], Course], assess: bool) -> Estimate:
-    """Estimate of shifts by `find`, in blocks of trials that fit into memory."""
     flat, present = checked(data, "align_envelopes")
     flat, shape = flat.detach(), data.shape[:-2]
     size = flat.shape[1] * flat.shape[2] * flat.element_size()
@@ -190,28 +175,6 @@ def _aligned(data: Tensor, find: Callable[[Envelopes], Course], assess: bool) ->
     judged = [envelope_assess.deviation(part, *course, find) for part, course in zip(parts, courses, strict=True)]
     std, agree = (torch.cat(each).reshape(shape) for each in zip(*judged, strict=True))
     return envelope_assess.assessed(found, std, agree, data.shape[-1])
-
-
-def drift_cells(shift_cells: Tensor) -> Tensor:
-    """Compute the mean drift of shifts: the slope of the straight line fitted by least squares.
-
-    Args:
-        shift_cells: Shifts in cells, shape (..., pulse).
-
-    Returns:
-        The drift in cells per pulse, shape (...,); 0 for a single pulse.
-
-    Raises:
-        ValueError: If the shifts are not real floating-point numbers, or there are none.
-    """
-    if not shift_cells.is_floating_point() or not shift_cells.ndim or not shift_cells.shape[-1]:
-        raise ValueError(
-            f"drift_cells needs shifts (..., pulse) in real numbers, got {shift_cells.dtype} of shape "
-            f"{tuple(shift_cells.shape)}"
-        )
-    n = shift_cells.shape[-1]
-    k = torch.arange(n, dtype=shift_cells.dtype, device=shift_cells.device) - (n - 1) / 2
-    return (shift_cells * k).sum(-1) / k.square().sum().clamp_min(1)
 
 
 class AlignEnvelopes(Stage):
@@ -246,8 +209,8 @@ class AlignEnvelopes(Stage):
         assess: bool = True,
     ) -> None:
         super().__init__()
-        self.method: Method = method
-        self.degree, self.tones, self.passes, self.blocks, self.assess = degree, tones, passes, blocks, assess
+        self.options: dict[str, Any] = {"method": method, "degree": degree, "tones": tones, "passes": passes}
+        self.options |= {"blocks": blocks, "assess": assess}
 
     def forward(self, signal: Signal, velocity_m_s: Tensor | None = None) -> Estimate:
         """Estimate the shifts of a signal of axes (pulse, range).
@@ -262,21 +225,13 @@ class AlignEnvelopes(Stage):
             value to give to `torchsar.focus.CompressDechirped`. `quality`, outcome and `info` are
             those of `align_envelopes`.
         """
-        found = align_envelopes(
-            signal.data,
-            method=self.method,
-            degree=self.degree,
-            tones=self.tones,
-            passes=self.passes,
-            blocks=self.blocks,
-            assess=self.assess,
-        )
-        cell_m, per_s = signal.axis("range").step, 1 / signal.axis("pulse").step
-        velocity = drift_cells(found["shift_cells"]) * (cell_m * per_s)
-        value = {
-            "shift_m": found["shift_cells"] * cell_m,
-            "velocity_m_s": velocity if velocity_m_s is None else velocity + velocity_m_s,
-        }
+        found = align_envelopes(signal.data, **self.options)
+        cells, cell_m = found["shift_cells"], signal.axis("range").step
+        # slope of the line fitted by least squares; 0 for a single pulse
+        k = torch.arange(cells.shape[-1], dtype=cells.dtype, device=cells.device) - (cells.shape[-1] - 1) / 2
+        drift = (cells * k).sum(-1) / k.square().sum().clamp_min(1)
+        velocity = drift * (cell_m / signal.axis("pulse").step) + (0 if velocity_m_s is None else velocity_m_s)
+        value = {"shift_m": cells * cell_m, "velocity_m_s": velocity}
         std = {"shift_m": found.std["shift_cells"] * cell_m} if found.std else {}
         return replace(found, value=value, std=std)
 

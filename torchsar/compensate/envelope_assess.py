@@ -15,8 +15,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.envelope_fit import Course, Envelopes, refined_shifts, robust_std, single_shifts, wrapped
-from torchsar.core import Estimate, Outcome, worst
+from torchsar.compensate.envelope_fit import Course, Envelopes, refined_shifts, robust_std, single_shifts
+from torchsar.core import Estimate, Outcome, worst, wrapped
 
 # standard deviation of a shift in cells from which on an alignment is not ok: a convention
 GOOD_CELLS = 0.5
@@ -24,14 +24,9 @@ GOOD_CELLS = 0.5
 # choice: polynomials in noise have 0.6 of it, single pulses by half of the band 0.28
 _RANDOM = 0.15
 _LEAST_RANGE_CELLS = 4
-# difference of the halves over the error of the whole band: 4 by the number and the width of the
-# cells, 4.5 to 6.5 in speckle and among points
-_APART = 5.0
 # usual differences of the halves by which those of a pulse are far, and largest share of such
 # pulses
 _FAR, _MOST_FAR = 4.0, 0.05
-# error of single pulses without noise, by the parabola through samples a quarter of a cell apart
-_INTERPOLATION_CELLS = 1e-3
 
 
 def deviation(
@@ -59,7 +54,9 @@ def deviation(
     lower, upper = (find(Envelopes.of(end))[0] * (n / half) for end in ends)
     phasor = torch.where(present, torch.polar(torch.ones_like(lower), 2 * math.pi / n * (lower - upper)), 0)
     apart = wrapped(lower - upper - torch.angle(phasor.sum(-1, keepdim=True)) * (n / (2 * math.pi)), n)
-    apart = torch.where(present, apart, 0) / _APART
+    # over the error of the whole band it is 4 by the number and the width of the cells, 4.5 to 6.5
+    # in speckle and among points
+    apart = torch.where(present, apart, 0) / 5.0
     count = (present.sum(-1) - 1).clamp_min(1)
     if std is not None:
         agree = (apart.square().sum(-1) / count).sqrt() < GOOD_CELLS
@@ -70,7 +67,8 @@ def deviation(
     envelopes = Envelopes.of(lines)
     likeliest = refined_shifts(envelopes, single_shifts(envelopes, shift, "likelihood", 3))
     terms = torch.minimum(apart.abs(), usual).square() + torch.where(present, wrapped(likeliest - shift, n), 0).square()
-    return (terms.sum(-1) / count + _INTERPOLATION_CELLS**2).sqrt(), agree
+    # without noise, the parabola through samples a quarter of a cell apart errs by 1e-3 cells
+    return (terms.sum(-1) / count + 1e-6).sqrt(), agree
 
 
 def assessed(found: Estimate, std: Tensor, agree: Tensor, cells: int) -> Estimate:
@@ -81,6 +79,9 @@ def assessed(found: Estimate, std: Tensor, agree: Tensor, cells: int) -> Estimat
         std: Standard deviation in cells, shape (...,).
         agree: Whether halves of the band confirm the shifts, bool, shape (...,).
         cells: Number of range cells.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
     count, random = found.info["present"].sum(-1), cells / math.sqrt(12)
     std = torch.where(count < 2, random, std)

@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from torchsar.core import legendre, linear_phasor, linear_solve, unit_level
-
-Match = Literal["likelihood", "amplitude"]
+from torchsar.core import legendre, linear_phasor, linear_solve, unit_level, wrapped
 
 _HALF = 2  # samples per cell: |s|^2 has twice the band of s
 _QUARTER = 4  # samples per cell in correlations, whose other factor is not band-limited
@@ -24,13 +21,7 @@ _FLOOR = 1e-2
 # Sidelobes of all cells, beyond this distance in cells and times this factor, are the least power
 # too: they repeat the speckle of the cells that they come from. Found by trial, on 1 to 200 points.
 _SIDELOBE_CELLS, _SIDELOBES = 1.5, 1.5
-# cycles in the window of the finest features used for the mean drift, found by trial: finer
-# features agree only close to the right drift, coarser ones measure it less well
-_COARSE = 16
-_TUKEY = 4.685  # the usual constant of the biweight: 95 % efficiency for normal errors
-_LEAST_CELLS = 1e-3  # keeps the scale of the biweight positive; far below any jitter
 _LEAST_TONE_CELLS = 0.05  # amplitude of a tone whose removal costs as much as it gains
-_TUNINGS = 5  # Gauss-Newton steps for a tone, found by trial: enough to converge
 # power of a tone in the mean powers of a periodogram, beyond the log of its number of cells: one
 # false tone in 400 trials (exp(-6) = 1 / 403)
 _STANDS_OUT = 6.0
@@ -69,10 +60,13 @@ class Envelopes:
             The envelopes.
         """
         n = lines.shape[-1]
-        present = (lines != 0).any(-1)
-        power = _interpolated(unit_level(lines, 1), _HALF).abs().square()
+        # band-limited interpolation; all n frequencies are kept, from -(n // 2) on
+        spectrum = torch.fft.fftshift(torch.fft.fft(unit_level(lines, 1)), dim=-1)
+        before = _HALF * n // 2 - n // 2
+        padded = torch.nn.functional.pad(spectrum, (before, (_HALF - 1) * n - before))
+        power = (torch.fft.ifft(torch.fft.ifftshift(padded, dim=-1)) * _HALF).abs().square()
         mean = power.mean(-1, keepdim=True)
-        return Envelopes(torch.fft.rfft(power / torch.where(mean > 0, mean, 1)), present, n)
+        return Envelopes(torch.fft.rfft(power / torch.where(mean > 0, mean, 1)), (lines != 0).any(-1), n)
 
     def moved(self, shift: Tensor) -> Tensor:
         """Remove range shifts from the envelopes.
@@ -113,35 +107,24 @@ class Envelopes:
 
         Args:
             mean: One-sided spectrum of T, shape (..., frequency).
-            sidelobes: Whether cells count that hold no more than sidelobes, see `floored`.
+            sidelobes: Whether cells count that hold no more than sidelobes of all other cells,
+                which repeat the speckle of those cells and are no evidence of their own.
 
         Returns:
             The one-sided spectrum of -1 / T, shape (..., frequency).
         """
         power = self.on_grid(mean, _QUARTER)
-        weight = -1 / (power.clamp_min(_FLOOR) if sidelobes else self.floored(power))
+        if not sidelobes:
+            samples = power.shape[-1]
+            at = torch.arange(samples, dtype=power.dtype, device=power.device) * (self.n / samples)
+            # upper limit of the power of a sinc pulse in a circular window
+            limit = (samples / self.n) * (self.n * torch.sin(math.pi * at / self.n)).square()
+            far = torch.minimum(at, self.n - at) >= _SIDELOBE_CELLS
+            kernel = torch.where(far, _SIDELOBES / torch.where(far, limit, 1), 0)
+            level = torch.fft.irfft(torch.fft.rfft(power) * torch.fft.rfft(kernel), samples)
+            power = torch.maximum(power, level)
+        weight = -1 / power.clamp_min(_FLOOR)
         return torch.fft.rfft(weight)[..., : self.spectra.shape[-1]] * (_HALF / _QUARTER)
-
-    def floored(self, power: Tensor) -> Tensor:
-        """Raise mean powers to the least power of a cell in the likelihood.
-
-        It is 1 % of the mean power, and the level of the sidelobes of all other cells, which repeat
-        the speckle of those cells and are no evidence of their own.
-
-        Args:
-            power: Samples of a mean envelope, shape (..., sample).
-
-        Returns:
-            The powers, same shape.
-        """
-        samples = power.shape[-1]
-        at = torch.arange(samples, dtype=power.dtype, device=power.device) * (self.n / samples)
-        # upper limit of the power of a sinc pulse in a circular window
-        limit = (samples / self.n) * (self.n * torch.sin(math.pi * at / self.n)).square()
-        far = torch.minimum(at, self.n - at) >= _SIDELOBE_CELLS
-        kernel = torch.where(far, _SIDELOBES / torch.where(far, limit, 1), 0)
-        level = torch.fft.irfft(torch.fft.rfft(power) * torch.fft.rfft(kernel), samples)
-        return torch.maximum(power, level).clamp_min(_FLOOR)
 
     def peak(self, spectra: Tensor, within: float = math.inf) -> Tensor:
         """Find the position of the maximum of a correlation, by a parabola through three samples.
@@ -171,15 +154,6 @@ class Envelopes:
 Course = tuple[Tensor, Tensor | None]
 
 
-def _interpolated(lines: Tensor, per_cell: int) -> Tensor:
-    """Band-limited interpolation; all n frequencies are kept, from -(n // 2) on."""
-    n = lines.shape[-1]
-    spectrum = torch.fft.fftshift(torch.fft.fft(lines), dim=-1)
-    before = per_cell * n // 2 - n // 2
-    padded = torch.nn.functional.pad(spectrum, (before, (per_cell - 1) * n - before))
-    return torch.fft.ifft(torch.fft.ifftshift(padded, dim=-1)) * per_cell
-
-
 def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
     """Find the shift of each pulse against an exponentially running mean of the pulses before it.
 
@@ -193,11 +167,8 @@ def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
         The shifts in cells, shape (trial, pulse), float64, of mean zero.
     """
     amplitude = pulses.amplitudes()
-    mean, shift, shifts = (
-        torch.zeros_like(amplitude.spectra[:, 0]),
-        amplitude.spectra.new_zeros((), dtype=torch.float64).expand(len(pulses.present)),
-        [],
-    )
+    mean, shifts = torch.zeros_like(amplitude.spectra[:, 0]), []
+    shift = torch.zeros(len(mean), dtype=torch.float64, device=mean.device)
     for k in range(pulses.present.shape[-1]):
         there, pulse = pulses.present[:, k], amplitude.spectra[:, k]
         found = amplitude.peak(pulse * mean.conj())
@@ -209,7 +180,7 @@ def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
     return centred(torch.stack(shifts, -1), pulses.present)
 
 
-def single_shifts(pulses: Envelopes, start: Tensor, match: Match, iterations: int) -> Tensor:
+def single_shifts(pulses: Envelopes, start: Tensor, match: str, iterations: int) -> Tensor:
     """Find the shift of each pulse separately against the mean envelope of all aligned pulses.
 
     The shifts lie within half a window of those in `start`.
@@ -274,7 +245,10 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
     """
     k = pulses.present.shape[-1]
     basis = legendre(unit_time(k, pulses.present.device), degree)
-    runs = runs_of(k, max(blocks, degree + 1), pulses.present)
+    # 1 where a present pulse belongs to a block of equal length, (trial, block, pulse)
+    length = -(-k // max(blocks, degree + 1))
+    run, block = (torch.arange(n, device=basis.device) for n in (k, -(-k // length)))
+    runs = ((run // length == block[:, None]) & pulses.present[:, None]).to(torch.float64)
     shift = mean_drift(pulses)[:, None] * (torch.arange(k, dtype=torch.float64, device=basis.device) - (k - 1) / 2)
     count, step, found = runs.sum(-1), torch.zeros_like(runs[:, :1, 0]), torch.zeros_like(runs[..., 0])
     middle = (runs @ basis) / count.clamp_min(1)[..., None]
@@ -303,7 +277,9 @@ def mean_drift(pulses: Envelopes) -> Tensor:
     Returns:
         The drift in cells per pulse, modulo the window, shape (trial,), float64.
     """
-    k, last = pulses.present.shape[-1], min(_COARSE, pulses.n - 1)
+    # found by trial: finer features agree only close to the right drift, coarser ones measure it
+    # less well
+    k, last = pulses.present.shape[-1], min(16, pulses.n - 1)
     if last < 1:
         return torch.zeros(len(pulses.present), dtype=torch.float64, device=pulses.present.device)
     length = 2 * last * k
@@ -336,8 +312,9 @@ def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 
         if iteration < iterations // 2:
             now = weight / residual.clamp_min(0.1)
         else:
-            scale = robust_std(residual, weight > 0) + _LEAST_CELLS
-            now = weight * (1 - (residual / (_TUKEY * scale)).square()).clamp_min(0).square()
+            # far below any jitter; the usual constant gives 95 % efficiency for normal errors
+            scale = 4.685 * (robust_std(residual, weight > 0) + 1e-3)
+            now = weight * (1 - (residual / scale).square()).clamp_min(0).square()
     return coefficients
 
 
@@ -371,30 +348,6 @@ def weighted_fit(values: Tensor, basis: Tensor, weight: Tensor) -> Tensor:
     return linear_solve(normal + 1e-9 * eye, (basis.mT * share[:, None]) @ values[..., None]).squeeze(-1)
 
 
-@dataclass(frozen=True)
-class _Tone:
-    """One sinusoid per trial.
-
-    frequency: (trial,) in cycles per pulse. parts: cosine and sine amplitudes (trial, 2) in cells.
-    """
-
-    frequency: Tensor
-    parts: Tensor
-
-    def waves(self, time: Tensor) -> Tensor:
-        """Cosine and sine, (trial, pulse, 2)."""
-        angle = 2 * math.pi * self.frequency[:, None] * time
-        return torch.stack([torch.cos(angle), torch.sin(angle)], -1)
-
-    def columns(self, time: Tensor) -> Tensor:
-        """Derivatives with respect to both parts and the frequency, (trial, pulse, 3)."""
-        waves = self.waves(time)
-        turned = (self.parts[:, None, 1] * waves[..., 0] - self.parts[:, None, 0] * waves[..., 1]) * (
-            2 * math.pi * (time - time.mean())
-        )
-        return torch.cat([waves, turned[..., None]], -1)
-
-
 def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Tensor:
     """Add sinusoids (vibration) to a history of range shifts, one by one.
 
@@ -410,32 +363,36 @@ def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Te
     Returns:
         The shift history in cells, shape (trial, pulse).
     """
-    course = smooth
+    course, k, weight = smooth, smooth.shape[-1], pulses.present.to(torch.float64)
+    time = torch.arange(k, dtype=torch.float64, device=course.device)
+    terms = legendre(unit_time(k, course.device), degree).expand(len(course), -1, -1)
+
+    def rest(course: Tensor) -> Tensor:
+        return single_shifts(pulses, course, "likelihood", 1) - course
+
     for _ in range(tones):
-        course = _with_tone(pulses, course, degree)
+        # fitted together with the polynomial
+        frequency, stands_out = strongest_tone(rest(course), pulses.present)
+        parts, base, now = torch.zeros_like(terms[:, 0, :1]).expand(-1, 2), course, course
+        for _ in range(5):  # found by trial: enough Gauss-Newton steps to converge
+            wave = _waves(frequency, time)
+            turned = (parts[:, None, 1] * wave[..., 0] - parts[:, None, 0] * wave[..., 1]) * (
+                2 * math.pi * (time - time.mean())
+            )
+            step = robust_fit(rest(now), torch.cat([terms, wave, turned[..., None]], -1), weight)
+            frequency, parts = frequency + step[:, -1].clamp(-0.5 / k, 0.5 / k), parts + step[:, -3:-1]
+            base = base + (terms @ step[:, :-3, None]).squeeze(-1)
+            now = base + (_waves(frequency, time) @ parts[..., None]).squeeze(-1)
+        gain = log_likelihood(pulses, now) - log_likelihood(pulses, course)
+        kept = stands_out & (parts.square().sum(-1).sqrt() > _LEAST_TONE_CELLS) & (gain > math.log(k) + _STANDS_OUT)
+        course = centred(torch.where(kept[:, None], now, course), torch.ones_like(pulses.present))
     return course
 
 
-def _with_tone(pulses: Envelopes, course: Tensor, degree: int) -> Tensor:
-    """Shift history with one more sinusoid, fitted together with the polynomial."""
-    k = course.shape[-1]
-    time, weight = torch.arange(k, dtype=torch.float64, device=course.device), pulses.present.to(torch.float64)
-    terms = legendre(unit_time(k, course.device), degree).expand(len(course), -1, -1)
-    frequency, stands_out = strongest_tone(_residual_shifts(pulses, course), pulses.present)
-    tone, base, now = _Tone(frequency, torch.zeros_like(terms[:, 0, :1]).expand(-1, 2)), course, course
-    for _ in range(_TUNINGS):
-        step = robust_fit(_residual_shifts(pulses, now), torch.cat([terms, tone.columns(time)], -1), weight)
-        tone = _Tone(tone.frequency + step[:, -1].clamp(-0.5 / k, 0.5 / k), tone.parts + step[:, -3:-1])
-        base = base + (terms @ step[:, :-3, None]).squeeze(-1)
-        now = base + (tone.waves(time) @ tone.parts[..., None]).squeeze(-1)
-    gain = log_likelihood(pulses, now) - log_likelihood(pulses, course)
-    kept = stands_out & (tone.parts.square().sum(-1).sqrt() > _LEAST_TONE_CELLS) & (gain > math.log(k) + _STANDS_OUT)
-    return centred(torch.where(kept[:, None], now, course), torch.ones_like(pulses.present))
-
-
-def _residual_shifts(pulses: Envelopes, course: Tensor) -> Tensor:
-    """Shifts of single pulses relative to a shift history, (trial, pulse)."""
-    return single_shifts(pulses, course, "likelihood", 1) - course
+def _waves(frequency: Tensor, time: Tensor) -> Tensor:
+    """Cosine and sine (trial, pulse, 2) of frequencies (trial,) in cycles per pulse."""
+    angle = 2 * math.pi * frequency[:, None] * time
+    return torch.stack([torch.cos(angle), torch.sin(angle)], -1)
 
 
 def log_likelihood(pulses: Envelopes, course: Tensor) -> Tensor:
@@ -487,19 +444,6 @@ def centred(shift: Tensor, present: Tensor) -> Tensor:
     return shift - (shift * present).sum(-1, keepdim=True) / present.sum(-1, keepdim=True).clamp_min(1)
 
 
-def wrapped(cells: Tensor, n: int) -> Tensor:
-    """Wrap shifts into the window, to -n/2..n/2.
-
-    Args:
-        cells: Shifts in cells, any shape.
-        n: Number of cells of the window.
-
-    Returns:
-        The wrapped shifts, same shape.
-    """
-    return cells - n * torch.round(cells / n)
-
-
 def unit_time(n: int, device: torch.device) -> Tensor:
     """Compute evenly spaced times of n pulses, scaled to the interval -1..1.
 
@@ -511,20 +455,3 @@ def unit_time(n: int, device: torch.device) -> Tensor:
         The times, shape (n,), float64.
     """
     return (2 * torch.arange(n, dtype=torch.float64, device=device) - (n - 1)) / max(1, n - 1)
-
-
-def runs_of(n: int, blocks: int, present: Tensor) -> Tensor:
-    """Divide the pulses into blocks of equal length.
-
-    Args:
-        n: Number of pulses.
-        blocks: Largest number of blocks.
-        present: False for pulses without samples, shape (trial, pulse), bool.
-
-    Returns:
-        1 where a present pulse belongs to a block, else 0; shape (trial, block, pulse), float64.
-    """
-    length = -(-n // blocks)
-    run = torch.arange(n, device=present.device) // length
-    member = run == torch.arange(-(-n // length), device=present.device)[:, None]
-    return (member & present[:, None]).to(torch.float64)

@@ -10,47 +10,15 @@ frame Doppler, for which estimators take the Doppler centroid.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchsar.core import fft_lines, per_trial, power_of
+from torchsar.core import fft_lines, per_trial, power_of, unit_level
 from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, refocus, refocus_turns_per_sample
 from torchsar.focus.reference import range_compress
 from torchsar.radar import StripmapRadar
-
-# range cells of a block: wide enough for the range walk that a wrong velocity leaves
-BLOCK_COLUMNS = 32
-
-
-def aperture_s(radar: StripmapRadar, n_range: int) -> float:
-    """Return the time that the beam illuminates a target in the middle of the swath.
-
-    Args:
-        radar: Radar parameters.
-        n_range: Number of range samples.
-
-    Returns:
-        The nominal dwell in seconds; if the radar has none, the time in which the Doppler frequency
-        of the target changes by one PRF.
-    """
-    middle = radar.near_range_m + n_range / 2 * radar.range_step_m
-    return radar.aperture_s(middle)
-
-
-def central_lines(raw: Tensor, most: int) -> Tensor:
-    """Cut out the lines about the middle of the record.
-
-    Args:
-        raw: Lines, shape (..., pulse, range).
-        most: Largest number of lines to keep.
-
-    Returns:
-        At most `most` lines, shape (..., pulse, range).
-    """
-    first = max(0, (raw.shape[-2] - most) // 2)
-    return raw[..., first : first + most, :]
 
 
 def full_columns(n_range: int, pulse_samples: int) -> int:
@@ -122,19 +90,6 @@ class BeamSpectrum:
     data: Tensor
     doppler_hz: Tensor
 
-    def moved(self, by_hz: Tensor | float) -> BeamSpectrum:
-        """Reinterpret the spectrum at another absolute Doppler; the samples stay as they are.
-
-        This serves to try another Doppler ambiguity.
-
-        Args:
-            by_hz: Increase of the Doppler in Hz, shape (...,) or a number.
-
-        Returns:
-            The spectrum with the new Doppler of its rows.
-        """
-        return replace(self, doppler_hz=self.doppler_hz + by_hz)
-
     def rows(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
         """Focus the group of range cells without the last transform, that from Doppler to azimuth.
 
@@ -147,12 +102,7 @@ class BeamSpectrum:
             Range-Doppler spectrum of the focused group, shape (..., d, width), complex.
         """
         radar, n = self.group.radar, self.data.shape[-1]
-        at = FrameGeometry(
-            radar,
-            self.doppler_hz,
-            per_trial(velocity_m_s, 0, self.data),
-            frame_hz,
-        )
+        at = FrameGeometry(radar, self.doppler_hz, per_trial(velocity_m_s, 0, self.data), frame_hz)
         middle = self.group.middle_m[..., None, None]
         rows = self.data * bulk_filter(
             FrequencyBasis(radar, n, self.data.device, wait=False), at, middle, None, self.data.dtype
@@ -241,6 +191,25 @@ def column_signal(lines: Tensor) -> Tensor:
     return excess.clamp(1e-3, 10)
 
 
+def aperture_lines(raw: Tensor, radar: StripmapRadar, spectrum: Tensor | None) -> tuple[Tensor, float]:
+    """Compress the middle of a record: four apertures, or 1024 lines if that is more.
+
+    Args:
+        raw: Lines, shape (..., pulse, range), complex.
+        radar: Radar parameters.
+        spectrum: Range reference spectrum, see `compress`.
+
+    Returns:
+        Range-compressed lines of unit level, shape (..., pulse, column), complex; and the time in
+        seconds for which the beam illuminates a target in the middle of the swath: the nominal
+        dwell, or without one that in which its Doppler frequency changes by one PRF.
+    """
+    dwell = radar.aperture_s(radar.near_range_m + raw.shape[-1] / 2 * radar.range_step_m)
+    most = max(1024, round(4 * dwell * radar.prf_hz))
+    first = max(0, (raw.shape[-2] - most) // 2)
+    return compress(unit_level(raw[..., first : first + most, :]), radar, spectrum), dwell
+
+
 def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
     """Choose the group of neighbouring range cells with the most signal above the background.
 
@@ -310,8 +279,8 @@ def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwe
 
 
 def _block_count(width: int) -> int:
-    """Number of blocks of about BLOCK_COLUMNS columns."""
-    return max(1, width // BLOCK_COLUMNS)
+    """Number of blocks of 32 columns, wide enough for the range walk by a wrong velocity."""
+    return max(1, width // 32)
 
 
 def block_entropy(image: Tensor) -> Tensor:
@@ -340,20 +309,13 @@ def entropy_parts(image: Tensor, parts: int) -> tuple[Tensor, Tensor]:
         The summands in nats and the shares of the energy of the block, shape (..., block, parts)
         each, float64. The sum of the summands over the last dimension is `block_entropy`.
     """
-    power = power_of(image)
-    tiny = torch.finfo(power.dtype).tiny
+    tiny = torch.finfo(image.real.dtype).tiny
     blocks, shares = [], []
-    for block in power.tensor_split(_block_count(image.shape[-1]), -1):
+    for block in power_of(image).tensor_split(_block_count(image.shape[-1]), -1):
         p = block / block.sum((-2, -1), keepdim=True).clamp_min(tiny * 1e3)
-        terms = -(p * torch.log(p.clamp_min(tiny)))
-        blocks.append(_part_sums(terms, parts))
-        shares.append(_part_sums(p, parts))
+        for sums, x in ((blocks, -(p * torch.log(p.clamp_min(tiny)))), (shares, p)):
+            sums.append(torch.stack([part.sum((-2, -1)).to(torch.float64) for part in x.tensor_split(parts, -2)], -1))
     return torch.stack(blocks, -2), torch.stack(shares, -2)
-
-
-def _part_sums(x: Tensor, parts: int) -> Tensor:
-    """Sums (..., parts) of x (..., azimuth, range) over parts of the azimuth samples, float64."""
-    return torch.stack([part.sum((-2, -1)).to(torch.float64) for part in x.tensor_split(parts, -2)], -1)
 
 
 def student_log_likelihood(t: Tensor, degrees: Tensor | int) -> Tensor:
@@ -372,20 +334,15 @@ def student_log_likelihood(t: Tensor, degrees: Tensor | int) -> Tensor:
     return -0.5 * (degrees + 1) * torch.log1p(t.square() / degrees)
 
 
-def jackknife_std(left_out: Tensor) -> Tensor:
-    """Compute the standard deviation of an estimate from its leave-one-out values.
+def quotient(value: Tensor, curvature: Tensor) -> Tensor:
+    """Divide by a curvature that may not be positive.
 
     Args:
-        left_out: Estimates without one block each, shape (..., block).
+        value: Values, any shape.
+        curvature: Curvatures, same shape.
 
     Returns:
-        The standard deviation, shape (...,).
+        The quotient, 1e6 at most and where the curvature is not positive.
     """
-    n = left_out.shape[-1]
-    return math.sqrt((n - 1) / n) * torch.linalg.vector_norm(left_out - left_out.mean(-1, keepdim=True), dim=-1)
-
-
-def quotient(value: Tensor, curvature: Tensor) -> Tensor:
-    """Return the quotient, 1e6 at most and where the curvature is not positive."""
     good = curvature > 0
     return torch.where(good, value / torch.where(good, curvature, 1), 1e6).clamp_max(1e6)

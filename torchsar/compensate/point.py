@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate import doppler_assess
-from torchsar.compensate.doppler import nominal_doppler, point_doppler, wrap_hz
-from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, power_of, settle, unit_level
+from torchsar.compensate.doppler import nominal_doppler, point_doppler
+from torchsar.core import Estimate, Signal, Stage, checked_samples, cis, power_of, settle, unit_level, wrapped
 from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import StripmapRadar
 
@@ -107,8 +107,20 @@ def point_history(
     doppler_hz: Tensor,
     start_s: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the azimuth history of a point without its Doppler rate, (..., azimuth), zero where it
-    was not observed; and the phasor of its Doppler. The arguments are those of `peak_time_s`.
+    """Cut out the azimuth history of a point in an image.
+
+    Args:
+        image: As for `peak_time_s`, like the following arguments.
+        prf_hz: Pulse repetition frequency in Hz.
+        sample: Range position of the peak in samples.
+        rate_hz_s: Magnitude of the Doppler rate in Hz/s.
+        seen_s: First and last time at which the record observed the point.
+        doppler_hz: Doppler of the point in Hz.
+        start_s: Slow time of the peak in seconds.
+
+    Returns:
+        The history without its Doppler rate, shape (..., azimuth), zero where the point was not
+        observed; and the phasor of its Doppler.
     """
     n = image.shape[-2]
     columns = image.shape[-1]
@@ -117,7 +129,7 @@ def point_history(
     weights = weights * ((sample > -1) & (sample < columns))[..., None]
     column = (image * weights[..., None, :].to(image.real.dtype)).sum(-1).to(torch.complex128)
     spectrum = torch.fft.fft(column)
-    offset = wrap_hz(
+    offset = wrapped(
         torch.fft.fftfreq(n, 1 / prf_hz, dtype=torch.float64, device=image.device) - doppler_hz[..., None], prf_hz
     )
     rate = rate_hz_s[..., None]
@@ -220,13 +232,13 @@ class PointDoppler(Stage):
         seen = max(-dwell / 2, -crossing), min(dwell / 2, record - crossing)
         at_s = (response["position_azimuth_m"] - azimuth.start) / radar.velocity_m_s
         # an image is circular in azimuth: the peak may lie beyond its end
-        at_s = crossing + wrap_hz(at_s - crossing, record)
+        at_s = crossing + wrapped(at_s - crossing, record)
         value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
         for _ in range(4):
             at_s = peak_time_s(image, radar.prf_hz, slant.index_of(position), rate, seen, value, at_s)
             value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
         value, finite = settle(value, 0.0)
-        found = Estimate({"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)})
+        found = Estimate({"doppler_hz": value, "doppler_baseband_hz": wrapped(value, radar.prf_hz)})
         if not self.assess:
             return found
         sees = finite & torch.full_like(finite, 0 <= crossing <= record)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -19,12 +18,10 @@ from torchsar.compensate import velocity_assess
 from torchsar.compensate.group import (
     BeamSpectrum,
     RangeGroup,
-    aperture_s,
+    aperture_lines,
     beam_spectrum,
     block_entropy,
     block_weights,
-    central_lines,
-    compress,
     entropy_parts,
     pick_group,
     quotient,
@@ -39,38 +36,11 @@ from torchsar.core import (
     take,
     unit_level,
 )
+from torchsar.focus.omega_k import OmegaK
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import StripmapRadar
 
 Refine = Callable[..., tuple[Tensor, Tensor]]
-
-_PARTS = 8  # parts of the image along azimuth, for the standard deviation
-# The refinement stops at this share of the step of the grid, a sixth of the half width of the last
-# parabola. With half of that half width, estimates in speckle were displaced by 0.02 m/s.
-_STEP_SHARE = 60
-_GRID = 16  # largest number of steps of the grid search to either side
-
-
-class Focuser(Protocol):
-    """The part of a focusing stage, such as `torchsar.focus.OmegaK`, that `EffectiveVelocity` uses.
-
-    Args:
-        radar: Radar parameters of the stage.
-    """
-
-    radar: StripmapRadar
-
-    def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
-        """Compute the range reference spectrum for lines of n samples.
-
-        Args:
-            n: Number of range samples.
-            device: Device of the result.
-
-        Returns:
-            The spectrum, shape (n,), complex; None for range-compressed data.
-        """
-        ...
 
 
 def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> Callable[[Tensor], Tensor]:
@@ -90,18 +60,16 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
         A function of the velocity in m/s, shape (...,), that returns the entropies times their
         weights in nats, shape (..., block). Their sum over the last dimension is the objective.
     """
-    lines = checked_samples(group.data, "velocity_objective", "pulse, range")
-    group = RangeGroup(unit_level(lines), group.start, group.radar)
-    spectrum = beam_spectrum(group, doppler_hz)
-    return _objective(spectrum, doppler_hz, _nominal(spectrum, doppler_hz, dwell_s)[1])
+    spectrum, _, weight = _nominal(group, doppler_hz, dwell_s)
+    return _objective(spectrum, doppler_hz, weight)
 
 
-@torch.no_grad()
-def _nominal(spectrum: BeamSpectrum, doppler_hz: Tensor, dwell_s: float) -> tuple[Tensor, Tensor]:
-    """Image of the nominal velocity, and the weights of the blocks (..., block)."""
-    radar = spectrum.group.radar
-    image = spectrum.image(doppler_hz, radar.velocity_m_s)
-    return image, block_weights(image, radar, doppler_hz, dwell_s)
+def _nominal(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> tuple[BeamSpectrum, Tensor, Tensor]:
+    """Spectrum of a group, its image of the nominal velocity, weights of blocks (..., block)."""
+    spectrum, radar = beam_spectrum(replace(group, data=unit_level(group.data)), doppler_hz), group.radar
+    with torch.no_grad():
+        image = spectrum.image(doppler_hz, radar.velocity_m_s)
+        return spectrum, image, block_weights(image, radar, doppler_hz, dwell_s)
 
 
 def _objective(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Callable[[Tensor], Tensor]:
@@ -113,57 +81,18 @@ def _objective(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor) -> Ca
     return blocks
 
 
-class Parts(NamedTuple):
-    """Entropies of parts of an image, each times the weight of its block.
+def _parts(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, velocity_m_s: Tensor) -> tuple[Tensor, ...]:
+    """Range-Doppler spectrum (..., row, range) of the image of a velocity (...,), and what its
+    parts add to the entropies of the blocks, and to the shares of the energy, (..., block, part)
+    each, times the weights of the blocks.
 
     The image has twice as many azimuth samples as the spectrum has rows. The entropy of an image of
     one sample per resolution cell changes with the place of a target between two samples, and a
-    wrong velocity moves targets.
-
-    Args:
-        rows: Range-Doppler spectrum of the image, (..., row, range).
-        summands: What parts along azimuth add to the entropies of the blocks, (..., block, part).
-        shares: Their shares of the energy, (..., block, part).
+    wrong velocity moves targets. For the standard deviation, it has eight parts along azimuth.
     """
-
-    rows: Tensor
-    summands: Tensor
-    shares: Tensor
-
-
-def _parts(spectrum: BeamSpectrum, doppler_hz: Tensor, weight: Tensor, velocity_m_s: Tensor) -> Parts:
-    """Entropies of the parts of the image that belongs to a velocity (...,)."""
     rows = spectrum.rows(doppler_hz, velocity_m_s)
-    entropy, share = entropy_parts(fft_lines(rows, inverse=True, n=2 * rows.shape[-2]), _PARTS)
-    return Parts(rows, entropy * weight[..., None], share * weight[..., None])
-
-
-class Minimum(NamedTuple):
-    """What the assessment of a velocity depends on.
-
-    Args:
-        velocity_m_s: The velocity, (...,).
-        beside: Parts of the images a tenth of a step below, near and above it.
-        half_m_s: That tenth of a step.
-        slope: Slopes of the summands over the velocity, (..., block, part).
-        curvature: Curvature of the entropy, (...,).
-        objective: Entropy of the image as a function of the velocity (...,).
-        nominal: Image of the nominal velocity.
-        weight: Weights of the blocks, (..., block).
-        inside: Whether the best velocity of the first grid is not at an end, (...,).
-        step_m_s: Step of the grid, see `grid_step_m_s`.
-    """
-
-    velocity_m_s: Tensor
-    beside: tuple[Parts, Parts, Parts]
-    half_m_s: float
-    slope: Tensor
-    curvature: Tensor
-    objective: Callable[[Tensor], Tensor]
-    nominal: Tensor
-    weight: Tensor
-    inside: Tensor
-    step_m_s: float
+    entropy, share = entropy_parts(fft_lines(rows, inverse=True, n=2 * rows.shape[-2]), 8)
+    return rows, entropy * weight[..., None], share * weight[..., None]
 
 
 def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float:
@@ -224,10 +153,8 @@ def minimum_entropy_velocity(
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no trials or no samples, or a sample is not finite.
     """
-    lines = checked_samples(group.data, "minimum_entropy_velocity", "pulse, range", empty=False)
-    group = RangeGroup(unit_level(lines), group.start, group.radar)
-    spectrum, nominal = beam_spectrum(group, doppler_hz), group.radar.velocity_m_s
-    image, weight = _nominal(spectrum, doppler_hz, dwell_s)
+    checked_samples(group.data, "minimum_entropy_velocity", "pulse, range", empty=False)
+    (spectrum, image, weight), nominal = _nominal(group, doppler_hz, dwell_s), group.radar.velocity_m_s
     blocks = _objective(spectrum, doppler_hz, weight)
 
     def objective(velocity_m_s: Tensor) -> Tensor:
@@ -236,46 +163,29 @@ def minimum_entropy_velocity(
     step = grid_step_m_s(group.radar, float(group.radar.near_range_m), dwell_s)
     start = torch.full(doppler_hz.shape, nominal, dtype=torch.float64, device=doppler_hz.device)
     reach, known = min(reach_m_s, nominal / 2), (block_entropy(image) * weight).sum(-1)
-    grid = _search(spectrum, doppler_hz, weight, start, known, reach, step)
-    value, tolerance = grid.vertex_m_s, max(tolerance_m_s, step / _STEP_SHARE)
-    if grid.near_m_s > tolerance:
-        value, _ = refine(objective, value, grid.near_m_s, tolerance)
+    value, near, inside, costs = _search(spectrum, doppler_hz, weight, start, known, reach, step)
+    # The refinement stops at this share of the step of the grid, a sixth of the half width of the
+    # last parabola. With half of that half width, estimates in speckle were displaced by 0.02 m/s.
+    tolerance = max(tolerance_m_s, step / 60)
+    if near > tolerance:
+        value, _ = refine(objective, value, near, tolerance)
     value, _ = settle(value, nominal)
     with torch.no_grad():
         half = min(step, nominal / 2) / 10
-        low, middle, high = (_parts(spectrum, doppler_hz, weight, value + side * half) for side in (-1, 0, 1))
-        curvature = (low.summands - 2 * middle.summands + high.summands).sum((-2, -1)) / half**2
+        parts = [_parts(spectrum, doppler_hz, weight, value + side * half) for side in (-1, 0, 1)]
+        rows, (low, middle, high), shares = zip(*parts, strict=True)
+        curvature = (low - 2 * middle + high).sum((-2, -1)) / half**2
         # without the energy that moves from one part to another, which changes no entropy by itself
-        level = middle.summands.sum(-1, keepdim=True) / middle.shares.sum(-1, keepdim=True).clamp_min(1e-300)
-        slope = (high.summands - low.summands - level * (high.shares - low.shares)) / (2 * half)
+        level = middle.sum(-1, keepdim=True) / shares[1].sum(-1, keepdim=True).clamp_min(1e-300)
+        slope = (high - low - level * (shares[2] - shares[0])) / (2 * half)
         # the step to the vertex of the parabola, at most to its ends
         value = value - quotient(slope.sum((-2, -1)), curvature).clamp(-half, half)
-        points = nominal + torch.linspace(-reach, reach, grid.costs.shape[-1], dtype=torch.float64, device=start.device)
-        found = Estimate({"velocity_m_s": value}, info={"grid_velocity_m_s": points, "grid_entropy": grid.costs})
+        points = nominal + torch.linspace(-reach, reach, costs.shape[-1], dtype=torch.float64, device=start.device)
+        found = Estimate({"velocity_m_s": value}, info={"grid_velocity_m_s": points, "grid_entropy": costs})
         if not assess:
             return found
-        minimum = Minimum(
-            *(value, (low, middle, high), half, slope, curvature),
-            *(objective, image, weight, grid.inside, step),
-        )
-        return velocity_assess.assessed(found, minimum, group)
-
-
-class _Grid(NamedTuple):
-    """Result of the grid search.
-
-    Args:
-        vertex_m_s: Vertex of the parabola through the best velocity and its neighbours, or the best
-            velocity where it has only one neighbour, (...,).
-        near_m_s: Half width about the vertex for its refinement.
-        inside: Whether the best velocity of the first grid is not at an end, (...,).
-        costs: Entropies of the first grid, (..., grid).
-    """
-
-    vertex_m_s: Tensor
-    near_m_s: float
-    inside: Tensor
-    costs: Tensor
+        minimum = objective, weight, inside, step
+        return velocity_assess.assessed(found, spectrum.group, image, minimum, rows, half, slope, curvature)
 
 
 def _search(
@@ -286,14 +196,30 @@ def _search(
     cost: Tensor,
     reach: float,
     full_step: float,
-) -> _Grid:
+) -> tuple[Tensor, float, Tensor, Tensor]:
     """Search the whole band; first its middle, with few and wide steps, where it has many.
 
-    cost: Entropy of the image of the whole band at the start, (...,).
+    Args:
+        spectrum: Spectrum of the group.
+        doppler_hz: Absolute Doppler centroid in Hz, (...,).
+        weight: Weights of the blocks, (..., block).
+        start: Velocity in the middle of the search in m/s, (...,).
+        cost: Entropy of the image of the whole band at the start, (...,).
+        reach: Half width of the search in m/s.
+        full_step: Step for the whole band in m/s; there are at most 16 steps to either side.
+
+    Returns:
+        The vertex of the parabola through the best velocity and its neighbours, or the best
+        velocity where it has only one neighbour, (...,); the half width about it for its
+        refinement; whether the best velocity of the first grid is not at an end, (...,); and the
+        entropies of the first grid, (..., grid).
     """
-    share, value, first = min(1.0, math.sqrt(_GRID * full_step / reach)), start, None
+    share, value, first, rows = min(1.0, math.sqrt(16 * full_step / reach)), start, None, spectrum.data.shape[-2]
     while True:
-        blocks = _objective(_middle_rows(spectrum, share), doppler_hz, weight)
+        kept = min(rows, max(64, round(share * rows)))
+        part = slice((rows - kept) // 2, (rows - kept) // 2 + kept)
+        middle = replace(spectrum, data=spectrum.data[..., part, :], doppler_hz=spectrum.doppler_hz[..., part])
+        blocks = _objective(middle, doppler_hz, weight)
         step = min(full_step / share**2, reach / 2)
         count = 2 * math.ceil(reach / step - 1e-9) + 1
         known = cost if share == 1 and first is None else None
@@ -308,15 +234,7 @@ def _search(
     bent = (best > 0) & (best < count - 1) & (bend > 0)
     vertex = torch.where(bent, value + 0.5 * step * (low - high) / torch.where(bent, bend, 1), value)
     best = first.argmin(-1)
-    return _Grid(vertex, step / 4, (best > 0) & (best < first.shape[-1] - 1), first)
-
-
-def _middle_rows(spectrum: BeamSpectrum, share: float) -> BeamSpectrum:
-    """A share of the rows in the middle of the Doppler band, but at least 64."""
-    count = spectrum.data.shape[-2]
-    rows = min(count, max(64, round(share * count)))
-    part = slice((count - rows) // 2, (count - rows) // 2 + rows)
-    return replace(spectrum, data=spectrum.data[..., part, :], doppler_hz=spectrum.doppler_hz[..., part])
+    return vertex, step / 4, (best > 0) & (best < first.shape[-1] - 1), first
 
 
 class EffectiveVelocity(Stage):
@@ -346,7 +264,7 @@ class EffectiveVelocity(Stage):
 
     def __init__(
         self,
-        focuser: Focuser,
+        focuser: OmegaK,
         reach_m_s: float = 80.0,
         lines: int = 512,
         refine: Refine = parabola_minimum,
@@ -375,14 +293,14 @@ class EffectiveVelocity(Stage):
             The group, and the time that a target stays in the beam, in seconds.
         """
         focuser = self._focuser[0]
-        radar, n = focuser.radar, raw.shape[-1]
-        dwell = aperture_s(radar, n)
-        lines = compress(
-            unit_level(central_lines(raw, max(1024, round(4 * dwell * radar.prf_hz)))),
-            radar,
-            focuser.spectrum(n, raw.device),
-        )
-        return pick_group(lines, radar, self.lines), dwell
+        lines, dwell = aperture_lines(raw, focuser.radar, focuser.spectrum(raw.shape[-1], raw.device))
+        return pick_group(lines, focuser.radar, self.lines), dwell
+
+    def _doppler(self, raw: Tensor, doppler_hz: Tensor | None) -> Tensor:
+        """The given Doppler centroid, or that of the pointing, shape (...,)."""
+        pointing = self._focuser[0].radar.pointing_doppler_hz or 0.0
+        given = torch.as_tensor(pointing if doppler_hz is None else doppler_hz, dtype=torch.float64, device=raw.device)
+        return given.detach().expand(raw.shape[:-2])
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None) -> Estimate:
         """Estimate the effective velocity of a signal of axes (pulse, range).
@@ -406,9 +324,7 @@ class EffectiveVelocity(Stage):
             where the record is shorter than the dwell of the beam, so that every target is cut; and
             INEXACT where the standard deviation exceeds that eighth.
         """
-        raw = signal.data.detach()
-        group, dwell = self.group(raw)
-        doppler = self._doppler(raw, doppler_hz)
+        (group, dwell), doppler = self.group(signal.data.detach()), self._doppler(signal.data, doppler_hz)
         settings = self.reach_m_s, self.refine, self.tolerance_m_s
         found = minimum_entropy_velocity(group, doppler, dwell, *settings, assess=self.assess)
         return replace(found, info={**found.info, "group_start": group.start})
@@ -426,14 +342,6 @@ class EffectiveVelocity(Stage):
         Returns:
             The entropy in nats, a weighted mean over blocks of range cells, shape (..., n).
         """
-        raw = signal.data.detach()
-        doppler = self._doppler(raw, doppler_hz)
-        group, dwell = self.group(raw)
+        (group, dwell), doppler = self.group(signal.data.detach()), self._doppler(signal.data, doppler_hz)
         blocks = velocity_objective(group, doppler, dwell)
         return torch.stack([blocks(v.to(doppler).expand(doppler.shape)).sum(-1) for v in velocity_m_s], -1)
-
-    def _doppler(self, raw: Tensor, doppler_hz: Tensor | None) -> Tensor:
-        """The given Doppler centroid, or that of the pointing, shape (...,)."""
-        pointing = self._focuser[0].radar.pointing_doppler_hz or 0.0
-        given = torch.as_tensor(pointing if doppler_hz is None else doppler_hz, dtype=torch.float64, device=raw.device)
-        return given.detach().expand(raw.shape[:-2])

@@ -7,8 +7,8 @@ for whole apertures? How far do parts of the image disagree about it?
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,12 +16,6 @@ from torch import Tensor
 from torchsar.compensate.group import RangeGroup, block_entropy, quotient
 from torchsar.core import Estimate, Outcome, fft_lines, host_value, worst
 
-if TYPE_CHECKING:
-    from torchsar.compensate.velocity import Minimum, Parts
-
-# Variance of the entropy of n independent pixels of pure noise, times n: with the exponential
-# distribution of their intensity, 0.290.
-_NOISE_ENTROPY = 0.29
 # Depth of a significant minimum in standard deviations of noise. On noise and on clutter that fills
 # the Doppler band evenly the depth is below 5; 20 dB above the noise it is above 100.
 _LEAST_DEPTH = 8.0
@@ -32,13 +26,19 @@ _NEAR, _FAR = 2.0, 8.0
 # phase. It is a share of width^2 / velocity, or of the same with the step of the grid as the width.
 # Measured at time-bandwidth products of 19 to 374.
 _REST, _REST_STEP = 0.45, 0.11
-# Largest standard deviation of an estimate that is ok, over the width of the minimum: an eighth
-# of a cycle of phase at the ends of the aperture.
-_MOST_WIDTHS = 0.27
 _COMBS = 4  # interleaved sets of Doppler rows, of independent noise
 
 
-def assessed(found: Estimate, at: Minimum, group: RangeGroup) -> Estimate:
+def assessed(
+    found: Estimate,
+    group: RangeGroup,
+    nominal: Tensor,
+    minimum: tuple[Callable[[Tensor], Tensor], Tensor, Tensor, float],
+    rows: Sequence[Tensor],
+    half_m_s: float,
+    slope: Tensor,
+    curvature: Tensor,
+) -> Estimate:
     """Assess a velocity of least entropy.
 
     The standard deviation has three parts. The first follows from the parts of the image, blocks of
@@ -46,50 +46,67 @@ def assessed(found: Estimate, at: Minimum, group: RangeGroup) -> Estimate:
     divided by the curvature of the whole entropy. The second follows in the same way from four
     interleaved sets of Doppler rows, whose noise is independent also where one target dominates;
     the larger of both counts. The third is what remains without noise.
+
+    Args:
+        found: The estimate.
+        group: Group of range cells.
+        nominal: Its image of the nominal velocity.
+        minimum: Entropy of the image as a function of the velocity (...,); weights of the blocks,
+            (..., block); whether the best velocity of the first grid is not at an end, (...,); and
+            the step of the grid, see `grid_step_m_s`.
+        rows: Range-Doppler spectra of images a tenth of a step below, near and above the velocity.
+        half_m_s: That tenth of a step.
+        slope: Slopes of the summands of the entropy over the velocity, (..., block, part).
+        curvature: Curvature of the entropy, (...,).
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
-    radar = group.radar
-    depth, width = _depth(at, min(at.step_m_s, radar.velocity_m_s / 18))
-    by_parts = quotient(at.slope.flatten(-2).square().sum(-1).sqrt(), at.curvature)
-    rest = (_REST * width.square()).clamp_min(_REST_STEP * at.step_m_s**2) / radar.velocity_m_s
-    std = torch.hypot(torch.maximum(by_parts, _comb_std(at)), rest).clamp_max(1e6)
+    radar, (objective, weight, inside, step) = group.radar, minimum
+
+    def entropy(rows: Tensor) -> Tensor:
+        return (block_entropy(fft_lines(rows, inverse=True)) * weight).sum(-1)
+
+    def measured(distance: float) -> tuple[Tensor, Tensor]:
+        sides = [objective(found["velocity_m_s"] + side * distance) for side in (-1, 1)]
+        beside = 0.5 * (sides[0] + sides[1]) - entropy(rows[1])
+        return beside, quotient(2 * beside.clamp_min(0), curvature).sqrt()
+
+    # depth of the minimum in nats, and its width, that of a parabola of this depth and curvature
+    near = _NEAR * min(step, radar.velocity_m_s / 18)
+    depth, width = measured(near)
+    wide = width > near / 2
+    if host_value(wide.any(), True):
+        depth, width = (
+            torch.where(wide, x, y) for x, y in zip(measured(near * _FAR / _NEAR), (depth, width), strict=True)
+        )
+    by_parts = quotient(slope.flatten(-2).square().sum(-1).sqrt(), curvature)
+    rest = (_REST * width.square()).clamp_min(_REST_STEP * step**2) / radar.velocity_m_s
+    sets = [torch.stack([entropy(one[..., k::_COMBS, :]) for k in range(_COMBS)], -1) for one in rows]
+    bend = (sets[0] - 2 * sets[1] + sets[2]).mean(-1) / half_m_s**2
+    by_combs = quotient(((sets[2] - sets[0]) / (2 * half_m_s)).std(-1) / math.sqrt(_COMBS), bend)
+    std = torch.hypot(torch.maximum(by_parts, by_combs), rest).clamp_max(1e6)
     known = radar.integration_s
-    most = _MOST_WIDTHS * width if known is None else torch.full_like(width, at.step_m_s / 8)
+    # an eighth of a cycle of phase at the ends of the aperture
+    most = 0.27 * width if known is None else torch.full_like(width, step / 8)
     short = known is not None and group.data.shape[-2] < known * radar.prf_hz
     outcome = worst(
         (Outcome.INEXACT, std >= most),
-        (Outcome.MISFIT, torch.full_like(at.inside, short)),
-        (Outcome.OUTSIDE_SEARCH, ~at.inside),
-        (Outcome.NOISE, ~((at.curvature > 0) & (depth > _LEAST_DEPTH * _noise_std(at.nominal, at.weight)))),
+        (Outcome.MISFIT, torch.full_like(inside, short)),
+        (Outcome.OUTSIDE_SEARCH, ~inside),
+        (Outcome.NOISE, ~((curvature > 0) & (depth > _LEAST_DEPTH * _noise_std(nominal, weight)))),
         (Outcome.EMPTY, (group.data == 0).all((-2, -1))),
     )
     quality = torch.exp(-std / most.clamp_min(1e-12))
     return replace(found, std={"velocity_m_s": std}, quality=quality, outcome=outcome)
 
 
-def _depth(at: Minimum, step: float) -> tuple[Tensor, Tensor]:
-    """Depth of the minimum in nats, and its width in m/s, that of a parabola of this depth and of
-    the curvature at the minimum, (...,) each.
-    """
-    least = (block_entropy(fft_lines(at.beside[1].rows, inverse=True)) * at.weight).sum(-1)
-
-    def measured(distance: float) -> tuple[Tensor, Tensor]:
-        sides = [at.objective(at.velocity_m_s + side * distance * step) for side in (-1, 1)]
-        beside = 0.5 * (sides[0] + sides[1]) - least
-        return beside, quotient(2 * beside.clamp_min(0), at.curvature).sqrt()
-
-    depth, width = measured(_NEAR)
-    wide = width > _NEAR * step / 2
-    if not host_value(wide.any(), True):
-        return depth, width
-    far_depth, far_width = measured(_FAR)
-    return torch.where(wide, far_depth, depth), torch.where(wide, far_width, width)
-
-
 def _noise_std(image: Tensor, weight: Tensor) -> Tensor:
     """Standard deviation (...,) in nats of the weighted entropy of an image (..., azimuth, range)
     of noise that has the powers and the correlations of the image's range cells.
 
-    Cells of equal power without correlation have the variance 0.29 / number of pixels. In general,
+    Cells of equal power without correlation have the variance 0.29 / number of pixels, by the
+    exponential distribution of their intensity. In general,
     the squared elements of the covariance between cells take the place of 1 / number of cells.
     """
     n, parts = image.shape[-2], image.tensor_split(weight.shape[-1], -1)
@@ -99,16 +116,4 @@ def _noise_std(image: Tensor, weight: Tensor) -> Tensor:
     lines = torch.cat(scaled, -1)
     squares = torch.linalg.vector_norm(lines.mH @ lines, dim=(-2, -1)).square().to(torch.float64)
     # less what independent cells contribute because the number of pixels is finite
-    return (_NOISE_ENTROPY / n * (squares - 1 / n).clamp_min(1 / image.shape[-1])).sqrt()
-
-
-def _comb_std(at: Minimum) -> Tensor:
-    """Standard deviation (...,) in m/s from the slopes of interleaved sets of Doppler rows."""
-
-    def entropies(parts: Parts) -> Tensor:
-        sets = [fft_lines(parts.rows[..., first::_COMBS, :], inverse=True) for first in range(_COMBS)]
-        return torch.stack([(block_entropy(one) * at.weight).sum(-1) for one in sets], -1)
-
-    low, middle, high = map(entropies, at.beside)
-    curvature = (low - 2 * middle + high).mean(-1) / at.half_m_s**2
-    return quotient(((high - low) / (2 * at.half_m_s)).std(-1) / math.sqrt(_COMBS), curvature)
+    return (0.29 / n * (squares - 1 / n).clamp_min(1 / image.shape[-1])).sqrt()

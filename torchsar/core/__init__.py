@@ -50,7 +50,16 @@ from torchsar.core.memory import (
     wait_for_devices,
 )
 from torchsar.core.outcome import Outcome, counts, worst
-from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
+from torchsar.core.phase import (
+    cis,
+    linear_phasor,
+    outer_phasor,
+    phasor_tables,
+    real_dtype,
+    reduced_turns,
+    unit_phasor,
+    wrapped,
+)
 from torchsar.core.polynomials import legendre
 from torchsar.core.replace import OwnFiles, remove_empty
 from torchsar.core.seal import SEAL, address, canonical, checksum, is_sealed, sealed
@@ -148,4 +157,5 @@ __all__ = [
     "validation",
     "wait_for_devices",
     "worst",
+    "wrapped",
 ]

@@ -86,6 +86,19 @@ def reduced_turns(turns: Tensor) -> Tensor:
     return turns - torch.round(turns.detach())
 
 
+def wrapped(x: Tensor, period: float) -> Tensor:
+    """Wrap values into the interval -period / 2..period / 2.
+
+    Args:
+        x: Values, any shape.
+        period: Length of the interval, in the unit of the values.
+
+    Returns:
+        The wrapped values, same shape.
+    """
+    return x - period * torch.round(x / period)
+
+
 def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
     """Compute exp(2j * pi * turns); whole turns are removed while the phase is still float64.
 

@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchsar.compensate.doppler import wrap_hz
-from torchsar.core import Chain, Signal, Trace
+from torchsar.core import Chain, Signal, Trace, wrapped
 from torchsar.radar import StripmapRadar
 
 log = logging.getLogger("torchsar")
@@ -118,7 +117,7 @@ class Used:
         if self.doppler_hz is not None:
             sine = radar.sin_squint(self.doppler_hz, self.velocity_m_s).clamp(-1, 1)
             found["doppler_centroid_hz"] = self.doppler_hz
-            found["doppler_baseband_hz"] = wrap_hz(self.doppler_hz, radar.prf_hz)
+            found["doppler_baseband_hz"] = wrapped(self.doppler_hz, radar.prf_hz)
             found["squint_deg"] = torch.rad2deg(torch.asin(sine))
         return found
 

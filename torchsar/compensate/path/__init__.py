@@ -1,7 +1,6 @@
 """Autofocus of antennas on any path."""
 
-from torchsar.compensate.path.line_of_sight import path_autofocus
-from torchsar.compensate.path.phase import path_phase
+from torchsar.compensate.path.line_of_sight import path_autofocus, path_phase
 from torchsar.compensate.path.stages import CorrectPath, PathAutofocus, PathPhase, StripAutofocus
 from torchsar.compensate.path.strip import strip_autofocus
 

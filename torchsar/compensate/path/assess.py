@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,16 +15,9 @@ from torch import Tensor
 from torchsar.compensate.path.search import Search, Starts, sharpness
 from torchsar.core import Estimate, Outcome, worst
 
-if TYPE_CHECKING:
-    from torchsar.compensate.path.strip import StripFit
-
-LEAST_STREHL = 0.8  # Strehl ratio of a well-focused image, a convention (Marechal)
-# number of standard deviations that may not lower the Strehl ratio below its limit, by choice: the
-# difference of two starts is itself uncertain
-_SPREAD = 1.5
-# factor by which the sharpness must exceed that of noise: more than for the phases of pulses, 1.5,
-# because envelopes and three axes are free too
-_MARGIN = 2.0
+# Strehl ratio of a well-focused image, a convention (Marechal); number of standard deviations that
+# may not lower it below that, by choice: the difference of two starts is itself uncertain
+LEAST_STREHL, _SPREAD = 0.8, 1.5
 # largest share of the pulses whose fringes the last round may have changed, and factor by which the
 # sharpest image may leave more of the samples than that of another start, by trial: 3 % and 1.1
 # where the result was right, 19 % and 3 in a wrong minimum that all starts had in common; and share
@@ -36,7 +28,16 @@ LEAST_SCATTERERS, _LEAST_SEEN = 3, 0.95
 
 
 def strehl(square_m2: Tensor, fringe_m: float, spread: float = 1.0) -> Tensor:
-    """Return the Strehl ratio for a mean square error of the line of sight, times a factor."""
+    """Predict the Strehl ratio of an image.
+
+    Args:
+        square_m2: Mean square error of the line of sight in square metres.
+        fringe_m: Half a wavelength in metres.
+        spread: Factor of the error.
+
+    Returns:
+        The Strehl ratio.
+    """
     return torch.exp(-square_m2 * (spread * 2 * math.pi / fringe_m) ** 2)
 
 
@@ -49,6 +50,14 @@ def of_path(found: Estimate, starts: Starts, search: Search) -> Estimate:
     leaves of the samples: half the power of the difference comes from one that is as good, little
     from one that is lost. The doubt takes half the power in any case: a wrong motion can explain
     the samples as well as the true one, with more scatterers.
+
+    Args:
+        found: The estimate.
+        starts: Results of the search from several starts.
+        search: The search.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
     """
     best = starts.best
     other = torch.stack([one.noise for one in starts.others])
@@ -60,21 +69,35 @@ def of_path(found: Estimate, starts: Starts, search: Search) -> Estimate:
         (Outcome.INEXACT, strehl(doubt, search.fringe_m, _SPREAD) <= LEAST_STREHL),
         (Outcome.AMBIGUOUS, best.noise > most),
         (Outcome.NOT_CONVERGED, best.restless > RESTLESS),
-        (Outcome.NOISE, sharp <= _MARGIN * noise),
+        # more than for the phases of pulses, 1.5, because envelopes and three axes are free too
+        (Outcome.NOISE, sharp <= 2.0 * noise),
     )
     quality = strehl(doubt, search.fringe_m) * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1))
     return replace(found, std={"line_of_sight_m": std}, quality=quality, outcome=outcome)
 
 
-def of_strip(found: Estimate, fit: StripFit) -> Estimate:
-    """Assess the errors of a strip; see `strip_autofocus`."""
-    judged, fringe = fit.strip.judged, fit.strip.fringe_m
+def of_strip(
+    found: Estimate, judged: Tensor, fringe_m: float, pulses: Tensor, std_m: Tensor, change_m2: Tensor
+) -> Estimate:
+    """Assess the errors of a strip; see `strip_autofocus`.
+
+    Args:
+        found: The estimate.
+        judged: True for the pulses that see the strip, (pulse,).
+        fringe_m: Half a wavelength.
+        pulses: Numbers of the pulses that see a scatterer, int64.
+        std_m: Standard deviation of the line of sight in metres, float64 (pulse,).
+        change_m2: Mean square by which the last round changed the line of sight.
+
+    Returns:
+        The estimate with standard deviation, quality and outcome.
+    """
     seen = torch.zeros_like(judged)
-    seen[fit.echoes.pulses[fit.echoes.seen]] = True
-    square = fit.std_m[judged].square().mean()
+    seen[pulses] = True
+    square = std_m[judged].square().mean()
     outcome = worst(
-        (Outcome.INEXACT, strehl(square, fringe, _SPREAD) <= LEAST_STREHL),
-        (Outcome.NOT_CONVERGED, fit.change_m2 >= square),
+        (Outcome.INEXACT, strehl(square, fringe_m, _SPREAD) <= LEAST_STREHL),
+        (Outcome.NOT_CONVERGED, change_m2 >= square),
         (Outcome.TOO_FEW, seen[judged].double().mean() < _LEAST_SEEN),
     )
-    return replace(found, std={"line_of_sight_m": fit.std_m}, quality=strehl(square, fringe), outcome=outcome)
+    return replace(found, std={"line_of_sight_m": std_m}, quality=strehl(square, fringe_m), outcome=outcome)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.path.ground import line_free, sights
+from torchsar.compensate.path.ground import line_free, slope
 from torchsar.compensate.path.motion import Motion
 from torchsar.compensate.path.scene import scene_of
 from torchsar.compensate.pulse_phase.data import or_one
@@ -17,11 +17,6 @@ from torchsar.focus import TileOperator
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.spotlight import frequency_samples
 
-# pixels of the image along either axis from which the effect of a motion over the scene is known,
-# as a polynomial of second order, by choice
-_KNOWN = 3
-# factor by which the variance of the line of sight exceeds that for a known scene, by trial
-_UNKNOWN = 1.1
 # share of the standard deviation of the phases by which the last round may change them, by choice
 _SETTLED = 0.3
 # whole fringes that a round may add to the line of sight of a pulse, and logarithm of the
@@ -49,11 +44,6 @@ class Found:
     image: Tensor
     noise: Tensor
     restless: Tensor
-
-    @property
-    def line_of_sight_m(self) -> Tensor:
-        """Error of half the path over the middle of the scene in metres, float64 (pulse,)."""
-        return self.motion_m[:, 0]
 
 
 def three_axes(
@@ -100,7 +90,8 @@ def three_axes(
         whole = motion.of(left)
         left, step = left - motion.echo(whole), whole - across
         noise = scene.noise_of(left)
-        std = motion.std_m() * (_UNKNOWN * noise / scene.noise).sqrt()
+        # the variance exceeds that for a known scene by a tenth, by trial
+        std = motion.std_m() * (1.1 * noise / scene.noise).sqrt()
         fringes = _fringes(rows, rows - left, plan.frequency_hz, noise)
         before, found = found, found + step
         found[:, 0] = line_free(found[:, 0] + fringes * fringe, present)
@@ -124,7 +115,7 @@ def _axes(antennas: AntennaPath, height_m: float) -> Tensor:
     """Line of sight, scaled so that a unit changes half the path by one, and two unit vectors
     perpendicular to it, (pulse, axis, 3).
     """
-    sight = sights(antennas, height_m)
+    sight = slope(antennas.places, antennas.transmitter_m.new_tensor([0.0, 0.0, height_m]))
     up = torch.zeros_like(sight)
     up[:, 2] = 1
     level = torch.linalg.cross(up, sight, dim=-1)
@@ -141,22 +132,19 @@ def _units(operator: TileOperator, scene: Tensor, axes: Tensor) -> tuple[Tensor,
     scene: cells, (azimuth, range).
     """
     grid = operator.plan.grid
-    some = [torch.linspace(0, n - 1, _KNOWN).round().long() for n in grid.counts]
-    u, v = (torch.linspace(-1, 1, n, dtype=torch.float64, device=scene.device) for n in grid.counts)
-    terms = torch.stack(torch.broadcast_tensors(*_powers(u[:, None], v)))  # (term, azimuth, range)
+    # three places along either axis show the effect of a motion as a polynomial of second order
+    some = [torch.linspace(0, n - 1, 3).round().long() for n in grid.counts]
+    lines = (torch.linspace(-1, 1, n, dtype=torch.float64, device=scene.device) for n in grid.counts)
+    u, v = torch.meshgrid(*lines, indexing="ij")
+    terms = torch.stack([torch.ones_like(u), u, v, u.square(), u * v, v.square()])  # (term, azimuth, range)
     known = terms[:, some[0]][..., some[1]].flatten(1)
     places = grid.pixels_m()[some[0]][:, some[1]].reshape(-1, 3)
-    lever = _levers(operator.plan.antennas, places, axes).movedim(0, 1)
+    lever = (slope(operator.plan.antennas.places, places[:, None])[..., None, :] * axes).sum(-1).movedim(0, 1)
     share = torch.linalg.pinv(known.mT) @ lever  # (pulse, term, axis)
     radians = 4j * math.pi * float(operator.plan.frequency_hz.mean()) / LIGHT_M_S
     # one after another, with the tables of the other images
     echo = torch.stack([operator.adjoint((scene * term)[None])[0] for term in terms.to(scene.real.dtype)], -1)
     return echo @ (radians * share).to(scene.dtype), lever
-
-
-def _powers(u: Tensor, v: Tensor) -> tuple[Tensor, ...]:
-    """Terms of a polynomial of second order."""
-    return torch.ones_like(u), u, v, u.square(), u * v, v.square()
 
 
 def _fringes(rows: Tensor, model: Tensor, frequency_hz: Tensor, noise: Tensor) -> Tensor:
@@ -170,10 +158,3 @@ def _fringes(rows: Tensor, model: Tensor, frequency_hz: Tensor, noise: Tensor) -
     score = match / or_one(model.abs().square().double().sum(-1, keepdim=True) * noise)
     best, at = score.max(-1)
     return torch.where(best - score[:, _FRINGES] > _GAIN, number[at], 0.0)
-
-
-def _levers(antennas: AntennaPath, places_m: Tensor, axes: Tensor) -> Tensor:
-    """Change of half the path over places by a unit of each axis, (place, pulse, axis)."""
-    ways = [place - places_m[:, None] for place in antennas.places]
-    units = [way / torch.linalg.vector_norm(way, dim=-1, keepdim=True) for way in ways]
-    return (torch.stack(torch.broadcast_tensors(*units)).mean(0)[..., None, :] * axes).sum(-1)

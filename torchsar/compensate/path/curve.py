@@ -9,23 +9,6 @@ from torch import Tensor
 
 # share of an information that is added to it, so that rounding does not make it singular
 _RIDGE = 1e-9
-# scatterers whose cosines are computed at once, by choice
-_BLOCK = 16
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Most probable motion.
-
-    Args:
-        coefficient: Coefficients of the motion, float64 (axis, cosine).
-        covariance: Their covariance, float64 (axis * cosine, axis * cosine).
-        own: Phase that the place and the phase of each scatterer add, float64 (scatterer, seen).
-    """
-
-    coefficient: Tensor
-    covariance: Tensor
-    own: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +31,11 @@ class Curve:
     lever: Tensor
     own: Tensor
 
-    def motion_m(self, coefficient: Tensor) -> Tensor:
-        """Motion of coefficients (axis, cosine), float64 (pulse, axis)."""
-        return self.basis @ coefficient.mT
-
     def phase(self, motion_m: Tensor) -> Tensor:
         """Phase by a motion (pulse, axis), float64 (scatterer, seen)."""
         return (self.lever * motion_m[self.pulses]).sum(-1)
 
-    def solved(self, phase: Tensor, weight: Tensor, power: Tensor, known: Tensor) -> Solution:
+    def solved(self, phase: Tensor, weight: Tensor, power: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the most probable motion and terms of the scatterers.
 
         The coefficients of the motion and the terms of the scatterers are independent and Gaussian.
@@ -69,7 +48,9 @@ class Curve:
                 (scatterer, term).
 
         Returns:
-            The motion.
+            Coefficients of the motion, float64 (axis, cosine); their covariance, float64 (axis *
+            cosine, axis * cosine); and the phase that the terms of each scatterer add, float64
+            (scatterer, seen).
         """
         axes, count = power.shape
         pull = weight[..., None] * self.own
@@ -94,9 +75,11 @@ class Curve:
         found = torch.cholesky_solve(right[:, None], factor)[:, 0]
         terms = (inverse @ own[..., None])[..., 0] - tied @ found
         added = (self.own @ terms[..., None])[..., 0]
-        return Solution(found.reshape(axes, count), torch.cholesky_inverse(factor), added)
+        return found.reshape(axes, count), torch.cholesky_inverse(factor), added
 
     def _through(self, terms: Tensor) -> Tensor:
-        """Products of terms (scatterer, seen, term) with the cosines, (scatterer, term, cosine)."""
-        parts = zip(terms.split(_BLOCK), self.pulses.split(_BLOCK), strict=True)
+        """Products of terms (scatterer, seen, term) with the cosines, (scatterer, term, cosine),
+        some scatterers at once.
+        """
+        parts = zip(terms.split(16), self.pulses.split(16), strict=True)
         return torch.cat([term.mT @ self.basis[pulses] for term, pulses in parts])

@@ -15,9 +15,6 @@ from torchsar.optim import lbfgs
 from torchsar.radar import LIGHT_M_S
 from torchsar.radar.spotlight import frequency_samples, range_profiles
 
-# samples of a fringe at which the match with a model is computed, by choice: its maximum is then
-# found by a parabola
-_PER_FRINGE = 12
 # slopes of the envelopes that are tried: drift at the ends of the record, and its step, in cells
 _REACH_CELLS, _STEP_CELLS = 6.0, 0.6
 # highest degree of the polynomials of a drift, and steps of their search, found by trial
@@ -58,7 +55,8 @@ def matched_m(profiles: Tensor, model: Tensor, frequency_hz: Tensor, reach_m: fl
         best, float64 (pulse,).
     """
     products = frequency_samples(profiles) * frequency_samples(model).conj()
-    step = LIGHT_M_S / (2 * float(frequency_hz.mean())) / _PER_FRINGE
+    # twelve samples of a fringe, by choice: the maximum is then found by a parabola
+    step = LIGHT_M_S / (2 * float(frequency_hz.mean())) / 12
     count = max(1, math.ceil(reach_m / step))
     tried = step * torch.arange(-count, count + 1, dtype=torch.float64, device=products.device)
     match = (products @ unit_phasor(frequency_hz[:, None] * tried * (-2 / LIGHT_M_S), products.dtype)).real

@@ -7,25 +7,12 @@ import math
 import torch
 from torch import Tensor
 
-# pulses whose median replaces wrong envelopes: at the ends of recordings ten in a row were wrong
-_NEIGHBOURS = 25
+from torchsar.core import wrapped
+
 # by choice: most standard deviations by which a measurement of a smooth line of sight counts; one
 # of a rough line is wrong if its distance from the median exceeds 6 times the median distance and 2
 # fringes
 _MOST_STD, _FAR, _FAR_FRINGES = 3.0, 6.0, 2.0
-
-
-def fringe_error(x_m: Tensor, fringe_m: float) -> Tensor:
-    """Reduce lengths to the nearest fringe, to -fringe_m / 2..fringe_m / 2.
-
-    Args:
-        x_m: Lengths in metres, any shape.
-        fringe_m: Half a wavelength in metres.
-
-    Returns:
-        Lengths in metres, same shape.
-    """
-    return x_m - fringe_m * torch.round(x_m / fringe_m)
 
 
 def roughness(carrier_m: Tensor, fringe_m: float) -> Tensor:
@@ -39,7 +26,7 @@ def roughness(carrier_m: Tensor, fringe_m: float) -> Tensor:
         Rms of the second differences, reduced to the nearest fringe, over that of arbitrary ones,
         shape (...,): 1 for rough motion, which says nothing about fringes.
     """
-    bends = fringe_error(carrier_m.diff(n=2, dim=-1), fringe_m)
+    bends = wrapped(carrier_m.diff(n=2, dim=-1), fringe_m)
     return bends.square().mean(-1).sqrt() * (math.sqrt(12) / fringe_m)
 
 
@@ -53,8 +40,8 @@ def smoothest(carrier_m: Tensor, fringe_m: float) -> Tensor:
     Returns:
         Line of sight in metres, up to a constant and a linear term, shape (..., pulse).
     """
-    bends = fringe_error(carrier_m.diff(n=2, dim=-1), fringe_m)
-    first = fringe_error(carrier_m[..., 1:2] - carrier_m[..., :1], fringe_m)
+    bends = wrapped(carrier_m.diff(n=2, dim=-1), fringe_m)
+    first = wrapped(carrier_m[..., 1:2] - carrier_m[..., :1], fringe_m)
     steps = torch.cat([first, first + bends.cumsum(-1)], -1)
     return torch.cat([carrier_m[..., :1], carrier_m[..., :1] + steps.cumsum(-1)], -1)
 
@@ -99,9 +86,8 @@ def smooth_near(
         total, chosen = (cost[..., None] + weight * bend.square()).min(1)
         cost = total + far[:, p, None, :]
         back.append(chosen)
-    size = len(n)
     best = cost.flatten(1).argmin(-1)
-    path = [best % size, best // size]
+    path = [best % len(n), best // len(n)]
     rows = torch.arange(len(cost), device=cost.device)
     for chosen in reversed(back):
         path.append(chosen[rows, path[-1], path[-2]])
@@ -125,13 +111,16 @@ def rough_near(carrier_m: Tensor, near_m: Tensor, before_m: Tensor, fringe_m: fl
     median = before_m + _local_median(near_m - before_m)
     apart = (near_m - median).abs()
     limit = (_FAR * apart.median(-1, keepdim=True).values).clamp_min(_FAR_FRINGES * fringe_m)
-    return torch.where(apart > limit, median + fringe_error(carrier_m - median, fringe_m), near_m)
+    return torch.where(apart > limit, median + wrapped(carrier_m - median, fringe_m), near_m)
 
 
 def _local_median(x: Tensor) -> Tensor:
-    """Median of each value (trial, pulse) and its neighbours; at the ends of the nearest ones."""
+    """Median of each value (trial, pulse) and its neighbours; at the ends of the nearest ones.
+
+    There are 25 of them: at the ends of recordings ten envelopes in a row were wrong.
+    """
     pulses = x.shape[-1]
-    width = min(_NEIGHBOURS, pulses)
+    width = min(25, pulses)
     medians = x.unfold(-1, width, 1).median(-1).values
     at = torch.arange(pulses, device=x.device) - width // 2
     return medians[..., at.clamp(0, pulses - width)]

@@ -4,44 +4,67 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import without_line
-from torchsar.core import Estimate
+from torchsar.core import Estimate, Outcome, checked_samples
 from torchsar.focus import ImageGrid, TileOperator, TilePlan
 from torchsar.radar import LIGHT_M_S, AntennaPath
+from torchsar.radar.antenna_path import refuse_unusable
 from torchsar.radar.spotlight import frequency_step_hz
 
-# pixel spacing in resolution cells, by choice: images are sampled above their bandwidth
-STEP = 0.7
-# the same where the scene is fitted to the samples, by choice: two in a resolution cell
+# pixel spacing in resolution cells where the scene is fitted to the samples, by choice
 FINE_STEP = 0.5
 # error of the images in dB, by choice: far below what noise and side lobes leave
-_ERROR_DB = -40.0
+ERROR_DB = -40.0
 
 
 def trials_of(name: str, profiles: Tensor, frequency_hz: Tensor, antennas: AntennaPath) -> torch.Size:
-    """Return the leading dimensions of profiles and paths.
+    """Check range profiles and their path, and return their leading dimensions.
 
     Args:
         name: Name of the calling function, for the message.
-        profiles: Range profiles, shape (..., pulse, range).
-        frequency_hz: Frequencies in Hz, shape (range,).
+        profiles: Range profiles, shape (..., pulse, range), complex.
+        frequency_hz: Frequencies in Hz, float64 (range,).
         antennas: Recorded path.
 
     Returns:
         The leading dimensions to which they broadcast.
 
     Raises:
-        ValueError: If the sizes do not match.
+        TypeError: If the profiles are not complex, or frequencies are not float64.
+        ValueError: If values are not finite, or the sizes do not match.
     """
+    checked_samples(profiles, name, "pulse, range")
+    refuse_unusable(frequency_hz=frequency_hz)
     size = antennas.pulses, len(frequency_hz)
     if profiles.shape[-2:] != size:
         raise ValueError(f"{name} needs profiles (..., pulse, range) of {size}, got {tuple(profiles.shape)}")
     return torch.broadcast_shapes(profiles.shape[:-2], antennas.trials)
+
+
+def nothing(present: Tensor, info: dict[str, float], outcome: Outcome | None) -> Estimate:
+    """Return the estimate of a trial in which nothing is found.
+
+    Args:
+        present: Tensor of the shape (pulse,).
+        info: Numbers of the trial.
+        outcome: Why there is nothing; None without assessment.
+
+    Returns:
+        Estimate of no errors.
+    """
+    zero = torch.zeros(len(present), dtype=torch.float64, device=present.device)
+    none = zero.new_zeros(())
+    value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
+    found = Estimate(value, quality=none + 1, info={name: none + number for name, number in info.items()})
+    if outcome is None:
+        return found
+    return replace(found, std={"line_of_sight_m": zero + 1}, quality=none, outcome=outcome.like(none))
 
 
 def for_each(
@@ -60,8 +83,7 @@ def for_each(
     Returns:
         Estimate of all trials, with the leading dimensions.
     """
-    data = profiles.expand(*trials, *profiles.shape[-2:])
-    every = itertools.product(*map(range, trials))
+    data, every = profiles.expand(*trials, *profiles.shape[-2:]), itertools.product(*map(range, trials))
     found = [find(data[index], antennas.of_trial(index, trials)) for index in every]
 
     def joined(parts: list[Tensor]) -> Tensor:
@@ -100,25 +122,23 @@ def placed(x: Tensor, present: Tensor) -> Tensor:
     return x.new_zeros(len(present)).masked_scatter(present, x)
 
 
-def sights(antennas: AntennaPath, height_m: float = 0.0) -> Tensor:
-    """Return the direction in which positions lengthen half the path over the middle of the scene.
+def slope(places: Sequence[Tensor], points_m: Tensor) -> Tensor:
+    """Return the change of half the path over points by the position of the antennas.
 
     Args:
-        antennas: Path.
-        height_m: Height z of the middle in metres.
+        places: Positions of one or both antennas, which move together, in metres, (..., 3).
+        points_m: Points in metres, (..., 3).
 
     Returns:
-        Gradient of half the path by the position of the antennas, which move together, (..., pulse,
-        3); a unit vector if they share one place.
+        Gradient of half the path, (..., 3); a unit vector if both share one place.
     """
-    middle = antennas.transmitter_m.new_tensor([0.0, 0.0, height_m])
-    ways = [place - middle for place in antennas.places]
+    ways = [place - points_m for place in places]
     units = [way / torch.linalg.vector_norm(way, dim=-1, keepdim=True) for way in ways]
     return torch.stack(torch.broadcast_tensors(*units)).mean(0)
 
 
 def ground_image(
-    frequency_hz: Tensor, antennas: AntennaPath, height_m: float, extent_m: float | None = None, step: float = STEP
+    frequency_hz: Tensor, antennas: AntennaPath, height_m: float, extent_m: float | None = None, step: float = 0.7
 ) -> TileOperator:
     """Return the image of the ground about the origin, for one path.
 
@@ -129,7 +149,7 @@ def ground_image(
         antennas: Path of one trial.
         height_m: Height z of the ground in metres.
         extent_m: Side of the imaged square in metres; None for all of the unambiguous ground.
-        step: Spacing of the pixels in resolution cells.
+        step: Spacing of the pixels in resolution cells, by default finer than the bandwidth needs.
 
     Returns:
         Image formation of range profiles, with its adjoint.
@@ -140,11 +160,11 @@ def ground_image(
     middle = torch.zeros(3, dtype=torch.float64, device=frequency_hz.device)
     middle[2] = height_m
     with torch.no_grad():
-        slope = -2 * sights(antennas, height_m)[:, :2]  # change of the path per metre, (pulse, 2)
-        away = slope.mean(0)
+        by_place = -2 * slope(antennas.places, middle)[:, :2]  # change of the path per metre, (pulse, 2)
+        away = by_place.mean(0)
         steep = float(torch.linalg.vector_norm(away))
         across = torch.stack([-away[1], away[0]]) / max(steep, 1e-300)
-        turn = slope @ across
+        turn = by_place @ across
         span, per_pulse = float(turn.max() - turn.min()), float(turn.diff().abs().mean())
     band = float(frequency_hz[-1] - frequency_hz[0])
     wavelength = LIGHT_M_S / float(frequency_hz.mean())
@@ -160,4 +180,4 @@ def ground_image(
     corner = middle - spacing * sum(n // 2 * axis for n, axis in zip(counts, axes, strict=True))
     grid = ImageGrid(corner, axes, (counts[0], counts[1]), spacing)
     places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
-    return TileOperator(TilePlan(frequency_hz, *places, grid, _ERROR_DB))
+    return TileOperator(TilePlan(frequency_hz, *places, grid, ERROR_DB))

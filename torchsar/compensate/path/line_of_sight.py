@@ -1,4 +1,7 @@
-"""Autofocus of a path: one line-of-sight range per pulse, which moves phases and envelopes."""
+"""Autofocus of a path through the images along it.
+
+Errors of the path move phases and envelopes; a phase per pulse leaves the envelopes where they are.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,13 @@ from torch import Tensor
 
 from torchsar.compensate.path import assess as assessment
 from torchsar.compensate.path.axes import three_axes
-from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, trials_of
+from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, nothing, trials_of
 from torchsar.compensate.path.search import Search, found_from_starts
-from torchsar.core import Estimate, Outcome, checked_samples
+from torchsar.compensate.pulse_phase.recommended import autofocus
+from torchsar.core import Estimate, Outcome
 from torchsar.metrics import entropy
 from torchsar.radar import AntennaPath
-from torchsar.radar.antenna_path import refuse_unusable
 
-# fewest pulses
-_LEAST_PULSES = 8
 # noise as a share of the mean power of the samples below which the last rounds take finer cells,
 # their spacing in resolution cells, and most rounds, by trial: at 20 dB and errors of 5 cm the
 # error of the line of sight fell from 1.66 to 1.50 bounds, at 10 dB it did not change
@@ -107,8 +108,6 @@ def path_autofocus(
         ValueError: If sizes do not match, values are not finite, the line of sight does not turn,
             the extent is not positive, or there is no round.
     """
-    profiles = checked_samples(profiles, "path_autofocus", "pulse, range")
-    refuse_unusable(frequency_hz=frequency_hz)
     trials = trials_of("path_autofocus", profiles, frequency_hz, antennas)
     if extent_m is not None and not 0 < extent_m < math.inf:
         raise ValueError(f"extent_m must be positive and finite, got {extent_m}")
@@ -118,11 +117,15 @@ def path_autofocus(
     @torch.no_grad()
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
         present = (rows != 0).any(-1)
-        few = int(present.sum()) < _LEAST_PULSES
-        seen = one if few or bool(present.all()) else _only(one, present)
+        few = int(present.sum()) < 8
+        seen = one
+        if not (few or bool(present.all())):
+            receiver = None if one.receiver_m is None else one.receiver_m[present]
+            seen = AntennaPath(one.transmitter_m[present], receiver, one.reference_m[present])
         coarse = ground_image(frequency_hz, seen, height_m, extent_m)
         if few:
-            return _nothing(rows, present, assess)
+            outcome = Outcome.TOO_FEW if bool(present.any()) else Outcome.EMPTY
+            return nothing(present, {"roughness": 1.0, "entropy_nats": 0.0}, outcome if assess else None)
         imaging = partial(ground_image, frequency_hz, seen, height_m, extent_m)
         some = rows[present]
         some = some / some.abs().amax()
@@ -133,30 +136,12 @@ def path_autofocus(
             last = three_axes(some, imaging(_FINEST_STEP), best.motion_m, present, _LAST_ROUNDS, exact=True)
             if last.noise <= best.noise and last.restless <= assessment.RESTLESS:
                 best = replace(best, motion_m=last.motion_m, offset_m=last.offset_m)
-        value = {"line_of_sight_m": best.line_of_sight_m, "offset_m": best.offset_m}
+        value = {"line_of_sight_m": best.motion_m[:, 0], "offset_m": best.offset_m}
         info = {"roughness": results.roughness, "entropy_nats": entropy(best.image).double()}
         found = Estimate(value, quality=torch.ones_like(best.noise), info=info)
         return _spread(assessment.of_path(found, results, search) if assess else found, present)
 
     return for_each(find, profiles, antennas, trials)
-
-
-def _only(antennas: AntennaPath, present: Tensor) -> AntennaPath:
-    """The path of the pulses that are present."""
-    receiver = None if antennas.receiver_m is None else antennas.receiver_m[present]
-    return AntennaPath(antennas.transmitter_m[present], receiver, antennas.reference_m[present])
-
-
-def _nothing(rows: Tensor, present: Tensor, assess: bool) -> Estimate:
-    """The estimate of a trial with too few pulses."""
-    zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
-    none = zero.new_zeros(())
-    value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
-    found = Estimate(value, quality=none + 1, info={"roughness": none + 1, "entropy_nats": none})
-    if not assess:
-        return found
-    outcome = (Outcome.TOO_FEW if bool(present.any()) else Outcome.EMPTY).like(none)
-    return replace(found, std={"line_of_sight_m": zero + 1}, quality=none, outcome=outcome)
 
 
 def _spread(found: Estimate, present: Tensor) -> Estimate:
@@ -172,3 +157,52 @@ def _spread(found: Estimate, present: Tensor) -> Estimate:
 
     value, std = ({name: of(x) for name, x in table.items()} for table in (found.value, found.std))
     return replace(found, value=value, std=std)
+
+
+def path_phase(
+    profiles: Tensor,
+    frequency_hz: Tensor,
+    antennas: AntennaPath,
+    *,
+    height_m: float = 0.0,
+    search: int = 120,
+    polish: int = 20,
+    assess: bool = True,
+) -> Estimate:
+    """Estimate the phase of each pulse that sharpens the image of a spotlight scene on any path.
+
+    It is `autofocus` with images by tiles along the recorded path, in which scatterers do not
+    migrate. They cover the whole unambiguous ground. The middle of the scene, to which phases
+    refer, is the origin.
+
+    Args:
+        profiles: Range profiles, the unitary centred inverse FFT of a phase history, shape (...,
+            pulse, range), complex.
+        frequency_hz: Frequencies in Hz, rising in equal steps, float64 (range,).
+        antennas: Recorded path of the antennas, of all trials or of each of them.
+        height_m: Height z of the imaged plane in metres.
+        search: Largest number of iterations of the entropy fixed point, approximately.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
+        assess: Whether to add the standard deviation, the quality and the outcome.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation, quality and
+        outcome as for `autofocus`. They describe errors of one phase per pulse: errors of the path
+        that move envelopes by a range cell or act differently across the scene are not part of
+        them.
+
+    Raises:
+        TypeError: If the profiles are not complex, or frequencies are not float64.
+        ValueError: If sizes do not match, values are not finite, or the line of sight does not
+            turn.
+    """
+    trials = trials_of("path_phase", profiles, frequency_hz, antennas)
+
+    def find(rows: Tensor, one: AntennaPath) -> Estimate:
+        imaging = ground_image(frequency_hz, one, height_m)
+        return autofocus(rows, search=search, polish=polish, imaging=imaging, assess=assess)
+
+    if antennas.trials.numel() == 1:
+        return find(profiles, antennas.of_trial((0,) * len(antennas.trials)))
+    return for_each(find, profiles, antennas, trials)

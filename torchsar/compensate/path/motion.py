@@ -11,9 +11,6 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
 
-# neighbourhood over which the spectrum of the motion is averaged: share of the number of the
-# coefficient, plus a number of coefficients
-_WIDE, _LEAST_WIDE = 0.25, 2
 # lowest coefficients, of the constant and the linear term, which are not observable
 _UNSEEN = 2
 
@@ -120,6 +117,7 @@ def expected_power(power: Tensor) -> Tensor:
         Smooth power, never zero, float64 (cosine,).
     """
     order = torch.arange(_UNSEEN, _UNSEEN + len(power), dtype=torch.float64, device=power.device)
-    near = (order[:, None] - order).abs() <= order[:, None] * _WIDE + _LEAST_WIDE
+    # over a share of the number of the coefficient, plus a number of coefficients
+    near = (order[:, None] - order).abs() <= order[:, None] * 0.25 + 2
     mean = (near * power).sum(-1) / near.sum(-1)
     return mean.clamp_min(1e-9 * float(mean.max()) + 1e-18)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,13 +11,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from torchsar.compensate.path.ground import slope
 from torchsar.core import power_of, unit_phasor
 from torchsar.focus import ImageGrid
 from torchsar.radar import LIGHT_M_S, AntennaPath
 
-# power above the mean of clutter at the same range, by choice: speckle of a million cells exceeds
-# 14 times its mean in half of the images, and 20 times it in one of 500
-_FACTOR = 20.0
 # a scatterer is the strongest one within the first, in resolution cells, and not weaker than a
 # share of the strongest one within the second, whose side lobes it may be, by choice
 _ALONE_CELLS, _LOBE_CELLS, _LOBE_SHARE = (6, 2), (100, 2), 0.01
@@ -53,7 +51,9 @@ def prominent_places(image: Tensor, grid: ImageGrid, cells: tuple[float, float],
         return max_pool2d(power[None], (2 * half[0] + 1, 2 * half[1] + 1), 1, (half[0], half[1]))[0]
 
     alone = (power == strongest(_ALONE_CELLS)) & (power > _LOBE_SHARE * strongest(_LOBE_CELLS))
-    at = (alone & (power > _FACTOR * clutter)).nonzero()
+    # by choice: speckle of a million cells exceeds 14 times its mean in half of the images, and 20
+    # times it in one of 500
+    at = (alone & (power > 20.0 * clutter)).nonzero()
     at = at[power[at[:, 0], at[:, 1]].argsort(descending=True)[:most]]
     log = power.double().clamp_min(torch.finfo(torch.float64).tiny).log()
     index = torch.stack([_refined(log, at, dim) for dim in range(2)], -1)
@@ -125,16 +125,17 @@ class Echoes:
         first = ends[:, :1].clamp(max=antennas.pulses - length)
         pulses = first + torch.arange(length, device=ends.device)
         seen = (pulses >= ends[:, :1]) & (pulses < ends[:, 1:]) & (history != 0).any(-1)[pulses]
-        ways = [place[pulses] - places_m[:, None] for place in antennas.places]
-        legs = [torch.linalg.vector_norm(way, dim=-1, keepdim=True) for way in ways]
-        path = (2 if len(legs) == 1 else 1) * torch.stack(legs).sum(0)[..., 0] - antennas.reference_m[pulses]
-        slope = torch.stack([way / leg for way, leg in zip(ways, legs, strict=True)]).mean(0)
+        at = [place[pulses] for place in antennas.places]
+        legs = [torch.linalg.vector_norm(place - places_m[:, None], dim=-1) for place in at]
+        path = (2 if len(legs) == 1 else 1) * torch.stack(legs).sum(0) - antennas.reference_m[pulses]
         samples = torch.empty(path.shape, dtype=torch.complex128, device=history.device)
         weighted = history * weights.to(history.real.dtype)
-        for some in _blocks(len(path), length * len(frequency_hz)):
+        step = max(1, _BLOCK // max(1, length * len(frequency_hz)))
+        for first in range(0, len(path), step):
+            some = slice(first, first + step)
             turns = path[some, :, None] / LIGHT_M_S * frequency_hz
             samples[some] = (weighted[pulses[some]] * unit_phasor(turns, history.dtype)).sum(-1).to(samples.dtype)
-        return Echoes(pulses, seen, path, slope, samples * seen, frequency_hz, weights)
+        return Echoes(pulses, seen, path, slope(at, places_m[:, None]), samples * seen, frequency_hz, weights)
 
     @property
     def wave(self) -> float:
@@ -159,8 +160,7 @@ class Echoes:
         """Pairs of scatterers at nearly the same range: the numbers of both, the indices of the
         pulses of the first among those of the second, and the response there.
         """
-        cell = LIGHT_M_S / float(self.frequency_hz[-1] - self.frequency_hz[0])
-        reach = _REACH_CELLS * cell
+        reach = _REACH_CELLS * LIGHT_M_S / float(self.frequency_hz[-1] - self.frequency_hz[0])
         first, middle = self.pulses[:, 0], self.path_m.mean(1)
         near = (middle[:, None] - middle).abs() < 2 * reach
         near &= (first[:, None] - first).abs() < self.pulses.shape[1]
@@ -172,22 +172,10 @@ class Echoes:
         both &= self.seen[one] & self.seen[other].gather(1, at)
         off = self.path_m[one] - self.path_m[other].gather(1, at)
         carrier = float(self.weights @ self.frequency_hz)
-        response = self._response(off / reach) * both
-        return one, other, at, response * unit_phasor(off * (carrier / LIGHT_M_S), torch.complex128)
-
-    def _response(self, share: Tensor) -> Tensor:
-        """Response to path differences, given as shares of the reach, without the carrier."""
-        cell = LIGHT_M_S / float(self.frequency_hz[-1] - self.frequency_hz[0])
-        grid = torch.linspace(0, 1, _TABLE, dtype=torch.float64, device=share.device) * (_REACH_CELLS * cell)
-        off = self.frequency_hz - float(self.weights @ self.frequency_hz)
-        table = torch.cos(torch.outer(grid, off) * (2 * math.pi / LIGHT_M_S)) @ self.weights
-        place = share.abs() * (_TABLE - 1)
+        # response to path differences without the carrier, from a table
+        grid = torch.linspace(0, 1, _TABLE, dtype=torch.float64, device=off.device) * reach
+        table = torch.cos(torch.outer(grid, self.frequency_hz - carrier) * (2 * math.pi / LIGHT_M_S)) @ self.weights
+        place = (off / reach).abs() * (_TABLE - 1)
         low = place.long().clamp(max=_TABLE - 2)
-        value = torch.lerp(table[low], table[low + 1], place - low)
-        return torch.where(share.abs() < 1, value, 0.0)
-
-
-def _blocks(count: int, samples: int) -> Iterator[slice]:
-    """Scatterers whose samples take limited memory."""
-    step = max(1, _BLOCK // max(1, samples))
-    return (slice(first, first + step) for first in range(0, count, step))
+        response = torch.where(place < _TABLE - 1, torch.lerp(table[low], table[low + 1], place - low), 0.0) * both
+        return one, other, at, response * unit_phasor(off * (carrier / LIGHT_M_S), torch.complex128)

@@ -16,15 +16,6 @@ from torchsar.focus import TileOperator
 # may lower the cost, by trial: with .1 a fit left 70 times the noise at 40 dB, with .01 6
 # times, where 12 iterations left 50 times; at 0 dB the errors of the path were equal
 _STEPS, _LEFT = 40, 0.01
-# the same for the last rounds where there is little noise, by trial, see `path_autofocus`
-_EXACT_STEPS, _EXACT_LEFT = 120, 0.001
-# share of the mean variance that every cell of a scene keeps, and least share of the energy of the
-# samples that is taken as echo, by choice
-_FLOOR, _LEAST_ENERGY = 1e-4, 1e-3
-# least noise, as a share of the mean power of the samples, by choice: below it float32 rounds
-_LEAST_NOISE = 1e-8
-# largest share of the samples that a scene may explain of noise, by choice
-_MOST_EXPLAINED = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +61,8 @@ class Scene:
         left, cells = self.rows, torch.zeros_like(self.size, dtype=self.rows.dtype)
         gradient = self.image_of(without(left))
         toward, power = gradient, _energy(gradient)
-        steps, share = (_EXACT_STEPS, _EXACT_LEFT) if self.exact else (_STEPS, _LEFT)
+        # the first for the last rounds where there is little noise, by trial, see `path_autofocus`
+        steps, share = (120, 0.001) if self.exact else (_STEPS, _LEFT)
         enough = share * self.noise * left.numel()
         for _ in range(steps):
             echo = self.echo(toward)
@@ -97,12 +89,14 @@ class Scene:
         gain = self.size.double().square() * (samples * self.pixels)
         share = gain / (gain + self.noise)
         explained = (share * (3 - 2 * share.sqrt())).sum() / (samples * self.pixels)
-        return _floored(_energy(left) / (left.numel() * (1 - explained.clamp_max(_MOST_EXPLAINED))), self.rows)
+        return _floored(_energy(left) / (left.numel() * (1 - explained.clamp_max(0.9))), self.rows)
 
     def narrowed(self, cells: Tensor) -> Scene:
-        """The scene with the sizes that its most probable reflectivities (azimuth, range) have."""
+        """The scene with the sizes that its most probable reflectivities (azimuth, range) have, and
+        at least 1e-4 of their mean variance.
+        """
         power = cells.abs().square()
-        return _scaled(power + _FLOOR * power.mean(), self)
+        return _scaled(power + 1e-4 * power.mean(), self)
 
 
 def scene_of(rows: Tensor, imaging: TileOperator, noise: Tensor | None = None, exact: bool = False) -> Scene:
@@ -125,24 +119,22 @@ def scene_of(rows: Tensor, imaging: TileOperator, noise: Tensor | None = None, e
         echo = imaging.adjoint((image * (weight - weight.mean(-2, keepdim=True)))[None])[0]
         left = rows - echo * ((echo.conj() * rows).sum().real / or_one(_energy(echo)).to(power.dtype))
         noise = _floored(_energy(left) / (left.numel() * (1 - weight.double().mean()).square()), rows)
-    size = torch.zeros_like(power)
-    return _scaled(_smoothed(power) * weight, Scene(rows, imaging, size, noise, _pixels(imaging, rows), exact))
+    # the energy of the image of a point in the middle is the number of pixels per resolution cell
+    point = torch.zeros_like(image[None])
+    point[0, image.shape[0] // 2, image.shape[1] // 2] = 1
+    pixels = _energy(imaging.image(imaging.adjoint(point))) / rows.numel() ** 2
+    return _scaled(_smoothed(power) * weight, Scene(rows, imaging, torch.zeros_like(power), noise, pixels, exact))
 
 
 def _scaled(power: Tensor, scene: Scene) -> Scene:
-    """The scene with sizes of these powers, of which the energy of the samples is expected."""
+    """The scene with sizes of these powers, of which the energy of the samples is expected.
+
+    At least a thousandth of this energy is taken as echo.
+    """
     whole = _energy(scene.rows)
-    energy = (whole - scene.noise * scene.rows.numel()).clamp_min(_LEAST_ENERGY * whole)
+    energy = (whole - scene.noise * scene.rows.numel()).clamp_min(1e-3 * whole)
     size = (power * (energy / (scene.rows.numel() * or_one(power.double().sum()))).to(power.dtype)).sqrt()
     return replace(scene, size=size)
-
-
-def _pixels(imaging: TileOperator, rows: Tensor) -> Tensor:
-    """Number of pixels per resolution cell: energy of the image of a point in the middle."""
-    counts = imaging.plan.grid.counts
-    point = rows.new_zeros(1, *counts)
-    point[0, counts[0] // 2, counts[1] // 2] = 1
-    return _energy(imaging.image(imaging.adjoint(point))) / rows.numel() ** 2
 
 
 def _smoothed(power: Tensor) -> Tensor:
@@ -153,8 +145,8 @@ def _smoothed(power: Tensor) -> Tensor:
 
 
 def _floored(noise: Tensor, rows: Tensor) -> Tensor:
-    """Variance of the noise, at least what rounding allows."""
-    return noise.clamp_min(_LEAST_NOISE * float(_energy(rows) / rows.numel()))
+    """Variance of the noise, at least 1e-8 of the samples: below it float32 rounds."""
+    return noise.clamp_min(1e-8 * float(_energy(rows) / rows.numel()))
 
 
 def _energy(x: Tensor) -> Tensor:

@@ -33,27 +33,10 @@ _BANDS = (0.5, 1.0, 1.0)
 # roughness below which a line of sight is smooth: it was 0.3 to 0.6 for smooth errors, and 1.0 for
 # random walks; and assumed standard deviation of a measurement by envelopes in fringes
 _ROUGH, _NEAR_FRINGES = 0.75, 2.0
-# share of the band in the first step, in which range cells are four times as long; and in the third
-# start
-_FIRST_BAND, _OTHER_BAND = 0.25, 0.5
-# factor by which the sharpness of a start must exceed that of noise to be refined in more than one
-# round: in 43 scenes it was 0.5 to 1.3 times that of noise for noise and at -10 dB, 1.0 to 2.9
-# times for clutter, whose errors are not found, and 3.7 to 11 times where errors were found
-_HOPE = 1.25
 # factor by which another start may leave more of the samples than the sharpest image and still
 # count as a second opinion on it, by trial: those whose results were as good left up to 1.05 times
 # as much, those that had not come as far 1.1 to 1.35 times
 _AS_WELL = 1.1
-# mean square of the phases, in square radians, by which two results may differ without a third
-# start, by choice: a Strehl ratio of 0.8 for 1.5 standard deviations, of half their power each
-_APART = 2 * -math.log(0.8) / 1.5**2
-# least weight of the window over pulses
-_LEAST_WEIGHT = 0.1
-# iterations of the fixed points, by trial, and phase step at which they end
-_COARSE, _FINE, _TOLERANCE_RAD = 30, 12, 0.03
-# the same of the last ones, by trial: more drift off where errors across the line of sight are not
-# known yet
-_POLISH, _POLISHED_RAD = 10, 1e-3
 
 
 def _intensity(power: Tensor, mean: Tensor) -> Tensor:
@@ -68,11 +51,8 @@ def _surprise(power: Tensor, mean: Tensor) -> Tensor:
     return (log - (share * log).sum((-2, -1), keepdim=True)).clamp_min(0)
 
 
-# what a search sharpens by, iterations and phase step at which they end
-_BOTH: list[tuple[Weights, int, float]] = [
-    (_intensity, _COARSE, _TOLERANCE_RAD),
-    (_surprise, _FINE, _TOLERANCE_RAD),
-]
+# what a search sharpens by, most iterations and phase step at which they end, by trial
+_BOTH: list[tuple[Weights, int, float]] = [(_intensity, 30, 0.03), (_surprise, 12, 0.03)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +90,7 @@ class Search:
         real = real_dtype(self.rows.dtype)
         k = torch.linspace(-1, 1, n, dtype=torch.float64, device=self.rows.device) / share
         over_band = torch.where(k.abs() < 1, (1 + torch.cos(math.pi * k)) / 2, 0).to(real)
-        over_pulses = window_weights("hann", pulses, self.rows.device).to(real).clamp_min(_LEAST_WEIGHT)
+        over_pulses = window_weights("hann", pulses, self.rows.device).to(real).clamp_min(0.1)
         samples = frequency_samples(self.rows) * (over_pulses[:, None] * over_band)
         return range_profiles(samples)
 
@@ -171,7 +151,8 @@ class Search:
         imaging: Image formation of the scene.
         """
         columns = moved(self.rows, self.frequency_hz, range_m).mT[None].contiguous()
-        run = Run(Wiener(), Through(imaging), _POLISH, 1.0, _POLISHED_RAD)
+        # by trial: more iterations drift off, as errors across the line of sight are not known yet
+        run = Run(Wiener(), Through(imaging), 10, 1.0, 1e-3)
         phase, _ = fixed_point(columns, torch.zeros_like(columns[:, 0].real), run)
         return self.line_free(range_m + self.metres(phase[0]))
 
@@ -214,7 +195,7 @@ class Starts:
         best, *others = sorted(results, key=lambda one: float(entropy(one.image)))
         compared = [one for one in others if one.noise <= _AS_WELL * best.noise] or others
         radians, present = 2 * math.pi / search.fringe_m, search.present
-        phases = [radians * placed(one.line_of_sight_m, present) for one in (best, *compared)]
+        phases = [radians * placed(one.motion_m[:, 0], present) for one in (best, *compared)]
         apart = [residual_phase(phases[0], other, present)[present] / radians for other in phases[1:]]
         least = torch.stack([one.noise for one in results]).amin()
         return Starts(best, compared, torch.stack([x.square().mean() for x in apart]), least, roughness)
@@ -235,19 +216,33 @@ def found_from_starts(search: Search, fine: TileOperator, rounds: int) -> Starts
     def refined(range_m: Tensor) -> Found:
         range_m = search.polished(range_m, fine)
         sharp, noise = sharpness(fine.image(moved(search.rows, search.frequency_hz, range_m)[None])[0])
-        return three_axes(search.rows, fine, range_m, search.present, rounds if sharp > _HOPE * noise else 1)
+        # Otherwise there is one round: in 43 scenes the sharpness of a start was 0.5 to 1.3 times
+        # that of noise for noise and at -10 dB, 1.0 to 2.9 times for clutter, whose errors are not
+        # found, and 3.7 to 11 times where errors were found.
+        return three_axes(search.rows, fine, range_m, search.present, rounds if sharp > 1.25 * noise else 1)
 
-    range_m, rough = search.by_envelopes(_FIRST_BAND)
+    # in a quarter of the band range cells are four times as long; a third start takes half of it
+    range_m, rough = search.by_envelopes(0.25)
     results = [refined(range_m), refined(search.by_phases())]
     both = Starts.of(results, search, rough)
     spread = 2 * both.best.std_m.square().mean() + both.square_m2.amin()
     alone = both.others[0].noise > _AS_WELL * both.best.noise
-    if not (alone or spread * (2 * math.pi / search.fringe_m) ** 2 > _APART):
+    # By choice, two results may differ by a mean square phase that has a Strehl ratio of 0.8 for
+    # 1.5 standard deviations, of half their power each.
+    apart = 2 * -math.log(0.8) / 1.5**2
+    if not (alone or spread * (2 * math.pi / search.fringe_m) ** 2 > apart):
         return both
-    return Starts.of([*results, refined(search.by_envelopes(_OTHER_BAND)[0])], search, rough)
+    return Starts.of([*results, refined(search.by_envelopes(0.5)[0])], search, rough)
 
 
 def sharpness(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the sharpness of an image (azimuth, range) in nats, and that of noise."""
+    """Measure the sharpness of an image with pixels of `FINE_STEP`.
+
+    Args:
+        image: Image, shape (azimuth, range), complex.
+
+    Returns:
+        The sharpness in nats, and that of noise.
+    """
     sharp, rows, _ = sharpness_beyond_speckle(image.mT)
     return sharp, sharpness_of_noise((rows * FINE_STEP).clamp_min(1))

@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from torchsar.compensate.path.line_of_sight import path_autofocus
-from torchsar.compensate.path.phase import path_phase
+from torchsar.compensate.path.line_of_sight import path_autofocus, path_phase
 from torchsar.compensate.path.strip import strip_autofocus
 from torchsar.core import Estimate, Signal, Stage
 from torchsar.radar import AntennaPath

@@ -10,21 +10,18 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.path import assess as assessment
-from torchsar.compensate.path.curve import Curve, Solution
-from torchsar.compensate.path.ground import for_each, trials_of
+from torchsar.compensate.path.curve import Curve
+from torchsar.compensate.path.ground import ERROR_DB, for_each, nothing, slope, trials_of
 from torchsar.compensate.path.motion import cosines, expected_power
 from torchsar.compensate.path.scatterers import Echoes, prominent_places
 from torchsar.compensate.pulse_phase.data import or_one, without_line
-from torchsar.core import Estimate, Outcome, checked_samples, cis
+from torchsar.core import Estimate, Outcome, cis
 from torchsar.focus import ImageGrid, ProcessedBeam, TilePlan
 from torchsar.focus.image_grid import level_plane
 from torchsar.focus.spotlight import window_weights
 from torchsar.radar import LIGHT_M_S, AntennaPath, StraightTrack
-from torchsar.radar.antenna_path import refuse_unusable
 from torchsar.radar.spotlight import frequency_samples
 
-# error of the images in dB, by choice: far below the side lobes
-_ERROR_DB = -40.0
 # half periods of the fastest cosine while a scatterer is seen, and most cosines, by choice
 _BENDS, _COSINES = 32, 512
 # most scatterers, by choice
@@ -39,8 +36,6 @@ _LAG, _MEAN, _SMOOTH = 1 / 64, 1 / 64, 1 / 8
 # standard deviation of the range of a scatterer in the image, in range cells: by clutter, by trial;
 # and by noise, times the root of its signal-to-noise ratio in the image, with a Hann window
 _PLACED, _PLACED_IN_NOISE = 0.07, 0.7
-# least share of its mean amplitude at which an echo counts, by choice
-_FADED = 0.2
 
 
 def strip_autofocus(
@@ -114,8 +109,6 @@ def strip_autofocus(
             beam is not valid (see `ProcessedBeam`), the antenna does not advance, or no pulse sees
             the strip.
     """
-    profiles = checked_samples(profiles, "strip_autofocus", "pulse, range")
-    refuse_unusable(frequency_hz=frequency_hz)
     trials = trials_of("strip_autofocus", profiles, frequency_hz, antennas)
     numbers = (azimuth_m, range_m, *centre_m, range_axis_rad, height_m)
     if not (all(map(math.isfinite, numbers)) and azimuth_m > 0 and range_m > 0):
@@ -128,7 +121,37 @@ def strip_autofocus(
 
     @torch.no_grad()
     def find(rows: Tensor, one: AntennaPath) -> Estimate:
-        return _found(Strip.of(rows, frequency_hz, one, beam, axes, middle, (azimuth_m, range_m)), assess)
+        strip = Strip.of(rows, frequency_hz, one, beam, axes, middle, (azimuth_m, range_m))
+        outcome = Outcome.NOISE if bool((rows != 0).any()) else Outcome.EMPTY
+        none = nothing(strip.judged, {"scatterers": 0.0}, outcome if assess else None)
+        for _ in range(_SEARCHES):
+            after = strip.with_increments()
+            if after is None:
+                return none
+            change, strip = strip.changed_m2(after), after
+            if change.sqrt() < _NEAR * strip.fringe_m:
+                break
+        # increments show slow errors best: their spectrum would forbid fast ones
+        size = strip.line_free(strip.motion_m[:, 0])[strip.judged].square().mean()
+        power = torch.full_like(strip.basis[:2], float(size) * strip.basis.shape[0] / strip.basis.shape[1])
+        free = torch.stack([strip.line_free(cosine) for cosine in strip.basis.mT], -1)
+        change, std, echoes = size, torch.zeros_like(free[:, 0]), None
+        for _ in range(_FITS):
+            fitted = strip.fitted(power)
+            if fitted is None:
+                return none
+            after, covariance, power, echoes = fitted
+            # without a line over the judged pulses
+            std = ((free @ covariance) * free).sum(-1).clamp_min(0).sqrt()
+            change, strip = strip.changed_m2(after), after
+            if change < _SETTLED**2 * std[strip.judged].square().mean():
+                break
+        assert echoes is not None
+        value = {"line_of_sight_m": strip.line_free(strip.motion_m[:, 0]), "offset_m": strip.offset_m}
+        count = size.new_tensor(float(len(echoes.seen)))
+        found = Estimate(value, quality=torch.ones_like(count), info={"scatterers": count})
+        seen = echoes.pulses[echoes.seen]
+        return assessment.of_strip(found, strip.judged, strip.fringe_m, seen, std, change) if assess else found
 
     return for_each(find, profiles, antennas, trials)
 
@@ -137,9 +160,19 @@ def strip_autofocus(
 class Strip:
     """One trial.
 
-    axes: along the line of sight abeam, scaled so that a unit changes half the path by one, and
-    across it and the track, (pulse, 2, 3). grid: pixels of the image in which scatterers are found.
-    judged: pulses that see the strip. motion_m: errors found so far, (pulse, 2).
+    Args:
+        history: Phase history, complex (pulse, frequency).
+        frequency_hz: Frequencies in Hz, float64 (frequency,).
+        weights: Weights of the frequencies, whose sum is 1, float64 (frequency,).
+        recorded: Recorded path.
+        beam: The beam.
+        axes: Along the line of sight abeam, scaled so that a unit changes half the path by one, and
+            across it and the track, (pulse, 2, 3).
+        grid: Pixels of the image in which scatterers are found.
+        cells: Pixels of a resolution cell along either axis.
+        judged: True for the pulses that see the strip and hold samples, (pulse,).
+        basis: Cosines of which motions consist, float64 (pulse, cosine).
+        motion_m: Errors found so far along the axes in metres, float64 (pulse, 2).
     """
 
     history: Tensor
@@ -167,10 +200,7 @@ class Strip:
         place, pulses = antennas.places[-1], antennas.pulses
         track = StraightTrack.fitted(place)
         points = track.abeam_m(place, middle_m)
-        ways = [one - points for one in antennas.places]
-        sight = torch.stack(
-            torch.broadcast_tensors(*(way / torch.linalg.vector_norm(way, dim=-1, keepdim=True) for way in ways))
-        ).mean(0)
+        sight = slope(antennas.places, points)
         across = torch.linalg.cross(sight, track.along.expand_as(sight), dim=-1)
         across = across / or_one(torch.linalg.vector_norm(across, dim=-1, keepdim=True))
         axes = torch.stack([sight / sight.square().sum(-1, keepdim=True), across], 1)
@@ -242,7 +272,7 @@ class Strip:
         antennas = self.antennas
         lit = partial(self.beam.lit_pulses, antennas.places[-1])
         places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
-        plan = TilePlan(self.frequency_hz, *places, self.grid, _ERROR_DB, lit)
+        plan = TilePlan(self.frequency_hz, *places, self.grid, ERROR_DB, lit)
         image = plan.image(self.history * self.weights.to(self.history.real.dtype))
         found = prominent_places(image, self.grid, self.cells, most)
         if len(found) < assessment.LEAST_SCATTERERS:
@@ -266,10 +296,10 @@ class Strip:
             return None
         echoes, curve = found
         seen = echoes.seen.shape[1]
-        lag, near = max(1, round(_LAG * seen)), _odd(_MEAN * seen)
+        lag, near = max(1, round(_LAG * seen)), 2 * round(_MEAN * seen / 2) + 1
         smooth = _smooth(echoes.samples, near) * echoes.seen
         left = (echoes.samples - smooth) * echoes.seen
-        noise = _per_seen(left.abs().square(), echoes.seen) / near
+        noise = _mean(left.abs().square()[..., None], echoes.seen)[..., 0] / near
         turn = smooth[:, lag:] * smooth[:, :-lag].conj()
         mean = turn.sum(1, keepdim=True)
         turn = turn * (mean.conj() / or_one(mean.abs()))
@@ -282,23 +312,25 @@ class Strip:
         of_steps = Curve(steps, echoes.pulses[:, at], curve.lever[:, at, :1], curve.own[:, at, :1])
         power = torch.full_like(self.basis[:1], self.fringe_m**2 * self.basis.shape[0] / self.basis.shape[1])
         free = torch.zeros_like(weight[:, :1])
-        along = self.basis @ of_steps.solved(turn.angle(), weight, power, free).coefficient[0]
+        along = self.basis @ of_steps.solved(turn.angle(), weight, power, free)[0][0]
         return replace(self, motion_m=self.motion_m + torch.nn.functional.pad(along[:, None], (0, 1)))
 
-    def fitted(self, power: Tensor) -> tuple[Strip, Solution, Tensor, Echoes] | None:
-        """The strip with the most probable motion, its solution, and the power of its cosines."""
+    def fitted(self, power: Tensor) -> tuple[Strip, Tensor, Tensor, Echoes] | None:
+        """The strip with the most probable motion, the covariance of its cosines along the line of
+        sight, the power of its cosines, and the echoes.
+        """
         found = self.echoes(_SCATTERERS)
         if found is None:
             return None
         echoes, curve = found
-        near = _odd(_SMOOTH * echoes.seen.shape[1])
+        near = 2 * round(_SMOOTH * echoes.seen.shape[1] / 2) + 1
         # phases are those along the path less what has been found
         before = curve.phase(self.motion_m)
         steep = torch.linalg.vector_norm(_mean(echoes.slope @ self.grid.axes.mT, echoes.seen), dim=-1)[:, 0]
         cell = LIGHT_M_S / (2 * float(self.frequency_hz[-1] - self.frequency_hz[0]))
         turned = torch.zeros_like(before)
         model = torch.zeros_like(echoes.samples)
-        gain, solution = echoes.seen.double(), None
+        gain, motion, covariance = echoes.seen.double(), self.motion_m, torch.zeros_like(power)
         for _ in range(_STEPS):
             alone = (echoes.samples - echoes.crossed(model)) * cis(-turned) * echoes.seen
             mean = (alone * gain).sum(1, keepdim=True)
@@ -306,89 +338,18 @@ class Strip:
             alone = alone * way.conj()
             gain = _smooth(alone.real, near).clamp_min(0) * echoes.seen
             model = way * gain * cis(turned)
-            noise = _per_seen((alone - gain).abs().square() * echoes.seen, echoes.seen)
-            faded = gain < _FADED * gain.amax(1, keepdim=True)
+            noise = _mean((alone - gain).abs().square()[..., None], echoes.seen)[..., 0]
+            faded = gain < 0.2 * gain.amax(1, keepdim=True)
             weight = torch.where(faded, 0.0, 2 * gain.square() / or_one(noise))
             phase = torch.where(faded, 0.0, alone.imag / or_one(gain))
             # the range of a scatterer is known from the image; its phase and azimuth are free
             spread = cell**2 * (_PLACED**2 + _PLACED_IN_NOISE**2 / or_one(weight.sum(1) / 2))
             known = torch.stack([torch.zeros_like(spread), steep.square() / spread, torch.zeros_like(spread)], -1)
-            solution = curve.solved(phase + turned + before, weight, power, known)
-            turned = curve.phase(curve.motion_m(solution.coefficient)) - before + solution.own
-            count = power.shape[1]
-            known = solution.coefficient[0].square() + solution.covariance.diagonal()[:count]
-            power = expected_power(known).expand(2, -1)
-        assert solution is not None
-        return replace(self, motion_m=curve.motion_m(solution.coefficient)), solution, power, echoes
-
-
-@dataclass(frozen=True, eq=False)
-class StripFit:
-    """The last round of a fit.
-
-    Args:
-        strip: The strip with the motion found.
-        echoes: Echoes of the scatterers.
-        std_m: Standard deviation of the line of sight in metres, float64 (pulse,).
-        change_m2: Mean square by which the round changed the line of sight.
-    """
-
-    strip: Strip
-    echoes: Echoes
-    std_m: Tensor
-    change_m2: Tensor
-
-
-def _found(strip: Strip, assess: bool) -> Estimate:
-    """The estimate of one trial."""
-    for _ in range(_SEARCHES):
-        after = strip.with_increments()
-        if after is None:
-            return _nothing(strip, assess)
-        change, strip = strip.changed_m2(after), after
-        if change.sqrt() < _NEAR * strip.fringe_m:
-            break
-    # increments show slow errors best: their spectrum would forbid fast ones
-    size = strip.line_free(strip.motion_m[:, 0])[strip.judged].square().mean()
-    power = torch.full_like(strip.basis[:2], float(size) * strip.basis.shape[0] / strip.basis.shape[1])
-    fit = None
-    for _ in range(_FITS):
-        fitted = strip.fitted(power)
-        if fitted is None:
-            return _nothing(strip, assess)
-        after, solution, power, echoes = fitted
-        fit, strip = StripFit(after, echoes, _std_m(after, solution), strip.changed_m2(after)), after
-        if fit.change_m2 < _SETTLED**2 * fit.std_m[strip.judged].square().mean():
-            break
-    assert fit is not None
-    value = {"line_of_sight_m": strip.line_free(strip.motion_m[:, 0]), "offset_m": strip.offset_m}
-    count = size.new_tensor(float(len(fit.echoes.seen)))
-    found = Estimate(value, quality=torch.ones_like(count), info={"scatterers": count})
-    return assessment.of_strip(found, fit) if assess else found
-
-
-def _nothing(strip: Strip, assess: bool) -> Estimate:
-    """The estimate where there are too few scatterers."""
-    zero = torch.zeros(len(strip.judged), dtype=torch.float64, device=strip.judged.device)
-    none = zero.new_zeros(())
-    value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
-    found = Estimate(value, quality=none + 1, info={"scatterers": none})
-    if not assess:
-        return found
-    outcome = (Outcome.NOISE if bool((strip.history != 0).any()) else Outcome.EMPTY).like(none)
-    return replace(found, std={"line_of_sight_m": zero + 1}, quality=none, outcome=outcome)
-
-
-def _std_m(strip: Strip, solution: Solution) -> Tensor:
-    """Standard deviation of the line of sight, (pulse,), without a line over the judged pulses."""
-    count = strip.basis.shape[1]
-    free = torch.stack([strip.line_free(cosine) for cosine in strip.basis.mT], -1)
-    return ((free @ solution.covariance[:count, :count]) * free).sum(-1).clamp_min(0).sqrt()
-
-
-def _odd(length: float) -> int:
-    """An odd number near a length."""
-    return 2 * round(length / 2) + 1
+            coefficient, covariance, own = curve.solved(phase + turned + before, weight, power, known)
+            motion, covariance = self.basis @ coefficient.mT, covariance[: power.shape[1], : power.shape[1]]
+            turned = curve.phase(motion) - before + own
+            power = expected_power(coefficient[0].square() + covariance.diagonal()).expand(2, -1)
+        return replace(self, motion_m=motion), covariance, power, echoes
 
 
 def _smooth(x: Tensor, length: int) -> Tensor:
@@ -402,8 +363,3 @@ def _smooth(x: Tensor, length: int) -> Tensor:
 def _mean(x: Tensor, seen: Tensor) -> Tensor:
     """Mean of (scatterer, seen, term) over the pulses that are seen, (scatterer, 1, term)."""
     return (x * seen[..., None]).sum(1, keepdim=True) / or_one(seen.sum(1).to(x.dtype))[:, None, None]
-
-
-def _per_seen(x: Tensor, seen: Tensor) -> Tensor:
-    """Mean of (scatterer, seen) over the pulses that are seen, (scatterer, 1)."""
-    return (x.sum(1) / or_one(seen.sum(1).to(x.dtype)))[:, None]

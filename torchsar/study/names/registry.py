@@ -185,7 +185,6 @@ REPAIR: dict[str, Callable[..., Any]] = {
 COMPENSATE: dict[str, Callable[..., Any]] = {
     "phase_increment": compensate.PhaseIncrement,
     "energy_centre": compensate.EnergyCentre,
-    "range_dependent_centroid": compensate.RangeDependentCentroid,
     "doppler_centroid": compensate.DopplerCentroid,
     "point_doppler": compensate.PointDoppler,
     "effective_velocity": factories.effective_velocity,

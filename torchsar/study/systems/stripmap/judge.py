@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.doppler import wrap_hz
-from torchsar.core import Chain, Signal, Trace
+from torchsar.core import Chain, Signal, Trace, wrapped
 from torchsar.focus import ClosestRange
 from torchsar.focus.skew import common_lines
 from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
@@ -78,7 +77,7 @@ def estimation_metrics(trace: Trace, trials: Trials, prf_hz: float) -> dict[str,
             metrics[error_name(key)] = value - truth[key].to(value)
     doppler = values.get("doppler_hz", values.get("doppler_baseband_hz"))
     if doppler is not None and "doppler_hz" in truth:
-        metrics["doppler_baseband_error_hz"] = wrap_hz(doppler - truth["doppler_hz"].to(doppler), prf_hz)
+        metrics["doppler_baseband_error_hz"] = wrapped(doppler - truth["doppler_hz"].to(doppler), prf_hz)
     return metrics
 
 
