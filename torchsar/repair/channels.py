@@ -28,6 +28,7 @@ from torchsar.core import (
 )
 from torchsar.repair.assess import assess_imbalance
 
+
 def _sums(x: Tensor, noise: Tensor, blocks: int) -> tuple[Tensor, Tensor]:
     """Products of each line with the conjugate of the line before, and powers above the noise of
     the lines of a channel, summed over groups of lines, (..., block, channel) each.

@@ -439,8 +439,8 @@ def _fit_tone(lines: Tensor, cell: Tensor, present: Tensor, density: Tensor) -> 
     energy = power_of(blocks.sum(-1)) / n
     tiny, count = torch.finfo(energy.dtype).tiny, blocks.shape[-1]
     noise = torch.sqrt(density / (2 * energy.clamp_min(tiny))).to(torch.float64)
-    # a chirp has a given frequency in few blocks only, whereas a tone fills all of them; the coherent
-    # share of the energy that is expected of a tone with z = energy / density is z / (z + count)
+    # a chirp has a given frequency in few blocks only, whereas a tone fills all of them; the
+    # coherent share of the energy expected of a tone with z = energy / density is z / (z + count)
     coherent = power_of(blocks.sum(-1)) / (count * power_of(blocks).sum(-1).clamp_min(tiny))
     z = energy / density.clamp_min(tiny)
     return replace(tone, present=present & (coherent > _LASTING * z / (z + count)), noise_rad=noise)

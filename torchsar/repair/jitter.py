@@ -140,9 +140,7 @@ def band_limited_weights(instants: Tensor, band: float, floor: float = 1e-9) -> 
     return linear_solve(gram, torch.sinc(band * instants)[..., None])[..., 0]
 
 
-def _interpolated(
-    y: Tensor, offset_samples: Tensor, points: int, weights_of: Callable[[Tensor], Tensor]
-) -> Tensor:
+def _interpolated(y: Tensor, offset_samples: Tensor, points: int, weights_of: Callable[[Tensor], Tensor]) -> Tensor:
     """Uniform samples as weighted sums of the jittered ones next to them, with periodic lines.
 
     Sum over k of weights[n mod M, k] y[n + first[n mod M] + k]; weights_of gives the weights of

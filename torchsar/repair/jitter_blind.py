@@ -27,7 +27,8 @@ from torchsar.repair.assess import assess_offsets, of_trials
 from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap, uncrossed
 
 # Largest rms offset that is ok, in samples, found by trial: above it the fits settle on wrong
-# offsets. Error of the noise level: that of the lowest twentieth of a spectrum of 256 looks or more.
+# offsets. Error of the noise level: that of the lowest twentieth of a spectrum of 256 or more
+# looks.
 _MOST_RMS, _NOISE_ERROR = 0.22, 0.08
 # Least power over its mean that a frequency is given: the ends of a line leak as much.
 _LEAST_POWER = 1e-5
@@ -58,8 +59,8 @@ def cyclic_fit(
     Returns:
         First-order estimate of the jitter that remains:
 
-        - Fourier coefficients E_1 to E_(M-1) of the M timing offsets in samples, shape (..., M - 1),
-          complex;
+        - Fourier coefficients E_1 to E_(M-1) of the M timing offsets in samples, shape
+          (..., M - 1), complex;
         - variance of each coefficient in samples^2, shape (..., M - 1); the square root of their
           sum is the standard deviation of each offset;
         - share of the power of the lines that is noise, shape (...,);
@@ -173,7 +174,10 @@ def detect_jitter_period(y: Tensor, max_period: int = 16) -> Tensor:
     found = {}
     some = y[..., :: max(1, y.shape[-2] // 256), :]
     for m in range(2, max_period + 1):
-        (coefficient, variance, *_), primitive = cyclic_fit(some, m), [k - 1 for k in range(1, m) if math.gcd(k, m) == 1]
+        (coefficient, variance, *_), primitive = (
+            cyclic_fit(some, m),
+            [k - 1 for k in range(1, m) if math.gcd(k, m) == 1],
+        )
         found[m] = (coefficient.abs().square() / variance)[..., primitive].sum(-1), 9 * len(primitive) + 16
     leak = 0.002 * torch.stack([chi for chi, _ in found.values()]).amax(0)
     counted = {m: torch.where(chi > least + leak, chi, 0) for m, (chi, least) in found.items()}

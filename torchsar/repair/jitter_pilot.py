@@ -80,9 +80,7 @@ def estimate_jitter_pilot(
     frequency, noise, power, jitter = (torch.stack(parts, -1) for parts in fits)
     best = _choose(noise, power, jitter, n) if period is None else torch.zeros_like(power[..., 0], dtype=torch.int64)
     tiled = torch.arange(longest, device=x.device)
-    phase = take(
-        torch.stack([phase[..., tiled % m] for m, phase in zip(periods, phases, strict=True)], -2), best, -2
-    )
+    phase = take(torch.stack([phase[..., tiled % m] for m, phase in zip(periods, phases, strict=True)], -2), best, -2)
     frequency, noise, power = (take(x, best) for x in (frequency, noise, power))
     m = best + periods[0]
     radians = 2 * math.pi * torch.where(frequency.abs() > 1 / n, frequency, torch.inf)
@@ -143,8 +141,8 @@ def _choose(noise: Tensor, power: Tensor, jitter: Tensor, n: int) -> Tensor:
     noise, power, jitter: see `_fit`, (..., period). The threshold of 14 + 4 (M - 1) keeps false
     alarms below 1e-4 per trial.
     """
-    # rounding of float64 in a record of up to 1024 samples without noise, relative to the squares of
-    # phases of jitter and to the power: without it, rounding errors look like jitter of a longer
+    # rounding of float64 in a record of up to 1024 samples without noise, relative to the squares
+    # of phases of jitter and to the power: without it, rounding errors look like jitter of a longer
     # period; it grows with longer records
     longer = max(1.0, n / 1024)
     rounding = torch.maximum(1e-13 * longer * jitter.amax(-1), 1e-28 * longer * power[..., 0] + 1e-300)

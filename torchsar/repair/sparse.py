@@ -362,7 +362,7 @@ def bright_fill(
         spectra, lowest = scene.spectra(missing), last**2 * scene.mean_power(missing)
         if threshold is None:
             peaks = scene.in_blocks(
-                lambda rows, of=spectra.detach(): power_of(torch.fft.ifft(of[..., rows, :])).amax(-1, keepdim=True),
+                lambda rows, of=spectra: power_of(torch.fft.ifft(of.detach()[..., rows, :])).amax(-1, keepdim=True),
                 spectra.real.new_empty((*spectra.shape[:-1], 1)),
                 -2,
             )
