@@ -183,7 +183,13 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     # a line that keeps more than 1.5 times the power of clutter is lost, by choice
     lost = touched & (power.masked_fill(hit, 0).sum(-1) > 1.5 * density.sum(-1))
     data = torch.where(touched[..., None], torch.fft.ifft(spectrum.masked_fill(hit, 0)), raw)
-    return Repaired(data.masked_fill(lost[..., None], 0) * level, touched, lost, hit.sum(-1), _no_tone(touched))
+    return Repaired(
+        data.masked_fill(lost[..., None], 0) * level,
+        touched,
+        lost,
+        hit.sum(-1),
+        torch.zeros_like(touched, dtype=torch.float64),
+    )
 
 
 def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
@@ -205,7 +211,13 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     """
     raw, level, _, touched = _searched(raw, "drop_interference", threshold)
     data = raw.masked_fill(touched[..., None], 0)
-    return Repaired(data * level, touched, touched, torch.where(touched, raw.shape[-1], 0), _no_tone(touched))
+    return Repaired(
+        data * level,
+        touched,
+        touched,
+        torch.where(touched, raw.shape[-1], 0),
+        torch.zeros_like(touched, dtype=torch.float64),
+    )
 
 
 def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones: int = 4) -> Repaired:
@@ -238,14 +250,16 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
     found = find_contamination(raw, threshold)
     nothing = torch.zeros_like(found.lines)
     if not _anything(found.lines):
-        return Repaired(raw * scale, nothing, nothing, found.cells.sum(-1), _no_tone(nothing))
+        return Repaired(
+            raw * scale, nothing, nothing, found.cells.sum(-1), torch.zeros_like(nothing, dtype=torch.float64)
+        )
     # the marked lines of each trial; unmarked ones follow
     count = host_largest(found.lines.sum(-1), found.lines.shape[-1])
     index = torch.argsort((~found.lines).to(torch.int8), dim=-1, stable=True)[..., :count]
     wide = index[..., None].expand(*index.shape, raw.shape[-1])
     lines, density = raw.gather(-2, wide), found.density.gather(-2, wide)
     tones = _find_tones(lines, density, index.to(torch.float64), most_tones, threshold)
-    touched, cycles = torch.zeros_like(index, dtype=torch.bool), _no_tone(index)
+    touched, cycles = torch.zeros_like(index, dtype=torch.bool), torch.zeros_like(index, dtype=torch.float64)
     cleaned = lines - sum(_waveforms(lines, tones))
     for tone in reversed(tones):
         touched, cycles = touched | tone.present, torch.where(tone.present, tone.frequency, cycles)
@@ -266,7 +280,7 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
         touched,
         lost,
         found.cells.sum(-1) * touched,
-        _no_tone(nothing).scatter(-1, index, cycles),
+        torch.zeros_like(nothing, dtype=torch.float64).scatter(-1, index, cycles),
     )
 
 
@@ -284,11 +298,6 @@ def _searched(raw: Tensor, name: str, threshold: float) -> tuple[Tensor, Tensor,
         for tone in _find_tones(raw, found.density, row, 1, threshold):
             touched = touched | tone.present
     return raw, level, found.density, touched
-
-
-def _no_tone(lines: Tensor) -> Tensor:
-    """Frequency zero for every line."""
-    return torch.zeros(lines.shape, dtype=torch.float64, device=lines.device)
 
 
 def _anything(mask: Tensor) -> bool:

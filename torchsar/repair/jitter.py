@@ -85,28 +85,6 @@ def refuse_crossing(offset_samples: Tensor) -> None:
         )
 
 
-def neighbours(offset_samples: Tensor, points: int) -> tuple[Tensor, Tensor]:
-    """Find the jittered samples nearest to each instant of the uniform grid.
-
-    The pattern of offsets repeats every M samples, so that M uniform instants are sufficient.
-
-    Args:
-        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M).
-        points: Number of jittered samples for each instant; an even number is centred on the
-            interval that holds the instant.
-
-    Returns:
-        Instants of these jittered samples relative to the uniform instant, in samples, shape (...,
-        M, points); and the index of the first of them relative to the index of the uniform instant,
-        shape (..., M), int64.
-    """
-    m, device = offset_samples.shape[-1], offset_samples.device
-    first = torch.where(offset_samples.detach() > 0, -(points // 2), -((points - 1) // 2))
-    lag = first[..., None] + torch.arange(points, device=device)
-    phase = (torch.arange(m, device=device)[:, None] + lag) % m
-    return lag + torch.gather(offset_samples, -1, phase.flatten(-2)).reshape(lag.shape), first
-
-
 def lagrange_weights(instants: Tensor) -> Tensor:
     """Compute weights of uneven samples that give the value of their polynomial at instant 0.
 
@@ -143,18 +121,23 @@ def band_limited_weights(instants: Tensor, band: float, floor: float = 1e-9) -> 
 def _interpolated(y: Tensor, offset_samples: Tensor, points: int, weights_of: Callable[[Tensor], Tensor]) -> Tensor:
     """Uniform samples as weighted sums of the jittered ones next to them, with periodic lines.
 
-    Sum over k of weights[n mod M, k] y[n + first[n mod M] + k]; weights_of gives the weights of
-    instants (..., M, points).
+    Sum over k of weights[n mod M, k] y[n + first[n mod M] + k], since the pattern of offsets
+    repeats every M samples; weights_of gives the weights of instants (..., M, points) relative to
+    the uniform ones. An even number of points is centred on the interval of the uniform instant.
     """
     y, offsets = _checked(y, offset_samples)
-    instants, first = neighbours(offsets, points)
+    m, device = offsets.shape[-1], offsets.device
+    first = torch.where(offsets.detach() > 0, -(points // 2), -((points - 1) // 2))
+    near = first[..., None] + torch.arange(points, device=device)
+    number = (torch.arange(m, device=device)[:, None] + near) % m
+    instants = near + torch.gather(offsets, -1, number.flatten(-2)).reshape(near.shape)
     lowest = -(points // 2)
     # 0 or 1: both placements share the lags lowest .. lowest + points
     shift = (first - lowest)[..., None]
     lag = torch.arange(points + 1, device=y.device)
     weights = torch.nn.functional.pad(weights_of(instants), (1, 1))
     table = torch.gather(weights, -1, (lag + 1 - shift).clamp(0, points + 1)).to(real_dtype(y.dtype))
-    phase = torch.arange(y.shape[-1], device=y.device) % offsets.shape[-1]
+    phase = torch.arange(y.shape[-1], device=y.device) % m
     out = torch.zeros_like(y)
     for k in range(points + 1):
         out = out + table[..., None, phase, k] * torch.roll(y, -(lowest + k), -1)

@@ -136,7 +136,7 @@ class IncompleteLines:
     def __init__(self, operator: InvertibleOmegaK, lines: Tensor, mask: Tensor) -> None:
         self.operator = operator
         self.received = torch.fft.fft(lines).mT.contiguous()
-        self._energy = power_of(self.received.detach()).sum((-2, -1), keepdim=True)
+        self.energy = power_of(self.received.detach()).sum((-2, -1), keepdim=True)
         most = max(1, host_largest(mask.sum(-1), mask.shape[-1]))
         order = torch.sort(mask.to(torch.uint8), dim=-1, descending=True, stable=True).indices
         self._index = order[..., None, :most]
@@ -155,15 +155,6 @@ class IncompleteLines:
             Lines, shape (..., pulse, range).
         """
         return self._put(torch.zeros_like(self.received), torch.fft.ifft(missing, dim=-2)).mT
-
-    def mean_power(self, missing: Tensor) -> Tensor:
-        """Return the mean power of the pixels of the image, shape (..., 1, 1).
-
-        Args:
-            missing: Range spectra of missing lines, shape (..., range frequency, m).
-        """
-        energy = self._energy + power_of(missing.detach()).sum((-2, -1), keepdim=True)
-        return energy / (self.received.shape[-2] ** 2 * self.received.shape[-1])
 
     def spectra(self, missing: Tensor, received: bool = True) -> Tensor:
         """Compute the focused azimuth spectra of the lines.
@@ -359,7 +350,10 @@ def bright_fill(
     missing, threshold = torch.zeros_like(scene.taken(scene.received)), None
     active = torch.ones_like(missing[..., :1, :1], dtype=torch.bool)
     for _ in range(steps):
-        spectra, lowest = scene.spectra(missing), last**2 * scene.mean_power(missing)
+        spectra = scene.spectra(missing)
+        # mean power of the pixels of the image
+        energy = scene.energy + power_of(missing.detach()).sum((-2, -1), keepdim=True)
+        lowest = last**2 * (energy / (scene.received.shape[-2] ** 2 * scene.received.shape[-1]))
         if threshold is None:
             peaks = scene.in_blocks(
                 lambda rows, of=spectra: power_of(torch.fft.ifft(of.detach()[..., rows, :])).amax(-1, keepdim=True),

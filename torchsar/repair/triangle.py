@@ -83,18 +83,6 @@ def split_record(
         TypeError: If the record is not a tensor of samples, or the trigger not a number.
     """
     record = checked_samples(record, "split_record", "pulse, time", real=True, finite=False)
-    trigger = _trigger_of(trigger_s, record)
-    joined = is_contiguous(record.shape[-1], radar) if contiguous is None else contiguous
-    lines = record.flatten(-2)[..., None, :] if joined else record
-    start, fraction = start_sample(trigger - first_s, radar, joined)
-    whole = delayed(lines, fraction, analytic=not record.is_complex())
-    periods = _cut_joined(whole, start, record.shape[-2], radar) if joined else _cut_inside(whole, start, radar)
-    sweeps = periods.unflatten(-1, (2, radar.sweep_samples)).movedim(-2, -3)
-    return sweeps if record.is_complex() else canonical_ramps(sweeps, radar, nearer)
-
-
-def _trigger_of(trigger_s: float | Tensor, record: Tensor) -> Tensor:
-    """The trigger as a float64 tensor, a number or one per trial of the record."""
     if not isinstance(trigger_s, Tensor | float | int):
         raise TypeError(f"trigger_s must be a number of seconds, or a tensor with one per trial, got {trigger_s!r}")
     trigger, trials = torch.as_tensor(trigger_s, dtype=torch.float64, device=record.device), record.shape[:-2]
@@ -112,7 +100,13 @@ def _trigger_of(trigger_s: float | Tensor, record: Tensor) -> Tensor:
             f"trigger_s must be one number, or one number per trial with the trials {tuple(trials)}, "
             f"got the shape {tuple(trigger.shape)}"
         )
-    return trigger
+    joined = is_contiguous(record.shape[-1], radar) if contiguous is None else contiguous
+    lines = record.flatten(-2)[..., None, :] if joined else record
+    start, fraction = start_sample(trigger - first_s, radar, joined)
+    whole = delayed(lines, fraction, analytic=not record.is_complex())
+    periods = _cut_joined(whole, start, record.shape[-2], radar) if joined else _cut_inside(whole, start, radar)
+    sweeps = periods.unflatten(-1, (2, radar.sweep_samples)).movedim(-2, -3)
+    return sweeps if record.is_complex() else canonical_ramps(sweeps, radar, nearer)
 
 
 def is_contiguous(block_samples: int, radar: TriangularLadar) -> bool:

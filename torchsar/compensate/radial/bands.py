@@ -423,8 +423,7 @@ def _line_phase(
     samples.
     """
     j = torch.arange(lines, dtype=torch.float64, device=like.device)
-    beat_hz = (first + j) / radar.sweep_s
-    video = sign * remove_video * math.pi * beat_hz.square() / radar.chirp_rate_hz_s
+    video = sign * remove_video * math.pi * ((first + j) / radar.sweep_s).square() / radar.chirp_rate_hz_s
     offset = math.pi * j * (1 / m - sign / radar.sweep_samples)
     return torch.exp(1j * ((video + offset) % (2 * math.pi))).to(like.dtype)
 

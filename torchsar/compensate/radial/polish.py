@@ -103,10 +103,9 @@ def sharpened(rows: Tensor, start: Tensor | None, iterations: int, tolerance_rad
         The phases in rad, shape (trial, pulse), and the iterations taken, shape (trial,).
     """
     start = torch.zeros_like(rows[:, 0].real) if start is None else start
-    along = AlongPulses()
     runs = [
-        Run(_single_points, along, 1, 1.0, 0.0),
-        Run(_SCENE, along, iterations, _RELAXATION, tolerance_rad),
+        Run(_single_points, AlongPulses(), 1, 1.0, 0.0),
+        Run(_SCENE, AlongPulses(), iterations, _RELAXATION, tolerance_rad),
         Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 2),
     ]
     return in_turn(rows, start, runs)

@@ -31,11 +31,11 @@ from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
 from torchsar.radar import TriangularLadar, sweep_middles
 
 # random walk of the integrated velocities beyond which the polish is started from PGA, found by
-# trial: beyond a radian the polish alone may end in an image of two peaks
-_FAR_RAD = 0.4
+# trial: beyond a radian the polish alone may end in an image of two peaks; least number of periods
+# for that, because the first window of PGA is as wide
+_FAR_RAD, _FEW_PERIODS = 0.4, 32
 # scenes of more effective image cells are dense
 _DENSE_CELLS = 20.0
-_FEW_PERIODS = 32  # fewer periods are not started from PGA, whose first window is as wide
 # windows of PGA in Doppler cells, found by trial: a random walk blurs by few cells
 _WINDOWS = Listed((31.0, 21.0, 15.0, 9.0, 9.0, 9.0))
 
@@ -207,10 +207,8 @@ def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
     """
     radar, m = bands.radar, bands.time_s.shape[-1]
     turns = carrier_turns(sweep_motion(velocity_m_s, radar, pulse), radar)[..., 0, :, :]
-    remaining = torch.cat(
-        [turns[..., :1], turns[..., 1:2] - (bands.shift.to(torch.float64) / radar.sweep_s)[..., None], turns[..., 2:]],
-        -1,
-    )
+    # less the linear term that is removed already
+    remaining = turns - torch.nn.functional.pad((bands.shift.to(torch.float64) / radar.sweep_s)[..., None], (1, 4))
     compensated = bands.up * polynomial_phasor(-remaining, radar.sweep_s / m, m, bands.up.dtype)
     lines = torch.arange(bands.first, bands.first + bands.lines, device=compensated.device)
     cells = torch.fft.fft(compensated)[..., lines % m] / m

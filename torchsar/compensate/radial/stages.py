@@ -286,7 +286,7 @@ class PhasePolish(Stage):
 
     def __init__(self, iterations: int = 80, tolerance_rad: float = 0.005, assess: bool = True) -> None:
         super().__init__()
-        self.iterations, self.tolerance_rad, self.assess = iterations, tolerance_rad, assess
+        self.options: dict[str, Any] = {"iterations": iterations, "tolerance_rad": tolerance_rad, "assess": assess}
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the residual phase of every pulse of a signal of axes (pulse, range).
@@ -295,9 +295,7 @@ class PhasePolish(Stage):
             `Estimate` by the function `phase_polish` with `phase_rad` of shape (..., pulse), to be
             removed.
         """
-        return phase_polish(
-            signal.data, iterations=self.iterations, tolerance_rad=self.tolerance_rad, assess=self.assess
-        )
+        return phase_polish(signal.data, **self.options)
 
 
 class PulseGain(Stage):
