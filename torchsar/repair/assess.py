@@ -219,8 +219,8 @@ def assess_response(
     change = sum(slope(moved).chunk(2)) - both
     curvature = (change / 2 * step).sum(-1) / step.square().sum(-1).clamp_min(1e-300)
     finer = (first * second).sum(-1).clamp_min(0).sqrt() / curvature.clamp_min(_CURVATURE)
-    parts = torch.stack(found.chunk(2), -2)
-    std = torch.hypot(torch.linalg.vector_norm(left_out_deviation(parts), dim=-1), finer).maximum(bound)
+    apart = left_out_deviation(torch.stack(found.chunk(2), -2))
+    std = torch.hypot(torch.linalg.vector_norm(apart, dim=-1), finer).maximum(bound)
     outcome = worst(
         (Outcome.INEXACT, ~(std < _MOST_RESPONSE)),
         (Outcome.MISFIT, finer >= _MOST_RESPONSE),

@@ -42,6 +42,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -210,9 +211,8 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
         ValueError: If there are no samples or a sample is not finite.
     """
     raw, level, _, touched = _searched(raw, "drop_interference", threshold)
-    data = raw.masked_fill(touched[..., None], 0)
     return Repaired(
-        data * level,
+        raw.masked_fill(touched[..., None], 0) * level,
         touched,
         touched,
         torch.where(touched, raw.shape[-1], 0),
@@ -707,7 +707,7 @@ class _InterferenceCorrection(Stage):
             "touched": result.touched,
             "tone_cycles_per_sample": result.tone_cycles,
         }
-        not_assessed = {"outcome": Outcome.NOT_ASSESSED.like(info["lines_touched"])}
+        not_assessed: dict[str, Any] = {"outcome": Outcome.NOT_ASSESSED.like(info["lines_touched"])}
         judged = assess_lines(result.data, result.missing) if self.assess else not_assessed
         return signal.with_data(result.data), Estimate({"missing": given_up}, **judged, info=info)
 

@@ -128,8 +128,7 @@ def _fit(x: Tensor, m: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
             scale = phasor.abs().square().sum(-1).clamp_min(1e-300) / m
             frequency = frequency + (position * aligned.imag).sum(-1) / scale / (2 * math.pi * position.square().sum())
     noise = (z - phasor[..., index]).abs().square().sum(-1) / max(1, n - m - 1)
-    mean = phasor.sum(-1, keepdim=True)
-    phase = torch.angle(phasor * mean.conj())
+    phase = torch.angle(phasor * phasor.sum(-1, keepdim=True).conj())
     phase = phase - phase.mean(-1, keepdim=True)
     power = phasor.abs().square()
     return frequency, noise, power.mean(-1), (2 * count * power * phase.square()).sum(-1), phase

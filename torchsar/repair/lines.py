@@ -111,8 +111,7 @@ def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tens
 def _repeats(lines: Tensor, number: Tensor, present: Tensor) -> Tensor:
     """Lines with the samples of the line before, (..., line) bool; lines of zeros do not count."""
     same = (lines[..., 1:, :] == lines[..., :-1, :]).all(-1) & (lines[..., 1:, :] != 0).any(-1)
-    first = same.new_zeros(*same.shape[:-1], 1)
-    return torch.cat([first, same], -1) & present
+    return torch.nn.functional.pad(same, (1, 0)) & present
 
 
 def _empty_lines(lines: Tensor, present: Tensor) -> Tensor:
@@ -261,8 +260,8 @@ def _first(verified: Tensor) -> Tensor:
 def _sources(slot: Tensor, inside: Tensor, rows: int) -> Tensor:
     """Received row for each row of the grid, -1 where there is none."""
     row = torch.arange(slot.shape[-1], device=slot.device).expand(slot.shape)
-    plan = slot.new_full((*slot.shape[:-1], rows + 1), -1)
-    return plan.scatter(-1, torch.where(inside, slot, rows), row)[..., :rows]
+    empty = slot.new_full((*slot.shape[:-1], rows + 1), -1)
+    return empty.scatter(-1, torch.where(inside, slot, rows), row)[..., :rows]
 
 
 def place_lines(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:

@@ -381,8 +381,8 @@ def _align(spectra: Tensor, reference: Tensor) -> Tensor:
     correlation = torch.fft.fft(spectra * reference.conj(), n)
     index = power_of(correlation).argmax(-1, keepdim=True)
     slope = (index - n * (2 * index >= n)).to(torch.float64) / n
-    turned = torch.gather(correlation, -1, index)
-    return spectra * linear_phasor(-slope[..., 0], 0, spectra.shape[-1], spectra.dtype) * cis(-torch.angle(turned))
+    constant = cis(-torch.angle(torch.gather(correlation, -1, index)))
+    return spectra * linear_phasor(-slope[..., 0], 0, spectra.shape[-1], spectra.dtype) * constant
 
 
 def estimate_response_points(

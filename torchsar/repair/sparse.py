@@ -424,8 +424,13 @@ def sparse_fill(
     x = torch.where(mask[..., None], 0, lines)
     level = level_of(x)
     x = x / level
-    flat = None if reference is None else all_pass(reference)
-    operator = InvertibleOmegaK(radar, x, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, reference=flat)
+    operator = InvertibleOmegaK(
+        radar,
+        x,
+        doppler_hz=doppler_hz,
+        velocity_m_s=velocity_m_s,
+        reference=None if reference is None else all_pass(reference),
+    )
     turns = torch.as_tensor(doppler_hz, dtype=torch.float64, device=x.device) / radar.prf_hz
     scene = IncompleteLines(operator, x, mask)
     model = SubLooks(scene, look_windows(x.shape[-2], looks, turns.expand(x.shape[:-2])))

@@ -187,8 +187,7 @@ def _instants(error_s: Tensor, radar: TriangularLadar, dtau_s: float, steps: int
 
 def _resampled(x: Tensor, instant: Tensor, points: int, band: float) -> Tensor:
     """x (..., 2, K, N) at fractional indices (..., 2, N) of its last dimension."""
-    n = x.shape[-1]
-    first = (torch.floor(instant.detach()).long() - (points // 2 - 1)).clamp(0, n - points)
+    first = (torch.floor(instant.detach()).long() - (points // 2 - 1)).clamp(0, x.shape[-1] - points)
     index = first[..., None] + torch.arange(points, device=x.device)
     weights = band_limited_weights(index - instant[..., None], band).to(x.real.dtype)
     out = torch.zeros_like(x)

@@ -101,7 +101,7 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
     changes = _changes_of_product(measured, law.intercept or "free") if law.changes is None else law.changes()
     square = filled(variance(changes) / share, clear)
     slope, bend = (_rms_difference(measured.raw_m_s, clear, order) for order in (1, 2))
-    # 1 / 32: mean of the square of the time between two samples of a product over 24 squared periods
+    # 1 / 32: mean square of the time between two samples of a product over 24 squared periods
     jerk = bend / 32 * (measured.product.radar.period_s / pulse.step) ** 2
     square = square + _interpolated(clear, slope, bend).square() + jerk.square() + law.floor_m_s**2
     if law.intercept:

@@ -98,8 +98,7 @@ def carrier_turns(motion: Tensor, radar: TriangularLadar, carrier_only: bool = F
     Returns:
         Coefficients by power of u, in turns/s^k, shape (..., 2, pulse, 6).
     """
-    per_m = 2 * radar.carrier_hz / radar.wave_speed_m_s
-    turns = torch.nn.functional.pad(motion * per_m, (0, 1))
+    turns = torch.nn.functional.pad(motion * (2 * radar.carrier_hz / radar.wave_speed_m_s), (0, 1))
     if carrier_only:
         return turns
     sign = torch.arange(1, -2, -2, dtype=torch.float64, device=motion.device)

@@ -74,7 +74,7 @@ class Levels(NamedTuple):
         """
         up, down = (power_of(x.detach()[..., bands.inner]).mean(-1).to(torch.float64) for x in (bands.up, bands.down))
         shared, total = (mean_of(x, bands.lit)[..., 0] for x in (common, (up + down) / 2))
-        # the magnitude of a mean of noise is not zero: up to 1.5 times of what noise alone would give
+        # the magnitude of a mean of noise is not zero: up to 1.5 times what noise alone would give
         # is no scene
         chance = total / math.sqrt(min(len(bands.time_s[bands.inner]), 2 * bands.noise_lines))
         scene = torch.where(shared > 1.5 * chance, shared, 0).clamp_max(total)

@@ -149,8 +149,7 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
     """
     both = torch.stack([bands.up, bands.down], -3)
     m = both.shape[-1]
-    spectrum = torch.fft.fft(both.detach(), _PAD * m)
-    power = power_of(spectrum)
+    power = power_of(torch.fft.fft(both.detach(), _PAD * m))
     searched = inside(bands.radar, window_m, _PAD * m, _PAD, both.device)
     centre = torch.where(searched, power.mean((-3, -2), keepdim=True), -1).argmax(-1, keepdim=True)
     distance = (torch.arange(_PAD * m, device=both.device) - centre + _PAD * m // 2) % (_PAD * m) - _PAD * m // 2

@@ -124,8 +124,7 @@ def scene_cells(rows: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         The number of image cells and that of range cells, float64 (trial,) each.
     """
-    image = torch.fft.fft(rows, norm="ortho")
-    power = power_of(image).to(torch.float64)
+    power = power_of(torch.fft.fft(rows, norm="ortho")).to(torch.float64)
     noise = power.flatten(-2).median(-1).values[:, None, None] / math.log(2)
     scene = torch.where(power > 12 * noise, power - noise, 0)
     row, tiny = scene.sum(-1), torch.finfo(torch.float64).tiny

@@ -76,8 +76,7 @@ def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
     The peak of a zero-padded transform, refined by Newton steps.
     """
     n, per = z.shape[-1], 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s
-    spectrum = torch.fft.fft(z.detach(), _PAD * n)
-    power = power_of(spectrum)
+    power = power_of(torch.fft.fft(z.detach(), _PAD * n))
     # 6 bins about the removed shift, which is right to a bin or two
     reach = min(round(6 * _PAD * n / bands.time_s.shape[-1]), n // 2)
     best = torch.cat([power[..., -reach:], power[..., : reach + 1]], -1).argmax(-1) - reach

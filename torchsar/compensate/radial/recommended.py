@@ -158,12 +158,11 @@ def polished(
         step_rad = 4 * math.pi / radar.wavelength_m * pulse.step * coarse.info["noise_m_s"].detach().flatten()[at]
         linked = linked_walk(cells.reshape(-1, *cells.shape[-2:])[at], phase[at], step_rad)
         walk = Walk(*(all_.index_copy(0, at, some) for all_, some in zip(walk, linked, strict=True)))
-    shape = pulses.trials
     info = {"iterations": taken, "image_cells": image_cells, "range_cells": range_cells}
     return replace(
         coarse,
-        value={**coarse.value, "phase_rad": walk.phase_rad.reshape(*shape, pulse.n)},
-        info={**coarse.info, **{name: value.reshape(shape) for name, value in info.items()}},
+        value={**coarse.value, "phase_rad": walk.phase_rad.reshape(*pulses.trials, pulse.n)},
+        info={**coarse.info, **{name: value.reshape(pulses.trials) for name, value in info.items()}},
     ), walk
 
 

@@ -138,8 +138,16 @@ class RadialMotion(_OfSweeps):
         tolerance_rad: float = 0.005,
         assess: bool = True,
     ) -> None:
-        options = {"iterations": iterations, "tolerance_rad": tolerance_rad}
-        super().__init__(radar, window_m, azimuth_m, assess, intercept=intercept, taper=taper, **options)
+        super().__init__(
+            radar,
+            window_m,
+            azimuth_m,
+            assess,
+            intercept=intercept,
+            taper=taper,
+            iterations=iterations,
+            tolerance_rad=tolerance_rad,
+        )
 
 
 class MlPeak(_OfSweeps):
@@ -232,8 +240,17 @@ class SegmentedInterference(_OfSweeps):
         azimuth_m: float = 0.0,
         assess: bool = True,
     ) -> None:
-        options = {"bins": bins, "unwrap": unwrap, "scatterers": scatterers, "padding": padding, "hann": hann}
-        super().__init__(radar, window_m, azimuth_m, assess, **options)
+        super().__init__(
+            radar,
+            window_m,
+            azimuth_m,
+            assess,
+            bins=bins,
+            unwrap=unwrap,
+            scatterers=scatterers,
+            padding=padding,
+            hann=hann,
+        )
 
 
 class CompensateMotion(Stage):

@@ -52,8 +52,8 @@ def geometric_velocity_m_s(
         The velocity in m/s, receding positive, shape (..., pulse), float64.
     """
     t = turning_points(radar, pulse).values(device)
-    x = per_trial(azimuth_m, 1, t)
-    return radar.speed_m_s * (radar.speed_m_s * t - x) / (radar.reference_range_m + relative_range_m)
+    along_m = radar.speed_m_s * t - per_trial(azimuth_m, 1, t)
+    return radar.speed_m_s * along_m / (radar.reference_range_m + relative_range_m)
 
 
 def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:
