@@ -70,19 +70,11 @@ def _enclosed(trusted: Tensor) -> Tensor:
     return (trusted.cumsum(-1) > 0) & (trusted.flip(-1).cumsum(-1).flip(-1) > 0)
 
 
-def _lossy(offset: Tensor, trusted: Tensor) -> Tensor:
-    """Whether lines are lost between the accepted ones, (..., 1)."""
-    limit = torch.iinfo(offset.dtype)
-    last = torch.where(trusted, offset, limit.min).amax(-1, keepdim=True)
-    return last > torch.where(trusted, offset, limit.max).amin(-1, keepdim=True)
-
-
-def _inconsistent(offset: Tensor, trusted: Tensor) -> Tensor:
-    """Accepted lines whose offset exceeds that of a later or is below that of an earlier one."""
+def _extremes(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
+    """Highest offset of the accepted lines up to each line, and lowest from each line on."""
     limit = torch.iinfo(offset.dtype)
     highest = torch.where(trusted, offset, limit.min).cummax(-1).values
-    lowest = torch.where(trusted, offset, limit.max).flip(-1).cummin(-1).values.flip(-1)
-    return trusted & ((highest > offset) | (lowest < offset))
+    return highest, torch.where(trusted, offset, limit.max).flip(-1).cummin(-1).values.flip(-1)
 
 
 def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tensor:
@@ -104,7 +96,8 @@ def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tens
         contradicting = [_contradictions(offset, trusted, reach, longest_gap, sign) for sign in (-1, 1)]
         trusted = trusted & ~torch.stack([2 * no > count for no, count in contradicting]).any(0)
     # the offsets that remain must not fall anywhere: all inconsistent numbers are dropped
-    trusted = trusted & ~_inconsistent(offset, trusted)
+    highest, lowest = _extremes(offset, trusted)
+    trusted = trusted & (highest <= offset) & (lowest >= offset)
     return trusted & ~_unconfirmed_ends(offset, trusted)
 
 
@@ -191,7 +184,9 @@ def line_integrity(
     verified = torch.where(ok[..., None], verified, torch.where(present, row, PADDING))
     # row 0 is the first received line, whether its own number is right or wrong
     origin = _first(verified) if first_number is None else ok * first_number
-    outside = ok[..., None] & ~_enclosed(trusted) & _lossy(offset, trusted)
+    highest, lowest = _extremes(offset, trusted)
+    lossy = highest[..., -1:] > lowest[..., :1]  # lines are lost between the accepted ones
+    outside = ok[..., None] & ~_enclosed(trusted) & lossy
     verified = torch.where(outside, PADDING, verified)
     slot = verified - origin[..., None]
     rows = max(n, 1 + host_largest(torch.where(verified != PADDING, slot, 0), 0)) if n_lines is None else n_lines

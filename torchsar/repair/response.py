@@ -68,21 +68,6 @@ def unit_legendre(u: Tensor, order: int) -> Tensor:
     return (legendre(u, order) * torch.sqrt(2 * degree + 1)).movedim(-1, 0)
 
 
-def without_line(phase_rad: Tensor) -> Tensor:
-    """Remove the constant and linear parts of a phase over the band, by least squares.
-
-    Args:
-        phase_rad: Phase in radians at GRID = 1025 equally spaced frequencies of the band, shape
-            (..., GRID), float64.
-
-    Returns:
-        Remaining phase in radians, same shape.
-    """
-    line = unit_legendre(band_grid(phase_rad.device), 1)
-    line = line / torch.linalg.vector_norm(line, dim=-1, keepdim=True)
-    return phase_rad - (phase_rad @ line.mT) @ line
-
-
 def on_axis(values: Tensor, u: Tensor) -> Tensor:
     """Interpolate a sampled response linearly at other frequencies.
 

@@ -145,9 +145,7 @@ class Measured:
     @property
     def enough(self) -> Tensor:
         """Whether the SNR suffices for peaks that exceed the noise in all periods, shape (...,)."""
-        if self.law.intercept:
-            return self.levels.squared >= LEAST_SQUARED
-        return self.levels.after >= _LEAST_SNR
+        return self.levels.squared >= LEAST_SQUARED if self.law.intercept else self.levels.after >= _LEAST_SNR
 
     @property
     def white_m_s(self) -> Tensor:
