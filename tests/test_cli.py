@@ -49,7 +49,18 @@ def test_list_explains_experiments_systems_stages_keys_and_data(capsys: pytest.C
 @pytest.mark.parametrize(
     "words, lines",
     [
-        (["pga_sca"], ["STAGES, compensate", "  pga_sca ", "      kernel", "      windows", "      iter", "      pat"]),
+        (
+            ["pga_sca"],
+            [
+                "STAGES, compensate",
+                "  pga_sca ",
+                "      kernel",
+                "      windows",
+                "      iter",
+                "      pat",
+                "      assess",
+            ],
+        ),
         (["isal_SNR"], ["EXPERIMENTS", "  isal_snr "]),
         (["velocity", "stripmap_doppler"], ["EXPERIMENTS", "  stripmap_doppler "]),
         (

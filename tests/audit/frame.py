@@ -17,13 +17,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from scipy.stats import beta
 from torch import Tensor, nn
 
 from torchsar.core import Draws, Estimate
 
 PACKAGES = ("core", "repair", "compensate", "multichannel", "focus", "metrics", "optim", "io")
 NOTHING = ("noise", "zeros", "real noise", "bright cells", "bright lines")  # worlds with nothing to be found
-SURE, RATIO = 5.0, (0.7, 1.5)  # predicted standard deviations of a false ok; bar of predicted over true
+SURE, RATIO = 5.0, (0.5, 2.0)  # predicted standard deviations of a false ok; bar of predicted over true
+FALSE = 0.02  # bar of the lower end of the 95 % interval of the share that is ok and wrong
 DOUBT = 0.05  # bar of needless doubt, 10 dB above the threshold
 SNR_DB = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 40.0, 60.0)
 
@@ -189,7 +191,9 @@ def verdict(row: Mapping[str, Any]) -> list[str]:
     """List the bars that a row misses."""
     missed = []
     nothing = row["world"] in NOTHING
-    if row["ok" if nothing else "false_ok"] > 0.01:
+    share = row["ok" if nothing else "false_ok"]
+    count, trials = round(share * row["trials"]), row["trials"]
+    if count and float(beta.ppf(0.025, count, trials - count + 1)) > FALSE:
         missed.append(f"ok {row['ok']:.2f}" if nothing else f"false ok {row['false_ok']:.2f}")
     ratio = row["rms_over_std"]
     if ratio is not None and row["trials"] * row["ok"] >= 20 and not 1 / RATIO[1] <= ratio <= 1 / RATIO[0]:

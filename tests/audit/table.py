@@ -23,6 +23,7 @@ SAME = {
     "compensate.strip_autofocus": "compensate.StripAutofocus",
     "compensate.phase_polish": "compensate.PhasePolish",
     "compensate.PulseGain": "compensate.pulse_gain",
+    "compensate.minimum_entropy_velocity": "compensate.EffectiveVelocity",
     "compensate.uneven_rotation": "compensate.UnevenRotation",
     "compensate.coarse_rotation": "compensate.CoarseRotation",
     "compensate.phase_fit_rotation": "compensate.PhaseFitRotation",

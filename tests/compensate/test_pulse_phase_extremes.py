@@ -12,7 +12,6 @@ from tests.compensate.scenes import DOUBLE, METHODS, noise, noisy, still, turned
 from torchsar.compensate import autofocus, correct_pulse_phase, entropy_fixed_point, link_phases, pga, phase_polish, sca
 from torchsar.compensate.pulse_phase.homogeneous import occupied_band
 from torchsar.compensate.pulse_phase.sharpness import sharpness_of_noise
-from torchsar.core import Outcome
 from torchsar.metrics import phase_rmse, residual_phase
 
 NAMES = list(METHODS)
@@ -287,14 +286,14 @@ def test_fitted_sharpness_of_noise_equals_the_measured_one(rows):
 @pytest.mark.parametrize("above_db", [20, 60, 100])
 @pytest.mark.parametrize("name", ["sca", "pga_sca", "entropy_fixed_point", "autofocus"])
 def test_a_strong_scatterer_determines_the_phase(name, above_db):
-    """It makes all of the sharpness: its own motion would be a phase error too."""
+    """It also makes all of the sharpness; the steady modulus of its echo confirms the phases."""
     x, a = still(2, width=0.8), white(2)
     k = torch.arange(128, dtype=torch.float64)
     x[..., 20] += 10 ** (above_db / 20) * x.abs().amax() * torch.exp(2j * math.pi * 0.1371 * k)
     found = METHODS[name](turned(x, a).to(torch.complex64))
     error = phase_rmse(found["phase_rad"], a)
-    assert float(error.max()) < 0.6 * 10 ** (-above_db / 20) + 1e-5
-    assert (found.outcome == Outcome.TOO_FEW).all()
+    assert float(error.max()) < 0.6 * 10 ** (-above_db / 20) + 1e-5 and found.ok.all()
+    assert (error < 1.5 * found.std["phase_rad"][:, 0] + 1e-5).all()
 
 
 # layout, batches, threads

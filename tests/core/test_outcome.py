@@ -34,7 +34,7 @@ def test_the_greatest_code_of_the_reasons_that_apply_counts() -> None:
     assert worst((Outcome.NOISE, no), (Outcome.MISFIT, yes)).tolist() == [30, 15, 0], "whatever their order"
     assert worst((Outcome.MISFIT, yes[:, None]), (Outcome.NOISE, no)).shape == (3, 3)
     assert Outcome.of(yes, Outcome.TOO_FEW).tolist() == [0, 0, 19]
-    assert Outcome.EMPTY.like(yes).tolist() == [31] * 3 and Outcome.EMPTY.like(yes).dtype == torch.int64
+    assert Outcome.EMPTY.like(yes).tolist() == [32] * 3 and Outcome.EMPTY.like(yes).dtype == torch.int64
 
 
 def test_counts_are_in_the_order_of_the_codes() -> None:

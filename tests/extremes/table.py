@@ -692,6 +692,8 @@ REASONS = {
     "core.machine_memory_bytes": "takes no arguments",
     "core.is_plain": "whether a tensor has storage, whatever its values",
     "core.over_blocks": "runs a function; takes no numbers",
+    "core.counts": "counts codes, not samples; tests/core/test_outcome.py",
+    "core.worst": "joins codes, not samples; tests/core/test_outcome.py",
     "core.use": "names connections; takes no numbers",
     "core.checked_samples": "the check itself; tests/core/test_core.py",
     "core.refuse_non_finite": "the check itself; tests/core/test_core.py",

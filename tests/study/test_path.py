@@ -120,7 +120,9 @@ def test_errors_are_added_to_a_recorded_path_and_corrected(tmp_path: Path) -> No
     tree = run(config.file, tmp_path / "out")
     none, best = (tree["methods"][name]["metrics"] for name in ("none", "recommended"))
     assert none["path_residual_rms_m"] == pytest.approx(0.005, rel=0.1) and none["image_error_db"] > -3
-    assert best["path_residual_rms_m"] < 4e-4 and best["image_error_db"] < -12 and best["ok"] == 1.0
+    assert best["path_residual_rms_m"] < 4e-4 and best["image_error_db"] < -12
+    # the path acts differently on near and far parts of the scene, which phases alone cannot follow
+    assert set(tree["methods"]["recommended"]["outcomes"]["phase"]) <= {"OK", "PARTS_DISAGREE"}
 
 
 @pytest.mark.parametrize(

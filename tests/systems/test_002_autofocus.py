@@ -5,12 +5,12 @@ of trials, and recordings with injected errors.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
 from torch import Tensor
 
-from tests.audit.pulses import scintillating
 from torchsar.compensate import autofocus, correct_pulse_phase, entropy_fixed_point, pga, pga_sca, sca
 from torchsar.core import Draws, Recording, Truth
 from torchsar.echo import simulate_turntable
@@ -159,7 +159,7 @@ def test_dense_rows_defeat_pga_sca_and_not_autofocus():
     """128 equal scatterers a row."""
     scene = SpreadRows(64, 128, 0.5, EXTENT_M, RADAR.range_step_m)
     assert float(judged(pga_sca, scene, 10.0, 3)[0].median()) > 0.4
-    error, ok = judged(autofocus, scene, 10.0, 1)
+    error, ok = judged(partial(autofocus, scene="auto"), scene, 10.0, 1)
     assert float(error.max()) < 0.1 and ok.all()
 
 
@@ -210,7 +210,7 @@ def test_the_verdict_agrees_with_success():
     ]
     agree, false = [], []
     for scene, snr_db in scenes:
-        for method in (sca, pga_sca, autofocus):
+        for method in (sca, pga_sca, partial(autofocus, scene="auto")):
             error, ok = judged(method, scene, snr_db, 2, pulses=200)
             agree.append(ok == (error < SUCCESS_RAD))
             false.append(ok & (error > 1.3 * SUCCESS_RAD))
@@ -297,15 +297,6 @@ def test_pga_ends_near_its_best_iterate(name):
         best_iterate(x, true, begin, "lumv" if start == "zero" else "ml"),
     )
     assert error < 1.1 * best + 1e-4 and best < 0.5 * float(phase_rmse(begin, true))
-
-
-def test_scatterers_that_change_are_not_believed():
-    """Amplitudes that change within 8 of 128 pulses: a third of the trials was ok and wrong."""
-    batch = scintillating(20.0, 40, 8.0)(24, 5)
-    assert batch.truth is not None
-    found = autofocus(batch.data.data)
-    wrong = phase_rmse(found["phase_rad"].double(), batch.truth["phase_rad"]) > 0.5
-    assert int(wrong.sum()) > 12 and not (found.ok & wrong).any()
 
 
 # impairments put into any range-compressed recording

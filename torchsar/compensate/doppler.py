@@ -331,8 +331,15 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
 
 
 def weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return coefficients and residuals of a weighted least-squares fit of y (..., b) by a basis
-    (b, n).
+    """Fit values by functions in the sense of weighted least squares.
+
+    Args:
+        basis: Functions, shape (b, n).
+        y: Values, shape (..., b).
+        weight: Weights, shape (..., b).
+
+    Returns:
+        The coefficients, shape (..., n), and the residuals, shape (..., b).
     """
     weighted = basis * weight[..., None]
     normal = weighted.mT @ basis

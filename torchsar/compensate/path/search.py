@@ -249,5 +249,5 @@ def found_from_starts(search: Search, fine: TileOperator, rounds: int) -> Starts
 
 def sharpness(image: Tensor) -> tuple[Tensor, Tensor]:
     """Return the sharpness of an image (azimuth, range) in nats, and that of noise."""
-    sharp, rows = sharpness_beyond_speckle(image.mT)
+    sharp, rows, _ = sharpness_beyond_speckle(image.mT)
     return sharp, sharpness_of_noise((rows * FINE_STEP).clamp_min(1))

@@ -25,7 +25,7 @@ from torchsar.compensate.pulse_phase.homogeneous import describe, different_rows
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
-from torchsar.compensate.pulse_phase.sharpness import sharpness_beyond_speckle, sharpness_of_noise
+from torchsar.compensate.pulse_phase.sharpness import scatter_of_point, sharpness_beyond_speckle, sharpness_of_noise
 from torchsar.core import Estimate, Outcome, fft_lines, host_value, power_of, worst
 from torchsar.metrics.phase import phase_rmse, residual_phase
 
@@ -48,10 +48,15 @@ _DISTURBED_RAD, _RETURNED_RAD, _ROUNDS = 0.4, 0.04, 2
 # difference of halves from which on a phase counts as unknown: half of the difference of uniformly
 # distributed phases is half of their error
 _APART_RAD = 2.0
-# Effective number of ranges below which all scatterers have one: phases can then be found that make
-# one point of them. Longest gap as a share of the pulses from the first to the last, up to which
+# A single scatterer: the sharpness is that of so many rows, or the rows are side lobes of one
+# range. Its own motion cannot be told from a phase error, and phases can be found that make one point of
+# several. But no phase changes its modulus: noise and weaker scatterers change it as much as the
+# phase. It is steady if the modulus scatters by less than this, far below the 0.52 of noise, over
+# at least so many pulses.
+_ONE_ROW, _ONE_RANGE, _STEADY, _LEAST_PULSES = 1.5, 1.2, 0.25, 32
+# Longest gap as a share of the pulses from the first to the last, up to which
 # scenes of many points tell how the phases before and after it go together.
-_ONE_RANGE, _LONGEST_GAP = 1.2, 0.36
+_LONGEST_GAP = 0.36
 _STRIP = 4  # lines of an image in a strip, by choice: more than the response of a point is wide
 
 
@@ -85,11 +90,12 @@ def conclude(
         Outcomes: EMPTY; SINGULAR with fewer than three pulses; NOISE if the image is less than 1.5
         times as sharp as autofocus makes noise; INEXACT if the Strehl ratio is below 0.8;
         PARTS_DISAGREE if one of three blocks of range cells gets sharper with phases of its own by
-        more than 2.2 times the sharpness of noise; HOMOGENEOUS; TOO_FEW if all scatterers have one
-        range, or one gap takes more than 0.36 of the pulses; DISPLACED. `info` holds "present",
-        shape (..., pulse), False for pulses of zeros; and, of shape (...,), "iterations", and if
-        assessed "sharpness_nats", "noise_sharpness_nats", "gain_of_parts", "jitter_cells" and
-        "migration_cells".
+        more than 2.2 times the sharpness of noise; HOMOGENEOUS; TOO_FEW if a single scatterer makes
+        the sharpness and its modulus is not steady, or one gap takes more than 0.36 of the pulses;
+        DISPLACED. Of a steady single scatterer the standard deviation is the scatter of its modulus
+        and phase. `info` holds "present", shape (..., pulse), False for pulses of zeros; and, of
+        shape (...,), "iterations", and if assessed "sharpness_nats", "noise_sharpness_nats",
+        "gain_of_parts", "jitter_cells" and "migration_cells".
     """
     trials, n = pulses.trials, pulses.n
     enough = pulses.present.sum(-1) >= 3
@@ -103,14 +109,14 @@ def conclude(
         return Estimate(value, unknown, torch.zeros_like(outcome).to(phase_rad.dtype), outcome, info)
     rows, present, again = pulses.rows.detach(), pulses.present, again or settled
     seen = by_blocks(pulses, partial(_seen, rows, present, phase_rad.detach(), again, through), through is not None)
-    sharp, noise, std, gain, ranges, homogeneous, jitter, migration = (x.reshape(trials) for x in seen)
+    sharp, noise, std, gain, unsteady, homogeneous, jitter, migration = (x.reshape(trials) for x in seen)
     gap = longest_gap(pulses.present).reshape(trials)
     strehl = torch.exp(-std.square())
     outcome = worst(
         (Outcome.INEXACT, strehl <= LEAST_STREHL),
         (Outcome.PARTS_DISAGREE, gain > _LARGEST_GAIN),
         (Outcome.HOMOGENEOUS, homogeneous > 0),
-        (Outcome.TOO_FEW, (ranges < _ONE_RANGE) | (gap > _LONGEST_GAP)),
+        (Outcome.TOO_FEW, (unsteady > 0) | (gap > _LONGEST_GAP)),
         (Outcome.DISPLACED, (jitter >= LARGEST_JITTER) | (migration >= LARGEST_MIGRATION)),
         (Outcome.NOISE, (sharp <= _MARGIN * noise) & (homogeneous == 0)),
         (Outcome.EMPTY, ~present.any(-1).reshape(trials)),
@@ -135,15 +141,15 @@ def settled(rows: Tensor, which: Tensor | slice, phase: Tensor) -> Tensor:
 def _seen(
     rows: Tensor, present: Tensor, phase: Tensor, again: Again, through: Through | None, part: slice
 ) -> tuple[Tensor, ...]:
-    """Sharpness, that of noise, standard deviation, gain of parts, number of ranges that hold
-    scatterers, 1 where the scene is homogeneous, jitter and migration of a block of trials,
+    """Sharpness, that of noise, standard deviation, gain of parts, 1 where a single scatterer is
+    not steady, 1 where the scene is homogeneous, jitter and migration of a block of trials,
     (trial,) each, float64.
     """
     which = torch.arange(len(rows), device=rows.device)[part]
     rows, present, phase = rows[part], present[part], phase[part]
     focused = rotate(rows, phase)
     image = torch.fft.fft(focused, norm="ortho") if through is None else through.image(focused).mT
-    sharp, count = sharpness_beyond_speckle(image)
+    sharp, count, telling = sharpness_beyond_speckle(image)
     noise, zero = sharpness_of_noise(count.clamp_min(1)), torch.zeros_like(sharp)
     if through is not None:
         halves = halves_of_image(through, rows, phase)
@@ -159,13 +165,16 @@ def _seen(
     band = occupied_band(spectrum)
     apart = half_difference(halves_of_rows(rows), present, phase, partial(_disturbed, again, which, present))
     moved = displacement(spectrum, present)
+    scatter, rest = scatter_of_point(focused, present)
+    single = ((telling < _ONE_ROW) & (sharp > noise)) | (different_rows(rows, power_of(rows).sum(-1)) < _ONE_RANGE)
+    steady = (scatter < _STEADY) & (present.sum(-1) >= _LEAST_PULSES) & (rows.shape[-2] > 1)
     return (
         sharp,
         noise,
-        apart / band.sqrt(),
+        torch.where(single & steady, torch.hypot(scatter, rest), apart / band.sqrt()),
         gain_of_parts(rows, present, phase),
-        different_rows(rows, power_of(rows).sum(-1)),
-        describe(rows, phase, band).homogeneous.double(),
+        (single & ~steady).double(),
+        (describe(rows, phase, band).homogeneous & ~single).double(),
         moved.jitter,
         moved.migration,
     )
@@ -194,7 +203,7 @@ def gain_of_parts(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
             0
         ]
         images = (torch.fft.fft(rotate(block, at), norm="ortho") for at in (own, phase))
-        (alone, count), (common, _) = (sharpness_beyond_speckle(image) for image in images)
+        (alone, count, _), (common, _, _) = (sharpness_beyond_speckle(image) for image in images)
         gains.append((alone - common) / sharpness_of_noise(count.clamp_min(1)))
     return torch.stack(gains).amax(0)
 

@@ -7,14 +7,16 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import or_one
+from torchsar.compensate.pulse_phase.data import or_one, safe_angle
+from torchsar.core import cis, power_of
+from torchsar.metrics.phase import phase_rmse
 
 # difference of the entropies of a uniform row and of speckle, whose power has an exponential
 # distribution: 1 - Euler's constant
 SPECKLE_NATS = 1 - 0.5772156649015329
 
 
-def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor]:
+def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     r"""Compute by how much the entropy of an image lies below that of speckle.
 
     The speckle has the same energy in each row (range cell) as the image. The sharpness is
@@ -26,8 +28,9 @@ def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor]:
         image: Image, shape (..., range, Doppler), complex.
 
     Returns:
-        The sharpness in nats and the effective number of rows over which the energy is spread,
-        :math:`1 / \sum s_n^2`, shape (...,) each, float64.
+        The sharpness in nats; the effective number of rows over which the energy is spread,
+        :math:`1 / \sum s_n^2`; and that over which the sharpness is spread (1 if one bright row
+        makes all of it); shape (...,) each, float64.
     """
     real, imag = image.real.contiguous(), image.imag.contiguous()
     power = torch.addcmul(real * real, imag, imag)
@@ -38,7 +41,8 @@ def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor]:
     row, entropy = row.to(torch.float64), entropy.to(torch.float64)
     share = row / or_one(row.sum(-1, keepdim=True))
     lack = share * torch.where(row > 0, math.log(image.shape[-1]) - SPECKLE_NATS - entropy, 0)
-    return lack.sum(-1), 1 / or_one(share.square().sum(-1))
+    sharp = lack.sum(-1)
+    return sharp, 1 / or_one(share.square().sum(-1)), sharp.square() / or_one(lack.square().sum(-1))
 
 
 def sharpness_of_noise(rows: Tensor) -> Tensor:
@@ -55,3 +59,30 @@ def sharpness_of_noise(rows: Tensor) -> Tensor:
         The sharpness in nats, shape (...,).
     """
     return 0.62 / torch.sqrt(rows) + 2.1 / rows
+
+
+def scatter_of_point(focused: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the scatter of modulus and phase of the strongest point over the pulses.
+
+    The rows are added up with the weights and phases of the point: with the conjugate of its cell
+    in the image.
+
+    Args:
+        focused: Pulses with the phases removed, shape (trial, range, pulse), complex.
+        present: False where a pulse holds only zeros, shape (trial, pulse).
+
+    Returns:
+        The standard deviation of the modulus over its mean, and that of the phase in rad about a
+        straight line, shape (trial,) each, float64.
+    """
+    bright = power_of(focused).sum(-1).argmax(-1)
+    row = focused.gather(1, bright[:, None, None].expand(-1, 1, focused.shape[-1]))
+    at = power_of(torch.fft.fft(row)).argmax(-1)[:, 0]
+    pulse = torch.arange(focused.shape[-1], dtype=torch.float64, device=focused.device)
+    tone = cis(-2 * math.pi / focused.shape[-1] * at[:, None] * pulse).to(focused.dtype)
+    echo = ((focused @ tone[..., None]).mH @ focused)[:, 0]
+    modulus, count = echo.abs().to(torch.float64), present.sum(-1).clamp_min(1)
+    mean = modulus.sum(-1) / count
+    spread = torch.where(present, (modulus - mean[:, None]).square(), 0).sum(-1) / (count - 1).clamp_min(1)
+    angle = safe_angle(echo).to(torch.float64)
+    return torch.where(mean > 0, spread.sqrt() / or_one(mean), torch.pi), phase_rmse(angle, 0 * angle, present)
