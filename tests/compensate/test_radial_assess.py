@@ -40,7 +40,7 @@ def test_without_assessment_none_of_its_work_is_done(name: str, monkeypatch: pyt
     monkeypatch.setattr(blocks, "assessed_velocity", refuse)
     for part in ("assessed_velocity", "assessed_motion"):
         monkeypatch.setattr(recommended, part, refuse)
-    for part in ("_variance", "mirror_velocity", "_changes_of_product", "_modulation"):
+    for part in ("_variance", "mirror_velocity", "_changes_of_product"):
         monkeypatch.setattr(assess, part, refuse)
     sweeps, pulse, truth = noisy(10.0)
     found = ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE, assess=False)

@@ -23,9 +23,16 @@ from torchsar.repair import (
     estimate_response_points,
     estimate_response_sharpest,
 )
-from torchsar.repair.response import band_grid, band_power, on_axis, unit_legendre, without_line
+from torchsar.repair.response import band_grid, band_power, on_axis, unit_legendre
 from torchsar.repair.response_phase import brightest_windows
 from torchsar.scene import Dwell, RandomPoints, StripmapWorld
+
+
+def without_line(phase_rad: torch.Tensor) -> torch.Tensor:
+    """Phase (..., GRID) without the constant and linear parts over the band, by least squares."""
+    line = unit_legendre(band_grid(), 1)
+    line = line / torch.linalg.vector_norm(line, dim=-1, keepdim=True)
+    return phase_rad - (phase_rad @ line.mT) @ line
 
 
 def rms(x: torch.Tensor) -> float:
@@ -44,12 +51,6 @@ def test_legendre_is_orthonormal_over_the_band():
     torch.testing.assert_close(
         basis @ basis.mT / basis.shape[-1], torch.eye(13, dtype=torch.float64), atol=2e-3, rtol=0
     )
-
-
-def test_constant_and_linear_phase_are_removed():
-    u = band_grid()
-    assert rms(without_line(0.7 + 2.3 * u)) < 1e-12
-    assert rms(without_line(reference_phase(u)) - reference_phase(u)) < 5e-3
 
 
 @pytest.fixture(scope="module")

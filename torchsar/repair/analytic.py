@@ -25,21 +25,12 @@ def delayed(lines: Tensor, fraction: Tensor, analytic: bool = False) -> Tensor:
         is False.
     """
     n = lines.shape[-1]
-    if not analytic and _all_zero(fraction):
+    # inside vmap, where values cannot be read, shifts may be other than zero
+    if not analytic and not fraction.requires_grad and not host_value(fraction.any(), True):
         return lines
     spectrum = torch.fft.fft(lines)
     turn = torch.fft.ifftshift(linear_phasor(fraction / n, -(n // 2), n, spectrum.dtype), dim=-1)[..., None, :]
     if analytic:
-        turn = turn * _positive(n, lines.device)
+        order = torch.arange(n, device=lines.device)
+        turn = turn * ((2 * order < n).int() + ((2 * order <= n) & (order > 0)).int())
     return torch.fft.ifft(spectrum * turn)
-
-
-def _positive(n: int, device: torch.device) -> Tensor:
-    """Factors of the analytic signal in FFT order, (n,): 2, 1 at zero and half the rate, 0."""
-    order = torch.arange(n, device=device)
-    return (2 * order < n).int() + ((2 * order <= n) & (order > 0)).int()
-
-
-def _all_zero(x: Tensor) -> bool:
-    """Whether x is zero and constant; False inside vmap, where values cannot be read."""
-    return not x.requires_grad and not host_value(x.any(), True)

@@ -19,13 +19,9 @@ from torch import Tensor
 from torchsar.core import Outcome, worst
 from torchsar.repair.jitter import uncrossed
 
-# Least number of blocks of lines from which a deviation is taken.
-_LEAST_BLOCKS = 8
 # Largest standard deviation of a phase in rad and of a relative gain: the remaining imbalance is 20
-# dB below the signal.
-_MOST_IMBALANCE = 0.1
-# Standard deviation of a phase in rad from which on it is taken for that of noise, by choice.
-_NOISE_PHASE = 0.25
+# dB below the signal. Deviation of a phase from which on it is taken for that of noise, by choice.
+_MOST_IMBALANCE, _NOISE_PHASE = 0.1, 0.25
 # Standard deviations by which the noise may be wrong, the relative error of a power whose noise is
 # not known, and the least coherence of lines whose noise is not known, by choice.
 _NOISE_SIGMAS, _WEAK_NOISE, _LEAST_COHERENCE = 3.0, 0.03, 0.2
@@ -109,7 +105,7 @@ def assess_imbalance(
     inexact = (phase_std > _MOST_IMBALANCE) | (gain_std > _MOST_IMBALANCE * gain)
     outcome = worst(
         (Outcome.INEXACT, inexact.any(-1)),
-        (Outcome.TOO_FEW, torch.full_like(known, left_out[0].shape[-2] < _LEAST_BLOCKS)),
+        (Outcome.TOO_FEW, torch.full_like(known, left_out[0].shape[-2] < 8)),
         (Outcome.NOISE, ~known | chance),
         (Outcome.SINGULAR, ((gain < 1e-3) | (gain > 1e3)).any(-1)),
         (Outcome.EMPTY, power == 0),
@@ -223,8 +219,8 @@ def assess_response(
     change = sum(slope(moved).chunk(2)) - both
     curvature = (change / 2 * step).sum(-1) / step.square().sum(-1).clamp_min(1e-300)
     finer = (first * second).sum(-1).clamp_min(0).sqrt() / curvature.clamp_min(_CURVATURE)
-    parts = torch.stack(found.chunk(2), -2)
-    std = torch.hypot(torch.linalg.vector_norm(left_out_deviation(parts), dim=-1), finer).maximum(bound)
+    apart = left_out_deviation(torch.stack(found.chunk(2), -2))
+    std = torch.hypot(torch.linalg.vector_norm(apart, dim=-1), finer).maximum(bound)
     outcome = worst(
         (Outcome.INEXACT, ~(std < _MOST_RESPONSE)),
         (Outcome.MISFIT, finer >= _MOST_RESPONSE),

@@ -10,7 +10,6 @@ rho and every phi_c - phi_0. Gains follow from the powers of the lines.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -29,68 +28,39 @@ from torchsar.core import (
 )
 from torchsar.repair.assess import assess_imbalance
 
-# Blocks of lines that are left out in turn for standard deviations, by choice.
-_BLOCKS = 16
-# Samples of a line from which on the noise is measured beside the band of the signal.
-_LEAST_BAND = 32
-# Standard deviations of the averaged noise by which it must lie below the mean power, by choice.
-_SURE = 6.0
 
-
-@dataclass(frozen=True)
-class _Sums:
-    """Sums over groups of lines, (..., block, channel) each.
+def _sums(x: Tensor, noise: Tensor, blocks: int) -> tuple[Tensor, Tensor]:
+    """Products of each line with the conjugate of the line before, and powers above the noise of
+    the lines of a channel, summed over groups of lines, (..., block, channel) each.
 
     Group g holds, of each channel, the mean of the lines before and after line C g, weighted so
     that their centre is line C g. A slow change of the scene is therefore the same in all channels.
 
-    Args:
-        product: Products of each line with the conjugate of the line before, in their channel.
-        own: Powers above the noise of the lines of a channel.
+    x: lines (..., line, range); noise: (..., channel). The sums are divided by the power of the
+    strongest line.
     """
+    channels = noise.shape[-1]
+    groups, device = x.shape[-2] // channels - 1, x.device
+    power = x.abs().square().mean(-1).to(torch.float64)
+    scale = power.amax(-1, keepdim=True).clamp_min(1e-300)
+    product = (x[..., 1:, :] * x[..., :-1, :].conj()).mean(-1).to(torch.complex128) / scale
+    clean = power / scale - (noise / scale)[..., torch.arange(x.shape[-2], device=device) % channels]
+    before = torch.arange(channels, dtype=torch.float64, device=device) / channels
+    block = torch.arange(groups, device=device) * blocks // groups
 
-    product: Tensor
-    own: Tensor
+    def summed(values: Tensor) -> Tensor:
+        table = values[..., : channels * (groups + 1)].unflatten(-1, (groups + 1, channels))
+        centred = (1 - before) * table[..., 1:, :] + before * table[..., :-1, :]
+        total = torch.zeros(*centred.shape[:-2], blocks, channels, dtype=values.dtype, device=device)
+        return total.index_add(-2, block, centred)
 
-    @staticmethod
-    def of(x: Tensor, noise: Tensor, blocks: int) -> _Sums:
-        """Sums of lines (..., line, range) with noise (..., channel), divided by the power of the
-        strongest line.
-        """
-        channels = noise.shape[-1]
-        groups, device = x.shape[-2] // channels - 1, x.device
-        power = x.abs().square().mean(-1).to(torch.float64)
-        scale = power.amax(-1, keepdim=True).clamp_min(1e-300)
-        product = (x[..., 1:, :] * x[..., :-1, :].conj()).mean(-1).to(torch.complex128) / scale
-        channel = torch.arange(x.shape[-2], device=device) % channels
-        clean = power / scale - (noise / scale)[..., channel]
-        before = torch.arange(channels, dtype=torch.float64, device=device) / channels
-        block = torch.arange(groups, device=device) * blocks // groups
+    return summed(torch.nn.functional.pad(product, (1, 0))), summed(clean)
 
-        def summed(values: Tensor) -> Tensor:
-            table = values[..., : channels * (groups + 1)].unflatten(-1, (groups + 1, channels))
-            centred = (1 - before) * table[..., 1:, :] + before * table[..., :-1, :]
-            total = torch.zeros(*centred.shape[:-2], blocks, channels, dtype=values.dtype, device=device)
-            return total.index_add(-2, block, centred)
 
-        return _Sums(summed(torch.nn.functional.pad(product, (1, 0))), summed(clean))
-
-    @property
-    def total(self) -> _Sums:
-        """Sums over all blocks, without the dimension of the blocks."""
-        return _Sums(self.product.sum(-2), self.own.sum(-2))
-
-    @property
-    def left_out(self) -> _Sums:
-        """Sums over all blocks but one, in turn."""
-        whole = self.total
-        return _Sums(whole.product[..., None, :] - self.product, whole.own[..., None, :] - self.own)
-
-    @property
-    def gain(self) -> Tensor:
-        """Gain of each channel relative to channel 0, (..., channel)."""
-        own = self.own.clamp_min(1e-300)
-        return torch.exp(torch.log(own / own[..., :1]) / 2)
+def _gain(own: Tensor) -> Tensor:
+    """Gain of each channel relative to channel 0 from powers (..., channel)."""
+    own = own.clamp_min(1e-300)
+    return torch.exp(torch.log(own / own[..., :1]) / 2)
 
 
 def _noise(x: Tensor, channels: int) -> Tensor:
@@ -100,10 +70,11 @@ def _noise(x: Tensor, channels: int) -> Tensor:
     lines of fewer than 32 samples.
     """
     n, half = x.shape[-1], x.shape[-1] // 32
-    if n < _LEAST_BAND:
+    if n < 32:
         return torch.zeros(*x.shape[:-2], channels, dtype=torch.float64, device=x.device)
     floors = []
-    flat = 1 - _SURE / math.sqrt(_looks(x, channels))
+    # the averaged noise must lie six of its standard deviations below the mean power, by choice
+    flat = 1 - 6 / math.sqrt(_looks(x, channels))
     for y in (x, torch.fft.fft(x, norm="ortho")):
         square = y.abs().square().to(torch.float64)
         power = torch.stack([square[..., c::channels, :].mean(-2) for c in range(channels)], -2)
@@ -166,19 +137,20 @@ def estimate_imbalance(
         )
     x = unit_level(x)
     noise = _noise(x, channels)
-    blocks = _Sums.of(x, noise, min(_BLOCKS, x.shape[-2] // channels - 1))
-    sums = blocks.total
-    value = {"gain": sums.gain, "phase_rad": _phases(sums.product, channels, doppler_cycles)}
+    # at most 16 blocks, which are left out in turn for the standard deviations, by choice
+    products, powers = _sums(x, noise, min(16, x.shape[-2] // channels - 1))
+    product, gain = products.sum(-2), _gain(powers.sum(-2))
+    value = {"gain": gain, "phase_rad": _phases(product, channels, doppler_cycles)}
     if not assess:
-        return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(sums.gain[..., 0]))
-    some = blocks.left_out
-    turns = torch.angle(some.product * sums.product.conj()[..., None, :])
+        return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(gain[..., 0]))
+    turns = torch.angle((product[..., None, :] - products) * product.conj()[..., None, :])
     phases = torch.nn.functional.pad((turns - turns.mean(-1, keepdim=True))[..., 1:].cumsum(-1), (1, 0))
+    left_out = _gain(powers.sum(-2, keepdim=True) - powers), phases
     power = x.abs().square().mean(-1).to(torch.float64)
     level = power.mean(-1) / power.amax(-1).clamp_min(1e-300)
-    lag = sums.product / (level * (x.shape[-2] // channels - 1)).clamp_min(1e-300)[..., None]
+    lag = product / (level * (x.shape[-2] // channels - 1)).clamp_min(1e-300)[..., None]
     looks = (x.shape[-1] * x.shape[-2] / channels, _looks(x, channels))
-    return Estimate(value, **assess_imbalance(sums.gain, lag, power.mean(-1), noise, (some.gain, phases), looks))
+    return Estimate(value, **assess_imbalance(gain, lag, power.mean(-1), noise, left_out, looks))
 
 
 def _phases(product: Tensor, channels: int, doppler_cycles: Tensor | float | None) -> Tensor:
@@ -223,8 +195,7 @@ def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
     refuse_non_finite_values("correct_imbalance", gain=gain, phase_rad=phase_rad)
     real = real_dtype(x.dtype)
     factor = cis(-phase_rad.to(real)) / gain.to(real)
-    channel = torch.arange(x.shape[-2], device=x.device) % gain.shape[-1]
-    return x * factor[..., channel, None]
+    return x * factor[..., torch.arange(x.shape[-2], device=x.device) % gain.shape[-1], None]
 
 
 class EstimateImbalance(Stage):

@@ -31,11 +31,6 @@ def _mask(lines: Tensor, missing: Tensor) -> Tensor:
     return missing.bool()[..., None]
 
 
-def _nothing_missing(missing: Tensor) -> bool:
-    """Whether no line is missing; False inside vmap, where values cannot be read."""
-    return not host_value(missing.any(), True)
-
-
 def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:
     """Set missing lines to zero, the simplest of the fills.
 
@@ -236,7 +231,8 @@ class BandLimitedFill(Stage):
         Returns:
             Signal of the same shape; the signal itself if no line is missing.
         """
-        if _nothing_missing(missing):
+        # inside vmap, where values cannot be read, lines may be missing
+        if not host_value(missing.any(), True):
             return signal
         return signal.with_data(band_limited_fill(signal.data, missing, self.rounds, self.steps))
 
@@ -286,7 +282,7 @@ class SparseFill(Stage):
                 f"rounds={rounds}, steps={steps}"
             )
         self.radar, self.reference = radar, reference
-        self.looks, self.rounds, self.steps = looks, rounds, steps
+        self.options = {"looks": looks, "rounds": rounds, "steps": steps}
         self.hold("velocity_m_s", radar.velocity_m_s if velocity_m_s is None else velocity_m_s)
         self.hold("doppler_hz", (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz)
 
@@ -305,9 +301,9 @@ class SparseFill(Stage):
         Returns:
             Signal of the same shape; the signal itself if no line is missing.
         """
-        lines, radar = signal.data, self.radar
-        if _nothing_missing(missing):
+        if not host_value(missing.any(), True):
             return signal
+        lines, radar = signal.data, self.radar
         reference = (
             None
             if self.reference is None
@@ -320,8 +316,6 @@ class SparseFill(Stage):
             doppler_hz=self.doppler_hz if doppler_hz is None else doppler_hz,
             velocity_m_s=self.velocity_m_s if velocity_m_s is None else velocity_m_s,
             reference=reference,
-            looks=self.looks,
-            rounds=self.rounds,
-            steps=self.steps,
+            **self.options,
         )
         return signal.with_data(filled)

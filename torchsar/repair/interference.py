@@ -81,13 +81,9 @@ _SWEEP_CELLS, _OFFSET_CELLS = 48, 12
 # Share of the energy around a tone that its subtraction leaves at most, at first, when other tones
 # may be near, and in the end; wider interference leaves more.
 _LEFT_AT_FIRST, _LEFT = 0.7, 0.1
-# Largest number of bands that are subtracted, by choice: every round costs a search of all lines.
-_BAND_ROUNDS = 3
 # Lines that share one spectrum, by choice: more lines estimate it better, fewer follow a changing
 # interferer.
 _STRETCH = 32
-# Power of a line after a notch filter over that of clutter from which on it is lost, by choice.
-_MOST_LEFT = 1.5
 
 
 @dataclass(frozen=True)
@@ -130,6 +126,7 @@ class Contamination:
     lines: Tensor
 
 
+@torch.no_grad()
 def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contamination:
     """Find range-frequency cells with more power than clutter has, and the lines that hold them.
 
@@ -155,11 +152,9 @@ def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contaminati
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples or a sample is not finite.
     """
-    raw = checked_samples(raw, "find_contamination", "pulse, range")
-    with torch.no_grad():
-        power = _line_spectra(unit_level(raw))
-        density = _clean_density(power)
-        excess = _excess(power, density)
+    power = _line_spectra(unit_level(checked_samples(raw, "find_contamination", "pulse, range")))
+    density = _clean_density(power)
+    excess = _excess(power, density)
     return Contamination(density, excess, excess > threshold, _stands_out(excess, threshold))
 
 
@@ -184,14 +179,18 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     """
     raw, level, density, touched = _searched(raw, "notch_interference", threshold)
     spectrum = torch.fft.fft(raw)
-    with torch.no_grad():
-        power = power_of(spectrum) / raw.shape[-1]
-        hit = (_excess(power, density) > threshold) & touched[..., None]
-        left = power.masked_fill(hit, 0).sum(-1)
-        lost = touched & (left > _MOST_LEFT * density.sum(-1))
+    power = power_of(spectrum.detach()) / raw.shape[-1]
+    hit = (_excess(power, density) > threshold) & touched[..., None]
+    # a line that keeps more than 1.5 times the power of clutter is lost, by choice
+    lost = touched & (power.masked_fill(hit, 0).sum(-1) > 1.5 * density.sum(-1))
     data = torch.where(touched[..., None], torch.fft.ifft(spectrum.masked_fill(hit, 0)), raw)
-    data = data.masked_fill(lost[..., None], 0)
-    return Repaired(data * level, touched, lost, hit.sum(-1), _no_tone(touched))
+    return Repaired(
+        data.masked_fill(lost[..., None], 0) * level,
+        touched,
+        lost,
+        hit.sum(-1),
+        torch.zeros_like(touched, dtype=torch.float64),
+    )
 
 
 def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
@@ -212,8 +211,13 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
         ValueError: If there are no samples or a sample is not finite.
     """
     raw, level, _, touched = _searched(raw, "drop_interference", threshold)
-    data = raw.masked_fill(touched[..., None], 0)
-    return Repaired(data * level, touched, touched, torch.where(touched, raw.shape[-1], 0), _no_tone(touched))
+    return Repaired(
+        raw.masked_fill(touched[..., None], 0) * level,
+        touched,
+        touched,
+        torch.where(touched, raw.shape[-1], 0),
+        torch.zeros_like(touched, dtype=torch.float64),
+    )
 
 
 def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones: int = 4) -> Repaired:
@@ -246,20 +250,21 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
     found = find_contamination(raw, threshold)
     nothing = torch.zeros_like(found.lines)
     if not _anything(found.lines):
-        return Repaired(raw * scale, nothing, nothing, found.cells.sum(-1), _no_tone(nothing))
+        return Repaired(
+            raw * scale, nothing, nothing, found.cells.sum(-1), torch.zeros_like(nothing, dtype=torch.float64)
+        )
     # the marked lines of each trial; unmarked ones follow
     count = host_largest(found.lines.sum(-1), found.lines.shape[-1])
     index = torch.argsort((~found.lines).to(torch.int8), dim=-1, stable=True)[..., :count]
     wide = index[..., None].expand(*index.shape, raw.shape[-1])
     lines, density = raw.gather(-2, wide), found.density.gather(-2, wide)
-    with torch.no_grad():
-        tones = _find_tones(lines, density, index.to(torch.float64), most_tones, threshold)
-    cleaned, touched, cycles = lines, torch.zeros_like(index, dtype=torch.bool), _no_tone(index)
-    for wave in _waveforms(lines, tones):
-        cleaned = cleaned - wave
+    tones = _find_tones(lines, density, index.to(torch.float64), most_tones, threshold)
+    touched, cycles = torch.zeros_like(index, dtype=torch.bool), torch.zeros_like(index, dtype=torch.float64)
+    cleaned = lines - sum(_waveforms(lines, tones))
     for tone in reversed(tones):
         touched, cycles = touched | tone.present, torch.where(tone.present, tone.frequency, cycles)
-    for _ in range(_BAND_ROUNDS):
+    # at most three bands, by choice: every round costs a search of all lines
+    for _ in range(3):
         banded = _find_band(cleaned, density, threshold)
         if not _anything(banded):
             break
@@ -275,7 +280,7 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
         touched,
         lost,
         found.cells.sum(-1) * touched,
-        _no_tone(nothing).scatter(-1, index, cycles),
+        torch.zeros_like(nothing, dtype=torch.float64).scatter(-1, index, cycles),
     )
 
 
@@ -290,14 +295,9 @@ def _searched(raw: Tensor, name: str, threshold: float) -> tuple[Tensor, Tensor,
     touched = _find_band(raw, found.density, threshold) if _anything(found.lines) else found.lines
     if _anything(found.lines & ~touched):
         row = torch.arange(raw.shape[-2], dtype=torch.float64, device=raw.device).expand(touched.shape)
-        for tone in _find_tones(raw.detach(), found.density, row, 1, threshold):
+        for tone in _find_tones(raw, found.density, row, 1, threshold):
             touched = touched | tone.present
     return raw, level, found.density, touched
-
-
-def _no_tone(lines: Tensor) -> Tensor:
-    """Frequency zero for every line."""
-    return torch.zeros(lines.shape, dtype=torch.float64, device=lines.device)
 
 
 def _anything(mask: Tensor) -> bool:
@@ -378,12 +378,6 @@ def _block_sums(x: Tensor) -> Tensor:
     return pad(x, (0, -n % length)).unflatten(-1, (-1, length)).sum(-1)
 
 
-def _lasts(blocks: Tensor) -> Tensor:
-    """Whether the energy of demodulated lines is present during most of a line, (..., pulse)."""
-    power = power_of(blocks)
-    return power.median(-1).values > _LASTING * power.mean(-1)
-
-
 @dataclass(frozen=True)
 class _Tone:
     """One tone per line, (..., pulse) each.
@@ -426,7 +420,7 @@ def _coarse_offset(blocks: Tensor) -> tuple[Tensor, Tensor]:
     u = torch.linspace(-0.5, 0.5, count, dtype=torch.float64, device=blocks.device)
     offset = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64, device=blocks.device) / 2
     best = torch.full(blocks.shape[:-1], -1.0, dtype=blocks.real.dtype, device=blocks.device)
-    cells, sweep = torch.zeros_like(best, dtype=torch.float64), torch.zeros_like(best, dtype=torch.float64)
+    cells = sweep = torch.zeros_like(best, dtype=torch.float64)
     for cells_per_line in sorted(range(-_SWEEP_CELLS, _SWEEP_CELLS + 1, 2), key=abs):
         chirp = unit_phasor(-0.5 * cells_per_line * u.square(), blocks.dtype)
         # the strongest cell of a drifting tone may be any cell that it passes
@@ -452,8 +446,13 @@ def _fit_tone(lines: Tensor, cell: Tensor, present: Tensor, density: Tensor) -> 
     for steps in (6, 3, 1):
         tone, blocks = _refined(lines, tone, steps)
     energy = power_of(blocks.sum(-1)) / n
-    noise = torch.sqrt(density / (2 * energy.clamp_min(torch.finfo(energy.dtype).tiny))).to(torch.float64)
-    return replace(tone, present=present & _coherent(blocks, energy, density), noise_rad=noise)
+    tiny, count = torch.finfo(energy.dtype).tiny, blocks.shape[-1]
+    noise = torch.sqrt(density / (2 * energy.clamp_min(tiny))).to(torch.float64)
+    # a chirp has a given frequency in few blocks only, whereas a tone fills all of them; the
+    # coherent share of the energy expected of a tone with z = energy / density is z / (z + count)
+    coherent = power_of(blocks.sum(-1)) / (count * power_of(blocks).sum(-1).clamp_min(tiny))
+    z = energy / density.clamp_min(tiny)
+    return replace(tone, present=present & (coherent > _LASTING * z / (z + count)), noise_rad=noise)
 
 
 def _refined(lines: Tensor, tone: _Tone, steps: int) -> tuple[_Tone, Tensor]:
@@ -475,19 +474,7 @@ def _refined(lines: Tensor, tone: _Tone, steps: int) -> tuple[_Tone, Tensor]:
     ), blocks
 
 
-def _coherent(blocks: Tensor, energy: Tensor, density: Tensor) -> Tensor:
-    """Whether a spectral line is that of a tone that lasts the whole line, (..., pulse) bool.
-
-    A chirp has a given frequency in few blocks only, whereas a tone fills all B blocks. The
-    coherent share of the energy is |sum of blocks|^2 / (B sum |block|^2), z / (z + B) is expected
-    of a tone with z = energy / density.
-    """
-    tiny, count = torch.finfo(energy.dtype).tiny, blocks.shape[-1]
-    coherent = power_of(blocks.sum(-1)) / (count * power_of(blocks).sum(-1).clamp_min(tiny))
-    z = energy / density.clamp_min(tiny)
-    return coherent > _LASTING * z / (z + count)
-
-
+@torch.no_grad()
 def _find_tones(lines: Tensor, density: Tensor, position: Tensor, most: int, threshold: float) -> list[_Tone]:
     """Tones in lines at positions (..., pulse): the strongest first, then the strongest in what
     remains, and so on.
@@ -569,11 +556,10 @@ def _smooth_track(value: Tensor, std: Tensor, present: Tensor, position: Tensor)
     unit = position / position.amax(-1, keepdim=True).clamp_min(1)
     chosen, half = value, 2
     while half < value.shape[-1]:
-        box = _window_sums(half)
-        line, support = _local_line(value, weight, unit, box)
+        line, support = _local_line(value, weight, unit, half)
         misfit = torch.where(present, (value - line) / std.clamp_min(1e-30), 0.0).square()
-        count = box(present.to(value.dtype))
-        spread = box(misfit) / (count - 2).clamp_min(1)
+        count = _window_sums(present.to(value.dtype), half)
+        spread = _window_sums(misfit, half) / (count - 2).clamp_min(1)
         wider = half < present.sum(-1, keepdim=True)
         expected = (spread < 1 + 3 * torch.sqrt(2 / count.clamp_min(1))) & (misfit < 16)
         chosen = torch.where(present & support & wider & (count >= 5) & expected, line, chosen)
@@ -581,21 +567,18 @@ def _smooth_track(value: Tensor, std: Tensor, present: Tensor, position: Tensor)
     return chosen
 
 
-def _window_sums(half: int) -> Callable[[Tensor], Tensor]:
-    """Function that sums over a sliding window of 2 half + 1 lines, which is cut at the ends."""
-
-    def sums(x: Tensor) -> Tensor:
-        total = pad(x, (half + 1, half)).cumsum(-1)
-        return total[..., 2 * half + 1 :] - total[..., : x.shape[-1]]
-
-    return sums
+def _window_sums(x: Tensor, half: int) -> Tensor:
+    """Sums over a sliding window of 2 half + 1 lines, which is cut at the ends."""
+    total = pad(x, (half + 1, half)).cumsum(-1)
+    return total[..., 2 * half + 1 :] - total[..., : x.shape[-1]]
 
 
-def _local_line(value: Tensor, weight: Tensor, i: Tensor, box: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+def _local_line(value: Tensor, weight: Tensor, i: Tensor, half: int) -> tuple[Tensor, Tensor]:
     """Weighted straight-line fit in a sliding window, and where it is determined."""
     anchor = (weight * value).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp_min(1e-300)
     y = torch.where(weight > 0, value - anchor, 0.0)
-    s0, s1, s2, sy, s1y = (box(part) for part in (weight, weight * i, weight * i * i, weight * y, weight * i * y))
+    parts = weight, weight * i, weight * i * i, weight * y, weight * i * y
+    s0, s1, s2, sy, s1y = (_window_sums(part, half) for part in parts)
     determinant = s0 * s2 - s1 * s1
     support = determinant > 1e-12 * s0 * s2.clamp_min(1e-300)
     slope = torch.where(support, (s0 * s1y - s1 * sy) / torch.where(support, determinant, 1), 0.0)
@@ -616,9 +599,10 @@ def _find_band(lines: Tensor, density: Tensor, threshold: float) -> Tensor:
         return strong
     frequency = excess.argmax(-1).to(torch.float64) / lines.shape[-1]
     carrier = _Tone(frequency, torch.zeros_like(frequency), strong, frequency).phasor(lines)
-    near = _window_sums(_STRETCH // 2)
-    votes = near((strong & _lasts(_block_sums(lines * carrier.conj()))).to(torch.float64))
-    return strong & (votes > 0.5 * near(strong.to(torch.float64)))
+    power = power_of(_block_sums(lines * carrier.conj()))
+    lasts = power.median(-1).values > _LASTING * power.mean(-1)
+    votes, of_all = (_window_sums(x.to(torch.float64), _STRETCH // 2) for x in (strong & lasts, strong))
+    return strong & (votes > 0.5 * of_all)
 
 
 def _subtract_band(lines: Tensor, touched: Tensor, density: Tensor) -> Tensor:
@@ -723,9 +707,8 @@ class _InterferenceCorrection(Stage):
             "touched": result.touched,
             "tone_cycles_per_sample": result.tone_cycles,
         }
-        judged: dict[str, Any] = {"outcome": Outcome.NOT_ASSESSED.like(info["lines_touched"])}
-        if self.assess:
-            judged = assess_lines(result.data, result.missing)
+        not_assessed: dict[str, Any] = {"outcome": Outcome.NOT_ASSESSED.like(info["lines_touched"])}
+        judged = assess_lines(result.data, result.missing) if self.assess else not_assessed
         return signal.with_data(result.data), Estimate({"missing": given_up}, **judged, info=info)
 
 

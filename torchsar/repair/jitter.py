@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -84,42 +85,6 @@ def refuse_crossing(offset_samples: Tensor) -> None:
         )
 
 
-def sample_offsets(offset_samples: Tensor, n: int) -> Tensor:
-    """Return the timing offset of every sample of a line.
-
-    Args:
-        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M).
-        n: Number of samples of the line.
-
-    Returns:
-        Offsets in samples, shape (..., n).
-    """
-    m = offset_samples.shape[-1]
-    return offset_samples[..., torch.arange(n, device=offset_samples.device) % m]
-
-
-def neighbours(offset_samples: Tensor, points: int) -> tuple[Tensor, Tensor]:
-    """Find the jittered samples nearest to each instant of the uniform grid.
-
-    The pattern of offsets repeats every M samples, so that M uniform instants are sufficient.
-
-    Args:
-        offset_samples: Timing offsets of the M interleaved converters in samples, shape (..., M).
-        points: Number of jittered samples for each instant; an even number is centred on the
-            interval that holds the instant.
-
-    Returns:
-        Instants of these jittered samples relative to the uniform instant, in samples, shape (...,
-        M, points); and the index of the first of them relative to the index of the uniform instant,
-        shape (..., M), int64.
-    """
-    m, device = offset_samples.shape[-1], offset_samples.device
-    first = torch.where(offset_samples.detach() > 0, -(points // 2), -((points - 1) // 2))
-    lag = first[..., None] + torch.arange(points, device=device)
-    phase = (torch.arange(m, device=device)[:, None] + lag) % m
-    return lag + torch.gather(offset_samples, -1, phase.flatten(-2)).reshape(lag.shape), first
-
-
 def lagrange_weights(instants: Tensor) -> Tensor:
     """Compute weights of uneven samples that give the value of their polynomial at instant 0.
 
@@ -153,19 +118,29 @@ def band_limited_weights(instants: Tensor, band: float, floor: float = 1e-9) -> 
     return linear_solve(gram, torch.sinc(band * instants)[..., None])[..., 0]
 
 
-def _combine(y: Tensor, weights: Tensor, first: Tensor) -> Tensor:
-    """Sum over k of weights[n mod M, k] y[n + first[n mod M] + k], with lines taken as periodic."""
-    points = weights.shape[-1]
+def _interpolated(y: Tensor, offset_samples: Tensor, points: int, weights_of: Callable[[Tensor], Tensor]) -> Tensor:
+    """Uniform samples as weighted sums of the jittered ones next to them, with periodic lines.
+
+    Sum over k of weights[n mod M, k] y[n + first[n mod M] + k], since the pattern of offsets
+    repeats every M samples; weights_of gives the weights of instants (..., M, points) relative to
+    the uniform ones. An even number of points is centred on the interval of the uniform instant.
+    """
+    y, offsets = _checked(y, offset_samples)
+    m, device = offsets.shape[-1], offsets.device
+    first = torch.where(offsets.detach() > 0, -(points // 2), -((points - 1) // 2))
+    near = first[..., None] + torch.arange(points, device=device)
+    number = (torch.arange(m, device=device)[:, None] + near) % m
+    instants = near + torch.gather(offsets, -1, number.flatten(-2)).reshape(near.shape)
     lowest = -(points // 2)
     # 0 or 1: both placements share the lags lowest .. lowest + points
     shift = (first - lowest)[..., None]
     lag = torch.arange(points + 1, device=y.device)
-    table = torch.gather(torch.nn.functional.pad(weights, (1, 1)), -1, (lag + 1 - shift).clamp(0, points + 1)).to(
-        real_dtype(y.dtype)
-    )
+    weights = torch.nn.functional.pad(weights_of(instants), (1, 1))
+    table = torch.gather(weights, -1, (lag + 1 - shift).clamp(0, points + 1)).to(real_dtype(y.dtype))
+    phase = torch.arange(y.shape[-1], device=y.device) % m
     out = torch.zeros_like(y)
     for k in range(points + 1):
-        out = out + sample_offsets(table[..., k], y.shape[-1])[..., None, :] * torch.roll(y, -(lowest + k), -1)
+        out = out + table[..., None, phase, k] * torch.roll(y, -(lowest + k), -1)
     return out
 
 
@@ -294,9 +269,7 @@ class Lagrange:
             )
 
     def __call__(self, y: Tensor, offset_samples: Tensor) -> Tensor:
-        y, offsets = _checked(y, offset_samples)
-        instants, first = neighbours(offsets, self.points)
-        return _combine(y, lagrange_weights(instants), first)
+        return _interpolated(y, offset_samples, self.points, lagrange_weights)
 
 
 @names_arguments
@@ -327,9 +300,7 @@ class BandLimited:
             )
 
     def __call__(self, y: Tensor, offset_samples: Tensor) -> Tensor:
-        y, offsets = _checked(y, offset_samples)
-        instants, first = neighbours(offsets, self.points)
-        return _combine(y, band_limited_weights(instants, self.band), first)
+        return _interpolated(y, offset_samples, self.points, partial(band_limited_weights, band=self.band))
 
 
 @names_arguments

@@ -18,7 +18,6 @@ S(f) + S(f - k/M) is fitted along with it. The mean offset (k = 0) cannot be obs
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -27,11 +26,10 @@ from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, uni
 from torchsar.repair.assess import assess_offsets, of_trials
 from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap, uncrossed
 
-# Largest rms offset that is ok, in samples, found by trial: above 0.23 the fits settle on wrong
-# offsets.
-_MOST_RMS = 0.22
-# Error of the noise level: that of the lowest twentieth of a spectrum of 256 looks or more.
-_NOISE_ERROR = 0.08
+# Largest rms offset that is ok, in samples, found by trial: above it the fits settle on wrong
+# offsets. Error of the noise level: that of the lowest twentieth of a spectrum of 256 or more
+# looks.
+_MOST_RMS, _NOISE_ERROR = 0.22, 0.08
 # Least power over its mean that a frequency is given: the ends of a line leak as much.
 _LEAST_POWER = 1e-5
 # Standard deviation of a share that may be anything between 0 and 1.
@@ -42,39 +40,9 @@ _SETTLED = 0.1
 _SHORTEST, _LONGEST = 0.3, 2.0
 
 
-@dataclass(frozen=True)
-class CyclicFit:
-    """First-order estimate of timing jitter for one assumed period of M samples.
-
-    Args:
-        coefficient: Fourier coefficients E_1 to E_(M-1) of the M timing offsets in samples, shape
-            (..., M - 1), complex.
-        variance: Variance of each coefficient in samples^2, shape (..., M - 1).
-        noise: Share of the power of the lines that is noise, shape (...,).
-        converter: Share of the noise that the converter adds, fitted to corrected lines, shape
-            (...,).
-        converter_std: Standard deviation of this share, shape (...,); infinite without correction.
-    """
-
-    coefficient: Tensor
-    variance: Tensor
-    noise: Tensor
-    converter: Tensor
-    converter_std: Tensor
-
-    @property
-    def offset_samples(self) -> Tensor:
-        """Timing offsets of the M converters in samples, with mean zero, shape (..., M)."""
-        m = self.coefficient.shape[-1] + 1
-        return torch.fft.ifft(torch.nn.functional.pad(self.coefficient, (1, 0)) * m).real
-
-    @property
-    def std_samples(self) -> Tensor:
-        """Standard deviation of each timing offset in samples, equal for all, shape (...,)."""
-        return torch.sqrt(self.variance.sum(-1))
-
-
-def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None, converter: Tensor | float = 1.0) -> CyclicFit:
+def cyclic_fit(
+    y: Tensor, period: int, corrected: Tensor | None = None, converter: Tensor | float = 1.0
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Fit the Fourier coefficients of timing jitter to correlations in the range spectrum.
 
     Jitter of period M correlates spectral components that lie k / M cycles per sample apart, with
@@ -89,7 +57,15 @@ def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None, converte
         converter: Share of the noise that the converter adds, shape (...,) or a number.
 
     Returns:
-        Coefficients of the jitter that remains, and their variance.
+        First-order estimate of the jitter that remains:
+
+        - Fourier coefficients E_1 to E_(M-1) of the M timing offsets in samples, shape
+          (..., M - 1), complex;
+        - variance of each coefficient in samples^2, shape (..., M - 1); the square root of their
+          sum is the standard deviation of each offset;
+        - share of the power of the lines that is noise, shape (...,);
+        - share of the noise that the converter adds, fitted to corrected lines, shape (...,);
+        - standard deviation of this share, shape (...,); infinite without correction.
     """
     n = y.shape[-1] - y.shape[-1] % period
     taper = _taper(n, y.device)
@@ -107,12 +83,12 @@ def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None, converte
     coefficient, variance, of_noise = [], [], []
     for k in range(1, period // 2 + 1):
         step = k * (n // period)
-        own = floor * _lagged(noise, step)
+        own = floor * (noise * torch.roll(noise, step, -1).conj()).mean(-2)
         both = power + torch.roll(power, step, -1)  # the correlation that a periodic gain gives
         weight = 1 / (power.clamp_min(_LEAST_POWER) * torch.roll(power, step, -1).clamp_min(_LEAST_POWER))
         slope = 2j * math.pi * (torch.roll(tilted, step, -1) - tilted)
         slope = slope - both * _along(slope, both, weight)
-        cross = _lagged(spectrum, step) / scale - share * own
+        cross = (spectrum * torch.roll(spectrum, step, -1).conj()).mean(-2) / scale - share * own
         cross = cross - both * _along(cross, both, weight)
         value = _along(cross, slope, weight)
         rest, information = cross - slope * value, (weight * slope.abs().square()).sum(-1).clamp_min(1e-150)
@@ -127,18 +103,13 @@ def cyclic_fit(y: Tensor, period: int, corrected: Tensor | None = None, converte
     mirrored = slice(0, (period - 1) // 2)
     seen, of_own, scatter = torch.stack(of_noise).sum(0)
     of_own = of_own.clamp_min(1e-150)
-    return CyclicFit(
+    return (
         torch.stack(coefficient + [c.conj() for c in coefficient[mirrored]][::-1], -1),
         torch.stack(variance + variance[mirrored][::-1], -1),
         (floor * density).mean(-1),
         share[..., 0] + seen / of_own,
         (related * scatter).sqrt() / of_own,
     )
-
-
-def _lagged(spectra: Tensor, step: int) -> Tensor:
-    """Mean products (..., n) of spectra (..., line, n) at frequencies a step apart."""
-    return (spectra * torch.roll(spectra, step, -1).conj()).mean(-2)
 
 
 def _along(x: Tensor, regressor: Tensor, weight: Tensor) -> Tensor:
@@ -203,8 +174,11 @@ def detect_jitter_period(y: Tensor, max_period: int = 16) -> Tensor:
     found = {}
     some = y[..., :: max(1, y.shape[-2] // 256), :]
     for m in range(2, max_period + 1):
-        fit, primitive = cyclic_fit(some, m), [k - 1 for k in range(1, m) if math.gcd(k, m) == 1]
-        found[m] = (fit.coefficient.abs().square() / fit.variance)[..., primitive].sum(-1), 9 * len(primitive) + 16
+        (coefficient, variance, *_), primitive = (
+            cyclic_fit(some, m),
+            [k - 1 for k in range(1, m) if math.gcd(k, m) == 1],
+        )
+        found[m] = (coefficient.abs().square() / variance)[..., primitive].sum(-1), 9 * len(primitive) + 16
     leak = 0.002 * torch.stack([chi for chi, _ in found.values()]).amax(0)
     counted = {m: torch.where(chi > least + leak, chi, 0) for m, (chi, least) in found.items()}
     explained = [
@@ -275,7 +249,7 @@ def estimate_jitter_blind(
             total, deviation = refine_offsets(rows[chosen], m, passes)
             offsets[chosen], std[chosen] = total[:, tiled % m], deviation[:, None].expand(-1, longest)
         elif assess:
-            std[chosen] = cyclic_fit(rows[chosen], longest).std_samples[:, None].expand(-1, longest)
+            std[chosen] = cyclic_fit(rows[chosen], longest)[1].sum(-1).sqrt()[:, None].expand(-1, longest)
     value = {
         "offset_samples": uncrossed(offsets).reshape(*y.shape[:-2], longest),
         "period": periods.reshape(y.shape[:-2]),
@@ -322,19 +296,22 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor]
     for i in range(passes):
         at, before = total[active], change[active]
         corrected = correct_jitter_exact(y[active], at) if i else y
-        fit = cyclic_fit(corrected, period, at if i else None, converter[active])
-        step = fit.offset_samples
+        coefficient, variance, noise, share, share_std = cyclic_fit(
+            corrected, period, at if i else None, converter[active]
+        )
+        step = torch.fft.ifft(torch.nn.functional.pad(coefficient, (1, 0)) * period).real
+        step_std = torch.sqrt(variance.sum(-1))
         if i:
             turned = before - step
             factor[active] *= (before * turned).sum(-1) / turned.square().sum(-1).clamp_min(1e-300)
             factor[active] = factor[active].clamp(_SHORTEST, _LONGEST)
         moved = at + factor[active, None] * step.clamp(-0.4, 0.4)
         total[active] = torch.where((smallest_gap(moved) >= 2 * MIN_GAP)[:, None], moved, at)
-        converter[active] = torch.where(fit.converter_std < _MOST_SHARE, fit.converter.clamp(0, 1), converter[active])
-        unknown = torch.hypot(fit.converter_std.clamp_max(_MOST_SHARE), torch.full_like(factor[active], _NOISE_ERROR))
-        level = unknown * fit.noise / (1 - fit.noise).clamp_min(0.1) * total[active].square().mean(-1).sqrt()
-        std[active], change[active] = torch.hypot(fit.std_samples, level), step
-        active = active[step.square().mean(-1).sqrt() > _SETTLED * fit.std_samples]
+        converter[active] = torch.where(share_std < _MOST_SHARE, share.clamp(0, 1), converter[active])
+        unknown = torch.hypot(share_std.clamp_max(_MOST_SHARE), torch.full_like(factor[active], _NOISE_ERROR))
+        level = unknown * noise / (1 - noise).clamp_min(0.1) * total[active].square().mean(-1).sqrt()
+        std[active], change[active] = torch.hypot(step_std, level), step
+        active = active[step.square().mean(-1).sqrt() > _SETTLED * step_std]
         if not len(active):
             break
     return total, torch.hypot(std, change.square().mean(-1).sqrt())

@@ -12,7 +12,6 @@ Reference:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -21,14 +20,8 @@ from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, lin
 from torchsar.repair.assess import assess_offsets
 from torchsar.repair.jitter import uncrossed
 
-# Rounding of float64 in a record of up to 1024 samples without noise, relative to the squares of
-# phases of jitter and to the power: without it, rounding errors look like jitter of a longer
-# period. It grows with longer records.
-_OF_JITTER, _OF_POWER, _SAMPLES = 1e-13, 1e-28, 1024
 # steps after which the frequency is exact even in short records of strong jitter
 _STEPS = 12
-# conventions for the offset that no pilot can determine
-ORIGINS = ("mean", "first")
 
 
 def estimate_jitter_pilot(
@@ -71,8 +64,8 @@ def estimate_jitter_pilot(
     longest = max_period if period is None else period
     if longest < 1:
         raise ValueError(f"a jitter period must be at least one sample, got {longest}")
-    if origin not in ORIGINS:
-        raise ValueError(f"origin {origin!r} is unknown; choose one of {ORIGINS}")
+    if origin not in ("mean", "first"):
+        raise ValueError(f"origin {origin!r} is unknown; choose one of ('mean', 'first')")
     n = pilot.shape[-1] if pilot.ndim else 0
     if n < 4 * longest:
         raise ValueError(
@@ -83,15 +76,12 @@ def estimate_jitter_pilot(
     finite = torch.isfinite(torch.view_as_real(pilot)).flatten(-2).all(-1)
     x = unit_level(torch.where(finite[..., None], pilot, 0).to(torch.complex128), 1)
     periods = range(1, longest + 1) if period is None else [longest]
-    fits = [_fit(x, _peak_frequency(x), m) for m in periods]
-    best = _choose(fits) if period is None else torch.zeros(x.shape[:-1], dtype=torch.int64, device=x.device)
+    *fits, phases = zip(*(_fit(x, m) for m in periods), strict=True)
+    frequency, noise, power, jitter = (torch.stack(parts, -1) for parts in fits)
+    best = _choose(noise, power, jitter, n) if period is None else torch.zeros_like(power[..., 0], dtype=torch.int64)
     tiled = torch.arange(longest, device=x.device)
-    phase = take(
-        torch.stack([fit.phase_rad[..., tiled % m] for m, fit in zip(periods, fits, strict=True)], -2), best, -2
-    )
-    frequency, noise, power = (
-        take(torch.stack([getattr(fit, name) for fit in fits], -1), best) for name in ("frequency", "noise", "power")
-    )
+    phase = take(torch.stack([phase[..., tiled % m] for m, phase in zip(periods, phases, strict=True)], -2), best, -2)
+    frequency, noise, power = (take(x, best) for x in (frequency, noise, power))
     m = best + periods[0]
     radians = 2 * math.pi * torch.where(frequency.abs() > 1 / n, frequency, torch.inf)
     offsets = phase / radians[..., None]
@@ -115,39 +105,18 @@ def estimate_jitter_pilot(
     )
 
 
-def _peak_frequency(x: Tensor, oversampling: int = 4) -> Tensor:
-    """Frequency of the strongest spectral line in cycles per sample, within 1 / (8 n), (...,)."""
-    n = oversampling * x.shape[-1]
-    index = torch.fft.fft(x, n).abs().argmax(-1)
-    return (index - n * (2 * index >= n)).to(torch.float64) / n
+def _fit(x: Tensor, m: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Fit a tone with one free phasor for each of M interleaved converters.
 
-
-@dataclass(frozen=True)
-class _Fit:
-    """Tone with one free phasor for each of M interleaved converters, per trial."""
-
-    frequency: Tensor  # cycles per sample, (...,)
-    phasor: Tensor  # (..., M)
-    count: Tensor  # samples of each, (M,)
-    noise: Tensor  # variance of a sample about the fit, (...,)
-    phase_rad: Tensor  # relative to the tone, mean zero, (..., M)
-
-    @property
-    def power(self) -> Tensor:
-        """Mean power of the phasors."""
-        return self.phasor.abs().square().mean(-1)
-
-    @property
-    def jitter(self) -> Tensor:
-        """Squares of the phases of the M converters, weighted so that without jitter their ratio to
-        the noise is chi-squared with M - 1 degrees of freedom.
-        """
-        return (2 * self.count * self.phasor.abs().square() * self.phase_rad.square()).sum(-1)
-
-
-def _fit(x: Tensor, frequency: Tensor, m: int) -> _Fit:
-    """Refine the frequency jointly with the M phasors by the phase slope that remains."""
-    n = x.shape[-1]
+    The frequency is that of the strongest spectral line, refined jointly with the phasors by the
+    phase slope that remains. Per trial: frequency in cycles per sample; variance of a sample about
+    the fit; mean power of the phasors; squares of their phases, weighted so that without jitter
+    their ratio to the noise is chi-squared with M - 1 degrees of freedom; and the phases in rad
+    relative to the tone, with mean zero, (..., M).
+    """
+    n, fine = x.shape[-1], 4 * x.shape[-1]
+    peak = torch.fft.fft(x, fine).abs().argmax(-1)
+    frequency = (peak - fine * (2 * peak >= fine)).to(torch.float64) / fine
     index = torch.arange(n, device=x.device) % m
     count = torch.bincount(index, minlength=m).to(torch.float64)
     position = torch.arange(n, dtype=torch.float64, device=x.device) - (n - 1) / 2
@@ -159,21 +128,26 @@ def _fit(x: Tensor, frequency: Tensor, m: int) -> _Fit:
             scale = phasor.abs().square().sum(-1).clamp_min(1e-300) / m
             frequency = frequency + (position * aligned.imag).sum(-1) / scale / (2 * math.pi * position.square().sum())
     noise = (z - phasor[..., index]).abs().square().sum(-1) / max(1, n - m - 1)
-    mean = phasor.sum(-1, keepdim=True)
-    phase = torch.angle(phasor * mean.conj())
-    return _Fit(frequency, phasor, count, noise, phase - phase.mean(-1, keepdim=True))
+    phase = torch.angle(phasor * phasor.sum(-1, keepdim=True).conj())
+    phase = phase - phase.mean(-1, keepdim=True)
+    power = phasor.abs().square()
+    return frequency, noise, power.mean(-1), (2 * count * power * phase.square()).sum(-1), phase
 
 
-def _choose(fits: list[_Fit]) -> Tensor:
-    """Index of the shortest period that explains the record, (...,).
+def _choose(noise: Tensor, power: Tensor, jitter: Tensor, n: int) -> Tensor:
+    """Index of the shortest period that explains the record of n samples, (...,).
 
-    The threshold of 14 + 4 (M - 1) keeps false alarms below 1e-4 per trial.
+    noise, power, jitter: see `_fit`, (..., period). The threshold of 14 + 4 (M - 1) keeps false
+    alarms below 1e-4 per trial.
     """
-    jitter, longer = torch.stack([fit.jitter for fit in fits]), max(1.0, float(fits[0].count.sum()) / _SAMPLES)
-    noise = torch.stack([fit.noise for fit in fits]).amin(0).maximum(_OF_JITTER * longer * jitter.amax(0))
-    noise = noise.maximum(_OF_POWER * longer * fits[0].power + 1e-300)
-    gain = [squares / noise - (14 + 4 * i if i else 0) for i, squares in enumerate(jitter)]
-    return torch.stack(gain).argmax(0)
+    # rounding of float64 in a record of up to 1024 samples without noise, relative to the squares
+    # of phases of jitter and to the power: without it, rounding errors look like jitter of a longer
+    # period; it grows with longer records
+    longer = max(1.0, n / 1024)
+    rounding = torch.maximum(1e-13 * longer * jitter.amax(-1), 1e-28 * longer * power[..., 0] + 1e-300)
+    index = torch.arange(jitter.shape[-1], device=jitter.device)
+    threshold = torch.where(index > 0, 14 + 4 * index, 0)
+    return (jitter / noise.amin(-1).maximum(rounding)[..., None] - threshold).argmax(-1)
 
 
 class PilotJitter(Stage):

@@ -11,7 +11,7 @@ Reference:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,35 +23,6 @@ PADDING = -1
 # numbers of neighbours on each side that are compared with a line, by choice: many at first,
 # against clusters of corrupted numbers, then few, against small errors
 _REACHES = (16, 4, 2)
-
-
-@dataclass(frozen=True)
-class LinePlan:
-    """Positions of the received lines on a regular azimuth grid.
-
-    Args:
-        source: Row of the recording for each of the n rows of the grid, -1 where there is none,
-            shape (..., n).
-        number: Verified number of each received line, shape (..., received); -1 for padding at the
-            end of a trial, repeated lines and lines without a unique position.
-        missing: Rows of the grid without a line, shape (..., n), bool.
-        corrected: Lines with a corrected number, shape (..., received), bool.
-        repeated: Lines that repeat the line before, shape (..., received), bool.
-        unplaced: Lines without a unique position, shape (..., received), bool.
-        first_number: Line number that belongs to row 0 of the grid, shape (...,).
-        trusted: Share of numbers that were accepted as received, shape (...,).
-        ok: False where fewer than half of the numbers were accepted, shape (...,), bool.
-    """
-
-    source: Tensor
-    number: Tensor
-    missing: Tensor
-    corrected: Tensor
-    repeated: Tensor
-    unplaced: Tensor
-    first_number: Tensor
-    trusted: Tensor
-    ok: Tensor
 
 
 def _shifted(x: Tensor, by: int, fill: int | bool) -> Tensor:
@@ -80,13 +51,8 @@ def _unconfirmed_ends(offset: Tensor, trusted: Tensor) -> Tensor:
     first = trusted & (trusted.cumsum(-1) == 1)
     last = trusted & (trusted.flip(-1).cumsum(-1).flip(-1) == 1)
     inner = trusted & ~first & ~last
-    known = torch.where(inner & _inner_before(inner), offset - before, 1).amax(-1, keepdim=True).clamp_min(1)
+    known = torch.where(inner & (inner.cumsum(-1) > 1), offset - before, 1).amax(-1, keepdim=True).clamp_min(1)
     return (first & (after - offset > known)) | (last & (offset - before > known))
-
-
-def _inner_before(inner: Tensor) -> Tensor:
-    """Lines that have an inner line somewhere before them."""
-    return inner.cumsum(-1) > 1
 
 
 def _nearest(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,23 +66,15 @@ def _nearest(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _enclosed(trusted: Tensor) -> Tensor:
-    """Lines with accepted lines on both sides, or accepted themselves."""
+    """Lines with accepted (or lit) lines on both sides, or accepted themselves."""
     return (trusted.cumsum(-1) > 0) & (trusted.flip(-1).cumsum(-1).flip(-1) > 0)
 
 
-def _lossy(offset: Tensor, trusted: Tensor) -> Tensor:
-    """Whether lines are lost between the accepted ones, (..., 1)."""
-    limit = torch.iinfo(offset.dtype)
-    last = torch.where(trusted, offset, limit.min).amax(-1, keepdim=True)
-    return last > torch.where(trusted, offset, limit.max).amin(-1, keepdim=True)
-
-
-def _inconsistent(offset: Tensor, trusted: Tensor) -> Tensor:
-    """Accepted lines whose offset exceeds that of a later or is below that of an earlier one."""
+def _extremes(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
+    """Highest offset of the accepted lines up to each line, and lowest from each line on."""
     limit = torch.iinfo(offset.dtype)
     highest = torch.where(trusted, offset, limit.min).cummax(-1).values
-    lowest = torch.where(trusted, offset, limit.max).flip(-1).cummin(-1).values.flip(-1)
-    return trusted & ((highest > offset) | (lowest < offset))
+    return highest, torch.where(trusted, offset, limit.max).flip(-1).cummin(-1).values.flip(-1)
 
 
 def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tensor:
@@ -138,21 +96,21 @@ def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tens
         contradicting = [_contradictions(offset, trusted, reach, longest_gap, sign) for sign in (-1, 1)]
         trusted = trusted & ~torch.stack([2 * no > count for no, count in contradicting]).any(0)
     # the offsets that remain must not fall anywhere: all inconsistent numbers are dropped
-    trusted = trusted & ~_inconsistent(offset, trusted)
+    highest, lowest = _extremes(offset, trusted)
+    trusted = trusted & (highest <= offset) & (lowest >= offset)
     return trusted & ~_unconfirmed_ends(offset, trusted)
 
 
 def _repeats(lines: Tensor, number: Tensor, present: Tensor) -> Tensor:
     """Lines with the samples of the line before, (..., line) bool; lines of zeros do not count."""
     same = (lines[..., 1:, :] == lines[..., :-1, :]).all(-1) & (lines[..., 1:, :] != 0).any(-1)
-    first = same.new_zeros(*same.shape[:-1], 1)
-    return torch.cat([first, same], -1) & present
+    return torch.nn.functional.pad(same, (1, 0)) & present
 
 
 def _empty_lines(lines: Tensor, present: Tensor) -> Tensor:
     """Lines of zeros between other lines, but not before the first or after the last echo."""
     lit = (lines != 0).any(-1)
-    return present & ~lit & (lit.cumsum(-1) > 0) & (lit.flip(-1).cumsum(-1).flip(-1) > 0)
+    return present & ~lit & _enclosed(lit)
 
 
 def line_integrity(
@@ -162,7 +120,8 @@ def line_integrity(
     first_number: int | None = None,
     n_lines: int | None = None,
     longest_gap: int = 1000,
-) -> LinePlan:
+    assess: bool = True,
+) -> Estimate:
     """Verify line numbers and plan the regular azimuth grid.
 
     Repeated lines (samples equal to those of the line before) are dropped. A number that
@@ -171,8 +130,8 @@ def line_integrity(
     with a wrong number before the first or after the last accepted one, if lines were lost in this
     recording: some may be lost there as well. Lines of zeros
     between other lines count as missing. Rows after the last received line do not, since trials of
-    different lengths are padded there. A trial with fewer than half of its numbers accepted has
-    `ok` False, and its lines stay in the order received.
+    different lengths are padded there. A trial with fewer than half of its numbers accepted keeps
+    its lines in the order received.
 
     Args:
         lines: Received lines, shape (..., line, range), complex.
@@ -183,9 +142,22 @@ def line_integrity(
             the line numbers span more.
         longest_gap: Largest number of successive lost lines that is accepted; a larger step of the
             numbers is taken for an error.
+        assess: Whether to add the outcome.
 
     Returns:
-        Plan that assigns the received lines to rows of the grid.
+        Estimate with `missing` of shape (..., n), bool: rows of the grid without a line. `quality`
+        is the share of numbers that were accepted as received; the outcome is SINGULAR where it is
+        below one half. `info` holds
+
+        - `source`, the row of the recording for each of the n rows of the grid, -1 where there is
+          none, shape (..., n);
+        - `number`, the verified number of each received line, shape (..., received); -1 for padding
+          at the end of a trial, repeated lines and lines without a unique position;
+        - `corrected`, `repeated` and `unplaced`, shape (..., received), bool: lines with a
+          corrected number, lines that repeat the line before, lines without a unique position;
+        - `first_number`, the line number that belongs to row 0 of the grid, shape (...,);
+        - the counts `received`, `placed`, `repeated_count`, `corrected_count`, `unplaced_count` and
+          `missing_count` per trial, with received = placed + repeated + unplaced.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
@@ -212,26 +184,31 @@ def line_integrity(
     verified = torch.where(ok[..., None], verified, torch.where(present, row, PADDING))
     # row 0 is the first received line, whether its own number is right or wrong
     origin = _first(verified) if first_number is None else ok * first_number
-    outside = ok[..., None] & ~_enclosed(trusted) & _lossy(offset, trusted)
+    highest, lowest = _extremes(offset, trusted)
+    lossy = highest[..., -1:] > lowest[..., :1]  # lines are lost between the accepted ones
+    outside = ok[..., None] & ~_enclosed(trusted) & lossy
     verified = torch.where(outside, PADDING, verified)
     slot = verified - origin[..., None]
-    rows = n_lines if n_lines is not None else _rows(slot, verified, n)
+    rows = max(n, 1 + host_largest(torch.where(verified != PADDING, slot, 0), 0)) if n_lines is None else n_lines
     inside = (verified != PADDING) & (slot >= 0) & (slot < rows)
     _check_grid(inside, verified, rows)
     source = _sources(slot, inside, rows)
     empty = _empty_lines(lines, present).gather(-1, source.clamp_min(0)) & (source >= 0)
     before_last = (source >= 0).flip(-1).cumsum(-1).flip(-1) > 0
-    return LinePlan(
-        source=source,
-        number=torch.where(inside, verified, PADDING),
-        missing=ok[..., None] & (((source < 0) & before_last) | empty),
-        corrected=ok[..., None] & inside & ~trusted,
-        repeated=ok[..., None] & repeated,
-        unplaced=(single | (present & ~ok[..., None])) & ~inside,
-        first_number=origin,
-        trusted=share,
-        ok=ok,
-    )
+    found = ok[..., None]
+    missing = found & (((source < 0) & before_last) | empty)
+    info = {
+        "source": source,
+        "number": torch.where(inside, verified, PADDING),
+        "corrected": found & inside & ~trusted,
+        "repeated": found & repeated,
+        "unplaced": (single | (present & ~found)) & ~inside,
+        "first_number": origin,
+    }
+    counts = {f"{name}_count": info[name].sum(-1) for name in ("repeated", "corrected", "unplaced")}
+    counts |= {"received": present.sum(-1), "placed": inside.sum(-1), "missing_count": missing.sum(-1)}
+    outcome = Outcome.of(ok, Outcome.SINGULAR) if assess else Outcome.NOT_ASSESSED.like(ok)
+    return Estimate({"missing": missing}, quality=share, outcome=outcome, info=info | counts)
 
 
 def _check(lines: Tensor, line_number: Tensor, longest_gap: int) -> None:
@@ -275,16 +252,11 @@ def _first(verified: Tensor) -> Tensor:
     return torch.where(least == torch.iinfo(verified.dtype).max, 0, least)
 
 
-def _rows(slot: Tensor, verified: Tensor, n: int) -> int:
-    """Number of rows that holds every line of every trial, at least n."""
-    return max(n, 1 + host_largest(torch.where(verified != PADDING, slot, 0), 0))
-
-
 def _sources(slot: Tensor, inside: Tensor, rows: int) -> Tensor:
     """Received row for each row of the grid, -1 where there is none."""
     row = torch.arange(slot.shape[-1], device=slot.device).expand(slot.shape)
-    plan = slot.new_full((*slot.shape[:-1], rows + 1), -1)
-    return plan.scatter(-1, torch.where(inside, slot, rows), row)[..., :rows]
+    empty = slot.new_full((*slot.shape[:-1], rows + 1), -1)
+    return empty.scatter(-1, torch.where(inside, slot, rows), row)[..., :rows]
 
 
 def place_lines(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
@@ -308,21 +280,6 @@ def place_lines(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
     x = checked_samples(x, "place_lines", "line, range", real=True, finite=False)
     index = source.clamp_min(0)[..., None].expand(*source.shape, x.shape[-1])
     return torch.where(source[..., None] >= 0, x.expand(*source.shape[:-1], *x.shape[-2:]).gather(-2, index), fill)
-
-
-def place_per_line(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
-    """Put side data with one value per received line on the regular azimuth grid of the lines.
-
-    Args:
-        x: Side data, shape (..., received).
-        source: Row of the recording for each of the n rows of the grid, -1 where there is none,
-            shape (..., n).
-        fill: Value of the rows without a line.
-
-    Returns:
-        Side data on the grid, shape (..., n).
-    """
-    return place_lines(x[..., None], source, fill)[..., 0]
 
 
 class LineIntegrity(Stage):
@@ -350,8 +307,8 @@ class LineIntegrity(Stage):
         assess: bool = True,
     ) -> None:
         super().__init__()
-        self.assess = assess
-        self.first_number, self.n_lines, self.longest_gap = first_number, n_lines, longest_gap
+        numbers = {"first_number": first_number, "n_lines": n_lines, "longest_gap": longest_gap}
+        self.options: dict[str, Any] = {**numbers, "assess": assess}
 
     def forward(self, signal: Signal, line_number: Tensor) -> tuple[Signal, Estimate]:
         """Put every line on the row of the azimuth grid that its verified number gives.
@@ -362,32 +319,14 @@ class LineIntegrity(Stage):
 
         Returns:
             The signal on the grid, with missing lines zero (regular input is unchanged bit for
-            bit), and an Estimate with `missing` of shape (..., pulse), bool. `quality` is the share
-            of numbers that were accepted; the outcome is SINGULAR where it is below one half, and
-            the lines stay in the order received there. `info` has `source`, `number`, `corrected`,
-            `repeated`, `unplaced` and `first_number` (see `LinePlan`), and the counts `received`,
-            `placed`, `repeated_count`, `corrected_count`, `unplaced_count` and `missing_count` per
-            trial, with received = placed + repeated + unplaced.
+            bit), and the Estimate of `line_integrity`.
 
         Raises:
             ValueError: If the numbers do not fit the lines or are not integers, `longest_gap` is
                 less than one, fewer than half of the numbers are accepted in every trial, or the
                 grid holds none of the lines.
         """
-        plan = line_integrity(
-            signal.data, line_number, first_number=self.first_number, n_lines=self.n_lines, longest_gap=self.longest_gap
-        )
-        axis = signal.axis("pulse").part(0, plan.source.shape[-1])
-        counts = {
-            "received": (line_number.expand(signal.data.shape[:-1]) != PADDING).flip(-1).cumsum(-1).gt(0).sum(-1),
-            "placed": (plan.number != PADDING).sum(-1),
-            "repeated_count": plan.repeated.sum(-1),
-            "corrected_count": plan.corrected.sum(-1),
-            "unplaced_count": plan.unplaced.sum(-1),
-            "missing_count": plan.missing.sum(-1),
-        }
-        names = ("source", "number", "corrected", "repeated", "unplaced", "first_number")
-        info = {name: getattr(plan, name) for name in names} | counts
-        outcome = Outcome.of(plan.ok, Outcome.SINGULAR) if self.assess else Outcome.NOT_ASSESSED.like(plan.ok)
-        estimate = Estimate({"missing": plan.missing}, quality=plan.trusted, outcome=outcome, info=info)
-        return signal.with_axis(place_lines(signal.data, plan.source), pulse=axis), estimate
+        plan = line_integrity(signal.data, line_number, **self.options)
+        source = plan.info["source"]
+        axis = signal.axis("pulse").part(0, source.shape[-1])
+        return signal.with_axis(place_lines(signal.data, source), pulse=axis), plan

@@ -68,21 +68,6 @@ def unit_legendre(u: Tensor, order: int) -> Tensor:
     return (legendre(u, order) * torch.sqrt(2 * degree + 1)).movedim(-1, 0)
 
 
-def without_line(phase_rad: Tensor) -> Tensor:
-    """Remove the constant and linear parts of a phase over the band, by least squares.
-
-    Args:
-        phase_rad: Phase in radians at GRID = 1025 equally spaced frequencies of the band, shape
-            (..., GRID), float64.
-
-    Returns:
-        Remaining phase in radians, same shape.
-    """
-    line = unit_legendre(band_grid(phase_rad.device), 1)
-    line = line / torch.linalg.vector_norm(line, dim=-1, keepdim=True)
-    return phase_rad - (phase_rad @ line.mT) @ line
-
-
 def on_axis(values: Tensor, u: Tensor) -> Tensor:
     """Interpolate a sampled response linearly at other frequencies.
 
@@ -99,28 +84,6 @@ def on_axis(values: Tensor, u: Tensor) -> Tensor:
     low = position.floor().to(torch.int64).clamp(0, values.shape[-1] - 2)
     part = position - low
     return values[..., low] * (1 - part) + values[..., low + 1] * part
-
-
-def response_filter(
-    phase_rad: Tensor, amplitude: Tensor | None, n: int, band: float, dtype: torch.dtype = torch.complex128
-) -> Tensor:
-    """Return the inverse response exp(-j psi) / A, by which range spectra are to be multiplied.
-
-    Args:
-        phase_rad: Phase psi of the response in radians at GRID = 1025 equally spaced frequencies of
-            the band, shape (..., GRID), float64.
-        amplitude: Amplitude A of the response at the same frequencies, shape (..., GRID), or None
-            for one.
-        n: Length of the spectra.
-        band: Bandwidth of the pulse over the sampling rate.
-        dtype: complex64 or complex128.
-
-    Returns:
-        Complex factors in FFT order, shape (..., n).
-    """
-    u = band_axis(n, band, phase_rad.device)
-    inverse = cis(-on_axis(phase_rad, u).to(real_dtype(dtype)))
-    return inverse if amplitude is None else inverse / on_axis(amplitude, u).to(real_dtype(dtype))
 
 
 def correct_response(x: Tensor, phase_rad: Tensor, amplitude: Tensor | None, band: float) -> Tensor:
@@ -145,7 +108,10 @@ def correct_response(x: Tensor, phase_rad: Tensor, amplitude: Tensor | None, ban
     """
     x = checked_samples(x, "correct_response", "range", finite=False)
     refuse_non_finite_values("correct_response", phase_rad=phase_rad, amplitude=amplitude)
-    inverse = response_filter(phase_rad, amplitude, x.shape[-1], band, x.dtype)
+    u, real = band_axis(x.shape[-1], band, phase_rad.device), real_dtype(x.dtype)
+    inverse = cis(-on_axis(phase_rad, u).to(real))
+    if amplitude is not None:
+        inverse = inverse / on_axis(amplitude, u).to(real)
     return torch.fft.ifft(torch.fft.fft(x) * inverse[..., None, :])
 
 
@@ -194,8 +160,7 @@ def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, or
     ratio = _binned(power.to(torch.float64), band, bins) / wanted
     level = ratio.mean(-1, keepdim=True)
     half_log = 0.5 * torch.log((ratio / level.clamp_min(1e-300)).clamp_min(1e-6))
-    terms = unit_legendre(u, order).mT
-    terms = terms.expand(*half_log.shape[:-1], *terms.shape)
+    terms = unit_legendre(u, order).mT.expand(*half_log.shape[:-1], -1, -1)
     coefficients = torch.linalg.lstsq(terms, half_log[..., None], driver="gels").solution[..., 1:, 0]
     fitted = torch.exp(coefficients @ unit_legendre(band_grid(power.device), order)[1:])
     return torch.where(level > 0, fitted, 1)
@@ -211,9 +176,7 @@ def _binned(power: Tensor, band: float, bins: int) -> Tensor:
             f"{power.shape[-1]} samples has fewer; lower the order or give longer lines"
         )
     index = ((u[inside] + 1) / 2 * bins).to(torch.int64).clamp(0, bins - 1)
-    total = torch.zeros((*power.shape[:-1], bins), dtype=power.dtype, device=power.device).index_add(
-        -1, index, power[..., inside]
-    )
+    total = power.new_zeros(*power.shape[:-1], bins).index_add(-1, index, power[..., inside])
     return total / torch.bincount(index, minlength=bins).clamp_min(1)
 
 

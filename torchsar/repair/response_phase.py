@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -135,28 +135,14 @@ def halved(weight: Tensor, line: Tensor) -> Tensor:
     return torch.cat([weight * ~inner, weight * inner])
 
 
-@dataclass(frozen=True)
-class _Spectra:
-    """Spectra of the windows with a weight, those of a trial after those of the trial before.
-
-    Args:
-        unit: Spectra of unit energy, shape (window, n), complex128.
-        weight: Weights, with the sum 1 in each trial, shape (window,), float64.
-        trial: Number of the trial of each window, rising, shape (window,).
+def _spectra(windows: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Spectra of unit energy (window, n) of the windows (trial, point, n) with a weight above zero,
+    complex128; their weights, with the sum 1 in each trial; and their trials, in rising order.
     """
-
-    unit: Tensor
-    weight: Tensor
-    trial: Tensor
-
-    @staticmethod
-    def of(windows: Tensor, weight: Tensor) -> _Spectra:
-        """Spectra of windows (trial, point, n) with a weight (trial, point) above zero."""
-        used = (weight > 0) & (windows != 0).any(-1)
-        spectra = _transformed(windows[used].to(torch.complex128))
-        spectra = spectra / torch.linalg.vector_norm(spectra, dim=-1, keepdim=True)
-        share = weight / weight.sum(-1, keepdim=True).clamp_min(1e-300)
-        return _Spectra(spectra, share[used], used.nonzero()[:, 0])
+    used = (weight > 0) & (windows != 0).any(-1)
+    spectra = _transformed(windows[used].to(torch.complex128))
+    share = weight / weight.sum(-1, keepdim=True).clamp_min(1e-300)
+    return spectra / torch.linalg.vector_norm(spectra, dim=-1, keepdim=True), share[used], used.nonzero()[:, 0]
 
 
 def _transformed(windows: Tensor) -> Tensor:
@@ -164,7 +150,7 @@ def _transformed(windows: Tensor) -> Tensor:
     return torch.fft.fft(windows, norm="ortho") if windows.shape[0] else windows
 
 
-def window_entropy(spectra: _Spectra, phase_rad: Tensor) -> tuple[Tensor, Tensor]:
+def window_entropy(spectra: tuple[Tensor, Tensor, Tensor], phase_rad: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the mean entropy of windows after removal of a phase, and its gradient.
 
     The entropy of a window is H = -sum p ln p with p = |y|^2, where y is the range response,
@@ -172,7 +158,8 @@ def window_entropy(spectra: _Spectra, phase_rad: Tensor) -> tuple[Tensor, Tensor
     influence. Since the removal of a phase is unitary, p sums to one and dH/dy* = -(ln p + 1) y.
 
     Args:
-        spectra: Windows of the trials.
+        spectra: Spectra of unit energy, shape (window, n), their weights and their trials, shape
+            (window,) each.
         phase_rad: Phase to be removed, in radians, FFT order, shape (trial, n), float64.
 
     Returns:
@@ -181,10 +168,9 @@ def window_entropy(spectra: _Spectra, phase_rad: Tensor) -> tuple[Tensor, Tensor
     """
     total, gradient = torch.zeros_like(phase_rad[:, 0]), torch.zeros_like(phase_rad)
     turn = cis(-phase_rad)
-    for first in range(0, spectra.trial.numel(), _BLOCK):
-        block = slice(first, first + _BLOCK)
-        trial, weight = spectra.trial[block], spectra.weight[block]
-        entropy, slope = _entropy_slope(spectra.unit[block] * turn[trial])
+    for first in range(0, spectra[2].numel(), _BLOCK):
+        unit, weight, trial = (x[first : first + _BLOCK] for x in spectra)
+        entropy, slope = _entropy_slope(unit * turn[trial])
         total.index_add_(0, trial, weight * entropy)
         gradient.index_add_(0, trial, weight[:, None] * slope)
     return total, gradient
@@ -222,7 +208,7 @@ def sharpest_coefficients(
     Returns:
         Coefficients in radians of the degrees 2 to orders[-1], shape (trial, orders[-1] - 1).
     """
-    spectra = _Spectra.of(windows, weight)
+    spectra = _spectra(windows, weight)
     basis = unit_legendre(band_axis(windows.shape[-1], band, windows.device).clamp(-1, 1), orders[-1])[2:]
     c = torch.zeros((windows.shape[0], 0), dtype=torch.float64, device=windows.device)
     for order in orders:
@@ -330,7 +316,7 @@ def _estimate(phase_rad: Tensor, image: Tensor, fit: tuple[Tensor, Tensor, Tenso
     if fit is None:
         return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(value["phase_rad"][..., 0]))
     halves, weights, found, strength, band = fit
-    spectra, count = _Spectra.of(halves, weights), found.shape[-1]
+    spectra, count = _spectra(halves, weights), found.shape[-1]
     basis = unit_legendre(band_axis(halves.shape[-1], band, halves.device).clamp(-1, 1), 2 * (count + 1))[2:]
 
     def slope(coefficients: Tensor) -> Tensor:
@@ -375,9 +361,8 @@ def point_average_coefficients(
     spectra = torch.fft.ifftshift((windows[used] * taper).to(torch.complex128), dim=-1)
     spectra = torch.fft.fftshift(_transformed(spectra), dim=-1)[:, inside]
     spectra = spectra / torch.linalg.vector_norm(spectra, dim=-1, keepdim=True)
-    # the first window of each trial
     average = spectra.new_zeros(windows.shape[0], spectra.shape[-1])
-    first = torch.diff(trial, prepend=trial.new_full((1,), -1)) > 0
+    first = torch.diff(trial, prepend=trial.new_full((1,), -1)) > 0  # window of each trial
     average[trial[first]] = spectra[first]
     for _ in range(rounds if trial.numel() else 0):
         spectra = _align(spectra, average[trial])
@@ -396,8 +381,8 @@ def _align(spectra: Tensor, reference: Tensor) -> Tensor:
     correlation = torch.fft.fft(spectra * reference.conj(), n)
     index = power_of(correlation).argmax(-1, keepdim=True)
     slope = (index - n * (2 * index >= n)).to(torch.float64) / n
-    turned = torch.gather(correlation, -1, index)
-    return spectra * linear_phasor(-slope[..., 0], 0, spectra.shape[-1], spectra.dtype) * cis(-torch.angle(turned))
+    constant = cis(-torch.angle(torch.gather(correlation, -1, index)))
+    return spectra * linear_phasor(-slope[..., 0], 0, spectra.shape[-1], spectra.dtype) * constant
 
 
 def estimate_response_points(
@@ -455,9 +440,6 @@ def estimate_response_points(
     return _estimate(total @ basis, image, (halves, weights, found, strength, band))
 
 
-_METHODS = {"sharpest": estimate_response_sharpest, "points": estimate_response_points}
-
-
 class EstimateResponse(Stage):
     """Estimator of the channel's phase and amplitude response from a focused image.
 
@@ -495,7 +477,8 @@ class EstimateResponse(Stage):
     ) -> None:
         super().__init__()
         self.radar, self.assess = radar, assess
-        self.method = _METHODS[method] if isinstance(method, str) else method
+        methods = {"sharpest": estimate_response_sharpest, "points": estimate_response_points}
+        self.method = methods[method] if isinstance(method, str) else method
         self.register_buffer("expected_power", expected_power)
 
     def forward(self, signal: Signal) -> Estimate:
@@ -507,12 +490,9 @@ class EstimateResponse(Stage):
         Returns:
             Estimate with `phase_rad` in radians and `amplitude` at 1025 equally spaced frequencies
             of the pulse band. The amplitude is one unless the constructor received
-            `expected_power`.
+            `expected_power`; that of `EstimateFlatResponse` is relative to a flat spectrum.
         """
-        return self._estimated(signal, self.expected_power)
-
-    def _estimated(self, signal: Signal, expected: Tensor | None) -> Estimate:
-        """Estimate, with the amplitude if a power spectrum is expected."""
+        expected = self._expected(signal.data)
         band = self.radar.pulse.bandwidth_hz / self.radar.sampling_hz
         asked = {} if self.assess else {"assess": False}
         valid = max(1, signal.data.shape[-1] - self.radar.pulse_samples)
@@ -521,6 +501,9 @@ class EstimateResponse(Stage):
             return estimate
         amplitude = estimate_amplitude_response(band_power(unit_level(signal.data)), expected, band)
         return replace(estimate, value={**estimate.value, "amplitude": amplitude})
+
+    def _expected(self, image: Tensor) -> Tensor | None:
+        return self.expected_power
 
 
 class EstimateFlatResponse(EstimateResponse):
@@ -545,16 +528,5 @@ class EstimateFlatResponse(EstimateResponse):
     ) -> None:
         super().__init__(radar, method, assess=assess)
 
-    def forward(self, signal: Signal) -> Estimate:
-        """Estimate the phase and amplitude response of the channel along range.
-
-        Args:
-            signal: Image, shape (..., azimuth, range), compressed in range with the reference
-                "flat".
-
-        Returns:
-            Estimate with `phase_rad` in radians and `amplitude`, relative to a flat spectrum, at
-            1025 equally spaced frequencies of the pulse band.
-        """
-        flat = torch.ones(signal.data.shape[-1], dtype=torch.float64, device=signal.data.device)
-        return self._estimated(signal, flat)
+    def _expected(self, image: Tensor) -> Tensor | None:
+        return torch.ones(image.shape[-1], dtype=torch.float64, device=image.device)

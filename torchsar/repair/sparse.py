@@ -35,14 +35,8 @@ from torchsar.core import (
 from torchsar.focus.defocus import InvertibleOmegaK, all_pass
 from torchsar.radar import StripmapRadar
 
-# usual size on processors
-_CACHE_LINE_BYTES = 64
 # chosen: relative change in power of the missing lines, below which they count as settled
 _SETTLED = 1e-5
-# number of arrays of an operation that share the cache
-_ARRAYS = 4
-# measured: least width of a block of columns, below which reading and writing them takes longer
-_LEAST_COLUMNS = 32
 
 
 def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, residual: Tensor, steps: int) -> Tensor:
@@ -142,7 +136,7 @@ class IncompleteLines:
     def __init__(self, operator: InvertibleOmegaK, lines: Tensor, mask: Tensor) -> None:
         self.operator = operator
         self.received = torch.fft.fft(lines).mT.contiguous()
-        self._energy = power_of(self.received.detach()).sum((-2, -1), keepdim=True)
+        self.energy = power_of(self.received.detach()).sum((-2, -1), keepdim=True)
         most = max(1, host_largest(mask.sum(-1), mask.shape[-1]))
         order = torch.sort(mask.to(torch.uint8), dim=-1, descending=True, stable=True).indices
         self._index = order[..., None, :most]
@@ -150,10 +144,6 @@ class IncompleteLines:
         tensors = (self.received, operator.bulk, operator.fine)
         tracked = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
         self._whole = tracked or not all(is_plain(x) for x in (*tensors, self._index))
-
-    def nothing(self) -> Tensor:
-        """Return range spectra of missing lines that are zero, shape (..., range frequency, m)."""
-        return torch.zeros_like(self._taken(self.received))
 
     def lines(self, missing: Tensor) -> Tensor:
         """Return lines that are zero but for the missing ones.
@@ -165,15 +155,6 @@ class IncompleteLines:
             Lines, shape (..., pulse, range).
         """
         return self._put(torch.zeros_like(self.received), torch.fft.ifft(missing, dim=-2)).mT
-
-    def mean_power(self, missing: Tensor) -> Tensor:
-        """Return the mean power of the pixels of the image, shape (..., 1, 1).
-
-        Args:
-            missing: Range spectra of missing lines, shape (..., range frequency, m).
-        """
-        energy = self._energy + power_of(missing.detach()).sum((-2, -1), keepdim=True)
-        return energy / (self.received.shape[-2] ** 2 * self.received.shape[-1])
 
     def spectra(self, missing: Tensor, received: bool = True) -> Tensor:
         """Compute the focused azimuth spectra of the lines.
@@ -190,11 +171,10 @@ class IncompleteLines:
             others = self.received[..., rows, :]
             return torch.fft.fft(self._put(others if received else torch.zeros_like(others), missing[..., rows, :]))
 
-        def compress(columns: slice) -> Tensor:
-            return self.operator.compress(spectra[..., columns].mT.contiguous(), columns).mT
-
         spectra = self.in_blocks(azimuth, _spaced(self.received, self.received.shape), -2)
-        return self.in_blocks(compress, spectra, -1)
+        return self.in_blocks(
+            lambda columns: self.operator.compress(spectra[..., columns].mT.contiguous(), columns).mT, spectra, -1
+        )
 
     def missing(self, spectra: Tensor) -> Tensor:
         """Compute the missing lines from focused azimuth spectra.
@@ -205,15 +185,14 @@ class IncompleteLines:
         Returns:
             Range spectra of missing lines, shape (..., range frequency, m).
         """
-
-        def expand(columns: slice) -> Tensor:
-            return self.operator.expand(spectra[..., columns].mT.contiguous(), columns).mT
-
-        def azimuth(rows: slice) -> Tensor:
-            return torch.where(self._there, self._taken(torch.fft.ifft(expanded[..., rows, :])), 0)
-
-        expanded = self.in_blocks(expand, spectra, -1)
-        return self.in_blocks(azimuth, expanded.new_empty((*expanded.shape[:-1], self._index.shape[-1])), -2)
+        expanded = self.in_blocks(
+            lambda columns: self.operator.expand(spectra[..., columns].mT.contiguous(), columns).mT, spectra, -1
+        )
+        return self.in_blocks(
+            lambda rows: torch.where(self._there, self.taken(torch.fft.ifft(expanded[..., rows, :])), 0),
+            expanded.new_empty((*expanded.shape[:-1], self._index.shape[-1])),
+            -2,
+        )
 
     def in_blocks(self, make: Callable[[slice], Tensor], out: Tensor, dim: int) -> Tensor:
         """Compute an array in blocks of rows or of columns.
@@ -229,8 +208,9 @@ class IncompleteLines:
         if self._whole:
             return make(slice(None))
         n, beside = out.shape[dim], max(1, self.received.numel() // self.received.shape[dim])
-        least = _LEAST_COLUMNS if dim == -1 else 1
-        size = block_bytes_of(out.device) // (_ARRAYS * beside * self.received.element_size())
+        # measured: reading and writing of fewer columns takes longer; four arrays share the cache
+        least = 32 if dim == -1 else 1
+        size = block_bytes_of(out.device) // (4 * beside * self.received.element_size())
         step = max(1, size // least) * least
 
         def work(part: slice) -> None:
@@ -243,8 +223,8 @@ class IncompleteLines:
         """Add missing lines (..., f, m) to lines (..., f, pulse)."""
         return others.scatter_add(-1, self._index.expand(missing.shape), missing)
 
-    def _taken(self, lines: Tensor) -> Tensor:
-        """Missing lines (..., f, m) of lines (..., f, pulse)."""
+    def taken(self, lines: Tensor) -> Tensor:
+        """Return the missing lines (..., f, m) of lines (..., f, pulse)."""
         return lines.gather(-1, self._index.expand(*lines.shape[:-1], -1))
 
 
@@ -253,7 +233,7 @@ def _spaced(like: Tensor, shape: tuple[int, ...]) -> Tensor:
 
     At a distance of a power of two, the samples of a column would share a few places in the cache.
     """
-    line = _CACHE_LINE_BYTES // like.element_size()
+    line = 64 // like.element_size()  # a cache line has 64 bytes
     wide = like.new_empty((*shape[:-1], line * (-(-shape[-1] // line) | 1)))
     return wide[..., : shape[-1]]
 
@@ -283,11 +263,6 @@ class SubLooks:
     def _pixels(self, spectra: Tensor, window: Tensor) -> Tensor:
         """Pixels (..., n / step) of a sub-look from azimuth spectra (..., n)."""
         return torch.fft.ifft((spectra * window).unflatten(-1, (self.step, -1)).sum(-2))
-
-    def _spectra(self, pixels: Tensor, window: Tensor) -> Tensor:
-        """Azimuth spectra (..., n) from pixels (..., n / step), by the adjoint of `_pixels`."""
-        spectra = torch.fft.fft(pixels)
-        return window * torch.cat([spectra] * self.step, -1)
 
     def power(self, missing: Tensor, unexplained: Tensor) -> Tensor:
         """Estimate the local power of every sub-look of the focused lines.
@@ -342,12 +317,12 @@ class SubLooks:
         spectra = self.scene.spectra(missing, received)
 
         def weighted(rows: slice) -> Tensor:
-            some = spectra[..., rows, :]
-            products = (
-                self._spectra(w[..., rows, :] * self._pixels(some, window), window)
-                for window, w in zip(self.windows, weight, strict=True)
-            )
-            return sum(products, torch.zeros_like(some))
+            total = torch.zeros_like(spectra[..., rows, :])
+            for window, w in zip(self.windows, weight, strict=True):
+                # the adjoint of `_pixels`
+                folded = torch.fft.fft(w[..., rows, :] * self._pixels(spectra[..., rows, :], window))
+                total = total + window * torch.cat([folded] * self.step, -1)
+            return total
 
         return self.scene.missing(self.scene.in_blocks(weighted, spectra, -2))
 
@@ -372,39 +347,34 @@ def bright_fill(
     Returns:
         Range spectra of missing lines, shape (..., range frequency, m).
     """
-    missing, threshold = scene.nothing(), None
+    missing, threshold = torch.zeros_like(scene.taken(scene.received)), None
     active = torch.ones_like(missing[..., :1, :1], dtype=torch.bool)
     for _ in range(steps):
-        spectra, lowest = scene.spectra(missing), last**2 * scene.mean_power(missing)
-        threshold = (
-            first**2 * _peak_power(scene, spectra) if threshold is None else torch.maximum(fall**2 * threshold, lowest)
-        )
-        before, found = missing, scene.missing(_bright_part(scene, spectra, threshold))
+        spectra = scene.spectra(missing)
+        # mean power of the pixels of the image
+        energy = scene.energy + power_of(missing.detach()).sum((-2, -1), keepdim=True)
+        lowest = last**2 * (energy / (scene.received.shape[-2] ** 2 * scene.received.shape[-1]))
+        if threshold is None:
+            peaks = scene.in_blocks(
+                lambda rows, of=spectra: power_of(torch.fft.ifft(of.detach()[..., rows, :])).amax(-1, keepdim=True),
+                spectra.real.new_empty((*spectra.shape[:-1], 1)),
+                -2,
+            )
+            threshold = first**2 * peaks.amax(-2, keepdim=True)
+        else:
+            threshold = torch.maximum(fall**2 * threshold, lowest)
+
+        def bright(rows: slice, spectra: Tensor = spectra, threshold: Tensor = threshold) -> Tensor:
+            image = torch.fft.ifft(spectra[..., rows, :])
+            return torch.fft.fft(torch.where(power_of(image) > threshold, image, 0))
+
+        before, found = missing, scene.missing(scene.in_blocks(bright, spectra, -2))
         missing = torch.where(active, found, before)
         change, size = (power_of(x.detach()).sum((-2, -1), keepdim=True) for x in (found - before, found))
         active = active & ((threshold > lowest) | (change > _SETTLED * size))
         if not host_value(active.any(), True):
             break
     return missing
-
-
-def _bright_part(scene: IncompleteLines, spectra: Tensor, threshold: Tensor) -> Tensor:
-    """Azimuth spectra (..., range, Doppler) of the pixels whose power exceeds a threshold."""
-
-    def bright(rows: slice) -> Tensor:
-        image = torch.fft.ifft(spectra[..., rows, :])
-        return torch.fft.fft(torch.where(power_of(image) > threshold, image, 0))
-
-    return scene.in_blocks(bright, spectra, -2)
-
-
-def _peak_power(scene: IncompleteLines, spectra: Tensor) -> Tensor:
-    """Power (..., 1, 1) of the strongest pixel, from azimuth spectra (..., range, Doppler)."""
-
-    def peaks(rows: slice) -> Tensor:
-        return power_of(torch.fft.ifft(spectra.detach()[..., rows, :])).amax(-1, keepdim=True)
-
-    return scene.in_blocks(peaks, spectra.real.new_empty((*spectra.shape[:-1], 1)), -2).amax(-2, keepdim=True)
 
 
 def sparse_fill(
@@ -454,8 +424,13 @@ def sparse_fill(
     x = torch.where(mask[..., None], 0, lines)
     level = level_of(x)
     x = x / level
-    flat = None if reference is None else all_pass(reference)
-    operator = InvertibleOmegaK(radar, x, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, reference=flat)
+    operator = InvertibleOmegaK(
+        radar,
+        x,
+        doppler_hz=doppler_hz,
+        velocity_m_s=velocity_m_s,
+        reference=None if reference is None else all_pass(reference),
+    )
     turns = torch.as_tensor(doppler_hz, dtype=torch.float64, device=x.device) / radar.prf_hz
     scene = IncompleteLines(operator, x, mask)
     model = SubLooks(scene, look_windows(x.shape[-2], looks, turns.expand(x.shape[:-2])))

@@ -43,13 +43,11 @@ from torchsar.radar import TriangularLadar
 from torchsar.repair.analytic import delayed
 from torchsar.repair.trigger import find_trigger
 
-Trigger = float | Tensor
-
 
 def split_record(
     record: Tensor,
     radar: TriangularLadar,
-    trigger_s: Trigger = 0.0,
+    trigger_s: float | Tensor = 0.0,
     contiguous: bool | None = None,
     nearer: bool = False,
     first_s: float = 0.0,
@@ -85,22 +83,10 @@ def split_record(
         TypeError: If the record is not a tensor of samples, or the trigger not a number.
     """
     record = checked_samples(record, "split_record", "pulse, time", real=True, finite=False)
-    trigger = _trigger_of(trigger_s, record)
-    joined = is_contiguous(record.shape[-1], radar) if contiguous is None else contiguous
-    lines = record.flatten(-2)[..., None, :] if joined else record
-    start, fraction = start_sample(trigger - first_s, radar, joined)
-    whole = delayed(lines, fraction, analytic=not record.is_complex())
-    periods = _cut_joined(whole, start, record.shape[-2], radar) if joined else _cut_inside(whole, start, radar)
-    sweeps = periods.unflatten(-1, (2, radar.sweep_samples)).movedim(-2, -3)
-    return sweeps if record.is_complex() else canonical_ramps(sweeps, radar, nearer)
-
-
-def _trigger_of(trigger_s: Trigger, record: Tensor) -> Tensor:
-    """The trigger as a float64 tensor, a number or one per trial of the record."""
     if not isinstance(trigger_s, Tensor | float | int):
         raise TypeError(f"trigger_s must be a number of seconds, or a tensor with one per trial, got {trigger_s!r}")
     trigger, trials = torch.as_tensor(trigger_s, dtype=torch.float64, device=record.device), record.shape[:-2]
-    if _any(~torch.isfinite(trigger)):
+    if not host_value(torch.isfinite(trigger.detach()).all(), True):
         raise ValueError(
             "trigger_s must be finite, got NaN or Inf; use an estimate of find_trigger "
             "with ok True, or leave that trial out"
@@ -114,7 +100,13 @@ def _trigger_of(trigger_s: Trigger, record: Tensor) -> Tensor:
             f"trigger_s must be one number, or one number per trial with the trials {tuple(trials)}, "
             f"got the shape {tuple(trigger.shape)}"
         )
-    return trigger
+    joined = is_contiguous(record.shape[-1], radar) if contiguous is None else contiguous
+    lines = record.flatten(-2)[..., None, :] if joined else record
+    start, fraction = start_sample(trigger - first_s, radar, joined)
+    whole = delayed(lines, fraction, analytic=not record.is_complex())
+    periods = _cut_joined(whole, start, record.shape[-2], radar) if joined else _cut_inside(whole, start, radar)
+    sweeps = periods.unflatten(-1, (2, radar.sweep_samples)).movedim(-2, -3)
+    return sweeps if record.is_complex() else canonical_ramps(sweeps, radar, nearer)
 
 
 def is_contiguous(block_samples: int, radar: TriangularLadar) -> bool:
@@ -177,7 +169,7 @@ def _cut_joined(line: Tensor, start: Tensor, n_period: int, radar: TriangularLad
             f"a contiguous record of {n_period} periods of {period} samples must hold {n_period * period} "
             f"samples, got {line.shape[-1]}; give contiguous=False for blocks of another length"
         )
-    if start.ndim == 0 and not _any(start != 0):
+    if start.ndim == 0 and not host_value(start, 0):
         return line.squeeze(-2).unflatten(-1, (n_period, period))
     if n_period < 2:
         raise ValueError(
@@ -190,7 +182,7 @@ def _cut_joined(line: Tensor, start: Tensor, n_period: int, radar: TriangularLad
 def _cut_inside(blocks: Tensor, start: Tensor, radar: TriangularLadar) -> Tensor:
     """Periods (..., K, period) of blocks (..., K, n) from sample `start` on."""
     period, n = 2 * radar.sweep_samples, blocks.shape[-1]
-    if period > n or _any((start < 0) | (start + period > n)):
+    if period > n or host_value(((start < 0) | (start + period > n)).any(), False):
         allowed = (
             f"which allows triggers from 0 to {(n - period) / radar.sample_rate_hz:.4g} s after the first sample"
             if n >= period
@@ -210,11 +202,6 @@ def _taken(lines: Tensor, start: Tensor, n: int) -> Tensor:
     index = start[..., None, None] + torch.arange(n, device=lines.device)
     shape = np.broadcast_shapes(lines.shape[:-2], start.shape)
     return lines.expand(*shape, *lines.shape[-2:]).gather(-1, index.expand(*shape, lines.shape[-2], n))
-
-
-def _any(condition: Tensor) -> bool:
-    """Whether a condition holds for any trial; False inside vmap, where values cannot be read."""
-    return host_value(condition.detach().any(), False)
 
 
 def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Tensor:
@@ -344,47 +331,40 @@ class SplitSweeps(Stage):
             ValueError: If a recorded trigger is missing, the sampling rate is not that of the
                 radar, or a whole period does not fit a block after the trigger.
         """
+        radar, (pulse, time) = self.radar, signal.axes
+        if abs(time.step * radar.sample_rate_hz - 1) > 1e-9:
+            raise ValueError(
+                f"the record is sampled at {1 / time.step:.6g} Hz, but sample_rate_hz of the radar is "
+                f"{radar.sample_rate_hz:.6g} Hz; give the radar with which it was recorded"
+            )
+        contiguous = is_contiguous(time.n, radar) and abs(pulse.step / (time.n * time.step) - 1) < 1e-9
         if self.trigger == "search":
-            contiguous = self._contiguous(signal)
-            found = find_trigger(signal.data, self.radar, contiguous, self.nearer, assess=self.assess)
-            found = replace(found, value={"trigger_s": found["trigger_s"] + signal.axis("time").start})
-            return self._split(signal, _fitting(found["trigger_s"], signal, self.radar, contiguous)), found
+            found = find_trigger(signal.data, radar, contiguous, self.nearer, assess=self.assess)
+            estimated = found["trigger_s"] + time.start
+            found, fitting = replace(found, value={"trigger_s": estimated}), estimated
+            if not contiguous:  # limited so that a period fits its block
+                room = max(0, time.n - 2 * radar.sweep_samples)
+                fitting = estimated.clamp(
+                    time.start - 0.5 / radar.sample_rate_hz, time.start + (room - 0.6) / radar.sample_rate_hz
+                )
+            return self._split(signal, fitting, contiguous), found
         if self.trigger == "recorded" and trigger_s is None:
             raise ValueError(
                 "SplitSweeps(trigger='recorded') needs the recorded time trigger_s; in a chain write "
                 "use(SplitSweeps(radar, 'recorded'), trigger_s='aux.trigger_s')"
             )
-        return self._split(
-            signal, torch.as_tensor(self.trigger if trigger_s is None else trigger_s, dtype=torch.float64)
-        )
+        trigger = torch.as_tensor(self.trigger if trigger_s is None else trigger_s, dtype=torch.float64)
+        return self._split(signal, trigger, contiguous)
 
-    def _contiguous(self, signal: Signal) -> bool:
+    def _split(self, signal: Signal, trigger_s: Tensor, contiguous: bool) -> Signal:
         pulse, time = signal.axes
-        if abs(time.step * self.radar.sample_rate_hz - 1) > 1e-9:
-            raise ValueError(
-                f"the record is sampled at {1 / time.step:.6g} Hz, but sample_rate_hz of the radar is "
-                f"{self.radar.sample_rate_hz:.6g} Hz; give the radar with which it was recorded"
-            )
-        return is_contiguous(time.n, self.radar) and abs(pulse.step / (time.n * time.step) - 1) < 1e-9
-
-    def _split(self, signal: Signal, trigger_s: Tensor) -> Signal:
-        contiguous = self._contiguous(signal)
-        data = split_record(signal.data, self.radar, trigger_s, contiguous, self.nearer, signal.axis("time").start)
-        pulse = signal.axis("pulse")
+        data = split_record(signal.data, self.radar, trigger_s, contiguous, self.nearer, time.start)
         shift = 0.0
         if trigger_s.ndim == 0:
-            start, fraction = start_sample(trigger_s.detach() - signal.axis("time").start, self.radar, contiguous)
-            shift = signal.axis("time").start + (float(start + fraction) - 0.5) / self.radar.sample_rate_hz
+            start, fraction = start_sample(trigger_s.detach() - time.start, self.radar, contiguous)
+            shift = time.start + (float(start + fraction) - 0.5) / self.radar.sample_rate_hz
         axes = self.radar.sweep_axes(data.shape[-2], pulse.start + shift)
         return Signal(data, (axes[0], Axis("pulse", data.shape[-2], axes[1].start, pulse.step, "s"), axes[2]))
-
-
-def _fitting(trigger_s: Tensor, signal: Signal, radar: TriangularLadar, contiguous: bool) -> Tensor:
-    """Estimated trigger, limited so that a period fits its block."""
-    if contiguous:
-        return trigger_s
-    first, room = signal.axes[1].start, signal.axes[1].n - 2 * radar.sweep_samples
-    return trigger_s.clamp(first - 0.5 / radar.sample_rate_hz, first + (max(0, room) - 0.6) / radar.sample_rate_hz)
 
 
 class BlankTurningPoints(Stage):

@@ -20,7 +20,6 @@ Reference:
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -29,8 +28,6 @@ from torch import Tensor
 from torchsar.core import Signal, Stage, checked_samples, refuse_non_finite, unit_phasor
 from torchsar.radar import TriangularLadar
 from torchsar.repair.jitter import band_limited_weights
-
-Method = Literal["resample", "phase"]
 
 
 def sweep_error_s(calibration: Tensor, radar: TriangularLadar, delay_s: float) -> Tensor:
@@ -56,36 +53,24 @@ def sweep_error_s(calibration: Tensor, radar: TriangularLadar, delay_s: float) -
         ValueError: If the delay is not positive or exceeds half a sweep.
     """
     calibration = calibration.conj() if radar.dechirp_sign == "echo_conj_lo" else calibration
-    tone = _sign(calibration) * _line(radar, delay_s, calibration)
-    phasor = _mean_period(calibration.to(torch.complex128) * unit_phasor(-tone, torch.complex128)[..., None, :])
-    turns = _unwrapped(phasor) / (2 * math.pi)
+    if not delay_s > 0:
+        raise ValueError(f"delay_s of the calibration channel must be positive, got {delay_s} s")
+    # phase K u tc of a linear sweep in turns
+    tone = _sign(calibration) * (radar.chirp_rate_hz_s * delay_s * radar.fast_time_axis().values(calibration.device))
+    x = calibration.to(torch.complex128) * unit_phasor(-tone, torch.complex128)[..., None, :]
+    # mean over the periods, each rotated to the phase of the first, and its continuous phase
+    turn = (x * x[..., :1, :].conj()).sum(-1, keepdim=True)
+    phasor = (x * (turn.conj() / turn.abs().clamp_min(1e-300))).mean(-2)
+    steps = torch.angle(phasor[..., 1:] * phasor[..., :-1].conj())
+    turns = torch.nn.functional.pad(torch.cumsum(steps, -1), (1, 0)) / (2 * math.pi)
     moved = turns / (radar.chirp_rate_hz_s * delay_s) * _sign(calibration)
     error = _shifted(moved, radar, delay_s)
     return error - error.mean(-1, keepdim=True)
 
 
-def _line(radar: TriangularLadar, delay_s: float, like: Tensor) -> Tensor:
-    """Phase K u tc of a linear sweep in turns, (N,)."""
-    if not delay_s > 0:
-        raise ValueError(f"delay_s of the calibration channel must be positive, got {delay_s} s")
-    return radar.chirp_rate_hz_s * delay_s * radar.fast_time_axis().values(like.device)
-
-
 def _sign(like: Tensor) -> Tensor:
     """+1 for the up ramp and -1 for the down ramp, (2, 1)."""
     return torch.tensor([[1.0], [-1.0]], dtype=torch.float64, device=like.device)
-
-
-def _mean_period(x: Tensor) -> Tensor:
-    """Mean over periods, each rotated to the phase of the first, (..., N)."""
-    turn = (x * x[..., :1, :].conj()).sum(-1, keepdim=True)
-    return (x * (turn.conj() / turn.abs().clamp_min(1e-300))).mean(-2)
-
-
-def _unwrapped(phasor: Tensor) -> Tensor:
-    """Continuous phase in radians along the last dimension, 0 at its first sample."""
-    steps = torch.angle(phasor[..., 1:] * phasor[..., :-1].conj())
-    return torch.nn.functional.pad(torch.cumsum(steps, -1), (1, 0))
 
 
 def _shifted(error: Tensor, radar: TriangularLadar, delay_s: float) -> Tensor:
@@ -128,7 +113,6 @@ def calibrate_sweeps(
     calibration: Tensor,
     radar: TriangularLadar,
     delay_s: float,
-    method: Method = "resample",
     range_m: float | None = None,
     points: int = 12,
     band: float = 0.9,
@@ -136,32 +120,27 @@ def calibrate_sweeps(
     """Correct non-linear sweeps to those of a transmitter with linear sweeps.
 
     The calibration channel gives the time w(u) at which a linear sweep has the frequency that the
-    real sweep has at the time u. The method "resample" interpolates every sweep at instants of
-    uniform w and is valid for all ranges at once. Constant phases are kept. The phase of a Doppler
-    shift fd is linear in u, not in w, which leaves the phase error 2 pi fd (w - u). The method
-    "phase" multiplies by the conjugate phase error of one relative range; a scatterer at a distance
-    d from it keeps the phase error 4 pi K d (w - u) / c, with the chirp rate K. Differentiable in
-    the sweeps.
+    real sweep has at the time u. Every sweep is interpolated at instants of uniform w, which is
+    valid for all ranges at once. Constant phases are kept. The phase of a Doppler shift fd is
+    linear in u, not in w, which leaves the phase error 2 pi fd (w - u). Differentiable in the
+    sweeps.
 
     Residual phase rms for w - u of up to 9 ns (0.11 % of the sweep), measured for one scatterer at
     the relative range RD:
 
-    - RD 1.5 m, at rest: 0.16 rad before the correction; 0.0002 rad after "phase" (0.054 rad if
-      `range_m` is wrong by half a metre); 0.0025 rad after "resample" without `range_m`, 0.0012 rad
+    - RD 1.5 m, at rest: 0.16 rad before the correction; 0.0025 rad without `range_m`, 0.0012 rad
       with it (even if it is wrong by half a metre).
-    - RD 1.5 m, 0.5 m/s: 0.016 rad after "resample".
-    - RD 10.5 m, at rest: 0.56 rad before the correction; 1e-6 rad after "phase"; 0.027 rad after
-      "resample" without `range_m`, 0.002 rad with it.
+    - RD 1.5 m, 0.5 m/s: 0.016 rad.
+    - RD 10.5 m, at rest: 0.56 rad before the correction; 0.027 rad without `range_m`, 0.002 rad
+      with it.
 
     Args:
         sweeps: Sweeps, up before down, shape (..., 2, K, N), complex.
         calibration: Beat signal of the calibration channel, shape (..., 2, K or 1, N), complex.
         radar: Ladar parameters.
         delay_s: Delay in seconds with which the channel mixes the transmitted signal.
-        method: "resample" or "phase".
-        range_m: Range RD in metres relative to the reference range: for "phase" that of the
-            scatterer; for "resample" the middle of the range gate, so that the delay of the echo is
-            taken into account; None neglects this delay.
+        range_m: Middle of the range gate in metres relative to the reference range, so that the
+            delay of the echo is taken into account; None neglects this delay.
         points: Number of neighbouring samples that are combined in the interpolation.
         band: Bandwidth over the sampling rate for which the interpolation error is least.
 
@@ -169,11 +148,9 @@ def calibrate_sweeps(
         Sweeps of the same shape.
 
     Raises:
-        ValueError: If the method is unknown, its range is missing, shapes do not fit, the channel
-            is not finite, or the delay is not positive or exceeds half a sweep.
+        ValueError: If shapes do not fit, the channel is not finite, or the delay is not positive or
+            exceeds half a sweep.
     """
-    if method not in get_args(Method):
-        raise ValueError(f"method must be one of {', '.join(get_args(Method))}, got {method!r}")
     _check_sweeps(sweeps, "sweeps", "K", radar.sweep_samples)
     _check_sweeps(calibration, "calibration", "K or 1", radar.sweep_samples)
     if calibration.shape[-2] not in (1, sweeps.shape[-2]):
@@ -183,8 +160,6 @@ def calibrate_sweeps(
         )
     refuse_non_finite(calibration, "the calibration channel")
     error = sweep_error_s(calibration, radar, delay_s)
-    if method == "phase":
-        return _phase_corrected(sweeps, error, radar, range_m)
     dtau = 0.0 if range_m is None else 2 * range_m / radar.wave_speed_m_s
     return _resampled(sweeps, _instants(error, radar, dtau), points, band)
 
@@ -199,26 +174,11 @@ def _check_sweeps(x: Tensor, what: str, periods: str, n: int) -> None:
         )
 
 
-def _phase_corrected(sweeps: Tensor, error_s: Tensor, radar: TriangularLadar, range_m: float | None) -> Tensor:
-    """Sweeps times exp(-j 2 pi [e(u) - e(u - dtau)]) of one range."""
-    if range_m is None:
-        raise ValueError("method 'phase' corrects the sweeps for one relative range and needs range_m")
-    dtau = 2 * range_m / radar.wave_speed_m_s
-    instant = (
-        torch.arange(sweeps.shape[-1], dtype=torch.float64, device=sweeps.device) - dtau / 2 * radar.sample_rate_hz
-    )
-    turns = _sign(sweeps) * radar.chirp_rate_hz_s * dtau * _sampled(error_s, instant)
-    sense = 1 if radar.dechirp_sign == "lo_conj_echo" else -1
-    return sweeps * unit_phasor(-sense * turns, sweeps.dtype)[..., None, :]
-
-
 def _instants(error_s: Tensor, radar: TriangularLadar, dtau_s: float, steps: int = 4) -> Tensor:
     """Fractional index at which w(u - dtau / 2) + dtau / 2 equals each grid sample, (..., 2, N)."""
     error = error_s * radar.sample_rate_hz
-    grid, half = (
-        torch.arange(error.shape[-1], dtype=torch.float64, device=error.device),
-        dtau_s / 2 * radar.sample_rate_hz,
-    )
+    grid = torch.arange(error.shape[-1], dtype=torch.float64, device=error.device)
+    half = dtau_s / 2 * radar.sample_rate_hz
     instant = grid.expand(error.shape)
     for _ in range(steps):
         instant = grid - _sampled(error, instant - half)
@@ -227,14 +187,12 @@ def _instants(error_s: Tensor, radar: TriangularLadar, dtau_s: float, steps: int
 
 def _resampled(x: Tensor, instant: Tensor, points: int, band: float) -> Tensor:
     """x (..., 2, K, N) at fractional indices (..., 2, N) of its last dimension."""
-    n = x.shape[-1]
-    first = (torch.floor(instant.detach()).long() - (points // 2 - 1)).clamp(0, n - points)
+    first = (torch.floor(instant.detach()).long() - (points // 2 - 1)).clamp(0, x.shape[-1] - points)
     index = first[..., None] + torch.arange(points, device=x.device)
     weights = band_limited_weights(index - instant[..., None], band).to(x.real.dtype)
     out = torch.zeros_like(x)
     for i in range(points):
-        column = index[..., None, :, i].expand(x.shape)
-        out = out + weights[..., None, :, i] * x.gather(-1, column)
+        out = out + weights[..., None, :, i] * x.gather(-1, index[..., None, :, i].expand(x.shape))
     return out
 
 
@@ -249,31 +207,20 @@ class CalibrateSweeps(Stage):
         radar: Ladar parameters.
         delay_s: Delay in seconds with which the channel mixes the transmitted signal; None if
             `forward` receives it.
-        method: "resample", valid for all ranges, or "phase", for one range.
-        range_m: Range in metres relative to the reference range; required for "phase".
+        range_m: Middle of the range gate in metres relative to the reference range; None neglects
+            the delay of the echo.
 
     Raises:
-        ValueError: If the method is unknown or lacks its range, or the delay is not positive.
+        ValueError: If the delay is not positive.
     """
 
     works_on = ("ramp", "pulse", "fast_time")
 
-    def __init__(
-        self,
-        radar: TriangularLadar,
-        delay_s: float | None = None,
-        method: Method = "resample",
-        range_m: float | None = None,
-    ) -> None:
+    def __init__(self, radar: TriangularLadar, delay_s: float | None = None, range_m: float | None = None) -> None:
         super().__init__()
-        if method not in get_args(Method) or (method == "phase" and range_m is None):
-            raise ValueError(
-                f"method must be 'resample', or 'phase' together with range_m, got {method!r} with range_m={range_m}"
-            )
         if delay_s is not None and not delay_s > 0:
             raise ValueError(f"delay_s of the calibration channel must be positive, got {delay_s} s")
         self.radar, self.delay_s, self.range_m = radar, delay_s, range_m
-        self.method: Method = method
 
     def forward(self, signal: Signal, calibration: Tensor, delay_s: Tensor | None = None) -> Signal:
         """Correct non-linear sweeps by the calibration channel; see `calibrate_sweeps`.
@@ -299,6 +246,4 @@ class CalibrateSweeps(Stage):
                 "CalibrateSweeps(radar, delay_s), or use(..., delay_s='aux.calibration_delay_s') if it is recorded"
             )
         delay = self.delay_s if delay_s is None else float(delay_s)
-        return signal.with_data(
-            calibrate_sweeps(signal.data, calibration, self.radar, delay or 0.0, self.method, self.range_m)
-        )
+        return signal.with_data(calibrate_sweeps(signal.data, calibration, self.radar, delay or 0.0, self.range_m))

@@ -44,17 +44,13 @@ from torchsar.repair.assess import assess_trigger
 # Sweeps that are used in the search for turning points, by choice: more are more accurate but take
 # more time.
 MAX_WINDOWS = 192
-# Strongest scatterers whose tones are continued across a turning point, by choice.
-TONES = 4
-# Fringes tried on either side of the one nearest to the sharpest cuts, by choice.
-_FRINGES = 3
 # Steps per half sample in which the symmetry of the record is computed, enough for a linear
-# interpolation; and the share of the greatest symmetry below which a fringe may be excluded, by
-# trial on scenes of 1 to 40 scatterers.
-_FINE, _SYMMETRIC = 8, 0.9
-# Certainty above which a fringe is excluded, and above which another one than the nearest is
+# interpolation.
+_FINE = 8
+# Share of the greatest symmetry below which a fringe may be excluded, by trial on scenes of 1 to 40
+# scatterers; certainty above which it is excluded, and above which another one than the nearest is
 # chosen, in standard deviations, by choice.
-_EXCLUDED, _CHOSEN = 5.0, 3.0
+_SYMMETRIC, _EXCLUDED, _CHOSEN = 0.9, 5.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -140,8 +136,10 @@ def find_trigger(
     record = checked_samples(record, "find_trigger", "pulse, time", real=True)
     n, is_complex = radar.sweep_samples, record.is_complex()
     joined = (radar.keep_every == 1 and record.shape[-1] == 2 * n) if contiguous is None else contiguous
-    lines = record.flatten(-2)[..., None, :] if joined else record
-    windows = _Windows(_scaled(lines), radar, n // 8)
+    lines = unit_level(record.flatten(-2)[..., None, :] if joined else record)
+    if not is_complex:
+        lines = delayed(lines, torch.zeros((), dtype=torch.float64, device=lines.device), analytic=True)
+    windows = _Windows(lines, radar, n // 8)
     if windows.count < 2 or windows.count * windows.lines.shape[-2] < 4:
         raise ValueError(
             f"the record is too short to find turning points: they are {n} samples apart, and only "
@@ -160,8 +158,9 @@ def find_trigger(
     even, odd = cycles[..., 0::2, 0], side * cycles[..., 1::2, 0]
     gap, doppler = even - odd, (even + odd) / 2
     middle_gap = gap.flatten(-2).median(-1).values
-    order = _order_by_beat if is_complex else _order_by_envelope
-    even_is_up, order_sigmas = order(gap, doppler, nearer, radar)
+    even_is_up, order_sigmas = (
+        _order_by_beat(gap, nearer, radar) if is_complex else _order_by_envelope(gap, doppler, radar)
+    )
     phase_difference = turns[..., 0::2] - side * turns[..., 1::2] + n * doppler
     meeting = _meeting(phase_difference, middle_gap / 2, middle - base)
     symmetry = _symmetry(windows, base, _without_outliers(doppler.flatten(-2)), is_complex)
@@ -185,16 +184,6 @@ def find_trigger(
     return Estimate(value, **assess_trigger(order_sigmas, fringe_sigmas, symmetric, share, outside, depth), info=info)
 
 
-def _scaled(lines: Tensor) -> Tensor:
-    """Complex lines of unit level; the analytic signal of real ones."""
-    lines = unit_level(lines)
-    return (
-        lines
-        if lines.is_complex()
-        else delayed(lines, torch.zeros((), dtype=torch.float64, device=lines.device), analytic=True)
-    )
-
-
 def _turning_by_stft(windows: _Windows) -> tuple[Tensor, Tensor]:
     """Sample of the turning points, margin..margin + N, and the drop of concentration."""
     n = windows.radar.sweep_samples
@@ -212,7 +201,7 @@ def _turning_by_stft(windows: _Windows) -> tuple[Tensor, Tensor]:
         (torch.arange(sharp.shape[-1], device=lines.device) * hop + width / 2) % n / hop
     ).long() % round(n / hop)
     bins = int(frame.max()) + 1
-    total = torch.zeros((*sharp.shape[:-1], bins), dtype=sharp.dtype, device=sharp.device).index_add(-1, frame, sharp)
+    total = sharp.new_zeros(*sharp.shape[:-1], bins).index_add(-1, frame, sharp)
     mean = total / torch.bincount(frame, minlength=bins).clamp_min(1)
     smooth = (torch.roll(mean, 1, -1) + 2 * mean + torch.roll(mean, -1, -1)) / 4
     position = smooth.argmin(-1) * hop
@@ -220,23 +209,20 @@ def _turning_by_stft(windows: _Windows) -> tuple[Tensor, Tensor]:
     return torch.where(position < windows.margin, position + n, position), drop.to(torch.float64)
 
 
-def _sharpness(windows: _Windows, start: Tensor) -> Tensor:
-    """Sharpness (..., o) of sweeps from start samples (..., o) on, averaged over the sweeps: the
+def _sharpness(windows: _Windows, first: Tensor) -> Tensor:
+    """Sharpness (...,) of sweeps from the sample `first` (..., 1) on, averaged over the sweeps: the
     sum of the squared power of their spectra over the square of its sum.
     """
-
-    def sharpness(first: Tensor) -> Tensor:
-        power = torch.fft.fft(windows.cut(first)).abs().square().to(torch.float64)
-        return (power.square().sum(-1) / power.sum(-1).square().clamp_min(1e-300)).mean((-3, -2, -1))
-
-    return torch.stack([sharpness(start[..., i : i + 1]) for i in range(start.shape[-1])], -1)
+    power = torch.fft.fft(windows.cut(first)).abs().square().to(torch.float64)
+    return (power.square().sum(-1) / power.sum(-1).square().clamp_min(1e-300)).mean((-3, -2, -1))
 
 
 def _apex(windows: _Windows, near: Tensor, reach: int) -> Tensor:
     """First sample (...,) of the sharpest sweeps: lines through both slopes meet there."""
     step = max(1, reach // 8)
     offset = torch.tensor([*range(-8, -2), *range(3, 9)], device=near.device) * step
-    mean = _sharpness(windows, (near[..., None] + offset).clamp(0, windows.radar.sweep_samples + 2 * windows.margin))
+    start = (near[..., None] + offset).clamp(0, windows.radar.sweep_samples + 2 * windows.margin)
+    mean = torch.stack([_sharpness(windows, first) for first in start.split(1, -1)], -1)
     left, right = (
         _line_through(offset[part].to(torch.float64), mean[..., part]) for part in (slice(0, 6), slice(6, 12))
     )
@@ -251,7 +237,7 @@ def _line_through(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     return y.mean(-1) - slope * x.mean(), slope
 
 
-def _find_tones(sweeps: Tensor, skip: int, count: int = TONES) -> tuple[Tensor, Tensor]:
+def _find_tones(sweeps: Tensor, skip: int, count: int = 4) -> tuple[Tensor, Tensor]:
     """Frequencies and complex amplitudes of the strongest tones, (..., count), found in succession.
 
     sweeps: (..., N), without `skip` samples at each end; frequencies in cycles per sample,
@@ -316,7 +302,8 @@ def _fringe(
     odd = _extrapolated(cycles[..., 1::2, :], value[..., 1::2, :], position - (n - 1) / 2)
     difference = (around - odd).abs().square() - (around - even).abs().square()
     total = torch.nn.functional.pad(torch.cumsum(difference, -1), (1, 0)).flatten(-3, -2)
-    order = torch.arange(-_FRINGES, _FRINGES + 1, dtype=torch.float64, device=base.device)
+    # three fringes on either side of the one nearest to the sharpest cuts, by choice
+    order = torch.arange(-3, 4, dtype=torch.float64, device=base.device)
     offsets = expected[..., None] + order / (2 * plus_cycles.clamp_min(1e-6))[..., None]
     gain = _interpolated(total, (offsets + reach).clamp(0, 2 * reach))
     found = _interpolated(symmetry, ((offsets + reach) * 2 * _FINE).clamp(0, symmetry.shape[-1] - 1))
@@ -332,8 +319,8 @@ def _fringe(
     # at an end of the search, further fringes may be better
     beyond = (best == 0) | (best == len(order) - 1) | excluded.all(-1)
     certainty = torch.where(beyond, 0, certainty)
-    sure = certainty > _CHOSEN
-    return torch.where(sure, take(offsets, best), expected), certainty, take(found.mean(-2), best)
+    chosen = torch.where(certainty > _CHOSEN, take(offsets, best), expected)
+    return chosen, certainty, take(found.mean(-2), best)
 
 
 def _sigmas(x: Tensor) -> Tensor:
@@ -396,7 +383,7 @@ def _interpolated(x: Tensor, position: Tensor) -> Tensor:
     return low + (position - first)[..., None, :] * (high - low)
 
 
-def _order_by_beat(gap: Tensor, _: Tensor, nearer: bool, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
+def _order_by_beat(gap: Tensor, nearer: bool, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
     """Whether even sweeps are up, from the higher beat of up sweeps, and how certain; gap (...,
     line, pair) of the beats of even and odd sweeps in cycles per sample.
     """
@@ -407,7 +394,7 @@ def _order_by_beat(gap: Tensor, _: Tensor, nearer: bool, radar: TriangularLadar)
     return (middle > 0) == up_higher, middle.abs() / std * math.sqrt(gap.shape[-1] / 2)
 
 
-def _order_by_envelope(gap: Tensor, doppler: Tensor, _: bool, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
+def _order_by_envelope(gap: Tensor, doppler: Tensor, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
     """Whether even sweeps of a real record are up, and how certain.
 
     Even sweeps are up if the range of the beats rises with the velocity that this assumption gives.
@@ -429,9 +416,7 @@ def _order_by_envelope(gap: Tensor, doppler: Tensor, _: bool, radar: TriangularL
 def _without_outliers(x: Tensor, sigmas: float = 6.0) -> Tensor:
     """Values (..., k) with outliers replaced by a running median."""
     width = min(9, x.shape[-1] // 2 * 2 - 1)
-    padded = torch.cat(
-        [x[..., :1].expand(*x.shape[:-1], width // 2), x, x[..., -1:].expand(*x.shape[:-1], width // 2)], -1
-    )
-    middle = padded.unfold(-1, width, 1).median(-1).values
+    near = torch.arange(x.shape[-1], device=x.device)[:, None] + torch.arange(width, device=x.device) - width // 2
+    middle = x[..., near.clamp(0, x.shape[-1] - 1)].median(-1).values
     distance = (x - middle).abs()
     return torch.where(distance > sigmas * 1.5 * distance.median(-1, keepdim=True).values, middle, x)

@@ -23,12 +23,8 @@ from torchsar.metrics.phase import phase_rmse
 _NOISE = 10**0.9
 # a velocity at which both sweeps have so much more power in common, in more than so many periods
 _HIGHER, _CHANCE = 1.1, 0.05
-# bias of the product that the edges of the window leave, in halves of wavelength over sweep length
-_BIAS = 5e-4
 # periods for which the deviation that white noise explains counts beside the measured one
 _EXPECTED = 4.0
-# mean of the square of the time between two samples of a product over 24 squared periods
-_JERK = 1 / 32
 # standard deviation, in halves of wavelength over sweep length, beyond which a velocity is of no
 # use; noise alone gives 0.05 where the SNR is just enough
 _USELESS = 0.07
@@ -105,13 +101,15 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
     changes = _changes_of_product(measured, law.intercept or "free") if law.changes is None else law.changes()
     square = filled(variance(changes) / share, clear)
     slope, bend = (_rms_difference(measured.raw_m_s, clear, order) for order in (1, 2))
-    jerk = _JERK * bend * (measured.product.radar.period_s / pulse.step) ** 2
+    # 1 / 32: mean square of the time between two samples of a product over 24 squared periods
+    jerk = bend / 32 * (measured.product.radar.period_s / pulse.step) ** 2
     square = square + _interpolated(clear, slope, bend).square() + jerk.square() + law.floor_m_s**2
     if law.intercept:
         return square
     away = measured.velocity_m_s - mirror_velocity(measured.product, "free")[0]
     own = variance(changes if law.changes is None else _changes_of_product(measured, "free"))
-    bias = _BIAS * measured.product.radar.ambiguous_velocity_m_s
+    # that the edges of the window leave
+    bias = 5e-4 * measured.product.radar.ambiguous_velocity_m_s
     apart = mean_of(away.square() - own / share, clear) - bias**2
     judged = (measured.levels.squared >= LEAST_SQUARED)[..., None]
     return torch.where(judged, torch.maximum(square, apart), square)
@@ -188,7 +186,10 @@ def assessed_motion(found: Estimate, cells: Tensor, walk: Walk) -> Estimate:
     """
     n, lines = cells.shape[-2], cells.reshape(-1, *cells.shape[-2:])
     lit, range_cells = found.info["lit"].reshape(-1, n), found.info["range_cells"].flatten()
-    modulated = (_modulation(lines, lit) > _MODULATION + _SURE * math.sqrt(2) * walk.std_rad[:, 0]) & (n >= _FEW)
+    power = power_of(lines).sum(-1, dtype=torch.float64)
+    # standard deviation over mean of the power of the lit pulses
+    modulation = mean_of((power / mean_of(power, lit).clamp_min(TINY) - 1).square(), lit)[:, 0].sqrt()
+    modulated = (modulation > _MODULATION + _SURE * math.sqrt(2) * walk.std_rad[:, 0]) & (n >= _FEW)
     sparse = walk.apart_rad.isnan()
     one_cell = modulated & sparse & (range_cells < _ONE_CELL)
     compared = modulated & sparse & ~one_cell & found.ok.flatten()
@@ -211,12 +212,3 @@ def assessed_motion(found: Estimate, cells: Tensor, walk: Walk) -> Estimate:
         std={**found.std, "phase_rad": std.reshape(*shape, n)},
         outcome=torch.maximum(found.outcome, reasons.reshape(shape)),
     )
-
-
-def _modulation(lines: Tensor, lit: Tensor) -> Tensor:
-    """Standard deviation over mean of the power of the lit pulses, (trial,).
-
-    lines: (trial, pulse, range); lit: (trial, pulse), bool.
-    """
-    power = power_of(lines).sum(-1, dtype=torch.float64)
-    return mean_of((power / mean_of(power, lit).clamp_min(TINY) - 1).square(), lit)[:, 0].sqrt()

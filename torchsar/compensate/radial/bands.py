@@ -18,17 +18,12 @@ from torchsar.radar import TriangularLadar
 # periods over which envelopes are averaged, found by trial: more raise the SNR, fewer follow
 # vibration
 _BLOCK = 8
-# correlation coefficient of averaged envelopes that noise alone does not reach, found by trial
-_ALIKE = 0.35
-# share of the usual energy below which a period contains no echo, found by trial
-_FAINT = 0.3
-# correlation coefficient of the envelopes of one period above which they overrule those of the
-# neighbouring periods, found by trial
-_SURELY_ALIKE = 0.7
-# bins by which the shift of a single period may differ from those of its neighbours
-_ALONE = 3
-# lag in bins beyond which a match belongs to another scatterer, illuminated in one sweep only
-_FURTHEST = 14
+# correlation coefficients, found by trial: that of averaged envelopes that noise alone does not
+# reach; that of one period above which its envelopes overrule those of the neighbouring periods
+_ALIKE, _SURELY_ALIKE = 0.35, 0.7
+# bins by which the shift of a single period may differ from those of its neighbours; lag beyond
+# which a match belongs to another scatterer, illuminated in one sweep only
+_ALONE, _FURTHEST = 3, 14
 
 
 @dataclass(frozen=True)
@@ -100,22 +95,6 @@ class Bands:
         return slice(drop, self.time_s.shape[-1] - drop)
 
 
-def canonical(sweeps: Tensor, radar: TriangularLadar) -> Tensor:
-    """Convert sweeps to the sign convention of Remote Sens. 2024, 16, 793.
-
-    In that convention a scatterer beyond the reference range has a positive beat frequency in the
-    up sweep.
-
-    Args:
-        sweeps: Sweeps as recorded, any shape, complex.
-        radar: Ladar parameters.
-
-    Returns:
-        The sweeps, same shape.
-    """
-    return sweeps.conj() if radar.dechirp_sign == "echo_conj_lo" else sweeps
-
-
 def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str, pulse: Axis | None = None) -> None:
     """Check the type and shape of sweeps.
 
@@ -174,11 +153,10 @@ def window_lines(radar: TriangularLadar, window_m: tuple[float, float] | None) -
             f" with low < high, got {tuple(window_m)}"
         )
     first, last = round(low / radar.range_step_m), round(high / radar.range_step_m)
-    limit = n // 2
-    if first < -limit or last >= limit:
+    if first < -(n // 2) or last >= n // 2:
         raise ValueError(
             f"window_m {tuple(window_m)} reaches beyond the beat band of "
-            f"+-{limit * radar.range_step_m:.4g} m; make it smaller"
+            f"+-{n // 2 * radar.range_step_m:.4g} m; make it smaller"
         )
     if last - first + 1 < 4:
         raise ValueError(
@@ -303,8 +281,8 @@ class Spectra:
     """Beat spectra of both sweeps of every period, and the bulk of the Doppler shift.
 
     Args:
-        data: Spectra of the sweeps in the sign convention of `canonical`, zero frequency first,
-            shape (..., 2, pulse, N), complex.
+        data: Spectra of the sweeps in the sign convention of `Bands`, zero frequency first, shape
+            (..., 2, pulse, N), complex.
         smooth: Spectra of Hann-windowed sweeps, times the scale, same shape.
         scale: Power of two that brings the samples of a trial to about one, shape (..., 1, 1, 1).
         shift: Doppler shift in whole bins, shape (..., pulse), int64, see `bulk_shift`.
@@ -330,8 +308,14 @@ class Spectra:
         Returns:
             The spectra.
         """
-        spectrum, scale = torch.fft.fft(canonical(sweeps, radar)), _scale(sweeps.detach())
-        smooth = _smoothed(spectrum.detach(), scale)
+        middle = sweeps.shape[-1] // 2
+        # a power of two: squares then neither underflow nor overflow
+        scale = 1 / level_of(sweeps.detach()[..., middle - 4 : middle + 4], 3)
+        spectrum = torch.fft.fft(sweeps.conj() if radar.dechirp_sign == "echo_conj_lo" else sweeps)
+        # with a rectangular window, a peak between two bins would lose more than half of its power
+        whole = spectrum.detach()
+        between = torch.cat([whole[..., -1:], whole, whole[..., :1]], -1)
+        smooth = torch.sub(whole, between[..., :-2] + between[..., 2:], alpha=0.5).mul_(scale)
         blocks = torch.stack([power_of(part).mean(-2) for part in smooth.split(_BLOCK, -2)], -2)
         return Spectra(spectrum, smooth, scale, *bulk_shift(blocks, sweeps.shape[-2]), radar)
 
@@ -370,11 +354,9 @@ class Spectra:
         n, device = radar.sweep_samples, spectrum.device
         shift, certain = _corrected_shift(self.smooth, self.shift, first, lines)
         m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
-        line = torch.arange(lines, device=device)
-        line = torch.arange(lines, device=device)
         kept = _in_window(spectrum, shift, first, lines)
         edges = taper if window_m is not None else 0.0
-        shape = _raised_cosine(line.to(torch.float64), lines, edges)
+        shape = _raised_cosine(torch.arange(lines, dtype=torch.float64, device=device), lines, edges)
         filters = torch.stack(
             [shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)]
         )
@@ -382,46 +364,26 @@ class Spectra:
         middle = torch.stack([first + shift, shift - first], -2).to(torch.float64)
         turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
         series = torch.fft.ifft(kept * filters[:, None, :] * (turned * self.scale[..., 0])[..., None], m) * (m / n)
-        series = series * _beat_of_first(first, m, kept).to(series.dtype)
-        time_s = (torch.arange(m, dtype=torch.float64, device=device) - (m - 1) / 2) * (radar.sweep_s / m)
+        index = torch.arange(m, dtype=torch.float64, device=device) - (m - 1) / 2
+        # exp(2j pi first u / T), so that bins count from zero beat again
+        series = series * torch.exp(2j * math.pi * ((first * index / m) % 1)).to(series.dtype)
         up, down = series[..., 0, :, :], series[..., 1, :, :]
+        # a period without an echo has much less energy in the window than usual, by trial
+        energy = power_of(series.detach()).sum(-1)
+        usual = torch.where(self.alike, energy.mean(-2), torch.nan).nanmedian(-1, keepdim=True).values
+        faint = energy.amin(-2) < 0.3 * usual
         return Bands(
             up,
             down,
-            time_s,
+            index * (radar.sweep_s / m),
             shift,
-            self.alike & (certain | ~_without_echo(up, down, self.alike)),
+            self.alike & (certain | ~faint),
             lines,
             first,
             # computed on the host, for which the device need not be read
             float(_raised_cosine(torch.arange(lines, dtype=torch.float64), lines, edges).square().sum()),
             radar,
         )
-
-
-def _without_echo(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
-    """Whether a sweep has much less energy in the window than usual, (..., pulse) bool: no echo."""
-    both = torch.stack([power_of(x.detach()).sum(-1) for x in (up, down)])
-    usual = torch.where(alike, both.mean(0), torch.nan).nanmedian(-1, keepdim=True).values
-    return both.amin(0) < _FAINT * usual
-
-
-def _scale(sweeps: Tensor) -> Tensor:
-    """Power of two (..., 1, 1, 1) that brings the samples of a trial to about one.
-
-    Squares then neither underflow nor overflow. The level is measured in the middle of the sweeps.
-    """
-    middle = sweeps.shape[-1] // 2
-    return 1 / level_of(sweeps[..., middle - 4 : middle + 4], 3)
-
-
-def _smoothed(spectrum: Tensor, scale: Tensor) -> Tensor:
-    """Spectra of Hann-windowed sweeps, times a scale.
-
-    With a rectangular window, a peak between two bins would lose more than half of its power.
-    """
-    between = torch.cat([spectrum[..., -1:], spectrum, spectrum[..., :1]], -1)
-    return torch.sub(spectrum, between[..., :-2] + between[..., 2:], alpha=0.5).mul_(scale)
 
 
 def _corrected_shift(smooth: Tensor, shift: Tensor, first: int, lines: int) -> tuple[Tensor, Tensor]:
@@ -461,8 +423,7 @@ def _line_phase(
     samples.
     """
     j = torch.arange(lines, dtype=torch.float64, device=like.device)
-    beat_hz = (first + j) / radar.sweep_s
-    video = sign * remove_video * math.pi * beat_hz.square() / radar.chirp_rate_hz_s
+    video = sign * remove_video * math.pi * ((first + j) / radar.sweep_s).square() / radar.chirp_rate_hz_s
     offset = math.pi * j * (1 / m - sign / radar.sweep_samples)
     return torch.exp(1j * ((video + offset) % (2 * math.pi))).to(like.dtype)
 
@@ -473,9 +434,3 @@ def _raised_cosine(j: Tensor, lines: int, taper: float) -> Tensor:
         return torch.ones_like(j)
     distance = (j - (lines - 1) / 2).abs() / ((lines + 1) / 2)
     return torch.where(distance > 1 - taper, 0.5 * (1 + torch.cos(math.pi * (distance - 1 + taper) / taper)), 1.0)
-
-
-def _beat_of_first(first: int, m: int, like: Tensor) -> Tensor:
-    """exp(2j pi first u / T) on the grid of m samples, so that bins count from zero beat again."""
-    index = torch.arange(m, dtype=torch.float64, device=like.device) - (m - 1) / 2
-    return torch.exp(2j * math.pi * ((first * index / m) % 1))

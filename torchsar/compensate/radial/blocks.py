@@ -13,12 +13,6 @@ from torchsar.compensate.radial.measured import Measured
 from torchsar.core import Axis, Estimate, block_bytes_of, over_blocks, refuse_non_finite
 from torchsar.radar import TriangularLadar
 
-# size of a block over the size that is best for one operation, found by trial: smaller blocks cost
-# more in calls than they gain in the cache
-_BLOCKS = 16
-
-Estimator = Callable[[Tensor, Tensor | float], Estimate]
-
 
 def velocities(
     measure: Callable[[Spectra], Measured],
@@ -53,7 +47,9 @@ def velocities(
     return by_trials(estimator, sweeps, azimuth_m)
 
 
-def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
+def by_trials(
+    estimator: Callable[[Tensor, Tensor | float], Estimate], sweeps: Tensor, azimuth_m: Tensor | float
+) -> Estimate:
     """Apply an estimator to blocks of trials, in as many threads as torch uses.
 
     This takes less time and memory than one call with all trials and gives the same values. All
@@ -71,8 +67,14 @@ def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -
         ValueError: If `azimuth_m` is not finite, or neither one number nor one per trial.
     """
     trials, azimuth = sweeps.shape[:-3], torch.as_tensor(azimuth_m, dtype=torch.float64, device=sweeps.device)
-    _check_azimuth(azimuth, trials)
-    height = max(1, _BLOCKS * block_bytes_of(sweeps.device) // (sweeps.shape[-3:].numel() * sweeps.element_size()))
+    if azimuth.ndim and azimuth.shape != trials:
+        raise ValueError(
+            f"azimuth_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(azimuth.shape)}"
+        )
+    refuse_non_finite(azimuth, "azimuth_m")
+    # 16 times the size that is best for one operation, found by trial: smaller blocks cost more in
+    # calls than they gain in the cache
+    height = max(1, 16 * block_bytes_of(sweeps.device) // (sweeps.shape[-3:].numel() * sweeps.element_size()))
     count = trials.numel()
     if count <= height or (torch.is_grad_enabled() and (sweeps.requires_grad or azimuth.requires_grad)):
         return estimator(sweeps, azimuth_m)
@@ -86,12 +88,3 @@ def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -
 
     over_blocks(work, starts, sweeps)
     return Estimate.joined([parts[first] for first in starts], trials)
-
-
-def _check_azimuth(azimuth_m: Tensor, trials: torch.Size) -> None:
-    """Raise ValueError unless there is one finite azimuth, or one per trial."""
-    if azimuth_m.ndim and azimuth_m.shape != trials:
-        raise ValueError(
-            f"azimuth_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(azimuth_m.shape)}"
-        )
-    refuse_non_finite(azimuth_m, "azimuth_m")

@@ -62,42 +62,25 @@ def compensate_motion(
     """
     sweeps = checked_samples(sweeps, "compensate_motion", "ramp, pulse, fast time", finite=False)
     refuse_other_sweeps(sweeps, radar, "compensate_motion", pulse)
-    refuse_other_velocity(velocity_m_s, sweeps, "compensate_motion")
-    coefficients = sweep_motion(velocity_m_s, radar, pulse)
-    n = sweeps.shape[-1]
-    turns = carrier_turns(coefficients, radar, carrier_only)
-    if radar.dechirp_sign == "lo_conj_echo":
-        turns = -turns
-    return sweeps * polynomial_phasor(turns, radar.sweep_s / n, n, sweeps.dtype)
-
-
-def refuse_other_velocity(velocity_m_s: Tensor, sweeps: Tensor, what: str) -> None:
-    """Check that there is one finite velocity per period.
-
-    Args:
-        velocity_m_s: Velocities in m/s, shape (..., pulse).
-        sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N).
-        what: Name of the calling function for the error message.
-
-    Raises:
-        TypeError: If the velocity is not a real tensor.
-        ValueError: If there is not one velocity per period, or a velocity is not finite.
-    """
     if not isinstance(velocity_m_s, Tensor) or velocity_m_s.is_complex():
         raise TypeError(
-            f"{what}: velocity_m_s must be a tensor of real velocities (m/s), got "
+            "compensate_motion: velocity_m_s must be a tensor of real velocities (m/s), got "
             f"{getattr(velocity_m_s, 'dtype', type(velocity_m_s).__name__)}"
         )
     if velocity_m_s.ndim < 1 or velocity_m_s.shape[-1] != sweeps.shape[-2]:
         raise ValueError(
-            f"{what}: velocity_m_s must hold one velocity per period, shape (..., {sweeps.shape[-2]}), got shape "
-            f"{tuple(velocity_m_s.shape)}"
+            "compensate_motion: velocity_m_s must hold one velocity per period, shape (..., "
+            f"{sweeps.shape[-2]}), got shape {tuple(velocity_m_s.shape)}"
         )
-    if not host_value(torch.isfinite(velocity_m_s.detach()).all(), True):
+    wrong = ~torch.isfinite(velocity_m_s.detach())
+    if host_value(wrong.any(), False):
         raise ValueError(
-            f"{what}: {int((~torch.isfinite(velocity_m_s.detach())).sum())} velocities are NaN or "
+            f"compensate_motion: {int(wrong.sum())} velocities are NaN or "
             "Inf; use an estimate whose `ok` is True, or replace these velocities first"
         )
+    n, sign = sweeps.shape[-1], -1 if radar.dechirp_sign == "lo_conj_echo" else 1
+    turns = sign * carrier_turns(sweep_motion(velocity_m_s, radar, pulse), radar, carrier_only)
+    return sweeps * polynomial_phasor(turns, radar.sweep_s / n, n, sweeps.dtype)
 
 
 def carrier_turns(motion: Tensor, radar: TriangularLadar, carrier_only: bool = False) -> Tensor:
@@ -115,8 +98,7 @@ def carrier_turns(motion: Tensor, radar: TriangularLadar, carrier_only: bool = F
     Returns:
         Coefficients by power of u, in turns/s^k, shape (..., 2, pulse, 6).
     """
-    per_m = 2 * radar.carrier_hz / radar.wave_speed_m_s
-    turns = torch.nn.functional.pad(motion * per_m, (0, 1))
+    turns = torch.nn.functional.pad(motion * (2 * radar.carrier_hz / radar.wave_speed_m_s), (0, 1))
     if carrier_only:
         return turns
     sign = torch.arange(1, -2, -2, dtype=torch.float64, device=motion.device)
@@ -146,7 +128,10 @@ def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) 
     u = (start + torch.arange(n, dtype=torch.float64, device=turns.device)) * step_s
     edge = abs(start) * step_s
     bend: Tensor | None = None
-    reach = [largest * edge**k for k, largest in enumerate(_largest_of_power(turns))]
+    # largest magnitude of each power; infinite inside vmap, where values cannot be read
+    sizes = turns.detach().abs().reshape(-1, turns.shape[-1])
+    largest = host_values(sizes.amax(0), math.inf) if turns.numel() else [math.inf] * turns.shape[-1]
+    reach = [size * edge**k for k, size in enumerate(largest)]
     for k in range(len(reach) - 1, 1, -1):
         c = turns[..., k]
         if not turns.requires_grad and reach[k] <= _NEGLIGIBLE_TURNS[real]:
@@ -159,20 +144,7 @@ def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) 
         return total
     return total * (
         cis(2 * torch.pi * bend)
-        if bend.dtype == real and (sum(reach[2:]) < 2 * _MANY_TURNS or _largest(bend) < 2 * _MANY_TURNS)
+        if bend.dtype == real
+        and (sum(reach[2:]) < 2 * _MANY_TURNS or host_largest(bend.detach().abs(), math.inf) < 2 * _MANY_TURNS)
         else unit_phasor(bend.to(torch.float64), dtype)
     )
-
-
-def _largest_of_power(turns: Tensor) -> list[float]:
-    """Largest magnitude of the coefficients of each power; infinite inside vmap, where values
-    cannot be read.
-    """
-    if not turns.numel():
-        return [math.inf] * turns.shape[-1]
-    return host_values(turns.detach().abs().reshape(-1, turns.shape[-1]).amax(0), math.inf)
-
-
-def _largest(x: Tensor) -> float:
-    """Largest magnitude; infinite inside vmap, where values cannot be read."""
-    return host_largest(x.detach().abs(), math.inf)

@@ -17,8 +17,6 @@ from torchsar.compensate.radial.peak import from_beats
 from torchsar.core import Axis, Estimate
 from torchsar.radar import TriangularLadar
 
-_REACH = 4  # bins about the removed shift that are searched; the shift is right to a bin or two
-
 
 def spectrum_correlation(
     sweeps: Tensor,
@@ -109,11 +107,9 @@ def envelope_lag(bands: Bands, upsampling: int) -> Tensor:
     """
     m = bands.time_s.shape[-1]
     n = upsampling * m
-    both = torch.stack([bands.up, bands.down], -3)
-    envelope = torch.fft.fft(both, n).abs()
-    envelope = envelope - envelope.mean(-1, keepdim=True)
-    spectrum = torch.fft.rfft(envelope)
+    envelope = torch.fft.fft(torch.stack([bands.up, bands.down], -3), n).abs()
+    spectrum = torch.fft.rfft(envelope - envelope.mean(-1, keepdim=True))
     correlation = torch.fft.irfft(spectrum[..., 0, :, :] * spectrum[..., 1, :, :].conj(), n)
-    reach = min(_REACH * upsampling, n // 2 - 1)
+    reach = min(4 * upsampling, n // 2 - 1)
     near = torch.cat([correlation[..., -reach:], correlation[..., : reach + 1]], -1)
     return (near.argmax(-1) - reach).to(torch.float64) / upsampling

@@ -23,17 +23,11 @@ from torchsar.core.spline import UniformSpline
 from torchsar.metrics.phase import phase_rmse
 from torchsar.optim import adam
 
-# Pulses are averaged to about so many blocks, over which the residual phase is smooth; it makes the
-# search fast, because its time grows with the cube of their number.
-_BLOCKS = 128
 SAME_RAD = 0.1  # rms difference below which two results are the same
 # Descent to a smooth walk of the phase: number of cosines, rms of the walk expected in rad, noise
 # floors relative to the mean power, steps for each, and length of a step. A high floor lets the
 # descent pass over local minima; the walks of velocities from dense scenes are 0.4 to 1.6 rad.
 _COSINES, _WALK_RAD, _FLOORS, _STEPS, _RATE = 60, 1.0, (1e-1, 1e-2, 1e-3, 1e-4), 40, 0.15
-# variance of a random walk about a spline through the means of blocks of n steps, over n times that
-# of a step; simulated for n = 2 to 16
-_WITHIN = 0.115
 
 
 class Walk(NamedTuple):
@@ -66,7 +60,9 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Walk:
         The most likely of the phases from two or three starts.
     """
     n = cells.shape[-2]
-    size = max(1, n // _BLOCKS)
+    # Pulses are averaged to about 128 blocks, over which the residual phase is smooth; it makes the
+    # search fast, because its time grows with the cube of their number.
+    size = max(1, n // 128)
     count = n // size
     first = (n - count * size) // 2
 
@@ -88,20 +84,20 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Walk:
     trial = torch.arange(len(best), device=best.device)
     chosen = phase[best, trial]
     apart = phase_rmse(phase, chosen).index_put((best, trial), torch.full_like(gain[0], torch.inf)).amin(0)
-    walk = _without_line(chosen)
-    within = step_rad.to(torch.float64).square() * size * _WITHIN
+    # variance of a random walk about a spline through the means of blocks of n steps, over n times
+    # that of a step: .115, simulated for n = 2 to 16
+    within = step_rad.to(torch.float64).square() * size * 0.115
     # two results of the same deviation differ by the square root of two of it
     spread = (std[best, trial].square() + (within + apart.square() / 2)[:, None]).sqrt()
-    middle = first + (size - 1) / 2
     at = torch.arange(n, dtype=torch.float64, device=cells.device)
     block = ((at - first) / size).floor().clamp(0, count - 1).long()
-    return Walk(UniformSpline(walk, middle, size).at(at), spread[:, block], apart)
+    walk = UniformSpline(_without_line(chosen), first + (size - 1) / 2, size).at(at)
+    return Walk(walk, spread[:, block], apart)
 
 
 def _parts(found: Estimate) -> tuple[Tensor, Tensor, Tensor]:
     """Phase, likelihood and deviation; the first and third of shape (trial, pulse)."""
-    double = torch.float64
-    return found["phase_rad"].to(double), found.info["fit_nats"], found.std["phase_rad"].to(double)
+    return found["phase_rad"].double(), found.info["fit_nats"], found.std["phase_rad"].double()
 
 
 def smooth_walk(rows: Tensor) -> Tensor:
@@ -142,10 +138,8 @@ def smooth_walk(rows: Tensor) -> Tensor:
 def _without_line(phase: Tensor) -> Tensor:
     """Phases (trial, pulse) without their slope, unwrapped, and without the line that fits them."""
     pulse = torch.arange(phase.shape[-1], dtype=torch.float64, device=phase.device)
-    pulse = pulse - pulse.mean()
-    step = torch.diff(phase)
-    mean = torch.angle(cis(step.detach()).mean(-1, keepdim=True))
-    step = step - mean
+    pulse, step = pulse - pulse.mean(), torch.diff(phase)
+    step = step - torch.angle(cis(step.detach()).mean(-1, keepdim=True))
     step = step - 2 * math.pi * (step.detach() / (2 * math.pi)).round()
     whole = torch.nn.functional.pad(step.cumsum(-1), (1, 0))
     whole = whole - whole.mean(-1, keepdim=True)

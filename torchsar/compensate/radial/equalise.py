@@ -53,8 +53,7 @@ def pulse_gain(data: Tensor, *, assess: bool = True) -> Estimate:
     index = torch.arange(n, dtype=torch.float64, device=rows.device)
     turns = best.to(torch.float64)[..., None] * index / (_PAD * n)
     demodulated = rows * cis((-2 * math.pi * (turns - torch.round(turns))).to(rows.real.dtype))
-    level = demodulated.mean(-1)
-    energy = power_of(rows).sum(-1)
+    level, energy = demodulated.mean(-1), power_of(rows).sum(-1)
     power = power_of(level)
     tiny = torch.finfo(power.dtype).tiny
     share = n * power / energy.clamp_min(tiny)
@@ -66,11 +65,11 @@ def pulse_gain(data: Tensor, *, assess: bool = True) -> Estimate:
     gain = fitted / fitted.mean(-1, keepdim=True).clamp_min(LEAST_GAIN)
     ok = explained > 0.5
     gain = torch.where(ok[:, None], gain.clamp_min(LEAST_GAIN), 1)
-    shape = pulses.trials
+    outcome = Outcome.of(ok, Outcome.MISFIT) if assess else Outcome.NOT_ASSESSED.like(ok)
     return Estimate(
-        {"gain": gain.to(torch.float64).reshape(*shape, n)},
-        quality=explained.to(torch.float64).reshape(shape),
-        outcome=(Outcome.of(ok, Outcome.MISFIT) if assess else Outcome.NOT_ASSESSED.like(ok)).reshape(shape),
+        {"gain": gain.to(torch.float64).reshape(*pulses.trials, n)},
+        quality=explained.to(torch.float64).reshape(pulses.trials),
+        outcome=outcome.reshape(pulses.trials),
     )
 
 

@@ -23,8 +23,6 @@ _LEAST_SNR, LEAST_SQUARED = 10**1.6, 10**1.5
 # SNR after the squaring loss, 12 dB, below which a period has faded, because noise may exceed its
 # peak; share of the mean power below which it has faded too, because interference spoils the phase
 _FADED, _DEEP = 10**1.2, 0.05
-# power in common over that of noise by chance, from which on there is a scene
-_BEYOND_CHANCE = 1.5
 
 
 @dataclass(frozen=True)
@@ -76,9 +74,10 @@ class Levels(NamedTuple):
         """
         up, down = (power_of(x.detach()[..., bands.inner]).mean(-1).to(torch.float64) for x in (bands.up, bands.down))
         shared, total = (mean_of(x, bands.lit)[..., 0] for x in (common, (up + down) / 2))
-        # the magnitude of a mean of noise is not zero: what noise alone would give is no scene
+        # the magnitude of a mean of noise is not zero: up to 1.5 times what noise alone would give
+        # is no scene
         chance = total / math.sqrt(min(len(bands.time_s[bands.inner]), 2 * bands.noise_lines))
-        scene = torch.where(shared > _BEYOND_CHANCE * chance, shared, 0).clamp_max(total)
+        scene = torch.where(shared > 1.5 * chance, shared, 0).clamp_max(total)
         ratio = _ratio(scene, total - scene)
         after = ratio * bands.noise_lines
         return Levels(scene / total.clamp_min(TINY), total - scene, after, after / _loss(ratio))
@@ -129,7 +128,12 @@ class Measured:
         finite = torch.isfinite(velocity_m_s.detach())
         lit = (product.lit if lit is None else product.lit & lit) & finite
         raw = filled(torch.where(finite, velocity_m_s, 0), lit)
-        still = _without_motion(product, raw.detach() - product.shift_m_s)
+        # the product of up and mirrored down sweeps without the phase of the velocities
+        inner, radar = product.inner, product.radar
+        up, down = product.up.detach()[..., inner], product.down.detach()[..., inner]
+        turns = 4 * radar.carrier_hz / radar.wave_speed_m_s * (raw.detach() - product.shift_m_s)
+        turn = cis((-2 * math.pi * turns[..., None] * product.time_s[inner]).to(up.real.dtype))
+        still = up * down.conj() * turn
         common = still.mean(-1).abs().to(torch.float64)
         levels = Levels.of(common, product)
         counted = lit | ~lit.any(-1, keepdim=True)
@@ -141,9 +145,7 @@ class Measured:
     @property
     def enough(self) -> Tensor:
         """Whether the SNR suffices for peaks that exceed the noise in all periods, shape (...,)."""
-        if self.law.intercept:
-            return self.levels.squared >= LEAST_SQUARED
-        return self.levels.after >= _LEAST_SNR
+        return self.levels.squared >= LEAST_SQUARED if self.law.intercept else self.levels.after >= _LEAST_SNR
 
     @property
     def white_m_s(self) -> Tensor:
@@ -169,13 +171,14 @@ class Measured:
         bands = self.product
         centre = (bands.first + bands.lines / 2) * bands.radar.range_step_m
         geometric = geometric_velocity_m_s(bands.radar, pulse, azimuth_m, centre, self.velocity_m_s.device)
-        noise_m_s = (self.white_m_s.square() + self.law.floor_m_s**2).sqrt()
-        shown = {"snr_db": 10 * torch.log10(self.levels.after), "noise_m_s": noise_m_s}
-        return Estimate(
-            {"velocity_m_s": self.velocity_m_s - geometric},
-            quality=self.levels.share,
-            info={**shown, "shift": bands.shift, "lit": self.lit, **self.info},
-        )
+        info = {
+            "snr_db": 10 * torch.log10(self.levels.after),
+            "noise_m_s": (self.white_m_s.square() + self.law.floor_m_s**2).sqrt(),
+            "shift": bands.shift,
+            "lit": self.lit,
+        }
+        value = {"velocity_m_s": self.velocity_m_s - geometric}
+        return Estimate(value, quality=self.levels.share, info={**info, **self.info})
 
 
 def mean_of(x: Tensor, counted: Tensor) -> Tensor:
@@ -189,14 +192,6 @@ def mean_of(x: Tensor, counted: Tensor) -> Tensor:
         The mean, shape (..., 1); zero where no period counts.
     """
     return torch.where(counted, x, 0).sum(-1, keepdim=True) / counted.sum(-1, keepdim=True).clamp_min(1)
-
-
-def _without_motion(bands: Bands, residual_m_s: Tensor) -> Tensor:
-    """Product of up and mirrored down sweeps with the phase of a velocity (..., pulse) removed."""
-    inner = bands.inner
-    up, down = bands.up.detach()[..., inner], bands.down.detach()[..., inner]
-    turns = 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s * residual_m_s
-    return up * down.conj() * cis((-2 * math.pi * turns[..., None] * bands.time_s[inner]).to(up.real.dtype))
 
 
 def _ratio(signal: Tensor, noise: Tensor) -> Tensor:

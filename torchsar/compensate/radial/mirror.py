@@ -6,9 +6,9 @@ from typing import get_args
 
 from torch import Tensor
 
-from torchsar.compensate.radial.bands import Spectra, refuse_other_sweeps
+from torchsar.compensate.radial.bands import refuse_other_sweeps
 from torchsar.compensate.radial.blocks import velocities
-from torchsar.compensate.radial.measured import Intercept, Measured
+from torchsar.compensate.radial.measured import Intercept
 from torchsar.compensate.radial.product import mirror_measured
 from torchsar.core import Axis, Estimate
 from torchsar.radar import TriangularLadar
@@ -83,11 +83,14 @@ def mirror_product(
     """
     refuse_other_sweeps(sweeps, radar, "mirror_product", pulse)
     refuse_other_intercept(intercept)
-
-    def measure(spectra: Spectra) -> Measured:
-        return mirror_measured(spectra.bands(window_m, taper, oversampling=2), intercept)
-
-    return velocities(measure, sweeps, radar, pulse, azimuth_m, assess)
+    return velocities(
+        lambda spectra: mirror_measured(spectra.bands(window_m, taper, oversampling=2), intercept),
+        sweeps,
+        radar,
+        pulse,
+        azimuth_m,
+        assess,
+    )
 
 
 def refuse_other_intercept(intercept: str) -> None:

@@ -14,10 +14,8 @@ from torchsar.compensate.radial.newton import climbed
 from torchsar.core import Axis, Estimate, cis, power_of
 from torchsar.radar import TriangularLadar
 
-_PAD = 2  # zero-padding of the transform, enough for the Newton steps to converge
-_NEWTON = 3  # Newton steps, found by trial: enough to converge
-_REACH = 2.0  # range cells about the peak of the whole record that are searched
-_DARK = 0.2  # share of the mean power below which a scatterer is not illuminated, found by trial
+# zero-padding of the transform and number of Newton steps, found by trial: enough to converge
+_PAD, _NEWTON = 2, 3
 
 
 def ml_peak(
@@ -134,7 +132,7 @@ def shining(up: Tensor, down: Tensor) -> Tensor:
     Returns:
         True where the scatterer is illuminated, shape (..., pulse), bool.
     """
-    return torch.stack([power >= _DARK * power.mean(-1, keepdim=True) for power in (up, down)]).all(0) & (up + down > 0)
+    return torch.stack([power >= 0.2 * power.mean(-1, keepdim=True) for power in (up, down)]).all(0) & (up + down > 0)
 
 
 def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -151,12 +149,12 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
     """
     both = torch.stack([bands.up, bands.down], -3)
     m = both.shape[-1]
-    spectrum = torch.fft.fft(both.detach(), _PAD * m)
-    power = power_of(spectrum)
+    power = power_of(torch.fft.fft(both.detach(), _PAD * m))
     searched = inside(bands.radar, window_m, _PAD * m, _PAD, both.device)
     centre = torch.where(searched, power.mean((-3, -2), keepdim=True), -1).argmax(-1, keepdim=True)
     distance = (torch.arange(_PAD * m, device=both.device) - centre + _PAD * m // 2) % (_PAD * m) - _PAD * m // 2
-    peak, best = torch.where(distance.abs() <= round(_REACH * _PAD), power, -1).max(-1)
+    # within two range cells about the peak of the whole record
+    peak, best = torch.where(distance.abs() <= 2 * _PAD, power, -1).max(-1)
     best = torch.where(best >= _PAD * m // 2, best - _PAD * m, best)
     frequency = best.to(torch.float64) / (_PAD * bands.radar.sweep_s)
     frequency = climbed(both, bands.radar.sweep_s / m, frequency, _NEWTON)

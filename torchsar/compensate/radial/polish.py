@@ -103,10 +103,9 @@ def sharpened(rows: Tensor, start: Tensor | None, iterations: int, tolerance_rad
         The phases in rad, shape (trial, pulse), and the iterations taken, shape (trial,).
     """
     start = torch.zeros_like(rows[:, 0].real) if start is None else start
-    along = AlongPulses()
     runs = [
-        Run(_single_points, along, 1, 1.0, 0.0),
-        Run(_SCENE, along, iterations, _RELAXATION, tolerance_rad),
+        Run(_single_points, AlongPulses(), 1, 1.0, 0.0),
+        Run(_SCENE, AlongPulses(), iterations, _RELAXATION, tolerance_rad),
         Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 2),
     ]
     return in_turn(rows, start, runs)
@@ -125,8 +124,7 @@ def scene_cells(rows: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         The number of image cells and that of range cells, float64 (trial,) each.
     """
-    image = torch.fft.fft(rows, norm="ortho")
-    power = power_of(image).to(torch.float64)
+    power = power_of(torch.fft.fft(rows, norm="ortho")).to(torch.float64)
     noise = power.flatten(-2).median(-1).values[:, None, None] / math.log(2)
     scene = torch.where(power > 12 * noise, power - noise, 0)
     row, tiny = scene.sum(-1), torch.finfo(torch.float64).tiny

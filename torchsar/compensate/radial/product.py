@@ -12,9 +12,8 @@ from torchsar.compensate.radial.measured import Intercept, Law, Measured
 from torchsar.compensate.radial.newton import climbed, step_uphill
 from torchsar.core import cis, power_of, take
 
-_PAD = 2  # zero-padding of the transform, enough for the Newton steps to converge
-_NEWTON = 3  # Newton steps, found by trial: enough to converge from the parabola
-_REACH = 6  # bins about the removed shift that are searched; the shift is right to a bin or two
+# zero-padding of the transform and number of Newton steps, found by trial: enough to converge
+_PAD, _NEWTON = 2, 3
 
 
 def mirror_measured(bands: Bands, intercept: Intercept) -> Measured:
@@ -77,21 +76,16 @@ def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
     The peak of a zero-padded transform, refined by Newton steps.
     """
     n, per = z.shape[-1], 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s
-    spectrum = torch.fft.fft(z.detach(), _PAD * n)
-    power = power_of(spectrum)
-    reach = min(round(_REACH * _PAD * n / bands.time_s.shape[-1]), n // 2)
+    power = power_of(torch.fft.fft(z.detach(), _PAD * n))
+    # 6 bins about the removed shift, which is right to a bin or two
+    reach = min(round(6 * _PAD * n / bands.time_s.shape[-1]), n // 2)
     best = torch.cat([power[..., -reach:], power[..., : reach + 1]], -1).argmax(-1) - reach
-    best = best + _parabola(power, best)
+    # the vertex of the parabola through a peak and its neighbours
+    low, mid, high = (take(power, (best + k) % power.shape[-1]) for k in (-1, 0, 1))
+    bend = low - 2 * mid + high
+    best = best + torch.where(bend < 0, 0.5 * (low - high) / torch.where(bend < 0, bend, -1), 0)
     v = best.to(torch.float64) / (_PAD * n * (u[1] - u[0]) * per)
     return climbed(z, float(bands.radar.sweep_s / bands.time_s.shape[-1] * per), v, steps)
-
-
-def _parabola(power: Tensor, best: Tensor) -> Tensor:
-    """Offset of the vertex of the parabola through a peak and its neighbours, in bins."""
-    n = power.shape[-1]
-    low, mid, high = (take(power, (best + k) % n) for k in (-1, 0, 1))
-    bend = low - 2 * mid + high
-    return torch.where(bend < 0, 0.5 * (low - high) / torch.where(bend < 0, bend, -1), 0)
 
 
 def _through_zero(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
@@ -102,7 +96,5 @@ def _through_zero(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
     w = _weights(u, bands).to(z.real.dtype)
     for _ in range(_NEWTON):
         turned = _turned(z, u, v, bands)
-        gradient = (turned.imag * w).sum(-1)
-        bend = -(turned.real * w * w).sum(-1)
-        v = v + step_uphill(gradient, bend)
+        v = v + step_uphill((turned.imag * w).sum(-1), -(turned.real * w * w).sum(-1))
     return v

@@ -31,11 +31,11 @@ from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
 from torchsar.radar import TriangularLadar, sweep_middles
 
 # random walk of the integrated velocities beyond which the polish is started from PGA, found by
-# trial: beyond a radian the polish alone may end in an image of two peaks
-_FAR_RAD = 0.4
+# trial: beyond a radian the polish alone may end in an image of two peaks; least number of periods
+# for that, because the first window of PGA is as wide
+_FAR_RAD, _FEW_PERIODS = 0.4, 32
 # scenes of more effective image cells are dense
 _DENSE_CELLS = 20.0
-_FEW_PERIODS = 32  # fewer periods are not started from PGA, whose first window is as wide
 # windows of PGA in Doppler cells, found by trial: a random walk blurs by few cells
 _WINDOWS = Listed((31.0, 21.0, 15.0, 9.0, 9.0, 9.0))
 
@@ -158,12 +158,11 @@ def polished(
         step_rad = 4 * math.pi / radar.wavelength_m * pulse.step * coarse.info["noise_m_s"].detach().flatten()[at]
         linked = linked_walk(cells.reshape(-1, *cells.shape[-2:])[at], phase[at], step_rad)
         walk = Walk(*(all_.index_copy(0, at, some) for all_, some in zip(walk, linked, strict=True)))
-    shape = pulses.trials
     info = {"iterations": taken, "image_cells": image_cells, "range_cells": range_cells}
     return replace(
         coarse,
-        value={**coarse.value, "phase_rad": walk.phase_rad.reshape(*shape, pulse.n)},
-        info={**coarse.info, **{name: value.reshape(shape) for name, value in info.items()}},
+        value={**coarse.value, "phase_rad": walk.phase_rad.reshape(*pulses.trials, pulse.n)},
+        info={**coarse.info, **{name: value.reshape(pulses.trials) for name, value in info.items()}},
     ), walk
 
 
@@ -207,10 +206,8 @@ def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
     """
     radar, m = bands.radar, bands.time_s.shape[-1]
     turns = carrier_turns(sweep_motion(velocity_m_s, radar, pulse), radar)[..., 0, :, :]
-    remaining = torch.cat(
-        [turns[..., :1], turns[..., 1:2] - (bands.shift.to(torch.float64) / radar.sweep_s)[..., None], turns[..., 2:]],
-        -1,
-    )
+    # less the linear term that is removed already
+    remaining = turns - torch.nn.functional.pad((bands.shift.to(torch.float64) / radar.sweep_s)[..., None], (1, 4))
     compensated = bands.up * polynomial_phasor(-remaining, radar.sweep_s / m, m, bands.up.dtype)
     lines = torch.arange(bands.first, bands.first + bands.lines, device=compensated.device)
     cells = torch.fft.fft(compensated)[..., lines % m] / m

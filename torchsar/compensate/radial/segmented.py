@@ -15,12 +15,11 @@ from torchsar.compensate.radial.blocks import velocities
 from torchsar.compensate.radial.correlation import envelope_lag
 from torchsar.compensate.radial.measured import Law, Measured
 from torchsar.compensate.radial.peak import from_beats, shining
-from torchsar.core import Axis, Estimate, cis, power_of
+from torchsar.core import Axis, Estimate, cis, power_of, take
 from torchsar.radar import TriangularLadar
 
 Bins = Literal["peak", "sum"]
 Unwrap = Literal["gradient", "per_pulse"]
-_SUM_UPSAMPLING = 20  # of the spectra whose lag is removed first with "sum", as in section 3.3.2 of the paper
 
 
 def segmented_interference(
@@ -120,8 +119,13 @@ def segmented_interference(
     def measure(spectra: Spectra) -> Measured:
         bands = spectra.bands(video=bins == "peak")
         windowed = spectra.bands(window_m, taper=0.0)
-        coarse = envelope_lag(windowed, _SUM_UPSAMPLING if bins == "sum" else 4) / 2 + (windowed.shift - bands.shift)
-        halves = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
+        # with "sum", the upsampling of section 3.3.2 of the paper
+        coarse = envelope_lag(windowed, 20 if bins == "sum" else 4) / 2 + (windowed.shift - bands.shift)
+        moved = bands
+        if bins == "sum":  # without the Doppler shift of the envelopes
+            turn = cis((2 * math.pi * coarse[..., None] * (bands.time_s / radar.sweep_s)).to(bands.up.real.dtype))
+            moved = replace(bands, up=bands.up * turn.conj(), down=bands.down * turn)
+        halves = _halves(moved, padding, hann)
         searched = inside(radar, window_m, halves[0].shape[-1], padding / 2, sweeps.device)
         phases, weights, of_power = (
             _summed(halves, searched, coarse) if bins == "sum" else _at_peaks(halves, searched, padding, scatterers)
@@ -129,14 +133,11 @@ def segmented_interference(
         bands = replace(bands, lit=bands.lit & (weights > 0).any(-2))
         phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
         doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
-
-        def changes() -> Tensor:
-            return _weighted(of_power(), weights) * (radar.ambiguous_velocity_m_s / (2 * math.pi))
-
+        per_rad = radar.ambiguous_velocity_m_s / (2 * math.pi)
         return Measured.of(
             from_beats(doppler, -doppler, bands),
             spectra.bands(window_m, taper=0.5, oversampling=2),
-            Law(4.0, changes=changes),
+            Law(4.0, changes=lambda: _weighted(of_power(), weights) * per_rad),
             bands.lit,
             phase_rad=phase,
             integer=integer + bands.shift,
@@ -161,13 +162,6 @@ def _halves(bands: Bands, padding: int, hann: bool) -> tuple[Tensor, ...]:
     return up1, up2, down2, down1
 
 
-def _shifted(bands: Bands, shift: Tensor) -> Bands:
-    """The sweeps with a further Doppler shift in bins, (..., pulse), removed."""
-    angle = 2 * math.pi * shift[..., None] * (bands.time_s / bands.radar.sweep_s)
-    turn = cis(angle.to(bands.up.real.dtype))
-    return replace(bands, up=bands.up * turn.conj(), down=bands.down * turn)
-
-
 def _summed(
     halves: tuple[Tensor, ...], searched: Tensor, coarse: Tensor
 ) -> tuple[Tensor, Tensor, Callable[[], Tensor]]:
@@ -185,12 +179,15 @@ def _summed(
     phase = (torch.angle(first * second.conj()).to(torch.float64) - 2 * math.pi * coarse)[..., None, :]
 
     def changed(up: Tensor, down: Tensor, both: Tensor) -> Tensor:
-        return (power_of(up).sum(-1) - power_of(down).sum(-1)) / (2 * both.abs()).clamp_min(_tiny(both))
+        return (power_of(up).sum(-1) - power_of(down).sum(-1)) / (2 * both.abs()).clamp_min(
+            torch.finfo(both.dtype).tiny
+        )
 
-    def changes() -> Tensor:
-        return (changed(up1, down2, first) - changed(up2, down1, second)).to(torch.float64)[..., None, :]
-
-    return phase, torch.ones_like(phase), changes
+    return (
+        phase,
+        torch.ones_like(phase),
+        lambda: (changed(up1, down2, first) - changed(up2, down1, second)).to(torch.float64)[..., None, :],
+    )
 
 
 def _at_peaks(
@@ -204,55 +201,41 @@ def _at_peaks(
     up, down = (power_of(first) + power_of(second) for first, second in (halves[:2], halves[2:]))
     both = (up + down).detach()
     peaks = _strongest(torch.where(searched, both.mean(-2), -1), scatterers, padding)
-    reach = max(1, padding)
     phases, weights, picked = [], [], []
     for peak in peaks.unbind(-1):
-        at_up, at_down = (_own_peak(power.detach(), peak, reach) for power in (up, down))
-        of_halves = [_picked(x, at) for x, at in zip(halves, (at_up, at_up, at_down, at_down), strict=True)]
-        up1, up2, down1, down2 = of_halves
+        near = (_around(power.detach(), peak, padding) for power in (up, down))
+        at_up, at_down = (take(index, level.argmax(-1)) for index, level in near)
+        up1, up2, down1, down2 = (take(x, at) for x, at in zip(halves, (at_up, at_up, at_down, at_down), strict=True))
         phases.append(torch.angle(up1 * up2.conj() * down1 * down2.conj()).to(torch.float64))
-        picked.append(torch.stack(of_halves))
-        weight = _contrast_about(both, peak, reach).to(torch.float64)
-        weights.append(weight[..., None] * shining(_picked(up, at_up), _picked(down, at_down)))
+        picked.append(torch.stack([up1, up2, down1, down2]))
+        weight = _contrast_about(both, peak, padding).to(torch.float64)
+        weights.append(weight[..., None] * shining(take(up, at_up), take(down, at_down)))
 
     def changes() -> Tensor:
         level = power_of(torch.stack(picked, -2)).to(torch.float64)
-        first, second, third, fourth = level.clamp_min(_tiny(both)).log() / 2
+        first, second, third, fourth = level.clamp_min(torch.finfo(both.dtype).tiny).log() / 2
         return first - second + third - fourth
 
     return torch.stack(phases, -2), torch.stack(weights, -2), changes
 
 
-def _tiny(x: Tensor) -> float:
-    """Smallest normal number of the precision of x."""
-    return torch.finfo(x.dtype).tiny
-
-
 def _strongest(profile: Tensor, count: int, spacing: int) -> Tensor:
     """Bins (..., count) of the greatest values of a circular profile, at a spacing or more."""
     n = profile.shape[-1]
-    left, found = profile.clone(), []
+    left, found = profile, []
     index = torch.arange(n, device=profile.device)
     for _ in range(count):
-        best = left.argmax(-1, keepdim=True)
-        found.append(best)
-        distance = ((index - best + n // 2) % n - n // 2).abs()
-        left = torch.where(distance < 2 * spacing, torch.full_like(left, -1.0), left)
+        found.append(left.argmax(-1, keepdim=True))
+        distance = ((index - found[-1] + n // 2) % n - n // 2).abs()
+        left = torch.where(distance < 2 * spacing, -1.0, left)
     return torch.cat(found, -1)
 
 
-def _own_peak(power: Tensor, peak: Tensor, reach: int) -> Tensor:
-    """Bin (..., pulse) of the greatest power (..., pulse, n) near a peak (...,)."""
-    n = power.shape[-1]
-    near = (peak[..., None] + torch.arange(-reach, reach + 1, device=power.device)) % n
+def _around(power: Tensor, peak: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """Bins near a peak (...,), and their power in every period, of power (..., pulse, n)."""
+    near = (peak[..., None] + torch.arange(-reach, reach + 1, device=power.device)) % power.shape[-1]
     near = near[..., None, :].expand(*power.shape[:-1], -1)
-    best = power.gather(-1, near).argmax(-1, keepdim=True)
-    return near.gather(-1, best)[..., 0]
-
-
-def _picked(x: Tensor, index: Tensor) -> Tensor:
-    """Values at one index per period."""
-    return x.gather(-1, index[..., None])[..., 0]
+    return near, power.gather(-1, near)
 
 
 def _contrast_about(power: Tensor, peak: Tensor, reach: int) -> Tensor:
@@ -260,9 +243,7 @@ def _contrast_about(power: Tensor, peak: Tensor, reach: int) -> Tensor:
 
     Eq. (18) of the paper, made independent of scale. power: (..., pulse, n).
     """
-    n = power.shape[-1]
-    near = (peak[..., None] + torch.arange(-4 * reach, 4 * reach + 1, device=power.device)) % n
-    part = power.gather(-1, near[..., None, :].expand(*power.shape[:-1], -1)).sqrt()
+    part = _around(power, peak, 4 * reach)[1].sqrt()
     mean = part.mean((-2, -1))
     spread = (part - mean[..., None, None]).square().mean((-2, -1)).sqrt()
     return torch.where(mean > 0, spread / torch.where(mean > 0, mean, 1), 0)
@@ -279,15 +260,16 @@ def _unwrapped(
     integer = torch.round(coarse[..., None, :] + phases.detach() / turn)
     own = _weighted(phases - turn * integer, weights)  # phase minus whole turns: fd T = -own / 2 pi
     pairs = torch.minimum(weights[..., 1:], weights[..., :-1])
-    step = _weighted(_wrapped(_steps(phases)), pairs)
+    change = phases.diff(dim=-1)
+    step = _weighted(change - turn * torch.round(change.detach() / turn), pairs)
     # with the removed shift, which the gradient of the phase does not contain
     beyond = own - turn * bands.shift.to(torch.float64)
     both = bands.lit[..., 1:] & bands.lit[..., :-1] & (pairs > 0).any(-2)
-    step = torch.where(both, step, _steps(beyond))
+    step = torch.where(both, step, beyond.diff(dim=-1))
     gradient = torch.cat([torch.zeros_like(own[..., :1]), step.cumsum(-1)], -1)
     first = bands.lit.to(torch.int8).argmax(-1, keepdim=True)
     gradient = gradient + (beyond - gradient).gather(-1, first)
-    slips = ((_steps(torch.round((gradient - beyond).detach() / turn)) != 0) & both).sum(-1).to(torch.float64)
+    slips = ((torch.round((gradient - beyond).detach() / turn).diff(dim=-1) != 0) & both).sum(-1).to(torch.float64)
     chosen = gradient + turn * bands.shift.to(torch.float64) if unwrap == "gradient" else own
     whole = -torch.round(chosen.detach() / turn)
     return chosen + turn * whole, whole, slips
@@ -296,13 +278,3 @@ def _unwrapped(
 def _weighted(x: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean over scatterers, (..., pulse); zero where all weights are zero."""
     return (x * weights).sum(-2) / weights.sum(-2).clamp_min(torch.finfo(weights.dtype).tiny)
-
-
-def _steps(x: Tensor) -> Tensor:
-    """Differences between successive entries."""
-    return x[..., 1:] - x[..., :-1]
-
-
-def _wrapped(x: Tensor) -> Tensor:
-    """Phases modulo 2 pi; the removed turns are detached."""
-    return x - 2 * math.pi * torch.round(x.detach() / (2 * math.pi))

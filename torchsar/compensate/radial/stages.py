@@ -138,8 +138,16 @@ class RadialMotion(_OfSweeps):
         tolerance_rad: float = 0.005,
         assess: bool = True,
     ) -> None:
-        options = {"iterations": iterations, "tolerance_rad": tolerance_rad}
-        super().__init__(radar, window_m, azimuth_m, assess, intercept=intercept, taper=taper, **options)
+        super().__init__(
+            radar,
+            window_m,
+            azimuth_m,
+            assess,
+            intercept=intercept,
+            taper=taper,
+            iterations=iterations,
+            tolerance_rad=tolerance_rad,
+        )
 
 
 class MlPeak(_OfSweeps):
@@ -232,8 +240,17 @@ class SegmentedInterference(_OfSweeps):
         azimuth_m: float = 0.0,
         assess: bool = True,
     ) -> None:
-        options = {"bins": bins, "unwrap": unwrap, "scatterers": scatterers, "padding": padding, "hann": hann}
-        super().__init__(radar, window_m, azimuth_m, assess, **options)
+        super().__init__(
+            radar,
+            window_m,
+            azimuth_m,
+            assess,
+            bins=bins,
+            unwrap=unwrap,
+            scatterers=scatterers,
+            padding=padding,
+            hann=hann,
+        )
 
 
 class CompensateMotion(Stage):
@@ -286,7 +303,7 @@ class PhasePolish(Stage):
 
     def __init__(self, iterations: int = 80, tolerance_rad: float = 0.005, assess: bool = True) -> None:
         super().__init__()
-        self.iterations, self.tolerance_rad, self.assess = iterations, tolerance_rad, assess
+        self.options: dict[str, Any] = {"iterations": iterations, "tolerance_rad": tolerance_rad, "assess": assess}
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the residual phase of every pulse of a signal of axes (pulse, range).
@@ -295,9 +312,7 @@ class PhasePolish(Stage):
             `Estimate` by the function `phase_polish` with `phase_rad` of shape (..., pulse), to be
             removed.
         """
-        return phase_polish(
-            signal.data, iterations=self.iterations, tolerance_rad=self.tolerance_rad, assess=self.assess
-        )
+        return phase_polish(signal.data, **self.options)
 
 
 class PulseGain(Stage):

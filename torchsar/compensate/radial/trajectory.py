@@ -52,8 +52,8 @@ def geometric_velocity_m_s(
         The velocity in m/s, receding positive, shape (..., pulse), float64.
     """
     t = turning_points(radar, pulse).values(device)
-    x = per_trial(azimuth_m, 1, t)
-    return radar.speed_m_s * (radar.speed_m_s * t - x) / (radar.reference_range_m + relative_range_m)
+    along_m = radar.speed_m_s * t - per_trial(azimuth_m, 1, t)
+    return radar.speed_m_s * along_m / (radar.reference_range_m + relative_range_m)
 
 
 def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:
@@ -97,13 +97,11 @@ def sweep_motion(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> T
     Returns:
         Coefficients, shape (..., 2, pulse, 5), up before down, float64; c_k in m/s^k.
     """
-    v = velocity_m_s.to(torch.float64)
+    v, grid = velocity_m_s.to(torch.float64), turning_points(radar, pulse)
     middles = sweep_middles(radar, pulse, v.device)
     if pulse.n == 1:
-        constant = v[..., None, :] * (middles - turning_points(radar, pulse).start)
-        zero = torch.zeros_like(constant)
-        return torch.stack([constant, v[..., None, :].expand_as(constant), zero, zero, zero], -1)
-    grid = turning_points(radar, pulse)
+        constant = v[..., None, :] * (middles - grid.start)
+        return torch.nn.functional.pad(torch.stack([constant, v[..., None, :].expand_as(constant)], -1), (0, 3))
     spline = UniformSpline(v, grid.start, grid.step)
     pieces = spline.pieces()
     before = torch.cat([pieces[..., :1, :], pieces], -2)
@@ -113,15 +111,11 @@ def sweep_motion(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> T
     until = torch.full((pulse.n,), radar.sweep_s / 2, dtype=torch.float64, device=v.device)
     until[-1] = pulse.step + radar.sweep_s / 2
     moved = torch.stack([_recentred(before, since), _recentred(after, until)], -3)
-    constant = spline.integral(middles)
     order = torch.arange(1, 5, dtype=torch.float64, device=v.device)
-    return torch.cat([constant[..., None], moved / order], -1)
+    return torch.cat([spline.integral(middles)[..., None], moved / order], -1)
 
 
 def _recentred(cubic: Tensor, at: Tensor) -> Tensor:
     """Coefficients about `at` (n,) of cubics (..., n, 4) given about zero."""
-    columns = []
-    for k in range(4):
-        terms = [math.comb(j, k) * cubic[..., j] * at ** (j - k) for j in range(k, 4)]
-        columns.append(torch.stack(terms).sum(0))
-    return torch.stack(columns, -1)
+    terms = ([math.comb(j, k) * cubic[..., j] * at ** (j - k) for j in range(k, 4)] for k in range(4))
+    return torch.stack([torch.stack(of_power).sum(0) for of_power in terms], -1)
