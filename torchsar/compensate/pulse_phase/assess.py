@@ -49,13 +49,13 @@ _DISTURBED_RAD, _RETURNED_RAD, _ROUNDS = 0.4, 0.04, 2
 # distributed phases is half of their error
 _APART_RAD = 2.0
 # A single scatterer: the sharpness is that of so many rows, or the rows are side lobes of one
-# range. Its own motion cannot be told from a phase error, and phases can be found that make one point of
-# several. But no phase changes its modulus: noise and weaker scatterers change it as much as the
-# phase. It is steady if the modulus scatters by less than this, far below the 0.52 of noise, over
-# at least so many pulses.
+# range. Its own motion cannot be told from a phase error, and phases can be found that make one
+# point of several. But no phase changes its modulus: noise and weaker scatterers change it as much
+# as the phase. It is steady if it scatters by less than this, far below the 0.52 of noise, over at
+# least so many pulses.
 _ONE_ROW, _ONE_RANGE, _STEADY, _LEAST_PULSES = 1.5, 1.2, 0.25, 32
-# Longest gap as a share of the pulses from the first to the last, up to which
-# scenes of many points tell how the phases before and after it go together.
+# Longest gap as a share of the pulses from the first to the last, up to which scenes of many points
+# tell how the phases before and after it go together.
 _LONGEST_GAP = 0.36
 _STRIP = 4  # lines of an image in a strip, by choice: more than the response of a point is wide
 
