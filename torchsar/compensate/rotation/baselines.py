@@ -6,6 +6,8 @@ reach.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -14,26 +16,14 @@ from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEn
 from torchsar.compensate.rotation.unknowns import Variables
 from torchsar.core import Draws, Estimate
 
-# a genetic search that is short enough to compare: population, generations, part of the truth to
-# each side
-_POPULATION, _GENERATIONS, _PART = 10, 4, 0.1
 
-
-def _entropy(
-    data: Tensor,
-    variables: Variables,
-    wavelength_m: float,
-    prf_hz: float,
-    range_m: Tensor,
-    yc_m: float | None,
-    order: int,
-) -> ImageEntropy:
-    settings = EntropyObjective(order=order, yc_m=yc_m or 0.0, variables=variables)
-    return ImageEntropy(data, settings, wavelength_m=wavelength_m, prf_hz=prf_hz, range_m=range_m)
+def _entropy(data: Tensor, variables: Variables, yc_m: float | None, order: int, **known: Any) -> ImageEntropy:
+    """The image entropy of a rotation whose centre is known."""
+    return ImageEntropy(data, EntropyObjective(order=order, yc_m=yc_m or 0.0, variables=variables), **known)
 
 
 def descent_near_truth(
-    data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, assess: bool = True, **known: object
+    data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, assess: bool = True, **known: Any
 ) -> Estimate:
     """Estimate a rotation by a descent of the image entropy that starts at 0.95 of the true values.
 
@@ -48,12 +38,12 @@ def descent_near_truth(
     Returns:
         The `Estimate` that the function `descend_rotation` returns.
     """
-    objective = _entropy(data, "shape", **known)  # pyright: ignore[reportArgumentType]
+    objective = _entropy(data, "shape", **known)
     return descend_rotation(objective, objective.start(0.95 * omega_rad_s, 0.95 * warp_k, None), assess=assess)
 
 
 def genetic_near_truth(
-    data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, assess: bool = True, **known: object
+    data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, assess: bool = True, **known: Any
 ) -> Estimate:
     """Estimate a rotation by a genetic algorithm that searches within 10 % of the true values.
 
@@ -70,8 +60,8 @@ def genetic_near_truth(
     Returns:
         The `Estimate` that the function `genetic_rotation` returns.
     """
-    objective = _entropy(data, "raw", **known)  # pyright: ignore[reportArgumentType]
+    objective = _entropy(data, "raw", **known)
     centre = torch.cat([omega_rad_s[..., None], warp_k], -1)
-    box = _PART * torch.where(centre != 0, centre.abs(), 1)
-    size = {"population": _POPULATION, "generations": _GENERATIONS}
+    box = 0.1 * torch.where(centre != 0, centre.abs(), 1)
+    size = {"population": 10, "generations": 4}  # short enough to compare
     return genetic_rotation(objective, centre - box, centre + box, draws=Draws(1), assess=assess, **size)

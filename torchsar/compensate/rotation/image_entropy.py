@@ -7,7 +7,7 @@ settings say so), the image is formed by the matched Fourier transform
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -105,7 +105,10 @@ class ImageEntropy:
             data.shape[-2] / prf_hz, objective.order, objective.range_term, yc_m is None, objective.variables
         )
         self.trials, self.dtype = data.shape[:-2], data.dtype
-        self.rows = _normalised(data.detach()).reshape(-1, *data.shape[-2:])
+        unit = unit_level(data.detach())
+        rms = power_of(unit).mean((-2, -1), keepdim=True).sqrt()
+        # at unit rms, squares neither underflow nor overflow
+        self.rows = (unit / torch.where(rms > 0, rms, 1)).reshape(-1, *data.shape[-2:])
         known = torch.as_tensor(0.0 if yc_m is None else yc_m, dtype=torch.float64, device=data.device).detach()
         self._yc = known.expand(self.trials).reshape(-1)
 
@@ -158,13 +161,14 @@ class ImageEntropy:
         Returns:
             The entropies in nats, shape (...,), and their gradients, shape (..., n).
         """
-        rows = x.detach().reshape(-1, x.shape[-1])
-        pairs = [
-            _value_and_gradient(lambda part_x, part=part: self._cost(part, part_x, 1), rows[part])
-            for part in self.blocks(len(rows), 1)
-        ]
-        cost, gradient = (torch.cat(parts) for parts in zip(*pairs, strict=True))
-        return cost.reshape(x.shape[:-1]), gradient.reshape(x.shape)
+        rows, costs, gradients = x.detach().reshape(-1, x.shape[-1]), [], []
+        for part in self.blocks(len(rows), 1):
+            with torch.enable_grad():
+                own = rows[part].requires_grad_()
+                cost = self._cost(part, own, 1)
+                gradients += torch.autograd.grad(cost.sum(), own)
+            costs.append(cost.detach())
+        return torch.cat(costs).reshape(x.shape[:-1]), torch.cat(gradients).reshape(x.shape)
 
     def turn(self, x: Tensor) -> RotationParameters:
         """Convert vectors of unknowns to the rotations that they describe.
@@ -252,8 +256,7 @@ class ImageEntropy:
             The blocks.
         """
         size = self.rows[0].numel() * self.rows.element_size() * max(1.0, self.objective.oversampling)
-        height = max(1, int(4 * block_bytes_of(self.rows.device) // size))
-        whole = rows if count == 1 else count
+        height, whole = max(1, int(4 * block_bytes_of(self.rows.device) // size)), rows if count == 1 else count
         for begin in range(0, rows, max(1, whole)):
             yield from (slice(i, min(i + height, begin + whole)) for i in range(begin, begin + whole, height))
 
@@ -272,13 +275,12 @@ class ImageEntropy:
                 rotation.warp_k,
                 rotation.yc_m,
             )
-        return torch.where(rotation.feasible, self._entropy(pulses, rotation.warp_k), torch.inf)
-
-    def _entropy(self, pulses: Tensor, k: Tensor) -> Tensor:
-        """Entropy of the image of pulses without their range term."""
-        image = self.objective
-        lines, transform = DopplerLines(image.oversampling, image.lines), Gridding(image.taps)
-        return _entropy(matched_fourier(pulses, k, self.sampling.prf_hz, lines=lines, transform=transform))
+        lines, transform = (
+            DopplerLines(self.objective.oversampling, self.objective.lines),
+            Gridding(self.objective.taps),
+        )
+        image = matched_fourier(pulses, rotation.warp_k, self.sampling.prf_hz, lines=lines, transform=transform)
+        return torch.where(rotation.feasible, _entropy(image), torch.inf)
 
 
 def _entropy(image: Tensor) -> Tensor:
@@ -288,19 +290,3 @@ def _entropy(image: Tensor) -> Tensor:
     inner = (power * torch.log(power.clamp_min(torch.finfo(power.dtype).tiny))).sum((-2, -1), dtype=torch.float64)
     safe = torch.where(total > 0, total, 1)
     return torch.log(safe) - inner / safe
-
-
-def _value_and_gradient(cost: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
-    """Value and gradient of a cost."""
-    with torch.enable_grad():
-        x = x.detach().requires_grad_()
-        value = cost(x)
-        (gradient,) = torch.autograd.grad(value.sum(), x)
-    return value.detach(), gradient
-
-
-def _normalised(data: Tensor) -> Tensor:
-    """Each trial over its root mean square, so that squares neither underflow nor overflow."""
-    unit = unit_level(data)
-    rms = power_of(unit).mean((-2, -1), keepdim=True).sqrt()
-    return unit / torch.where(rms > 0, rms, 1)

@@ -15,10 +15,6 @@ from torchsar.radar import InverseRadar
 
 Variables = Literal["raw", "shape"]
 
-# slope of the warp at the first pulse over its mean slope below which k would be infinite: k is
-# relative to the rate at the first pulse
-_LEAST_START = 1e-6
-
 
 class RotationParameters(NamedTuple):
     """Parameters of the rotation of a target, one set per trial.
@@ -113,7 +109,11 @@ class Unknowns:
         finite = torch.isfinite(x).all(-1)
         k = torch.where(finite[..., None], k, 0)
         if self.variables == "shape":
-            grows = _grows_at_start(k)
+            # the warp grows at the first pulse if 1 + sum q_j P_j'(-1) > 0, with P_j'(-1) = -(-1)^j j (j + 1) / 2;
+            # k, which is relative to the rate there, would be infinite below 1e-6
+            j = torch.arange(2, k.shape[-1] + 2, dtype=k.dtype, device=k.device)
+            slope = torch.where(j.remainder(2) == 0, -0.5, 0.5) * j * (j + 1)
+            grows = 1 + (k * slope).sum(-1) > 1e-6
             finite, k = finite & grows, k_of_shape(torch.where(grows[..., None], k, 0), self.duration_s)
         feasible = finite & (least_rate(k, self.duration_s) > 0)
         k = torch.where(feasible[..., None], k, 0)
@@ -156,21 +156,20 @@ class Unknowns:
         Returns:
             The changes, positive, shape (..., n).
         """
-        bend = 4 / n_pulse
-        parts = [self._k_unit(i) * bend if self.variables == "raw" else bend for i in range(1, self.order)]
-        k = [torch.full_like(x[..., 0], part) for part in parts]
+        raw, t = self.variables == "raw", self.duration_s
+        # of a raw unknown: the k_i that makes q_(i+1) = 1 where all others are 0 and small
+        scales = [
+            math.factorial(2 * i + 2) / (2 * math.factorial(i + 1) * t**i) if raw else 1 for i in range(1, self.order)
+        ]
+        k = [torch.full_like(x[..., 0], scale * (4 / n_pulse)) for scale in scales]
         if not self.range_term:
             return torch.stack(k, -1)
         size = torch.where(x[..., 0] != 0, x[..., 0].abs(), 1)
-        angle = size * self.duration_s if self.variables == "raw" else size
+        angle = size * t if raw else size
         depth = wavelength_m / (2 * math.pi * angle.square())
         return torch.stack(
             [size * (depth / extent_m).clamp_max(1), *k, *((depth.clamp_max(extent_m),) if self.yc else ())], -1
         )
-
-    def _k_unit(self, i: int) -> float:
-        """k_i that makes q_(i+1) = 1 where all others are 0 and small."""
-        return math.factorial(2 * i + 2) / (2 * math.factorial(i + 1) * self.duration_s**i)
 
     def vector(self, values: Sequence[float] | Tensor, what: str) -> Tensor:
         """Convert numbers, one per unknown, to a vector, and check how many they are.
@@ -246,13 +245,3 @@ def uniform_rotation(radar: InverseRadar, names: Iterable[str], yc_m: Tensor | f
     """
     known = {"omega_rad_s": radar.rotation_rad_s or 0.0, "yc_m": 0.0 if yc_m is None else yc_m}
     return {name: known.get(name, 0.0) for name in names}
-
-
-def _grows_at_start(shape: Tensor) -> Tensor:
-    """Whether the warp of a shape (..., order - 1) grows at the first pulse.
-
-    The condition is 1 + sum q_j P_j'(-1) > 0, with P_j'(-1) = -(-1)^j j (j + 1) / 2.
-    """
-    j = torch.arange(2, shape.shape[-1] + 2, dtype=shape.dtype, device=shape.device)
-    slope = torch.where(j.remainder(2) == 0, -0.5, 0.5) * j * (j + 1)
-    return 1 + (shape * slope).sum(-1) > _LEAST_START
