@@ -143,23 +143,14 @@ def inner_products(
     weight = amplitude[near.trial, near.first].conj() * amplitude[near.trial, near.second]
     weight = torch.where(coupled, weight * (1 + _RIDGE * (near.first == near.second)), 0)
     index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
-    table = _product_tables(sampling, k, bases)
-    low, high = table[near.trial, whole], table[near.trial, whole + 1]
-    values = ((low + (position - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
-    return {pair: value for (n, m), value in zip(index, values) for pair in {(n, m), (m, n)}}
-
-
-def _product_tables(sampling: Sampling, k: Tensor, bases: Tensor) -> Tensor:
-    """Sums over pulses of b_n b_m exp(2j pi c u), m >= n, (trial, step, product).
-
-    The steps are 1 / _TABLE of a Doppler cell c.
-    """
+    # sums over pulses of b_n b_m exp(2j pi c u), m >= n, at steps of 1 / _TABLE of a Doppler cell c
     first, second = torch.triu_indices(bases.shape[1], bases.shape[1], device=bases.device)
     scale = bases.abs().amax(-1, keepdim=True).clamp_min(1e-300)
     unit = bases / scale
     products = (unit[:, first] * unit[:, second]).mT.to(torch.complex128)
-    lines = 2 * _NEAR_CELLS * _TABLE + 2
-    table = matched_fourier(
-        products, k, sampling.prf_hz, lines=DopplerLines(_TABLE, lines), transform=Gridding(6)
-    ) * math.sqrt(sampling.pulses)
-    return table[:, 1:] * (scale[:, first] * scale[:, second]).mT
+    lines = DopplerLines(_TABLE, 2 * _NEAR_CELLS * _TABLE + 2)
+    table = matched_fourier(products, k, sampling.prf_hz, lines=lines, transform=Gridding(6))[:, 1:]
+    table = table * math.sqrt(sampling.pulses) * (scale[:, first] * scale[:, second]).mT
+    low, high = table[near.trial, whole], table[near.trial, whole + 1]
+    values = ((low + (position - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
+    return {pair: value for (n, m), value in zip(index, values) for pair in {(n, m), (m, n)}}

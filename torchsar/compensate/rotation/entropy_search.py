@@ -282,7 +282,7 @@ def _estimate(
     motion = Motion(k, w, w * rotation.yc_m.reshape(-1), torch.zeros_like(w))
     with torch.no_grad():
         parts = [
-            judged_motion(figure.rows[i], figure.sampling, each(lambda x, i=i: x[i], motion))
+            judged_motion(figure.rows[i], figure.sampling, each(lambda x, i=i: x[i], motion), {})
             for i in figure.blocks(len(w))
         ]
     outcome = torch.maximum(torch.cat([part.outcome for part in parts]).reshape(figure.trials), doubts)

@@ -12,9 +12,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-_SAMPLED = 1 << 16  # pixels from which the median is taken: its error is then below a percent
-_CANDIDATES = 4  # local maxima that are examined for each peak that is wanted, found by trial
-
 
 @dataclass(frozen=True)
 class Peaks:
@@ -31,18 +28,6 @@ class Peaks:
     line: Tensor
     cell: Tensor
 
-    def first(self, count: Tensor) -> Peaks:
-        """Keep the brightest peaks of each trial.
-
-        Args:
-            count: Number of peaks to keep, shape (trial,).
-
-        Returns:
-            The peaks, brightest first; power 0 of those that are not kept.
-        """
-        kept = torch.arange(self.power.shape[-1], device=count.device) < count[:, None]
-        return Peaks(torch.where(kept, self.power, 0), self.line, self.cell)
-
 
 def noise_power(power: Tensor) -> Tensor:
     """Estimate the mean power of circular Gaussian noise in an image from the median of its power.
@@ -56,7 +41,8 @@ def noise_power(power: Tensor) -> Tensor:
         The noise power, shape (trial,).
     """
     every = power.flatten(1)
-    return every[:, :: max(1, every.shape[-1] // _SAMPLED)].median(-1).values / math.log(2)
+    # of 65536 pixels: its error is then below a percent
+    return every[:, :: max(1, every.shape[-1] // (1 << 16))].median(-1).values / math.log(2)
 
 
 def threshold(pixels: int) -> float:
@@ -91,8 +77,13 @@ def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: in
         The peaks.
     """
     n_line, n_cell = power.shape[1:]
-    maxima = torch.where(_local_maximum(power) & (power > floor[:, None, None]), power, 0).flatten(1)
-    level, index = maxima.topk(min(_CANDIDATES * count, maxima.shape[-1]), -1)
+    along, across = pad(power, (0, 0, 1, 1)), pad(power, (1, 1, 0, 0))
+    maximum = (
+        (power >= along[:, :-2]) & (power > along[:, 2:]) & (power >= across[..., :-2]) & (power > across[..., 2:])
+    )
+    maxima = torch.where(maximum & (power > floor[:, None, None]), power, 0).flatten(1)
+    # four local maxima are examined for each peak that is wanted, found by trial
+    level, index = maxima.topk(min(4 * count, maxima.shape[-1]), -1)
     line, cell = index // n_cell, index % n_cell
     offsets = torch.cartesian_prod(
         torch.arange(-lines, lines + 1, device=power.device), torch.arange(-cells, cells + 1, device=power.device)
@@ -106,9 +97,3 @@ def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: in
     kept = torch.where((level > 0) & (level >= share**2 * around), level, 0)
     found, order = kept.topk(min(count, kept.shape[-1]), -1)
     return Peaks(found, torch.gather(line, 1, order), torch.gather(cell, 1, order))
-
-
-def _local_maximum(power: Tensor) -> Tensor:
-    """Whether a pixel is not below its four neighbours, (trial, line, range) bool."""
-    along, across = pad(power, (0, 0, 1, 1)), pad(power, (1, 1, 0, 0))
-    return (power >= along[:, :-2]) & (power > along[:, 2:]) & (power >= across[..., :-2]) & (power > across[..., 2:])

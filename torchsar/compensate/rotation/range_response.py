@@ -16,9 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-# distance from the peak, in cells, within which the slope of a sinc is computed from its series:
-# the error of either form is below 1e-10 there
-_NEAR = 1e-4
+from torchsar.core import cis
 
 
 class Envelopes(NamedTuple):
@@ -48,26 +46,17 @@ def envelopes(share: Tensor, row: Tensor, cells: int) -> Envelopes:
     Returns:
         The responses.
     """
-    open_ended, periodic = _sinc(row, cells), _periodic(row, cells)
-    value, slope = (x + share[:, None, None] * (y - x) for x, y in zip(open_ended, periodic))
-    return Envelopes(value, slope, periodic[0] - open_ended[0])
-
-
-def _sinc(row: Tensor, cells: int) -> tuple[Tensor, Tensor]:
-    """A sinc about each row, and its derivative with respect to the row, (..., cells)."""
-    x = torch.arange(cells, dtype=row.dtype, device=row.device) - row[..., None]
-    value = torch.sinc(x)
-    near = x.abs() < _NEAR
-    safe = torch.where(near, 1, x)
-    slope = torch.where(near, math.pi**2 / 3 * x, (value - torch.cos(math.pi * x)) / safe)
-    return value.to(torch.complex128), slope.to(torch.complex128)
-
-
-def _periodic(row: Tensor, cells: int) -> tuple[Tensor, Tensor]:
-    """Mean of the FFT frequencies of `cells` samples about each row, and its derivative."""
-    frequency = 2 * math.pi * (torch.arange(cells, dtype=row.dtype, device=row.device) - cells // 2) / cells
-    angle = row[..., None] * -frequency
-    phasor = torch.polar(torch.ones_like(angle), angle) / cells
-    angle = torch.outer(frequency, torch.arange(cells, dtype=row.dtype, device=row.device))
-    lines = torch.polar(torch.ones_like(angle), angle)
-    return phasor @ lines, (phasor * (-1j * frequency)) @ lines
+    cell = torch.arange(cells, dtype=row.dtype, device=row.device)
+    x = cell - row[..., None]
+    sinc, near = torch.sinc(x), x.abs() < 1e-4
+    # near the peak the slope follows from the series: the error of either form is below 1e-10
+    slope = torch.where(near, math.pi**2 / 3 * x, (sinc - torch.cos(math.pi * x)) / torch.where(near, 1, x))
+    # the periodic response is the mean of the FFT frequencies of as many samples
+    frequency = 2 * math.pi * (cell - cells // 2) / cells
+    phasor, lines = cis(row[..., None] * -frequency) / cells, cis(torch.outer(frequency, cell))
+    periodic = phasor @ lines
+    difference = periodic - sinc
+    weight = share[:, None, None]
+    return Envelopes(
+        sinc + weight * difference, slope + weight * ((phasor * (-1j * frequency)) @ lines - slope), difference
+    )

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.data import refuse_odd_counts
 from torchsar.compensate.rotation.assess import judged_fit, judged_motion
 from torchsar.compensate.rotation.coarse import coarse_warp
 from torchsar.compensate.rotation.histories import HALF_CELLS, refined_by_histories
@@ -33,12 +35,7 @@ from torchsar.core import (
 )
 from torchsar.core.warp import k_of_shape, shape_of
 
-# size of a block of trials over the size that is best for one operation, found by trial
-_BLOCKS = 8
 HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
-
-Found = Motion | Fit
-Part = Callable[[Tensor, Sampling, Tensor | None], Found]
 
 
 def uneven_rotation(
@@ -106,11 +103,13 @@ def uneven_rotation(
         ValueError: If the data, the range axis or `yc_m` are invalid, or a number is not a whole
             number of 1 or more.
     """
-    _check_counts("uneven_rotation", 1, order=order, rounds=rounds, scatterers=1 if scatterers is None else scatterers)
+    refuse_odd_counts(
+        "uneven_rotation", 1, order=order, rounds=rounds, scatterers=1 if scatterers is None else scatterers
+    )
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Fit:
         options = {"free_centre": known is None}
-        motion = refined_by_histories(rows, sampling, _start(rows, sampling, order, known), **options)
+        motion = refined_by_histories(rows, sampling, _start(order, rows, sampling, known), **options)
         fit = fit_scatterers(rows, sampling, motion, **options, count=scatterers, rounds=rounds)
         if scatterers is None:
             # many more scatterers than usual leave most of the energy unexplained
@@ -167,12 +166,8 @@ def coarse_rotation(
         ValueError: If the data, the range axis or `yc_m` are invalid, or the order is not a whole
             number of 1 or more.
     """
-    _check_counts("coarse_rotation", 1, order=order)
-
-    def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
-        return _start(rows, sampling, order, known)
-
-    return _over_trials("coarse_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
+    refuse_odd_counts("coarse_rotation", 1, order=order)
+    return _over_trials("coarse_rotation", partial(_start, order), assess, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
 def phase_fit_rotation(
@@ -219,11 +214,11 @@ def phase_fit_rotation(
         TypeError: If the data are not complex.
         ValueError: If the data, the range axis or `yc_m` are invalid, or a number is too small.
     """
-    _check_counts("phase_fit_rotation", 1, order=order, steps=steps)
-    _check_counts("phase_fit_rotation", 4, half_cells=half_cells)
+    refuse_odd_counts("phase_fit_rotation", 1, order=order, steps=steps)
+    refuse_odd_counts("phase_fit_rotation", 4, half_cells=half_cells)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
-        motion = _start(rows, sampling, order, known)
+        motion = _start(order, rows, sampling, known)
         for _ in range(steps):
             motion = refined_by_histories(rows, sampling, motion, free_centre=known is None, half_cells=half_cells)
         return motion
@@ -231,7 +226,7 @@ def phase_fit_rotation(
     return _over_trials("phase_fit_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
-def _start(rows: Tensor, sampling: Sampling, order: int, known: Tensor | None) -> Motion:
+def _start(order: int, rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
     """The coarse warp in `order` terms, with rate zero."""
     k = (
         coarse_warp(rows, sampling.prf_hz)
@@ -240,12 +235,13 @@ def _start(rows: Tensor, sampling: Sampling, order: int, known: Tensor | None) -
     )
     if order == 2:
         k = k_of_shape(shape_of(k, sampling.duration_s)[:, :1], sampling.duration_s)
-    return Motion.of_unknown_rate(torch.nn.functional.pad(k, (0, max(0, order - 3))), known)
+    zero = k.new_zeros(len(k))
+    return Motion(torch.nn.functional.pad(k, (0, max(0, order - 3))), zero, zero, zero if known is None else known)
 
 
 def _over_trials(
     name: str,
-    find: Part,
+    find: Callable[[Tensor, Sampling, Tensor | None], Motion | Fit],
     assess: bool,
     data: Tensor,
     wavelength_m: float,
@@ -257,10 +253,16 @@ def _over_trials(
     data = checked_samples(data, name, "pulse, range")
     sampling = Sampling.of(name, data, wavelength_m, prf_hz, range_m)
     trials, rows = data.shape[:-2], data.detach().reshape(-1, *data.shape[-2:])
-    known = (
-        None if yc_m is None else _centre(name, torch.as_tensor(yc_m, dtype=torch.float64, device=data.device), trials)
-    )
-    height = max(1, _BLOCKS * block_bytes_of(data.device) // (rows[0].numel() * rows.element_size()))
+    known = None if yc_m is None else torch.as_tensor(yc_m, dtype=torch.float64, device=data.device)
+    if known is not None:
+        refuse_non_finite(known, f"{name}: yc_m")
+        if known.ndim and known.shape != trials:
+            raise ValueError(
+                f"{name}: yc_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(known.shape)}"
+            )
+        known = known.expand(trials).reshape(-1)
+    # eight times the size that is best for one operation, found by trial
+    height = max(1, 8 * block_bytes_of(data.device) // (rows[0].numel() * rows.element_size()))
     parts: dict[int, Estimate] = {}
 
     @torch.no_grad()
@@ -276,36 +278,16 @@ def _over_trials(
     return Estimate.joined([parts[first] for first in starts], trials)
 
 
-def _estimate(rows: Tensor, sampling: Sampling, found: Found, level: Tensor, assess: bool) -> Estimate:
+def _estimate(rows: Tensor, sampling: Sampling, found: Motion | Fit, level: Tensor, assess: bool) -> Estimate:
     """Estimate from a rotation or a joint fit of data that are divided by their level."""
-    motion, info = found.motion if isinstance(found, Fit) else found, {}
+    fit = isinstance(found, Fit)
+    motion = found.motion if fit else found
     motion = replace(motion, **{name: settle(getattr(motion, name), 0.0)[0] for name in ("k", "w", "v")})
-    value = values_of(motion.omega_rad_s, motion.k, motion.yc_m)
-    if isinstance(found, Fit):
-        info = {
-            "scatterers": found.scatterers.count,
-            "noise_power": found.noise * level.square(),
-            "steps": found.steps,
-        }
+    value, info = values_of(motion.omega_rad_s, motion.k, motion.yc_m), {}
+    if fit:
+        noise_power = found.noise * level.square()
+        info = {"scatterers": found.scatterers.count, "noise_power": noise_power, "steps": found.steps}
     if not assess:
         return Estimate(value, info=info)
-    fit = isinstance(found, Fit)
-    judged = judged_fit(rows, sampling, found) if fit else judged_motion(rows, sampling, motion)
-    return Estimate(value, judged.std, judged.quality, judged.outcome, {**judged.info, **info})
-
-
-def _check_counts(name: str, least: int, **counts: int) -> None:
-    """Raise ValueError unless numbers are integers of at least `least`."""
-    for what, count in counts.items():
-        if isinstance(count, bool) or not isinstance(count, int) or count < least:
-            raise ValueError(f"{name}: {what} must be a whole number of {least} or more, got {count!r}")
-
-
-def _centre(name: str, yc_m: Tensor, trials: torch.Size) -> Tensor:
-    """The range centre deviation known a priori for every trial, (trial,)."""
-    refuse_non_finite(yc_m, f"{name}: yc_m")
-    if yc_m.ndim and yc_m.shape != trials:
-        raise ValueError(
-            f"{name}: yc_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(yc_m.shape)}"
-        )
-    return yc_m.expand(trials).reshape(-1)
+    judged = judged_fit(rows, sampling, found, value) if fit else judged_motion(rows, sampling, motion, value)
+    return replace(judged, info={**judged.info, **info})

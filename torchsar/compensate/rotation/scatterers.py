@@ -25,45 +25,28 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchsar.compensate.pulse_phase.data import or_one
 from torchsar.compensate.rotation.couplings import Neighbours, inner_products
 from torchsar.compensate.rotation.histories import inverted
-from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, chosen, each, image_of
+from torchsar.compensate.rotation.motion import Motion, Sampling, chosen, each, image_of, warped_time
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.compensate.rotation.range_response import Envelopes, envelopes
 from torchsar.core import power_of, real_dtype, reduced_turns, settle
 from torchsar.core.warp import least_rate
 
 _OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
-# a new scatterer has at least this share of the largest amplitude within so many lines and range
-# cells, found by trial: side lobes are excluded until their scatterer is subtracted
-_SHARE, _LINES, _CELLS = 0.5, 24, 2
 MOST, ROUNDS = 800, 12  # largest number of scatterers, number of steps; accuracy against time
-_FEWEST = 128  # default number of scatterers on small data, found by trial
-# samples of the data per scatterer, so that a fit costs as much as about thirty images
-_SAMPLES_EACH = 1000
 # rounds that search for further scatterers, and the share of their number up to which they do: the
 # brightest alone bring the motion near, and the rounds between let it converge
 _SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
 _SEARCHED = max(_SEARCHES)
-_BLOCK_BYTES = 1 << 19  # phasors of a block of pulses that fit into the cache
-_GROUP = 16  # pulses over which the phase of an echo changes by a few turns
-_APART = 0.5  # Doppler and range cells within which scatterers are not resolved
-_BRIGHT = 0.1  # share of the largest amplitude from which a scatterer limits a step, found by trial
+# phasors of a block of pulses that fit into the cache; pulses over which the phase of an echo
+# changes by a few turns
+_BLOCK_BYTES, _GROUP = 1 << 19, 16
 _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
-_RIDGE = 1e-9  # added to the diagonal, relative: above the rounding of a matrix of float64
-_ALIKE = 1e-6  # share of the energy of an echo by which the two range responses have to differ
-_LEAST_RATE = 0.05  # least rate over that at the start; slower motions would nearly reverse
-# standard deviations by which the phase of a scatterer may differ before it loses weight, found by
-# trial
-_AGREES = 5.0
-# power of errors of the model over that of the brightest scatterer, found by trial: weaker noise
-# does not limit the fit, and residuals below it are no scatterers and no evidence against one
-_MODEL = 1e-4
 # least share of the energy above the noise that the scatterers explain, found by trial: a lower
 # share accepts wrong focus, a higher one rejects targets of many faint scatterers
 LEAST_EXPLAINED = 0.5
-_LOOK = 2  # rounds after which an accelerator is asked whether all trials have ended
-_SETTLED = 0.2  # steps of the motion below this share of its standard deviation end a trial
 
 
 @dataclass(frozen=True)
@@ -86,7 +69,7 @@ class Scatterers:
         return (self.amplitude != 0).sum(-1)
 
     def apart(self) -> Scatterers:
-        """Remove scatterers that lie within the resolution of a brighter one.
+        """Remove scatterers within half a Doppler cell and half a range cell of a brighter one.
 
         The amplitudes of two unresolved scatterers would grow without limit, with opposite phases,
         and bias the rotation.
@@ -95,8 +78,8 @@ class Scatterers:
             The scatterers, with zero amplitude for those removed.
         """
         level = self.amplitude.abs()
-        near = ((self.cell[:, :, None] - self.cell[:, None]).abs() < _APART) & (
-            (self.row[:, :, None] - self.row[:, None]).abs() < _APART
+        near = ((self.cell[:, :, None] - self.cell[:, None]).abs() < 0.5) & (
+            (self.row[:, :, None] - self.row[:, None]).abs() < 0.5
         )
         beside = (near & (level[:, None] > level[:, :, None])).any(-1)
         return replace(self, amplitude=torch.where(beside, 0, self.amplitude))
@@ -127,11 +110,6 @@ class Fit:
     steps: Tensor
     settled: Tensor
     change: Tensor
-
-    @property
-    def free_centre(self) -> bool:
-        """True if the range of the rotation centre is estimated."""
-        return self.change.shape[-1] > self.motion.k.shape[-1] + 1
 
     def replaced(self, at: Tensor, other: Fit) -> Fit:
         """Replace trials by those of another fit.
@@ -179,7 +157,8 @@ def usual_count(sampling: Sampling) -> int:
     Returns:
         The number, within 128..800.
     """
-    return min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH))
+    # a fit then costs as much as about thirty images
+    return min(MOST, max(128, sampling.pulses * sampling.cells // 1000))
 
 
 def fit_scatterers(
@@ -238,7 +217,7 @@ def fit_scatterers(
             used = each(lambda x, width=near.shape[1]: x[:, :width], found)
             fit = replace(fit, scatterers=used, noise=noise)
         # no trial settles before the search is over; an accelerator should not wait in every round
-        looks = iteration > _SEARCHED and (device.type == "cpu" or iteration % _LOOK == 0)
+        looks = iteration > _SEARCHED and (device.type == "cpu" or iteration % 2 == 0)
         if iteration == rounds or (looks and bool(fit.settled.all())):
             break
         residual, step = Step.of(data, sampling, fit, near, count)
@@ -249,10 +228,15 @@ def _new_scatterers(image: Tensor, floor: Tensor, pulses: int, fit: Fit, bound: 
     """Scatterers that clearly exceed the residual: up to `bound` per trial, with the known ones."""
     power = power_of(image)
     least = (floor * threshold(power[0].numel())).to(power.dtype)
-    peaks = find_peaks(power, least, bound, _SHARE, _LINES, _CELLS).first(bound - fit.scatterers.count)
+    # of at least half of the largest amplitude within 24 lines and 2 range cells, found by trial:
+    # side lobes are excluded until their scatterer is subtracted
+    peaks = find_peaks(power, least, bound, 0.5, 24, 2)
+    wanted = torch.arange(peaks.power.shape[-1], device=power.device) < (bound - fit.scatterers.count)[:, None]
     value = torch.gather(image.flatten(1), 1, peaks.line * image.shape[2] + peaks.cell).to(torch.complex128)
     cell = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING
-    return Scatterers(torch.where(peaks.power > 0, value / math.sqrt(pulses), 0), cell, peaks.cell.to(torch.float64))
+    return Scatterers(
+        torch.where(wanted & (peaks.power > 0), value / math.sqrt(pulses), 0), cell, peaks.cell.to(torch.float64)
+    )
 
 
 def _noise(power: Tensor, sampling: Sampling, fit: Fit, present: Tensor) -> tuple[Tensor, Tensor]:
@@ -264,8 +248,10 @@ def _noise(power: Tensor, sampling: Sampling, fit: Fit, present: Tensor) -> tupl
     brightest = torch.cat(
         [fit.scatterers.amplitude.abs().square(), power.flatten(1).amax(-1, keepdim=True) / sampling.pulses], -1
     )
-    # of a pixel; missing pulses add no noise
-    floor = torch.maximum(noise_power(power).double(), _MODEL * brightest.amax(-1))
+    # Of a pixel; missing pulses add no noise. Errors of the model have 1e-4 of the power of the
+    # brightest scatterer, found by trial: weaker noise does not limit the fit, and residuals below
+    # it are no scatterers and no evidence against one.
+    floor = torch.maximum(noise_power(power).double(), 1e-4 * brightest.amax(-1))
     return floor, torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
 
 
@@ -363,12 +349,12 @@ class Step:
             The residual, shape (trial, pulse, range), and the gradient and curvature for the step.
         """
         motion, found, present = fit.motion, fit.scatterers, (data != 0).any(-1)
-        warped = Warped.of(motion.k, sampling.times(data.device), sampling.duration_s)
-        square = sampling.turns_per_square * warped.phi.square()
-        rows = [torch.ones_like(warped.u), warped.u, *warped.slopes.unbind(1), 2 * math.pi * square]
+        phi, u, slopes = warped_time(motion.k, sampling.times(data.device), sampling.duration_s)
+        square = 1 / sampling.wavelength_m * phi.square()
+        rows = [torch.ones_like(u), u, *slopes.unbind(1), 2 * math.pi * square]
         bases = torch.stack(rows, 1) * present[:, None]
         range_m = sampling.range_m(found.row)
-        turns = torch.stack([warped.u, -square], -1)
+        turns = torch.stack([u, -square], -1)
         right = torch.stack([found.cell, motion.w[:, None] * range_m + motion.offset[:, None]], -2)
         around = envelopes(fit.response, found.row, sampling.cells)
         weighted = (found.amplitude[..., None] * around.value).conj().to(data.dtype).resolve_conj()
@@ -412,7 +398,11 @@ class Step:
         change, inverse, lost = reduced.solved()
         change = change * self._within_reach(reduced.joint, change)
         if late:
-            change = change * _without_reversal(old.change, change, reduced.curvature.sum(1))
+            # Steps that go back a part of the last one would go back and forth, since the curvature
+            # is an approximation. The factor, at least a half, ends a geometric sequence of steps.
+            curvature = reduced.curvature.sum(1)
+            size, back = (torch.einsum("bi,bij,bj->b", old.change, curvature, x) for x in (old.change, change))
+            change = change / (1 - (back / or_one(size)).nan_to_num(0.0).clamp(-1, 0))[:, None]
         own = reduced.joint[..., -1] - (reduced.joint[..., :-1] @ change[..., None])[..., 0]
         grow, turn, line, row = own.unflatten(-1, (4, -1)).unbind(-2)
         moved = Scatterers(
@@ -422,10 +412,11 @@ class Step:
         )
         motion = old.motion.moved(change)
         valid = torch.isfinite(change).all(-1) & motion.possible(sampling)
-        valid = valid & (least_rate(motion.k, sampling.duration_s) > _LEAST_RATE)
+        # slower motions would nearly reverse
+        valid = valid & (least_rate(motion.k, sampling.duration_s) > 0.05)
         std = (inverse.diagonal(dim1=-2, dim2=-1).clamp_min(0) / 2).sqrt() * noise.sqrt()[:, None]
         std = torch.where(lost, math.inf, std).clamp_min(torch.finfo(torch.float64).tiny)
-        small = (change.abs() / std).amax(-1) <= _SETTLED
+        small = (change.abs() / std).amax(-1) <= 0.2
         new = Fit(motion, moved.apart(), self._changed_response(), noise, old.steps, old.settled, change)
         # where the step is not possible, the fit stays; trials that have ended are not counted on
         new = replace(chosen(valid, new, old), noise=noise, change=torch.where(valid[:, None], change, math.inf))
@@ -478,14 +469,18 @@ class Step:
         size = torch.where(power > 0, 2 * size / self.fit.noise[:, None], torch.nan)
         # errors that all scatterers share, as those of pulse phases, must not favour weak ones
         usual = (size.nanmedian(-1, keepdim=True).values / curved.shape[-1]).nan_to_num(1.0).clamp_min(1)
-        return 1 / (1 + (size / (usual * _AGREES**2)).nan_to_num(0.0))
+        # a phase may differ by 5 standard deviations before it loses weight, found by trial
+        return 1 / (1 + (size / (usual * 5.0**2)).nan_to_num(0.0))
 
     def _within_reach(self, joint: Tensor, change: Tensor) -> Tensor:
-        """Factor (trial, 1) of a change that limits the Doppler by which it moves scatterers."""
+        """Factor (trial, 1) of a change that limits the Doppler by which it moves scatterers.
+
+        Those of a tenth of the largest amplitude or more count, found by trial.
+        """
         line = (joint[..., :-1] @ change[..., None])[..., 0].unflatten(-1, (4, -1))[:, 2].abs()
         level = self.fit.scatterers.amplitude.abs()
-        bright = level > _BRIGHT * level.amax(-1, keepdim=True)
-        return (_STEP / _or_one(torch.where(bright, line, 0).amax(-1, keepdim=True))).clamp_max(1)
+        bright = level > 0.1 * level.amax(-1, keepdim=True)
+        return (_STEP / or_one(torch.where(bright, line, 0).amax(-1, keepdim=True))).clamp_max(1)
 
     def _local(self) -> Tensor:
         """Gauss-Newton curvature of the scatterers' unknowns, (trial, 4 scatterer, 4 scatterer).
@@ -504,8 +499,9 @@ class Step:
         ]
         local = self.near.matrix(rows)
         diagonal = local.diagonal(dim1=-2, dim2=-1)
-        # zero without a scatterer, or with one range cell, which does not determine range
-        diagonal += torch.where(diagonal > 0, _RIDGE * diagonal, 1.0)
+        # above the rounding of float64; zero without a scatterer, or with one range cell, which
+        # does not determine range
+        diagonal += torch.where(diagonal > 0, 1e-9 * diagonal, 1.0)
         return local
 
     @cached_property
@@ -523,10 +519,11 @@ class Step:
         """Fit the share of the periodic range response to the residual by least squares.
 
         Both responses are the same where scatterers lie in the middle of their cells, as all do
-        after the first search: the share then stays as it is, instead of following rounding.
+        after the first search: the share then stays as it is, instead of following rounding. They
+        have to differ by 1e-6 of the energy of an echo.
         """
         apart = self.near.over_range(self.envelopes.difference, self.envelopes.difference)
-        energy = (self.products[(0, 0)] * (apart + _ALIKE * self._overlaps[0])).real[:, None]
+        energy = (self.products[(0, 0)] * (apart + 1e-6 * self._overlaps[0])).real[:, None]
         change = torch.nan_to_num(self.share / self.near.per_scatterer(energy).sum((-2, -1)), 0.0, 0.0, 0.0)
         return (self.fit.response + change).clamp(0, 1)
 
@@ -566,16 +563,6 @@ class Step:
         return slopes
 
 
-def _without_reversal(last: Tensor, change: Tensor, normal: Tensor) -> Tensor:
-    """Factor (trial, 1) of a step that goes back a part of the last one.
-
-    Such steps would go back and forth, since the curvature is an approximation. The factor is that
-    which ends a geometric sequence of steps, at least a half.
-    """
-    size, back = (torch.einsum("bi,bij,bj->b", last, normal, x) for x in (last, change))
-    return 1 / (1 - (back / _or_one(size)).nan_to_num(0.0).clamp(-1, 0))[:, None]
-
-
 def _solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:
     """Solve equations of the scatterers' unknowns, for right-hand sides (trial, 4 scatterer, n).
 
@@ -591,8 +578,3 @@ def _solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:
         return torch.where((info != 0)[:, None, None], alone.flatten(1, 2), joint)
 
     return solve
-
-
-def _or_one(x: Tensor) -> Tensor:
-    """Values that are positive, and 1 in place of the others."""
-    return torch.where(x > 0, x, 1)

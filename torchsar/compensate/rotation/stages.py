@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -25,11 +26,6 @@ from torchsar.focus.matched_fourier import MatchedFourierOperator, range_phase
 from torchsar.focus.transforms import Gridding
 from torchsar.radar import InverseRadar
 
-# of the entropy fixed point: the relaxation of `autofocus`, and the last floor of
-# `entropy_fixed_point`
-_FLOOR, _RELAXATION = 2.0, 1.8
-_SEARCH_TOLERANCE_RAD, _TOLERANCE_RAD = 0.01, 1e-3
-
 
 class _Rotation(Stage):
     """An estimator of the rotation; a connected yc_m takes precedence over its own.
@@ -43,14 +39,12 @@ class _Rotation(Stage):
         order: int,
         yc_m: float | None,
         find: Callable[..., Estimate],
-        assess: bool,
         **options: Any,
     ) -> None:
         super().__init__()
         if order < 1:
             raise ValueError(f"order of the rotation must be 1 (uniform rotation) or more, got {order}")
         self.radar, self.order, self.yc_m, self.find, self.options = radar, order, yc_m, find, options
-        self.assess = assess
         self.provides = ("omega_rad_s", "warp_k", "yc_m", *(k_name(i) for i in range(1, order)))
         self.neutral = uniform_rotation(radar, self.provides, yc_m)
 
@@ -72,7 +66,6 @@ class _Rotation(Stage):
             range_m=signal.axis("range").values(torch.device("cpu")),  # only their spacing is read, by the host
             order=self.order,
             yc_m=self.yc_m if yc_m is None else yc_m,
-            assess=self.assess,
             **self.options,
         )
 
@@ -275,17 +268,14 @@ def rotating_autofocus(
             warp_k, pulses.n, prf_hz, dtype=data.dtype, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS)
         )
     )
-    runs = [
-        Run(LogAbove(_FLOOR), through, search, _RELAXATION, _SEARCH_TOLERANCE_RAD),
-        Run(Wiener(), through, polish, 1.0, _TOLERANCE_RAD),
-    ]
-    again = Run(Wiener(), through, 6, 1.0, _TOLERANCE_RAD)
+    # the last floor of `entropy_fixed_point` and the relaxation of `autofocus`
+    runs = [Run(LogAbove(2.0), through, search, 1.8, 0.01), Run(Wiener(), through, polish, 1.0, 1e-3)]
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:
         return in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
 
     def continued(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
-        return fixed_point(rows, at, again)[0]
+        return fixed_point(rows, at, replace(runs[1], iterations=6))[0]
 
     with torch.no_grad():
         begin = starting_phase(start, pulses, "rotating_autofocus")

@@ -109,8 +109,8 @@ class Unknowns:
         finite = torch.isfinite(x).all(-1)
         k = torch.where(finite[..., None], k, 0)
         if self.variables == "shape":
-            # the warp grows at the first pulse if 1 + sum q_j P_j'(-1) > 0, with P_j'(-1) = -(-1)^j j (j + 1) / 2;
-            # k, which is relative to the rate there, would be infinite below 1e-6
+            # the warp grows at the first pulse if 1 + sum q_j P_j'(-1) > 0, with
+            # P_j'(-1) = -(-1)^j j (j + 1) / 2; below 1e-6, k, relative to that, would be infinite
             j = torch.arange(2, k.shape[-1] + 2, dtype=k.dtype, device=k.device)
             slope = torch.where(j.remainder(2) == 0, -0.5, 0.5) * j * (j + 1)
             grows = 1 + (k * slope).sum(-1) > 1e-6
