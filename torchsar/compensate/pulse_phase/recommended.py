@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 import torch
@@ -41,9 +40,6 @@ Scene = Literal["sparse", "points", "clutter", "auto"]
 # floor of the entropy fixed point in mean powers, found by trial: a lower floor includes noise, a
 # higher one excludes weak scatterers
 _FLOOR = 2.5
-# floor of the first iterations where noise is weak, and their number: without them one scene of two
-# hundred ended in a wrong minimum
-_FIRST_FLOOR, _FIRST_ITERATIONS = 5.0, 6
 # on scenes at 30 dB, 3 of 32 trials of the entropy fixed point ended in a local minimum without
 # over-relaxation and none with this one
 _RELAXATION = 1.8
@@ -162,13 +158,15 @@ def autofocus(
         return Run(Wiener(), imaging, count, factors, tolerance_rad)
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:
-        first = Run(
-            LogAbove(_first_floor(rows)),
-            AlongPulses(),
-            min(search, _FIRST_ITERATIONS),
-            _RELAXATION,
-            search_tolerance_rad,
-        )
+        # Noise is weak where less than half of the range cells hold the energy. A low floor of the
+        # first iterations then ends in a wrong minimum in one scene of two hundred; in strong
+        # noise, a high floor hides the target.
+        energy = power_of(rows.detach()).sum(-1)
+        tiny = torch.finfo(energy.dtype).tiny
+        share = energy / energy.sum(-1, keepdim=True).clamp_min(tiny)
+        filled = 1 / share.square().sum(-1).clamp_min(tiny) / rows.shape[-2]
+        floor = torch.where(filled < 0.5, 5.0, _FLOOR)[:, None, None].to(energy.dtype)
+        first = Run(LogAbove(floor), AlongPulses(), min(search, 6), _RELAXATION, search_tolerance_rad)
         begin = pair_phase(rows, present) if begin is None else begin
         phase, taken = in_turn(rows, begin, [first, iterations(AlongPulses())])
         explained = torch.zeros_like(present[:, 0])
@@ -177,9 +175,9 @@ def autofocus(
         phase, more = fixed_point(rows, phase, polishing(AlongPulses(2)))
         if through is None:
             phase = torch.where(explained[:, None], points, phase) if of_points else phase
-            filled = have_gaps(present) & ~explained & (polish > 0)
-            return _filled(rows, phase, phase, filled, _FILLING * polish, tolerance_rad / 10), taken + more
-        phase, last = _WithSlope(through, [iterations(through), polishing(through)])(rows, phase)
+            gaps = have_gaps(present) & ~explained & (polish > 0)
+            return _filled(rows, phase, phase, gaps, _FILLING * polish, tolerance_rad / 10), taken + more
+        phase, last = _with_slope(through, [iterations(through), polishing(through)], rows, phase)
         return phase, taken + more + last
 
     def again(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
@@ -232,48 +230,28 @@ def _with_linked(pulses: Pulses, sharpest: Estimate, assess: bool) -> Estimate:
     )
 
 
-def _first_floor(rows: Tensor) -> Tensor:
-    """Floor of the first iterations, (trial, 1, 1).
-
-    It is higher where less than half of the range cells hold the energy, that is where noise is
-    weak. A low floor then ends in a wrong minimum in one scene of two hundred; in strong noise, a
-    high floor hides the target.
-    """
-    energy = power_of(rows.detach()).sum(-1)
-    share = energy / energy.sum(-1, keepdim=True).clamp_min(torch.finfo(energy.dtype).tiny)
-    filled = 1 / share.square().sum(-1).clamp_min(torch.finfo(energy.dtype).tiny) / rows.shape[-2]
-    return torch.where(filled < 0.5, _FIRST_FLOOR, _FLOOR)[:, None, None].to(energy.dtype)
-
-
-@dataclass(frozen=True)
-class _WithSlope:
+def _with_slope(through: Through, runs: list[Run], rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
     """Slope and phase with an image formation in which scatterers do not migrate.
 
     Finds the slope over one turn, the phase, the slope again, and the phase again.
     """
-
-    through: Through
-    runs: list[Run]
-
-    def __call__(self, rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
-        step = 2 * math.pi / _SLOPES
-        phase = self._best_slope(rows, phase, step, _SLOPES)
-        total = torch.zeros_like(phase[:, 0], dtype=torch.int64)
-        for _ in range(2):
-            phase = self._best_slope(rows, phase, step / 8, 17)
-            phase, taken = in_turn(rows, phase, self.runs)
-            total = total + taken
-        return self._best_slope(rows, self._best_slope(rows, phase, step / 8, 17), step / 64, 17), total
+    n = rows.shape[-1]
+    ramp = torch.arange(n, dtype=phase.dtype, device=phase.device) - (n - 1) / 2
 
     @torch.no_grad()
-    def _best_slope(self, rows: Tensor, phase: Tensor, step_rad: float, count: int) -> Tensor:
+    def best_slope(phase: Tensor, step_rad: float, count: int) -> Tensor:
         """The phase plus the slope, of `count` about its own, that gives the least entropy."""
-        n = rows.shape[-1]
-        ramp = torch.arange(n, dtype=phase.dtype, device=phase.device) - (n - 1) / 2
         best, least = phase, torch.full_like(phase[:, 0], torch.inf)
         for index in range(count):
             candidate = phase + (index - count // 2) * step_rad * ramp
-            cost = entropy(self.through.image(rotate(rows, candidate)))
+            cost = entropy(through.image(rotate(rows, candidate)))
             better = cost < least
             best, least = torch.where(better[:, None], candidate, best), torch.where(better, cost, least)
         return best
+
+    step = 2 * math.pi / _SLOPES
+    phase, total = best_slope(phase, step, _SLOPES), torch.zeros_like(phase[:, 0], dtype=torch.int64)
+    for _ in range(2):
+        phase, taken = in_turn(rows, best_slope(phase, step / 8, 17), runs)
+        total = total + taken
+    return best_slope(best_slope(phase, step / 8, 17), step / 64, 17), total

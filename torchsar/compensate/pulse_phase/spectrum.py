@@ -7,9 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-# details within so many standard deviations are taken for noise: among thousands of details about
-# one exceeds it by chance
-_THRESHOLD = 3.3
 _WINDOW = 4  # half width of the Hann window in bins
 
 
@@ -38,7 +35,8 @@ def smoothed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
         detail = (mean - shifted) / 2
         # neighbouring bins of the padded transform are not independent: two count as one
         std = scatter / math.sqrt(2 * max(1.0, 2 ** (level - 1)))
-        details.append(torch.where(detail.abs() > _THRESHOLD * std, detail, 0))
+        # among thousands of details about one exceeds 3.3 by chance
+        details.append(torch.where(detail.abs() > 3.3 * std, detail, 0))
         mean = (mean + shifted) / 2
     for level, detail in reversed(list(enumerate(details))):
         mean = (mean + detail + (mean - detail).roll(-(2**level), -1)) / 2
