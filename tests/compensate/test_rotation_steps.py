@@ -26,9 +26,15 @@ from tests.compensate.turning import (
 )
 from tests.direct.turntable import Turntable
 from torchsar.compensate.rotation.couplings import Neighbours, inner_products
-from torchsar.compensate.rotation.histories import histories_of, inverted, refined_by_histories
+from torchsar.compensate.rotation.histories import (
+    find_peaks,
+    histories_of,
+    inverted,
+    noise_power,
+    refined_by_histories,
+    threshold,
+)
 from torchsar.compensate.rotation.motion import Motion, Sampling, image_of, warped_time, without_range_term
-from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.compensate.rotation.scatterers import Fit, Scatterers, Step, _solver
 from torchsar.core.warp import warp
 

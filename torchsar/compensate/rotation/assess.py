@@ -24,9 +24,8 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.couplings import Neighbours
-from torchsar.compensate.rotation.histories import Histories, histories_of, refined_by_histories
+from torchsar.compensate.rotation.histories import Histories, histories_of, refined_by_histories, threshold
 from torchsar.compensate.rotation.motion import Motion, Sampling, image_of, warped_time
-from torchsar.compensate.rotation.peaks import threshold
 from torchsar.compensate.rotation.scatterers import LEAST_EXPLAINED, Fit, Scatterers, Step, explained_share
 from torchsar.compensate.rotation.unknowns import k_name
 from torchsar.core import Estimate, Outcome, worst

@@ -8,6 +8,7 @@ from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchsar.compensate.pulse_phase.data import refuse_odd_counts
 from torchsar.compensate.rotation.assess import judged_fit, judged_motion
@@ -21,7 +22,6 @@ from torchsar.compensate.rotation.scatterers import (
     Fit,
     explained_share,
     fit_scatterers,
-    usual_count,
 )
 from torchsar.compensate.rotation.unknowns import values_of
 from torchsar.core import (
@@ -110,16 +110,22 @@ def uneven_rotation(
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Fit:
         options = {"free_centre": known is None}
         motion = refined_by_histories(rows, sampling, _start(order, rows, sampling, known), **options)
-        fit = fit_scatterers(rows, sampling, motion, **options, count=scatterers, rounds=rounds)
+        # a fit of one scatterer for 1000 samples costs as much as about thirty images
+        count = min(MOST, max(128, sampling.pulses * sampling.cells // 1000)) if scatterers is None else scatterers
+        fit = fit_scatterers(rows, sampling, motion, **options, count=count, rounds=rounds)
         if scatterers is None:
             # many more scatterers than usual leave most of the energy unexplained
-            count = usual_count(sampling)
             poor = explained_share(rows, fit)[0] < LEAST_EXPLAINED
             at = (poor & (2 * fit.scatterers.count > count)).nonzero()[:, 0]
             if len(at):
                 start, count = each(lambda x: x[at], fit.motion), min(MOST, 2 * count)
                 again = fit_scatterers(rows[at], sampling, start, **options, count=count, rounds=rounds)
-                fit = fit.replaced(at, again)
+                width = max(x.scatterers.cell.shape[-1] for x in (fit, again))
+                wide = [
+                    replace(x, scatterers=each(lambda y: pad(y, (0, width - y.shape[-1])), x.scatterers))
+                    for x in (fit, again)
+                ]
+                fit = each(lambda x, y: x.index_copy(0, at, y), *wide)
         return fit
 
     return _over_trials("uneven_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
@@ -236,7 +242,7 @@ def _start(order: int, rows: Tensor, sampling: Sampling, known: Tensor | None) -
     if order == 2:
         k = k_of_shape(shape_of(k, sampling.duration_s)[:, :1], sampling.duration_s)
     zero = k.new_zeros(len(k))
-    return Motion(torch.nn.functional.pad(k, (0, max(0, order - 3))), zero, zero, zero if known is None else known)
+    return Motion(pad(k, (0, max(0, order - 3))), zero, zero, zero if known is None else known)
 
 
 def _over_trials(

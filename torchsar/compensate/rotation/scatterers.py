@@ -23,14 +23,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchsar.compensate.pulse_phase.data import or_one
-from torchsar.compensate.rotation.couplings import Neighbours, inner_products
-from torchsar.compensate.rotation.histories import inverted
+from torchsar.compensate.rotation.couplings import Envelopes, Neighbours, envelopes, inner_products
+from torchsar.compensate.rotation.histories import find_peaks, inverted, noise_power, threshold
 from torchsar.compensate.rotation.motion import Motion, Sampling, chosen, each, image_of, warped_time
-from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
-from torchsar.compensate.rotation.range_response import Envelopes, envelopes
 from torchsar.core import power_of, real_dtype, reduced_turns, settle
 from torchsar.core.warp import least_rate
 
@@ -111,23 +108,6 @@ class Fit:
     settled: Tensor
     change: Tensor
 
-    def replaced(self, at: Tensor, other: Fit) -> Fit:
-        """Replace trials by those of another fit.
-
-        Args:
-            at: Numbers of the trials, shape (n,).
-            other: Fit of these n trials.
-
-        Returns:
-            The fit of all trials.
-        """
-        width = max(fit.scatterers.cell.shape[-1] for fit in (self, other))
-        wide = [
-            replace(fit, scatterers=each(lambda x: pad(x, (0, width - x.shape[-1])), fit.scatterers))
-            for fit in (self, other)
-        ]
-        return each(lambda x, y: x.index_copy(0, at, y), *wide)
-
 
 def explained_share(data: Tensor, fit: Fit) -> tuple[Tensor, Tensor]:
     """Compute how much of the energy of the data a fit explains.
@@ -148,26 +128,13 @@ def explained_share(data: Tensor, fit: Fit) -> tuple[Tensor, Tensor]:
     return explained, 1 - (1 - explained) * above / whole
 
 
-def usual_count(sampling: Sampling) -> int:
-    """Compute the largest number of scatterers by default: one for every 1000 samples of a trial.
-
-    Args:
-        sampling: Sampling of the data.
-
-    Returns:
-        The number, within 128..800.
-    """
-    # a fit then costs as much as about thirty images
-    return min(MOST, max(128, sampling.pulses * sampling.cells // 1000))
-
-
 def fit_scatterers(
     data: Tensor,
     sampling: Sampling,
     start: Motion,
     *,
+    count: int,
     free_centre: bool = True,
-    count: int | None = None,
     rounds: int = ROUNDS,
 ) -> Fit:
     """Fit the rotation of a target and all its scatterers by maximum likelihood.
@@ -180,16 +147,14 @@ def fit_scatterers(
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
         start: Rotation to start from.
+        count: Largest number of scatterers.
         free_centre: True also estimates the range of the rotation centre; False keeps that of
             `start`.
-        count: Largest number of scatterers; by default one for every 1000 samples of a trial,
-            within 128..800.
         rounds: Largest number of steps.
 
     Returns:
         The fit: rotation, scatterers and noise power.
     """
-    count = usual_count(sampling) if count is None else count
     present, device = (data != 0).any(-1), data.device
     empty = start.k.new_zeros(len(data), 0)
     fit = Fit(
@@ -417,7 +382,13 @@ class Step:
         std = (inverse.diagonal(dim1=-2, dim2=-1).clamp_min(0) / 2).sqrt() * noise.sqrt()[:, None]
         std = torch.where(lost, math.inf, std).clamp_min(torch.finfo(torch.float64).tiny)
         small = (change.abs() / std).amax(-1) <= 0.2
-        new = Fit(motion, moved.apart(), self._changed_response(), noise, old.steps, old.settled, change)
+        # Least squares for the share of the periodic range response. Both responses are the same
+        # where scatterers lie in the middle of their cells, as all do after the first search: the
+        # share then stays as it is, instead of following rounding.
+        apart = self.near.over_range(self.envelopes.difference, self.envelopes.difference)
+        energy = (self.products[(0, 0)] * (apart + 1e-6 * self._overlaps[0])).real[:, None]
+        share = torch.nan_to_num(self.share / self.near.per_scatterer(energy).sum((-2, -1)), 0.0, 0.0, 0.0)
+        new = Fit(motion, moved.apart(), (old.response + share).clamp(0, 1), noise, old.steps, old.settled, change)
         # where the step is not possible, the fit stays; trials that have ended are not counted on
         new = replace(chosen(valid, new, old), noise=noise, change=torch.where(valid[:, None], change, math.inf))
         new = replace(new, steps=old.steps + 1, settled=valid & small & (iteration > _SEARCHED))
@@ -433,7 +404,15 @@ class Step:
         Returns:
             The equations of the rotation.
         """
-        slopes, solve = self._slopes(), _solver(self._local())
+        # coefficients of the bases in the phase per unit of each common unknown, (trial, scatterer,
+        # unknown, base)
+        motion, cell = self.fit.motion, self.fit.scatterers.cell
+        order, size = motion.k.shape[-1], self.fit.change.shape[-1]
+        slopes = cell.new_zeros(*cell.shape, size, order + 3)
+        slopes[..., :order, 2:-1] = -2 * math.pi * cell[..., None, None] * torch.eye(order, device=cell.device)
+        slopes[..., order, -1] = self.range_m + motion.centre_m[:, None]
+        slopes[..., order + 1 :, -1] = 1
+        solve = _solver(self._local())
         found = self._without_scatterers(slopes, solve)
         if not robust:
             return found
@@ -515,18 +494,6 @@ class Step:
         factors = ((value, value), (value, slope), (slope, value), (slope, slope))
         return tuple(self.near.over_range(*pair) for pair in factors)  # pyright: ignore[reportReturnType]
 
-    def _changed_response(self) -> Tensor:
-        """Fit the share of the periodic range response to the residual by least squares.
-
-        Both responses are the same where scatterers lie in the middle of their cells, as all do
-        after the first search: the share then stays as it is, instead of following rounding. They
-        have to differ by 1e-6 of the energy of an echo.
-        """
-        apart = self.near.over_range(self.envelopes.difference, self.envelopes.difference)
-        energy = (self.products[(0, 0)] * (apart + 1e-6 * self._overlaps[0])).real[:, None]
-        change = torch.nan_to_num(self.share / self.near.per_scatterer(energy).sum((-2, -1)), 0.0, 0.0, 0.0)
-        return (self.fit.response + change).clamp(0, 1)
-
     def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
         """Curvature between scatterers and common unknowns, and of the common unknowns.
 
@@ -548,19 +515,6 @@ class Step:
         ]
         shared = torch.stack([summed(base, torch.real) for base in bases], -1)
         return torch.cat(parts, 1), torch.einsum("bpin,bpjn->bpij", slopes[..., 2:], shared)
-
-    def _slopes(self) -> Tensor:
-        """Coefficients of the bases in the phase per unit of each common unknown.
-
-        (trial, scatterer, unknown, base).
-        """
-        motion, cell = self.fit.motion, self.fit.scatterers.cell
-        order, size = motion.k.shape[-1], self.fit.change.shape[-1]
-        slopes = cell.new_zeros(*cell.shape, size, order + 3)
-        slopes[..., :order, 2:-1] = -2 * math.pi * cell[..., None, None] * torch.eye(order, device=cell.device)
-        slopes[..., order, -1] = self.range_m + motion.centre_m[:, None]
-        slopes[..., order + 1 :, -1] = 1
-        return slopes
 
 
 def _solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:

@@ -105,7 +105,9 @@ class Unknowns:
         Returns:
             The rotation.
         """
-        size, k, yc = self._parts(x, yc_m)
+        first = 1 if self.range_term else 0
+        size, k = x[..., 0] if first else torch.zeros_like(x[..., 0]), x[..., first : first + self.order - 1]
+        yc = x[..., -1] if self.yc else yc_m.expand(x.shape[:-1])
         finite = torch.isfinite(x).all(-1)
         k = torch.where(finite[..., None], k, 0)
         if self.variables == "shape":
@@ -191,12 +193,6 @@ class Unknowns:
                 f"{x.shape[-1] if x.ndim else 1}"
             )
         return x
-
-    def _parts(self, x: Tensor, yc_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rate or angle, warp or shape, and range centre deviation of the unknowns."""
-        first = 1 if self.range_term else 0
-        size = x[..., 0] if self.range_term else torch.zeros_like(x[..., 0])
-        return size, x[..., first : first + self.order - 1], x[..., -1] if self.yc else yc_m.expand(x.shape[:-1])
 
     def _phi(self, k: Tensor) -> Tensor:
         """phi(T), (...,)."""
