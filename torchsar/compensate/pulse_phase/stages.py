@@ -13,12 +13,10 @@ from torch import Tensor, nn
 
 from torchsar.compensate.pulse_phase.data import on_the_circle, rotate
 from torchsar.compensate.pulse_phase.descent import sharpest_phase
-from torchsar.compensate.pulse_phase.fixed_point import entropy_fixed_point
-from torchsar.compensate.pulse_phase.gradient import Kernel, Listed, Measured, Shrinking, Windows, pga, pga_sca
+from torchsar.compensate.pulse_phase.gradient import Kernel, Listed, Measured, Shrinking, Windows, pga, pga_sca, sca
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.compensate.pulse_phase.linking import link_phases
-from torchsar.compensate.pulse_phase.recommended import Scene, autofocus
-from torchsar.compensate.pulse_phase.sca import sca
+from torchsar.compensate.pulse_phase.recommended import Scene, autofocus, entropy_fixed_point
 from torchsar.core import Estimate, Signal, Stage, checked_samples, real_dtype, refuse_non_finite
 from torchsar.focus import TargetImage
 from torchsar.radar import FarField, InverseRadar, Spotlight

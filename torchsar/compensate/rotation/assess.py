@@ -25,9 +25,9 @@ from torch import Tensor
 
 from torchsar.compensate.rotation.couplings import Neighbours
 from torchsar.compensate.rotation.histories import Histories, histories_of, refined_by_histories, threshold
+from torchsar.compensate.rotation.image_entropy import k_name
 from torchsar.compensate.rotation.motion import Motion, Sampling, image_of, warped_time
-from torchsar.compensate.rotation.scatterers import LEAST_EXPLAINED, Fit, Scatterers, Step, explained_share
-from torchsar.compensate.rotation.unknowns import k_name
+from torchsar.compensate.rotation.scatterers import LEAST_EXPLAINED, Fit, Scatterers, Step, explained_share, solved
 from torchsar.core import Estimate, Outcome, worst
 from torchsar.metrics import entropy
 
@@ -100,16 +100,17 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit, value: Mapping[str, T
     found, motion, order = fit.scatterers, fit.motion, fit.motion.k.shape[-1]
     explained, accounted = explained_share(rows, fit)
     near = replace(Neighbours.find(found.amplitude, found.cell), shape=found.cell.shape)
-    reduced = Step.of(rows, sampling, fit, near, found.amplitude.shape[-1])[1].reduced(robust=True)
-    change, inverse, lost = reduced.solved()
+    _, equations = Step.of(rows, sampling, fit, near, found.amplitude.shape[-1])
+    _, pull, curvature = equations.reduced(robust=True)
+    change, inverse, lost = solved(pull, curvature)
     tiny = torch.finfo(torch.float64).tiny
     covariance = inverse / 2 * fit.noise[:, None, None]
     predicted = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(tiny)
     # shares of the scatterers in what is known about each parameter, and what each asks for
     alike, power = _alike(found), found.amplitude.abs().square()
-    shares = torch.einsum("bpij,bin,bjn->bpn", reduced.curvature, inverse, inverse)
+    shares = torch.einsum("bpij,bin,bjn->bpn", curvature, inverse, inverse)
     shares = shares / shares.sum(1, keepdim=True).clamp_min(tiny)
-    own = (reduced.pull - torch.einsum("bpij,bj->bpi", reduced.curvature, change)) @ inverse
+    own = (pull - torch.einsum("bpij,bj->bpi", curvature, change)) @ inverse
     seen = (own * (alike @ own)).sum(1) / predicted
     number = 1 / (shares * (alike @ shares)).sum(1).clamp_min(tiny)
     wider = (number * seen + _FEW + number.clamp_max(predicted.shape[-1])) / (

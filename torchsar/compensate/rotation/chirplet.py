@@ -29,8 +29,9 @@ from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.radar import InverseRadar
 
-_PARTS = 4  # samples that a segment keeps in the fine search, found by trial: reach against time
-_PAD = 2  # zero-padding of the transforms: a peak between two bins loses little power
+# samples that a segment keeps in the fine search, found by trial: reach against time; zero-padding
+# of the transforms: a peak between two bins loses little power
+_PARTS, _PAD = 4, 2
 
 
 @names_arguments
@@ -116,7 +117,7 @@ def chirplet_clean(
     n, level = data.shape[-2], level_of(data.detach())
     rows = (data.detach() / level).mT.contiguous()
     time = torch.arange(n, dtype=torch.float64, device=rows.device) - (n - 1) / 2
-    energy, tones, found = _energy(rows), torch.zeros_like(rows), []
+    energy, tones, found = power_of(rows).sum((-2, -1)), torch.zeros_like(rows), []
     peak = torch.zeros(rows.shape[:-2], dtype=real_dtype(rows.dtype), device=rows.device)
     for _ in range(atoms):
         frequency, rate = _coarse(rows, time, sweep)
@@ -137,7 +138,7 @@ def chirplet_clean(
         frequency * prf_hz,
         rate * prf_hz**2,
         amplitude * level,
-        _energy(rows) / torch.where(energy > 0, energy, 1),
+        power_of(rows).sum((-2, -1)) / torch.where(energy > 0, energy, 1),
     )
 
 
@@ -215,11 +216,6 @@ def _vertex(values: Tensor, index: Tensor, circular: bool) -> Tensor:
     bend = left - 2 * middle + right
     inside = (bend < 0) & (circular | ((index > 0) & (index < n - 1)))
     return torch.where(inside, 0.5 * (left - right) / torch.where(bend < 0, bend, -1), 0).clamp(-0.5, 0.5)
-
-
-def _energy(rows: Tensor) -> Tensor:
-    """Energy of the rows of each trial."""
-    return power_of(rows).sum((-2, -1))
 
 
 class ChirpletClean(Stage):

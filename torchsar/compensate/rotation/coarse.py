@@ -29,7 +29,6 @@ _WIDEST = 1.4  # largest logarithm of a ratio of rates that is searched: a facto
 _GRID = 0.07  # step of the search, in logarithms of rates at the middle and the end of the aperture
 _KEPT = 6  # candidates of the grid that are refined, found by trial: reliability against time
 _ROUNDS = 10  # refinements, each of which halves the step: to 0.0001 of a rate
-_ROWS = 16  # range cells of most energy that are used, found by trial: accuracy against time
 _LEAST_RATE = 0.1  # least rate over that at the start; slower targets would nearly reverse
 
 
@@ -54,8 +53,9 @@ def coarse_warp(data: Tensor, prf_hz: float) -> Tensor:
         k1 in 1/s and k2 in 1/s^2, shape (trial, 2), float64.
     """
     pulses, rows = data.shape[1], data
-    if data.shape[-1] > _ROWS:
-        order = data.abs().square().sum(1).topk(_ROWS, -1).indices
+    # the range cells of most energy, found by trial: accuracy against time
+    if data.shape[-1] > 16:
+        order = data.abs().square().sum(1).topk(16, -1).indices
         rows = torch.gather(data, 2, order[:, None].expand(-1, pulses, -1))
     # found by trial: more sections follow the rate more closely, fewer resolve Doppler better
     wanted = min(28, max(8, round(math.sqrt(pulses) / 2)))

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -123,22 +122,7 @@ class Neighbours:
         return (first.conj() @ second.mT)[self.trial, self.first, self.second]
 
 
-class Envelopes(NamedTuple):
-    """Range responses to scatterers.
-
-    Args:
-        value: Response in each range cell, of unit peak, shape (trial, scatterer, range),
-            complex128.
-        slope: Its derivative with respect to the range of the scatterer in cells, same shape.
-        difference: Its derivative with respect to the share of the periodic response, same shape.
-    """
-
-    value: Tensor
-    slope: Tensor
-    difference: Tensor
-
-
-def envelopes(share: Tensor, row: Tensor, cells: int) -> Envelopes:
+def envelopes(share: Tensor, row: Tensor, cells: int) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the responses to scatterers in all range cells.
 
     Args:
@@ -148,7 +132,9 @@ def envelopes(share: Tensor, row: Tensor, cells: int) -> Envelopes:
         cells: Number of range cells of the window.
 
     Returns:
-        The responses.
+        The response in each range cell, of unit peak, its derivative with respect to the range of
+        the scatterer in cells, and that with respect to the share; shape (trial, scatterer, range)
+        each, complex128.
     """
     cell = torch.arange(cells, dtype=row.dtype, device=row.device)
     x = cell - row[..., None]
@@ -161,9 +147,8 @@ def envelopes(share: Tensor, row: Tensor, cells: int) -> Envelopes:
     periodic = phasor @ lines
     difference = periodic - sinc
     weight = share[:, None, None]
-    return Envelopes(
-        sinc + weight * difference, slope + weight * ((phasor * (-1j * frequency)) @ lines - slope), difference
-    )
+    of_periodic = (phasor * (-1j * frequency)) @ lines
+    return sinc + weight * difference, slope + weight * (of_periodic - slope), difference
 
 
 def inner_products(

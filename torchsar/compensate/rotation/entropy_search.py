@@ -14,20 +14,21 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.assess import judged_motion
-from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
+from torchsar.compensate.rotation.image_entropy import (
+    EntropyObjective,
+    ImageEntropy,
+    Variables,
+    k_name,
+    uniform_rotation,
+    values_of,
+)
 from torchsar.compensate.rotation.motion import Motion, each
-from torchsar.compensate.rotation.unknowns import Variables, k_name, uniform_rotation, values_of
 from torchsar.core import Draws, Estimate, Outcome, Signal, Stage, worst
 from torchsar.optim import Descent, Searched, differential_evolution, genetic, grid_search, lbfgs, newton
 from torchsar.radar import InverseRadar
 
 Vector = Sequence[float] | Tensor
 
-# share of the width of a box from its edge within which a minimum is taken to lie outside, a
-# convention
-_EDGE = 1e-3
-# relative change of the entropy at which a descent ends, near its rounding
-_ROUNDING = {torch.complex64: 1e-8, torch.complex128: 1e-9}
 # what the stages minimise by default: the published unknowns; a more accurate transform for
 # Newton's method, which needs second derivatives; unknowns with uncorrelated errors for a descent
 _PUBLISHED, _FOR_NEWTON, _FOR_DESCENT = (
@@ -219,7 +220,7 @@ def descend_rotation(
         steps=steps,
         first_step=0.3,  # in units of the unknowns, of about a radian each
         gradient_tolerance=tolerance,
-        value_tolerance=_ROUNDING[figure.dtype],
+        value_tolerance=1e-8 if figure.dtype == torch.complex64 else 1e-9,  # near the rounding of the entropy
         with_gradient=True,
     )
     # its own verdict also reports infeasible candidates on its path
@@ -299,7 +300,8 @@ def _in_box(
 def _of_box(figure: ImageEntropy, found: Searched, low: Tensor, high: Tensor, assess: bool, **info: Tensor) -> Estimate:
     """Estimate from a search in a box."""
     width = high - low
-    edge = (torch.minimum(found.x - low, high - found.x) <= _EDGE * width) & (width > 0)
+    # a minimum so near the edge is taken to lie outside, a convention
+    edge = (torch.minimum(found.x - low, high - found.x) <= 1e-3 * width) & (width > 0)
     doubts = worst((Outcome.NOT_CONVERGED, ~found.ok), (Outcome.OUTSIDE_SEARCH, edge.any(-1)))
     info |= {"evaluations": found.evaluations, "on_edge": edge}
     return _estimate(figure, found.x, found.cost, doubts, info, assess)

@@ -1,9 +1,9 @@
 """Bright scatterers, and refinement of an estimated rotation from their phase histories.
 
 Scatterers are local maxima of an image above the noise and above the side lobes of their
-neighbours. The history of a scatterer is its signal over the aperture. It is cut out of the image by a window
-about the scatterer and transformed back to slow time. If the rotation is estimated without error,
-the phase of the history is a straight line. Errors add a curved phase:
+neighbours. The history of a scatterer is its signal over the aperture. It is cut out of the image
+by a window about the scatterer and transformed back to slow time. If the rotation is estimated
+without error, the phase of the history is a straight line. Errors add a curved phase:
 
 - an error dk of a relative derivative k of the rotation rate adds -2 pi c (du/dk) dk, where c is
 the Doppler cell of the scatterer. The warped time phi is the rotation angle over the rate at the
@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -33,24 +32,8 @@ from torchsar.compensate.rotation.motion import Motion, Sampling, chosen, image_
 from torchsar.core import cis
 from torchsar.core.warp import warp, warp_rate
 
-_OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
+OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
 HALF_CELLS = 24  # half width of a window in Doppler cells
-
-
-@dataclass(frozen=True)
-class Peaks:
-    """Peaks of an image, brightest first.
-
-    Args:
-        power: Power, shape (trial, peak); 0 in the places that a trial with fewer peaks does not
-            fill.
-        line: Image line, shape (trial, peak), int64.
-        cell: Range cell, shape (trial, peak), int64.
-    """
-
-    power: Tensor
-    line: Tensor
-    cell: Tensor
 
 
 def noise_power(power: Tensor) -> Tensor:
@@ -81,7 +64,9 @@ def threshold(pixels: int) -> float:
     return math.log(pixels) + 2.5
 
 
-def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: int, cells: int) -> Peaks:
+def find_peaks(
+    power: Tensor, floor: Tensor, count: int, share: float, lines: int, cells: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """Find local maxima of an image above the noise.
 
     A maximum that is weak compared with the brightest pixel near it is left out, because it may be
@@ -98,7 +83,8 @@ def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: in
         cells: Half width of the neighbourhood in range cells.
 
     Returns:
-        The peaks.
+        Power of the peaks, brightest first, 0 in the places that a trial with fewer peaks does not
+        fill; their image lines, int64; and their range cells, int64; shape (trial, peak) each.
     """
     n_line, n_cell = power.shape[1:]
     along, across = pad(power, (0, 0, 1, 1)), pad(power, (1, 1, 0, 0))
@@ -120,7 +106,7 @@ def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: in
     around = torch.where(inside, near, 0).amax(-1)
     kept = torch.where((level > 0) & (level >= share**2 * around), level, 0)
     found, order = kept.topk(min(count, kept.shape[-1]), -1)
-    return Peaks(found, torch.gather(line, 1, order), torch.gather(cell, 1, order))
+    return found, torch.gather(line, 1, order), torch.gather(cell, 1, order)
 
 
 class Histories(NamedTuple):
@@ -187,7 +173,7 @@ def histories_of(
     Returns:
         The histories and the change of the rotation.
     """
-    image = image_of(data, sampling, motion, oversampling=_OVERSAMPLING)
+    image = image_of(data, sampling, motion, oversampling=OVERSAMPLING)
     power = image.abs().square()
     least = threshold(power[0].numel())
     # Lines whose Doppler the pulse rate resolves at every time. The fastest rotation limits
@@ -195,18 +181,18 @@ def histories_of(
     times, lines = sampling.times(motion.k.device), image.shape[1]
     fastest = warp_rate(times, motion.k).amax(-1) * sampling.duration_s
     whole = warp(times.new_full((1,), sampling.duration_s), motion.k)[..., 0]
-    line = torch.arange(lines, device=times.device) - lines // 2
-    resolved = (line.abs() * (fastest / whole)[:, None] <= lines / 2)[..., None]
+    doppler = torch.arange(lines, device=times.device) - lines // 2
+    resolved = (doppler.abs() * (fastest / whole)[:, None] <= lines / 2)[..., None]
     speckle = torch.where(resolved, power, math.nan).nanmedian(1, keepdim=True).values / math.log(2)
     brightest, noise = power.amax((-2, -1)), noise_power(power) * least
     # side lobes below 1e-3 of the brightest pixel are to be expected more than 24 cells away
     floor = torch.maximum(speckle * least, 1e-3 * brightest[:, None, None])
     clear = torch.where(resolved & (power > floor), power, 0)
     # up to 128 scatterers, of at least half of the largest amplitude within the window; by trial
-    peaks = find_peaks(clear, noise, 128, 0.5, 2 * half_cells, 1)
-    cells, used = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING, peaks.power > 0
-    history, u = _windowed(image, peaks, half_cells)
-    bases = _bases(motion, sampling, cells, sampling.range_m(peaks.cell), u, free_centre)
+    peak, line, cell = find_peaks(clear, noise, 128, 0.5, 2 * half_cells, 1)
+    cells, used = (line - image.shape[1] // 2) / OVERSAMPLING, peak > 0
+    history, u = _windowed(image, line, cell, half_cells)
+    bases = _bases(motion, sampling, cells, sampling.range_m(cell), u, free_centre)
     # a window smears a history at both ends by 1/16 of its length, which is left out
     ends = max(1, len(u) // 16)
     history, bases = history[..., ends:-ends], bases[..., ends:-ends]
@@ -217,17 +203,17 @@ def histories_of(
     return Histories(cells, used, level, least_lit, *_fitted(history, bases, used))
 
 
-def _windowed(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Tensor]:
+def _windowed(image: Tensor, line: Tensor, cell: Tensor, half_cells: int) -> tuple[Tensor, Tensor]:
     """Histories (trial, peak, 2 half_cells) of windows about peaks, and u of their samples."""
-    lines = torch.arange(2 * half_cells * _OVERSAMPLING, device=image.device) - half_cells * _OVERSAMPLING
-    row = peaks.line[..., None] + lines
+    lines = torch.arange(2 * half_cells * OVERSAMPLING, device=image.device) - half_cells * OVERSAMPLING
+    row = line[..., None] + lines
     inside = (row >= 0) & (row < image.shape[1])
-    index = row.clamp(0, image.shape[1] - 1) * image.shape[2] + peaks.cell[..., None]
+    index = row.clamp(0, image.shape[1] - 1) * image.shape[2] + cell[..., None]
     window = torch.where(inside, torch.gather(image.flatten(1), 1, index.flatten(1)).view(index.shape), 0).to(
         torch.complex128
     )
     u = (torch.arange(2 * half_cells, dtype=torch.float64, device=image.device) + 0.5) / (2 * half_cells)
-    return window @ cis(-2 * math.pi / _OVERSAMPLING * lines[:, None] * u), u
+    return window @ cis(-2 * math.pi / OVERSAMPLING * lines[:, None] * u), u
 
 
 def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u: Tensor, free_centre: bool) -> Tensor:

@@ -16,22 +16,19 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
-from torchsar.compensate.rotation.couplings import Envelopes, Neighbours, envelopes, inner_products
-from torchsar.compensate.rotation.histories import find_peaks, inverted, noise_power, threshold
+from torchsar.compensate.rotation.couplings import Neighbours, envelopes, inner_products
+from torchsar.compensate.rotation.histories import OVERSAMPLING, find_peaks, inverted, noise_power, threshold
 from torchsar.compensate.rotation.motion import Motion, Sampling, chosen, each, image_of, warped_time
 from torchsar.core import power_of, real_dtype, reduced_turns, settle
 from torchsar.core.warp import least_rate
 
-_OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
 MOST, ROUNDS = 800, 12  # largest number of scatterers, number of steps; accuracy against time
 # rounds that search for further scatterers, and the share of their number up to which they do: the
 # brightest alone bring the motion near, and the rounds between let it converge
@@ -171,7 +168,7 @@ def fit_scatterers(
         share, noise, new = _SEARCHES.get(iteration), fit.noise, None
         if share or iteration > _SEARCHED:
             # the residual of the last search was larger: the fit had not converged
-            image = image_of(residual, sampling, fit.motion, oversampling=_OVERSAMPLING if share else 1)
+            image = image_of(residual, sampling, fit.motion, oversampling=OVERSAMPLING if share else 1)
             floor, noise = _noise(power_of(image), sampling, fit, present)
             new = _new_scatterers(image, floor, sampling.pulses, fit, math.ceil(count * share)) if share else None
         if step is not None:
@@ -195,13 +192,11 @@ def _new_scatterers(image: Tensor, floor: Tensor, pulses: int, fit: Fit, bound: 
     least = (floor * threshold(power[0].numel())).to(power.dtype)
     # of at least half of the largest amplitude within 24 lines and 2 range cells, found by trial:
     # side lobes are excluded until their scatterer is subtracted
-    peaks = find_peaks(power, least, bound, 0.5, 24, 2)
-    wanted = torch.arange(peaks.power.shape[-1], device=power.device) < (bound - fit.scatterers.count)[:, None]
-    value = torch.gather(image.flatten(1), 1, peaks.line * image.shape[2] + peaks.cell).to(torch.complex128)
-    cell = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING
-    return Scatterers(
-        torch.where(wanted & (peaks.power > 0), value / math.sqrt(pulses), 0), cell, peaks.cell.to(torch.float64)
-    )
+    peak, line, row = find_peaks(power, least, bound, 0.5, 24, 2)
+    wanted = torch.arange(peak.shape[-1], device=power.device) < (bound - fit.scatterers.count)[:, None]
+    value = torch.gather(image.flatten(1), 1, line * image.shape[2] + row).to(torch.complex128)
+    cell = (line - image.shape[1] // 2) / OVERSAMPLING
+    return Scatterers(torch.where(wanted & (peak > 0), value / math.sqrt(pulses), 0), cell, row.to(torch.float64))
 
 
 def _noise(power: Tensor, sampling: Sampling, fit: Fit, present: Tensor) -> tuple[Tensor, Tensor]:
@@ -249,32 +244,22 @@ def _blocks(data: Tensor, scatterers: int) -> Iterator[tuple[slice, slice]]:
         yield slice(trial, trial + some), slice(first, first + height)
 
 
-class Reduced(NamedTuple):
-    """Gauss-Newton equations of the rotation, without the unknowns of the scatterers.
+def solved(pull: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Solve the Gauss-Newton equations of the rotation, see `Step.reduced`.
 
     Args:
-        joint: The unknowns of the scatterers per unit of each parameter of the rotation, and, in
-            the last column, for an unchanged rotation, shape (trial, 4 scatterer, parameter + 1).
         pull: Gradient of the likelihood that each scatterer contributes, shape (trial, scatterer,
             parameter).
         curvature: Curvature that each scatterer contributes, shape (trial, scatterer, parameter,
             parameter).
+
+    Returns:
+        The change of the parameters, shape (trial, parameter); the inverse of the whole curvature,
+        shape (trial, parameter, parameter); and True for parameters that the data do not determine,
+        shape (trial, parameter).
     """
-
-    joint: Tensor
-    pull: Tensor
-    curvature: Tensor
-
-    def solved(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Solve the equations.
-
-        Returns:
-            The change of the parameters, shape (trial, parameter); the inverse of the whole
-            curvature, shape (trial, parameter, parameter); and True for parameters that the data do
-            not determine, shape (trial, parameter).
-        """
-        inverse, lost = inverted(self.curvature.sum(1))
-        return (inverse @ self.pull.sum(1)[..., None])[..., 0], inverse, lost
+    inverse, lost = inverted(curvature.sum(1))
+    return (inverse @ pull.sum(1)[..., None])[..., 0], inverse, lost
 
 
 @dataclass(frozen=True)
@@ -284,6 +269,9 @@ class Step:
     moments: (trial, scatterer, base), sums over pulses of base * conj(echo) * residual at the range
     of the scatterer, for the bases 1, u, du/dk..., phi^2. shift: the same of base 1 with the
     derivative of the envelope. share: gradient of the share of the periodic range response.
+    overlaps: inner product over range cells of the envelopes of each pair, its derivatives with
+    respect to the range of the second scatterer, of the first one, and of both, and that of the
+    derivatives of the envelopes with respect to this share.
     """
 
     fit: Fit
@@ -291,7 +279,7 @@ class Step:
     near: Neighbours
     products: Mapping[tuple[int, int], Tensor]
     gram: Tensor
-    envelopes: Envelopes
+    overlaps: Sequence[Tensor]
     moments: Tensor
     shift: Tensor
     share: Tensor
@@ -321,14 +309,14 @@ class Step:
         range_m = sampling.range_m(found.row)
         turns = torch.stack([u, -square], -1)
         right = torch.stack([found.cell, motion.w[:, None] * range_m + motion.offset[:, None]], -2)
-        around = envelopes(fit.response, found.row, sampling.cells)
-        weighted = (found.amplitude[..., None] * around.value).conj().to(data.dtype).resolve_conj()
-        back = around.value.mH.to(data.dtype).resolve_conj()
+        value, slope, difference = envelopes(fit.response, found.row, sampling.cells)
+        weighted = (found.amplitude[..., None] * value).conj().to(data.dtype).resolve_conj()
+        back = value.mH.to(data.dtype).resolve_conj()
         # the bases are almost linearly dependent: with orthonormal ones the small part that shows
         # the rotation is not lost in rounding
         orthonormal, mixed = torch.linalg.qr(bases.mT)
         orthonormal = orthonormal.mT.to(data.real.dtype)
-        residual, shift = torch.empty_like(data), data.new_zeros(around.value.shape)
+        residual, shift = torch.empty_like(data), data.new_zeros(value.shape)
         moments = bases.new_zeros(*bases.shape[:2], 2 * found.cell.shape[-1])
         for some, part in _blocks(data, count):
             echoes = _phasors(turns[some, part], right[some], data.dtype)  # conjugate, of unit amplitude
@@ -339,10 +327,12 @@ class Step:
             shift[some] += echoes.mT @ rest
         moments = torch.view_as_complex((mixed.mT @ moments).unflatten(-1, (-1, 2))).mT
         shift = shift.to(torch.complex128)
-        share = (found.amplitude.conj() * (shift * around.difference.conj()).sum(-1)).real.sum(-1)
+        share = (found.amplitude.conj() * (shift * difference.conj()).sum(-1)).real.sum(-1)
         products = inner_products(near, sampling, motion.k, found.amplitude, found.cell, bases)
-        shift = (shift * around.slope.conj()).sum(-1)
-        return residual, Step(fit, range_m, near, products, bases @ bases.mT, around, moments, shift, share)
+        shift = (shift * slope.conj()).sum(-1)
+        pairs = ((value, value), (value, slope), (slope, value), (slope, slope), (difference, difference))
+        overlaps = [near.over_range(*pair) for pair in pairs]
+        return residual, Step(fit, range_m, near, products, bases @ bases.mT, overlaps, moments, shift, share)
 
     def after(self, noise: Tensor, sampling: Sampling, iteration: int) -> Fit:
         """Take the Gauss-Newton step.
@@ -359,16 +349,16 @@ class Step:
             The fit after the step.
         """
         old, found, late = self.fit, self.fit.scatterers, iteration >= _SEARCHED
-        reduced = self.reduced(late)
-        change, inverse, lost = reduced.solved()
-        change = change * self._within_reach(reduced.joint, change)
+        joint, pull, curvature = self.reduced(late)
+        change, inverse, lost = solved(pull, curvature)
+        change = change * self._within_reach(joint, change)
         if late:
             # Steps that go back a part of the last one would go back and forth, since the curvature
             # is an approximation. The factor, at least a half, ends a geometric sequence of steps.
-            curvature = reduced.curvature.sum(1)
-            size, back = (torch.einsum("bi,bij,bj->b", old.change, curvature, x) for x in (old.change, change))
+            whole = curvature.sum(1)
+            size, back = (torch.einsum("bi,bij,bj->b", old.change, whole, x) for x in (old.change, change))
             change = change / (1 - (back / or_one(size)).nan_to_num(0.0).clamp(-1, 0))[:, None]
-        own = reduced.joint[..., -1] - (reduced.joint[..., :-1] @ change[..., None])[..., 0]
+        own = joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]
         grow, turn, line, row = own.unflatten(-1, (4, -1)).unbind(-2)
         moved = Scatterers(
             found.amplitude * torch.complex(1 + grow, turn),
@@ -385,8 +375,7 @@ class Step:
         # Least squares for the share of the periodic range response. Both responses are the same
         # where scatterers lie in the middle of their cells, as all do after the first search: the
         # share then stays as it is, instead of following rounding.
-        apart = self.near.over_range(self.envelopes.difference, self.envelopes.difference)
-        energy = (self.products[(0, 0)] * (apart + 1e-6 * self._overlaps[0])).real[:, None]
+        energy = (self.products[(0, 0)] * (self.overlaps[4] + 1e-6 * self.overlaps[0])).real[:, None]
         share = torch.nan_to_num(self.share / self.near.per_scatterer(energy).sum((-2, -1)), 0.0, 0.0, 0.0)
         new = Fit(motion, moved.apart(), (old.response + share).clamp(0, 1), noise, old.steps, old.settled, change)
         # where the step is not possible, the fit stays; trials that have ended are not counted on
@@ -394,7 +383,7 @@ class Step:
         new = replace(new, steps=old.steps + 1, settled=valid & small & (iteration > _SEARCHED))
         return chosen(old.settled, old, new)
 
-    def reduced(self, robust: bool) -> Reduced:
+    def reduced(self, robust: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Eliminate the unknowns of the scatterers.
 
         Args:
@@ -402,25 +391,19 @@ class Step:
                 rotation, as that of several scatterers in one resolution cell does.
 
         Returns:
-            The equations of the rotation.
+            The unknowns of the scatterers per unit of each parameter of the rotation, and, in the
+            last column, for an unchanged rotation, shape (trial, 4 scatterer, parameter + 1); and
+            the gradient and the curvature of the rotation, see `solved`.
         """
-        # coefficients of the bases in the phase per unit of each common unknown, (trial, scatterer,
-        # unknown, base)
-        motion, cell = self.fit.motion, self.fit.scatterers.cell
-        order, size = motion.k.shape[-1], self.fit.change.shape[-1]
-        slopes = cell.new_zeros(*cell.shape, size, order + 3)
-        slopes[..., :order, 2:-1] = -2 * math.pi * cell[..., None, None] * torch.eye(order, device=cell.device)
-        slopes[..., order, -1] = self.range_m + motion.centre_m[:, None]
-        slopes[..., order + 1 :, -1] = 1
-        solve = _solver(self._local())
+        slopes, solve = self._slopes(), _solver(self._local())
         found = self._without_scatterers(slopes, solve)
         if not robust:
             return found
-        change = found.solved()[0]
-        change = change * self._within_reach(found.joint, change)
+        change = solved(*found[1:])[0]
+        change = change * self._within_reach(found[0], change)
         return self._without_scatterers(slopes * self._agreement(slopes, change)[..., None, None], solve)
 
-    def _without_scatterers(self, slopes: Tensor, solve: Callable[[Tensor], Tensor]) -> Reduced:
+    def _without_scatterers(self, slopes: Tensor, solve: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """The equations of the rotation for these coefficients of its parameters."""
         conjugate = self.fit.scatterers.amplitude.conj()
         cross, shared = self._shared(slopes)
@@ -430,7 +413,7 @@ class Step:
         joint = solve(right)
         lost = torch.einsum("brpi,brpj->bpij", joint[..., :-1].unflatten(1, (4, -1)), right.unflatten(1, (4, -1)))
         pull = torch.einsum("bpin,bpn->bpi", slopes, turned.imag) - lost[..., -1]
-        return Reduced(joint, pull, shared - lost[..., :-1])
+        return joint, pull, shared - lost[..., :-1]
 
     def _agreement(self, slopes: Tensor, change: Tensor) -> Tensor:
         """Weights 0..1 (trial, scatterer) by how well the phase of a scatterer fits the step.
@@ -466,7 +449,7 @@ class Step:
 
         The unknowns are relative amplitude, phase, Doppler cell and range cell.
         """
-        overlap, slope, back, bend = self._overlaps
+        overlap, slope, back, bend, _ = self.overlaps
         products = self.products
         flat, line, bent = products[(0, 0)], 2 * math.pi * products[(0, 1)], 4 * math.pi**2 * products[(1, 1)]
         a, u, s, us, b, ub = (x * y for x, y in itertools.product((overlap, slope, back), (flat, line)))
@@ -483,16 +466,18 @@ class Step:
         diagonal += torch.where(diagonal > 0, 1e-9 * diagonal, 1.0)
         return local
 
-    @cached_property
-    def _overlaps(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Inner product over range cells of the envelopes of each pair, and its derivatives.
+    def _slopes(self) -> Tensor:
+        """Coefficients of the bases in the phase per unit of each common unknown.
 
-        The derivatives are those with respect to the range of the second scatterer, of the first
-        one, and of both.
+        (trial, scatterer, unknown, base).
         """
-        value, slope = self.envelopes.value, self.envelopes.slope
-        factors = ((value, value), (value, slope), (slope, value), (slope, slope))
-        return tuple(self.near.over_range(*pair) for pair in factors)  # pyright: ignore[reportReturnType]
+        motion, cell = self.fit.motion, self.fit.scatterers.cell
+        order, size = motion.k.shape[-1], self.fit.change.shape[-1]
+        slopes = cell.new_zeros(*cell.shape, size, order + 3)
+        slopes[..., :order, 2:-1] = -2 * math.pi * cell[..., None, None] * torch.eye(order, device=cell.device)
+        slopes[..., order, -1] = self.range_m + motion.centre_m[:, None]
+        slopes[..., order + 1 :, -1] = 1
+        return slopes
 
     def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
         """Curvature between scatterers and common unknowns, and of the common unknowns.
@@ -500,7 +485,7 @@ class Step:
         (trial, 4 scatterer, unknown) and, as sums over the pairs of each scatterer, (trial,
         scatterer, unknown, unknown).
         """
-        near, bases, (overlap, _, back, _) = self.near, range(2, slopes.shape[-1]), self._overlaps
+        near, bases, (overlap, _, back, *_) = self.near, range(2, slopes.shape[-1]), self.overlaps
         columns = slopes[near.trial, near.second].unbind(-1)[2:]
 
         def summed(base: int, part: Callable[[Tensor], Tensor], envelopes: Tensor = overlap) -> Tensor:
