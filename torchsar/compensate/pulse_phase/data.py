@@ -14,9 +14,6 @@ from torch import Tensor
 
 from torchsar.core import block_bytes_of, checked_samples, cis, is_plain, over_blocks, power_of, unit_level
 
-# a method: (rows, present, phase to start from) -> phase, iterations
-Find = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
-
 
 @dataclass(frozen=True)
 class Pulses:
@@ -174,7 +171,11 @@ def by_blocks(
 
 
 def find_phases(
-    pulses: Pulses, find: Find, start: Tensor | None = None, tuned: Sequence[Tensor | float] = (), whole: bool = False
+    pulses: Pulses,
+    find: Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]],
+    start: Tensor | None = None,
+    tuned: Sequence[Tensor | float] = (),
+    whole: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Run an autofocus method on all trials, in blocks of trials that fit into the cache.
 

@@ -341,7 +341,10 @@ class _Search:
         narrows, last = torch.ones_like(present[:, 0]), torch.full_like(phase[:, 0], torch.inf)
         for iteration in range(self.iterations + 1):
             view = _view(rows, phase)
-            cost = _entropy(view.power)
+            # entropy of the images in nats
+            total, tiny = view.power.sum((-2, -1)), torch.finfo(view.power.dtype).tiny
+            terms = view.power.clamp_min(tiny).log_().mul_(view.power).sum((-2, -1))
+            cost = torch.log(total.clamp_min(tiny)) - terms / torch.where(total > 0, total, 1)
             better = cost < lowest
             best, lowest = torch.where(better[:, None], phase, best), torch.where(better, cost, lowest)
             idle = torch.where(better | narrows, 0, idle + 1)
@@ -435,14 +438,6 @@ def _spread(cells: Tensor, n: int) -> Tensor:
     reach = cells.shape[-1] // 2
     zeros = cells.new_zeros((*cells.shape[:-1], n - cells.shape[-1]))
     return torch.cat([cells[..., reach:], zeros, cells[..., :reach]], -1)
-
-
-def _entropy(power: Tensor) -> Tensor:
-    """Entropy (trial,) of images in nats from their detached powers (trial, range, Doppler)."""
-    total = power.sum((-2, -1))
-    tiny = torch.finfo(power.dtype).tiny
-    terms = power.clamp_min(tiny).log_().mul_(power)
-    return torch.log(total.clamp_min(tiny)) - terms.sum((-2, -1)) / torch.where(total > 0, total, 1)
 
 
 def _profile(view: _View) -> Tensor:

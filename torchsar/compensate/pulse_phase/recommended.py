@@ -47,7 +47,6 @@ _RELAXATION = 1.8
 # Iterations across gaps for each of the third step: filled pulses grow slowly. A quarter of a
 # record of 40 points takes 60 to 100.
 _FILLING = 5
-_SLOPES = 48  # slopes tried over one turn per pulse, found by trial: spacing against time
 
 
 def autofocus(
@@ -319,8 +318,9 @@ def _with_slope(through: Through, runs: list[Run], rows: Tensor, phase: Tensor) 
             best, least = torch.where(better[:, None], candidate, best), torch.where(better, cost, least)
         return best
 
-    step = 2 * math.pi / _SLOPES
-    phase, total = best_slope(phase, step, _SLOPES), torch.zeros_like(phase[:, 0], dtype=torch.int64)
+    # 48 slopes over one turn per pulse, found by trial: spacing against time
+    step = 2 * math.pi / 48
+    phase, total = best_slope(phase, step, 48), torch.zeros_like(phase[:, 0], dtype=torch.int64)
     for _ in range(2):
         phase, taken = in_turn(rows, best_slope(phase, step / 8, 17), runs)
         total = total + taken

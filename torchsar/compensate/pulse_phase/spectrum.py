@@ -7,8 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-_WINDOW = 4  # half width of the Hann window in bins
-
 
 def smoothed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
     """Smooth a mean periodogram by a Haar wavelet transform of its logarithm.
@@ -53,6 +51,6 @@ def windowed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
     Returns:
         The smoothed power, same shape.
     """
-    window = torch.hann_window(2 * _WINDOW + 3, periodic=False, dtype=power.dtype, device=power.device)[1:-1]
-    padded = torch.nn.functional.pad(power[:, None], (_WINDOW, _WINDOW), mode="circular")
+    window = torch.hann_window(11, periodic=False, dtype=power.dtype, device=power.device)[1:-1]
+    padded = torch.nn.functional.pad(power[:, None], (4, 4), mode="circular")
     return torch.nn.functional.conv1d(padded, (window / window.sum())[None, None])[:, 0]

@@ -168,8 +168,14 @@ class Pga(_FromStart):
         patience: int = 6,
         assess: bool = True,
     ) -> None:
-        options: dict[str, Any] = {"windows": windows_of(windows), "iterations": iterations, "patience": patience}
-        super().__init__(pga, kernel=kernel, **options, assess=assess)
+        super().__init__(
+            pga,
+            kernel=kernel,
+            windows=windows_of(windows),
+            iterations=iterations,
+            patience=patience,
+            assess=assess,
+        )
 
 
 class PgaSca(_Estimator):
@@ -193,8 +199,14 @@ class PgaSca(_Estimator):
         patience: int = 6,
         assess: bool = True,
     ) -> None:
-        options: dict[str, Any] = {"windows": windows_of(windows), "iterations": iterations, "patience": patience}
-        super().__init__(pga_sca, kernel=kernel, **options, assess=assess)
+        super().__init__(
+            pga_sca,
+            kernel=kernel,
+            windows=windows_of(windows),
+            iterations=iterations,
+            patience=patience,
+            assess=assess,
+        )
 
 
 class EntropyFixedPoint(_FromStart):

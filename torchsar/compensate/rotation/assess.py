@@ -27,7 +27,7 @@ from torchsar.compensate.rotation.couplings import Neighbours
 from torchsar.compensate.rotation.histories import Histories, histories_of, refined_by_histories, threshold
 from torchsar.compensate.rotation.image_entropy import k_name
 from torchsar.compensate.rotation.motion import Motion, Sampling, image_of, warped_time
-from torchsar.compensate.rotation.scatterers import LEAST_EXPLAINED, Fit, Scatterers, Step, explained_share, solved
+from torchsar.compensate.rotation.scatterers import LEAST_EXPLAINED, Fit, Step, explained_share, solved
 from torchsar.core import Estimate, Outcome, worst
 from torchsar.metrics import entropy
 
@@ -107,7 +107,14 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit, value: Mapping[str, T
     covariance = inverse / 2 * fit.noise[:, None, None]
     predicted = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(tiny)
     # shares of the scatterers in what is known about each parameter, and what each asks for
-    alike, power = _alike(found), found.amplitude.abs().square()
+    # How far the errors of scatterers depend on each other, 0 to 1: those a few resolution cells
+    # apart, 8 in Doppler and 2 in range, share what the model does not describe; by trial: the errors
+    # of a few scatterers side by side in Doppler are large, with opposite signs.
+    lines, cells = (
+        ((x[:, :, None] - x[:, None]) / reach).square() for x, reach in ((found.cell, 8.0), (found.row, 2.0))
+    )
+    used, power = (found.amplitude != 0).double(), found.amplitude.abs().square()
+    alike = torch.exp(-(lines + cells) / 2) * used[:, :, None] * used[:, None]
     shares = torch.einsum("bpij,bin,bjn->bpn", curvature, inverse, inverse)
     shares = shares / shares.sum(1, keepdim=True).clamp_min(tiny)
     own = (pull - torch.einsum("bpij,bj->bpi", curvature, change)) @ inverse
@@ -168,20 +175,6 @@ def _questioned(
     dark = found.least_lit < 0.35  # noise at the detection threshold gives 0.25
     error = torch.nan_to_num(edge * (moved + unsure).sqrt(), math.inf, math.inf)
     return torch.where(few | dark, math.inf, error), [(Outcome.MISFIT, dark), (Outcome.TOO_FEW, few)]
-
-
-def _alike(found: Scatterers) -> Tensor:
-    """How far the errors of scatterers depend on each other, (trial, scatterer, scatterer), 0..1.
-
-    Scatterers a few resolution cells apart, 8 in Doppler and 2 in range, share what the model does
-    not describe; found by trial: the errors of a few scatterers side by side in Doppler are large,
-    with opposite signs.
-    """
-    lines, rows = (
-        ((x[:, :, None] - x[:, None]) / reach).square() for x, reach in ((found.cell, 8.0), (found.row, 2.0))
-    )
-    used = (found.amplitude != 0).double()
-    return torch.exp(-(lines + rows) / 2) * used[:, :, None] * used[:, None]
 
 
 def _entropies(rows: Tensor, sampling: Sampling, motion: Motion) -> tuple[dict[str, Tensor], Tensor]:

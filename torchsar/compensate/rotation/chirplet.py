@@ -172,7 +172,7 @@ def _coarse(rows: Tensor, time: Tensor, sweep: float) -> tuple[Tensor, Tensor]:
         power, index = power_of(torch.fft.ifft(parts, bins, norm="forward")).sum(-2).max(-1)
         better = power > best
         best = torch.where(better, power, best)
-        frequency = torch.where(better, _signed(index.to(torch.float64), bins) / bins, frequency)
+        frequency = torch.where(better, ((index + bins // 2) % bins - bins // 2).double() / bins, frequency)
         rate = torch.where(better, value, rate)
     return frequency, rate
 
@@ -195,13 +195,8 @@ def _fine(rows: Tensor, frequency: Tensor, rate: Tensor) -> tuple[Tensor, Tensor
     flat = power.flatten(-2).argmax(-1)
     row, column = flat // bins, flat % bins
     along_f, along_r = take(power, row, -2), take(power.mT, column, -2)
-    f = (_signed(column.to(torch.float64), bins) + _vertex(along_f, column, True)) / (bins * part)
+    f = ((column + bins // 2) % bins - bins // 2 + _vertex(along_f, column, True)) / (bins * part)
     return frequency + f, rate + rates[row] + _vertex(along_r, row, False) * (2.0 / n**2)
-
-
-def _signed(index: Tensor, n: int) -> Tensor:
-    """FFT index 0..n-1 as -n/2..n/2-1."""
-    return torch.where(index >= n / 2, index - n, index)
 
 
 def _vertex(values: Tensor, index: Tensor, circular: bool) -> Tensor:

@@ -26,9 +26,9 @@ from torchsar.metrics import entropy
 _OCTAVES = 3.5  # Doppler below the edge of the band that is used, found by trial
 _STEPS_PER_UNIT = 200  # steps per unit of the logarithm of Doppler: half a percent each
 _WIDEST = 1.4  # largest logarithm of a ratio of rates that is searched: a factor of 4
-_GRID = 0.07  # step of the search, in logarithms of rates at the middle and the end of the aperture
-_KEPT = 6  # candidates of the grid that are refined, found by trial: reliability against time
-_ROUNDS = 10  # refinements, each of which halves the step: to 0.0001 of a rate
+# step of the search, in logarithms of rates at the middle and the end of the aperture; candidates
+# of this grid that are refined, found by trial: reliability against time
+_GRID, _KEPT = 0.07, 6
 _LEAST_RATE = 0.1  # least rate over that at the start; slower targets would nearly reverse
 
 
@@ -112,7 +112,7 @@ def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -
     table = _correlations(products.to(torch.complex128), 0.0)
     nearby = torch.cartesian_prod(*2 * [torch.linspace(-1, 1, 5, **like)])
     size, kept = _GRID, _KEPT
-    for _ in range(_ROUNDS):
+    for _ in range(10):  # each refinement halves the step: to 0.0001 of a rate
         kept = max(1, kept // 2)
         best = best_of((best[:, :, None] + size * nearby).flatten(1, 2), table, kept)
         size /= 2

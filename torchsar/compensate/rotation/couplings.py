@@ -24,15 +24,8 @@ from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.focus.transforms import Gridding
 
 # Doppler cells beyond which the coupling of scatterers is neglected, found by trial: accuracy of a
-# step against time
-_NEAR_CELLS = 64
-# more Doppler cells from which two scatterers may come that near in later steps: in each of seven
-# they move by at most 0.3; those from farther away are not coupled
-_MARGIN_CELLS = 5
-# added, relative, to what a scatterer tells about itself and the rotation: the curvature stays
-# positive definite where scatterers nearly cancel each other, and one alone is damped by no more
-_RIDGE = 1e-3
-_TABLE = 16  # steps of the table per Doppler cell, enough for linear interpolation
+# step against time; steps of the table per Doppler cell, enough for linear interpolation
+_NEAR_CELLS, _TABLE = 64, 16
 
 
 @dataclass(frozen=True)
@@ -66,7 +59,8 @@ class Neighbours:
             are left out of `shape`.
         """
         used, n = amplitude != 0, cell.shape[1]
-        near = (cell[:, :, None] - cell[:, None]).abs() < _NEAR_CELLS + _MARGIN_CELLS
+        # they may come that near in later steps: in each of seven they move by at most 0.3 cells
+        near = (cell[:, :, None] - cell[:, None]).abs() < _NEAR_CELLS + 5
         near = (near & used[:, :, None] & used[:, None]).flatten()
         number = torch.arange(1, n + 1, device=cell.device)
         pairs, width = torch.stack([near.sum(), (used * number).amax()]).tolist() if len(near) else (0, 0)
@@ -179,7 +173,10 @@ def inner_products(
     # a separation just below the limit rounds to the last entry
     whole = position.floor().long().clamp_max(2 * _NEAR_CELLS * _TABLE - 1)
     weight = amplitude[near.trial, near.first].conj() * amplitude[near.trial, near.second]
-    weight = torch.where(coupled, weight * (1 + _RIDGE * (near.first == near.second)), 0)
+    # A part of 1e-3 is added to what a scatterer tells about itself and the rotation: the curvature
+    # stays positive definite where scatterers nearly cancel each other, and one alone is damped by
+    # no more.
+    weight = torch.where(coupled, weight * (1 + 1e-3 * (near.first == near.second)), 0)
     index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
     # sums over pulses of b_n b_m exp(2j pi c u), m >= n, at steps of 1 / _TABLE of a Doppler cell c
     first, second = torch.triu_indices(bases.shape[1], bases.shape[1], device=bases.device)

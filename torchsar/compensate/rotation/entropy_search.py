@@ -17,7 +17,6 @@ from torchsar.compensate.rotation.assess import judged_motion
 from torchsar.compensate.rotation.image_entropy import (
     EntropyObjective,
     ImageEntropy,
-    Variables,
     k_name,
     uniform_rotation,
     values_of,
@@ -228,7 +227,14 @@ def descend_rotation(
 
 
 def descent_near_truth(
-    data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, assess: bool = True, **known: Any
+    data: Tensor,
+    omega_rad_s: Tensor,
+    warp_k: Tensor,
+    *,
+    order: int,
+    yc_m: float | None,
+    assess: bool = True,
+    **known: Any,
 ) -> Estimate:
     """Estimate a rotation by a descent of the image entropy that starts at 0.95 of the true values.
 
@@ -237,18 +243,27 @@ def descent_near_truth(
         omega_rad_s: True rotation rate at the first pulse in rad/s, shape (...,).
         warp_k: True derivatives k1, k2, ... of the rotation rate at the first pulse, divided by
             that rate, in 1/s, 1/s^2, ..., shape (..., coefficient).
+        order: As in `uneven_rotation`.
+        yc_m: Range centre deviation in metres; None is 0.
         assess: False leaves out the assessment.
-        known: The arguments wavelength_m, prf_hz, range_m, yc_m and order of `uneven_rotation`.
+        known: The arguments wavelength_m, prf_hz and range_m of `uneven_rotation`.
 
     Returns:
         The `Estimate` that the function `descend_rotation` returns.
     """
-    objective = _entropy(data, "shape", **known)
+    objective = ImageEntropy(data, EntropyObjective(order=order, yc_m=yc_m or 0.0, variables="shape"), **known)
     return descend_rotation(objective, objective.start(0.95 * omega_rad_s, 0.95 * warp_k, None), assess=assess)
 
 
 def genetic_near_truth(
-    data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, assess: bool = True, **known: Any
+    data: Tensor,
+    omega_rad_s: Tensor,
+    warp_k: Tensor,
+    *,
+    order: int,
+    yc_m: float | None,
+    assess: bool = True,
+    **known: Any,
 ) -> Estimate:
     """Estimate a rotation by a genetic algorithm that searches within 10 % of the true values.
 
@@ -259,22 +274,19 @@ def genetic_near_truth(
         omega_rad_s: True rotation rate at the first pulse in rad/s, shape (...,).
         warp_k: True derivatives k1, k2, ... of the rotation rate at the first pulse, divided by
             that rate, in 1/s, 1/s^2, ..., shape (..., coefficient).
+        order: As in `uneven_rotation`.
+        yc_m: Range centre deviation in metres; None is 0.
         assess: False leaves out the assessment.
-        known: The arguments wavelength_m, prf_hz, range_m, yc_m and order of `uneven_rotation`.
+        known: The arguments wavelength_m, prf_hz and range_m of `uneven_rotation`.
 
     Returns:
         The `Estimate` that the function `genetic_rotation` returns.
     """
-    objective = _entropy(data, "raw", **known)
+    objective = ImageEntropy(data, EntropyObjective(order=order, yc_m=yc_m or 0.0, variables="raw"), **known)
     centre = torch.cat([omega_rad_s[..., None], warp_k], -1)
     box = 0.1 * torch.where(centre != 0, centre.abs(), 1)
     size = {"population": 10, "generations": 4}  # short enough to compare
     return genetic_rotation(objective, centre - box, centre + box, draws=Draws(1), assess=assess, **size)
-
-
-def _entropy(data: Tensor, variables: Variables, yc_m: float | None, order: int, **known: Any) -> ImageEntropy:
-    """The image entropy of a rotation whose centre is known."""
-    return ImageEntropy(data, EntropyObjective(order=order, yc_m=yc_m or 0.0, variables=variables), **known)
 
 
 def _scaled(figure: ImageEntropy, start: Tensor) -> tuple[Tensor, Tensor]:

@@ -292,26 +292,21 @@ def _over_trials(
         level = level_of(rows[part])
         some = rows[part] / level
         found = find(some, sampling, None if known is None else known[part])
-        parts[first] = _estimate(some, sampling, found, level[:, 0, 0].double(), assess)
+        fit = isinstance(found, Fit)
+        motion = found.motion if fit else found
+        motion = replace(motion, **{name: settle(getattr(motion, name), 0.0)[0] for name in ("k", "w", "v")})
+        value, info = values_of(motion.omega_rad_s, motion.k, motion.yc_m), {}
+        if fit:
+            noise_power = found.noise * level[:, 0, 0].double().square()
+            info = {"scatterers": found.scatterers.count, "noise_power": noise_power, "steps": found.steps}
+        parts[first] = Estimate(value, info=info)
+        if assess:
+            judged = judged_fit(some, sampling, found, value) if fit else judged_motion(some, sampling, motion, value)
+            parts[first] = replace(judged, info={**judged.info, **info})
 
     starts = range(0, rows.shape[0], height)
     over_blocks(work, starts, rows)
     return Estimate.joined([parts[first] for first in starts], trials)
-
-
-def _estimate(rows: Tensor, sampling: Sampling, found: Motion | Fit, level: Tensor, assess: bool) -> Estimate:
-    """Estimate from a rotation or a joint fit of data that are divided by their level."""
-    fit = isinstance(found, Fit)
-    motion = found.motion if fit else found
-    motion = replace(motion, **{name: settle(getattr(motion, name), 0.0)[0] for name in ("k", "w", "v")})
-    value, info = values_of(motion.omega_rad_s, motion.k, motion.yc_m), {}
-    if fit:
-        noise_power = found.noise * level.square()
-        info = {"scatterers": found.scatterers.count, "noise_power": noise_power, "steps": found.steps}
-    if not assess:
-        return Estimate(value, info=info)
-    judged = judged_fit(rows, sampling, found, value) if fit else judged_motion(rows, sampling, motion, value)
-    return replace(judged, info={**judged.info, **info})
 
 
 class _Rotation(Stage):

@@ -169,7 +169,14 @@ def fit_scatterers(
         if share or iteration > _SEARCHED:
             # the residual of the last search was larger: the fit had not converged
             image = image_of(residual, sampling, fit.motion, oversampling=OVERSAMPLING if share else 1)
-            floor, noise = _noise(power_of(image), sampling, fit, present)
+            power = power_of(image)
+            brightest = power.flatten(1).amax(-1, keepdim=True) / sampling.pulses
+            brightest = torch.cat([fit.scatterers.amplitude.abs().square(), brightest], -1).amax(-1)
+            # Of a pixel; missing pulses add no noise. Errors of the model have 1e-4 of the power of
+            # the brightest scatterer, found by trial: weaker noise does not limit the fit, and
+            # residuals below it are no scatterers and no evidence against one.
+            floor = torch.maximum(noise_power(power).double(), 1e-4 * brightest)
+            noise = torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
             new = _new_scatterers(image, floor, sampling.pulses, fit, math.ceil(count * share)) if share else None
         if step is not None:
             fit = step.after(noise, sampling, iteration)
@@ -197,22 +204,6 @@ def _new_scatterers(image: Tensor, floor: Tensor, pulses: int, fit: Fit, bound: 
     value = torch.gather(image.flatten(1), 1, line * image.shape[2] + row).to(torch.complex128)
     cell = (line - image.shape[1] // 2) / OVERSAMPLING
     return Scatterers(torch.where(wanted & (peak > 0), value / math.sqrt(pulses), 0), cell, row.to(torch.float64))
-
-
-def _noise(power: Tensor, sampling: Sampling, fit: Fit, present: Tensor) -> tuple[Tensor, Tensor]:
-    """Noise power of a pixel and of a sample, (trial,) each.
-
-    power: that of the image of the residual. The noise power of a sample is at most that of the
-    fit.
-    """
-    brightest = torch.cat(
-        [fit.scatterers.amplitude.abs().square(), power.flatten(1).amax(-1, keepdim=True) / sampling.pulses], -1
-    )
-    # Of a pixel; missing pulses add no noise. Errors of the model have 1e-4 of the power of the
-    # brightest scatterer, found by trial: weaker noise does not limit the fit, and residuals below
-    # it are no scatterers and no evidence against one.
-    floor = torch.maximum(noise_power(power).double(), 1e-4 * brightest.amax(-1))
-    return floor, torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
 
 
 def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
