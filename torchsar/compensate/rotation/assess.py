@@ -29,6 +29,7 @@ from torchsar.compensate.rotation.image_entropy import k_name
 from torchsar.compensate.rotation.motion import Motion, Sampling, image_of, warped_time
 from torchsar.compensate.rotation.scatterers import LEAST_EXPLAINED, Fit, Step, explained_share, solved
 from torchsar.core import Estimate, Outcome, worst
+from torchsar.focus.warped_sums import slow_times
 from torchsar.metrics import entropy
 
 # largest phase error, in rad rms, of a scatterer at the edge of the target: it then still has a
@@ -108,7 +109,7 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit, value: Mapping[str, T
     predicted = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(tiny)
     # shares of the scatterers in what is known about each parameter, and what each asks for
     # How far the errors of scatterers depend on each other, 0 to 1: those a few resolution cells
-    # apart, 8 in Doppler and 2 in range, share what the model does not describe; by trial: the errors
+    # apart, 8 in Doppler and 2 in range, share what the model does not describe; by trial: errors
     # of a few scatterers side by side in Doppler are large, with opposite signs.
     lines, cells = (
         ((x[:, :, None] - x[:, None]) / reach).square() for x, reach in ((found.cell, 8.0), (found.row, 2.0))
@@ -164,7 +165,9 @@ def _questioned(
     free = count / (count - found.inverse.shape[-1]).clamp_min(0.1)  # degrees of freedom of the fit
     covariance = found.inverse @ (pull.mT @ pull * free[:, None, None] + own) @ found.inverse
     edge = 2 * math.pi * torch.where(found.used, found.cells.abs(), 0).amax(-1)
-    _, u, slopes = warped_time(judged.k, sampling.times(judged.k.device), sampling.duration_s)
+    _, u, slopes = warped_time(
+        judged.k, slow_times(sampling.pulses, sampling.prf_hz, judged.k.device), sampling.duration_s
+    )
     line = torch.stack([torch.ones_like(u), u - u.mean(-1, keepdim=True)], 1)
     line = line / line.square().sum(-1, keepdim=True).sqrt()
     curves = slopes - (slopes @ line.mT) @ line

@@ -100,7 +100,17 @@ def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -
         """The `count` best of candidates (trial, candidate, 2), per trial."""
         k = _third_order(torch.exp(candidates), duration_s)
         rate = torch.log(warp_rate(middles, k).clamp_min(_LEAST_RATE))
-        score = _agreement(table, rate[..., second] - rate[..., first]).to(torch.float64)
+        # the sum of the correlations of all pairs at these shifts; through four points: a maximum
+        # between steps is not moved to one of them
+        reach = (table.shape[-1] - 1) // 2
+        shift = (rate[..., second] - rate[..., first]) * _STEPS_PER_UNIT + reach
+        shift = shift.clamp(1, 2 * reach - 1 - 1e-3)
+        whole = shift.floor().long()
+        x, flat = (shift - whole).to(table.dtype), table.flatten(1)
+        position = (torch.arange(table.shape[1], device=shift.device) * table.shape[-1] + whole).flatten(1)
+        a, b, c, d = (torch.gather(flat, 1, position + step).view(shift.shape) for step in (-1, 0, 1, 2))
+        score = b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a)))
+        score = score.sum(-1).to(torch.float64)
         score = torch.where(warp_rate(times, k).amin(-1) > _LEAST_RATE, score, -math.inf)
         return torch.gather(candidates, 1, score.topk(count, -1).indices[..., None].expand(-1, -1, 2))
 
@@ -130,18 +140,6 @@ def _correlations(transform: Tensor, blur: float) -> Tensor:
     table = torch.fft.irfft(transform * smooth, n)
     reach = min(math.ceil(_WIDEST * _STEPS_PER_UNIT), n // 2 - 1)
     return torch.cat([table[..., -reach:], table[..., : reach + 1]], -1)
-
-
-def _agreement(table: Tensor, log_ratio: Tensor) -> Tensor:
-    """Sum (trial, candidate) of the correlations of pairs at a shift (trial, candidate, pair)."""
-    reach = (table.shape[-1] - 1) // 2
-    shift = (log_ratio * _STEPS_PER_UNIT + reach).clamp(1, 2 * reach - 1 - 1e-3)
-    whole = shift.floor().long()
-    x, flat = (shift - whole).to(table.dtype), table.flatten(1)
-    position = (torch.arange(table.shape[1], device=shift.device) * table.shape[-1] + whole).flatten(1)
-    a, b, c, d = (torch.gather(flat, 1, position + step).view(shift.shape) for step in (-1, 0, 1, 2))
-    # through four points: a maximum between steps is not moved to one of them
-    return (b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a)))).sum(-1)
 
 
 def _image(rows: Tensor, prf_hz: float, k: Tensor) -> Tensor:

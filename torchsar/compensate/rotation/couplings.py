@@ -72,25 +72,6 @@ class Neighbours:
             index // (n * n), index // n % n, index % n, torch.Size([cell.shape[0], min(n, max(1, width))])
         )
 
-    def matrix(self, blocks: list[list[Tensor]]) -> Tensor:
-        """Assemble a matrix of blocks, each of which has one entry for each pair of scatterers.
-
-        Args:
-            blocks: The blocks, as a list of n rows of n blocks. A block is given by the entries of
-                its pairs, shape (pair,): that of a pair (p, q) stands in row p and column q of the
-                block.
-
-        Returns:
-            The matrix, shape (trial, n * scatterer, n * scatterer); zero where two scatterers do
-            not form a pair.
-        """
-        count, n = self.shape[1], len(blocks)
-        result = blocks[0][0].new_zeros(self.shape[0], n * count, n * count)
-        for i, row in enumerate(blocks):
-            for j, values in enumerate(row):
-                result[self.trial, self.first + i * count, self.second + j * count] = values
-        return result
-
     def per_scatterer(self, values: Tensor) -> Tensor:
         """Sum values of pairs over all pairs with the same first scatterer.
 
@@ -102,18 +83,6 @@ class Neighbours:
         """
         flat = values.new_zeros(self.shape[0] * self.shape[1], values.shape[-1])
         return flat.index_add(0, self.trial * self.shape[1] + self.first, values).unflatten(0, self.shape)
-
-    def over_range(self, first: Tensor, second: Tensor) -> Tensor:
-        """Compute inner products over range of functions of the two scatterers of each pair.
-
-        Args:
-            first: Functions of the first scatterers, shape (trial, scatterer, range), complex.
-            second: Functions of the second scatterers, same shape.
-
-        Returns:
-            The sums of conj(first) * second for each pair, shape (pair,).
-        """
-        return (first.conj() @ second.mT)[self.trial, self.first, self.second]
 
 
 def envelopes(share: Tensor, row: Tensor, cells: int) -> tuple[Tensor, Tensor, Tensor]:

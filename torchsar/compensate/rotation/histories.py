@@ -31,6 +31,7 @@ from torch.nn.functional import pad
 from torchsar.compensate.rotation.motion import Motion, Sampling, chosen, image_of, warped_time
 from torchsar.core import cis
 from torchsar.core.warp import warp, warp_rate
+from torchsar.focus.warped_sums import slow_times
 
 OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
 HALF_CELLS = 24  # half width of a window in Doppler cells
@@ -178,7 +179,7 @@ def histories_of(
     least = threshold(power[0].numel())
     # Lines whose Doppler the pulse rate resolves at every time. The fastest rotation limits
     # them; beyond them scatterers of the other end of the band return.
-    times, lines = sampling.times(motion.k.device), image.shape[1]
+    times, lines = slow_times(sampling.pulses, sampling.prf_hz, motion.k.device), image.shape[1]
     fastest = warp_rate(times, motion.k).amax(-1) * sampling.duration_s
     whole = warp(times.new_full((1,), sampling.duration_s), motion.k)[..., 0]
     doppler = torch.arange(lines, device=times.device) - lines // 2
@@ -191,7 +192,14 @@ def histories_of(
     # up to 128 scatterers, of at least half of the largest amplitude within the window; by trial
     peak, line, cell = find_peaks(clear, noise, 128, 0.5, 2 * half_cells, 1)
     cells, used = (line - image.shape[1] // 2) / OVERSAMPLING, peak > 0
-    history, u = _windowed(image, line, cell, half_cells)
+    # the histories of windows about the peaks, (trial, peak, 2 half_cells), and u of their samples
+    offsets = torch.arange(-half_cells * OVERSAMPLING, half_cells * OVERSAMPLING, device=image.device)
+    row = line[..., None] + offsets
+    index = row.clamp(0, lines - 1) * image.shape[2] + cell[..., None]
+    near = torch.gather(image.flatten(1), 1, index.flatten(1)).view(index.shape)
+    window = torch.where((row >= 0) & (row < lines), near, 0).to(torch.complex128)
+    u = (torch.arange(2 * half_cells, dtype=torch.float64, device=image.device) + 0.5) / (2 * half_cells)
+    history = window @ cis(-2 * math.pi / OVERSAMPLING * offsets[:, None] * u)
     bases = _bases(motion, sampling, cells, sampling.range_m(cell), u, free_centre)
     # a window smears a history at both ends by 1/16 of its length, which is left out
     ends = max(1, len(u) // 16)
@@ -201,19 +209,6 @@ def histories_of(
     tiny = torch.finfo(power.dtype).tiny
     level, least_lit = brightest / noise.clamp_min(tiny), seen.amin(-1) / seen.amax(-1).clamp_min(tiny)
     return Histories(cells, used, level, least_lit, *_fitted(history, bases, used))
-
-
-def _windowed(image: Tensor, line: Tensor, cell: Tensor, half_cells: int) -> tuple[Tensor, Tensor]:
-    """Histories (trial, peak, 2 half_cells) of windows about peaks, and u of their samples."""
-    lines = torch.arange(2 * half_cells * OVERSAMPLING, device=image.device) - half_cells * OVERSAMPLING
-    row = line[..., None] + lines
-    inside = (row >= 0) & (row < image.shape[1])
-    index = row.clamp(0, image.shape[1] - 1) * image.shape[2] + cell[..., None]
-    window = torch.where(inside, torch.gather(image.flatten(1), 1, index.flatten(1)).view(index.shape), 0).to(
-        torch.complex128
-    )
-    u = (torch.arange(2 * half_cells, dtype=torch.float64, device=image.device) + 0.5) / (2 * half_cells)
-    return window @ cis(-2 * math.pi / OVERSAMPLING * lines[:, None] * u), u
 
 
 def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u: Tensor, free_centre: bool) -> Tensor:

@@ -122,17 +122,6 @@ class Sampling:
         """Duration of the aperture in seconds."""
         return self.pulses / self.prf_hz
 
-    def times(self, device: torch.device) -> Tensor:
-        """Compute the slow times of the pulses in seconds, shape (pulse,).
-
-        Args:
-            device: Device of the result.
-
-        Returns:
-            The times, from 0 at the first pulse.
-        """
-        return slow_times(self.pulses, self.prf_hz, device)
-
     def range_m(self, cell: Tensor) -> Tensor:
         """Convert range cells to range in metres.
 
@@ -284,7 +273,7 @@ def image_of(data: Tensor, sampling: Sampling, motion: Motion, oversampling: flo
     Returns:
         The image, shape (trial, line, range), with zero Doppler in the middle.
     """
-    phi = warp(sampling.times(data.device), motion.k)
+    phi = warp(slow_times(sampling.pulses, sampling.prf_hz, data.device), motion.k)
     return matched_fourier(
         without_range_term(data, sampling, motion, phi),
         motion.k,

@@ -50,8 +50,6 @@ from torchsar.focus.matched_fourier import MatchedFourierOperator, range_phase
 from torchsar.focus.transforms import Gridding
 from torchsar.radar import InverseRadar
 
-HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
-
 
 def uneven_rotation(
     data: Tensor,
@@ -199,7 +197,7 @@ def phase_fit_rotation(
     range_m: Tensor,
     order: int = 3,
     yc_m: Tensor | float | None = None,
-    steps: int = HISTORY_STEPS,
+    steps: int = 4,
     half_cells: int = HALF_CELLS,
     assess: bool = True,
 ) -> Estimate:
@@ -218,7 +216,8 @@ def phase_fit_rotation(
             rotation.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
             rotation centre), if known a priori, a number or shape (...,); None estimates it.
-        steps: Number of times that the least-squares fit to the phase histories is repeated.
+        steps: Number of times that the least-squares fit to the phase histories is repeated;
+            four are enough to converge.
         half_cells: Half width of the windows about scatterers in Doppler cells, at least 4.
         assess: False leaves out the assessment.
 
@@ -426,7 +425,7 @@ class PhaseFitRotation(_Rotation):
         radar: InverseRadar,
         order: int = 3,
         yc_m: float | None = None,
-        steps: int = HISTORY_STEPS,
+        steps: int = 4,
         half_cells: int = HALF_CELLS,
         assess: bool = True,
     ) -> None:

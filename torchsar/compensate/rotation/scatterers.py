@@ -28,6 +28,7 @@ from torchsar.compensate.rotation.histories import OVERSAMPLING, find_peaks, inv
 from torchsar.compensate.rotation.motion import Motion, Sampling, chosen, each, image_of, warped_time
 from torchsar.core import power_of, real_dtype, reduced_turns, settle
 from torchsar.core.warp import least_rate
+from torchsar.focus.warped_sums import slow_times
 
 MOST, ROUNDS = 800, 12  # largest number of scatterers, number of steps; accuracy against time
 # rounds that search for further scatterers, and the share of their number up to which they do: the
@@ -293,7 +294,9 @@ class Step:
             The residual, shape (trial, pulse, range), and the gradient and curvature for the step.
         """
         motion, found, present = fit.motion, fit.scatterers, (data != 0).any(-1)
-        phi, u, slopes = warped_time(motion.k, sampling.times(data.device), sampling.duration_s)
+        phi, u, slopes = warped_time(
+            motion.k, slow_times(sampling.pulses, sampling.prf_hz, data.device), sampling.duration_s
+        )
         square = 1 / sampling.wavelength_m * phi.square()
         rows = [torch.ones_like(u), u, *slopes.unbind(1), 2 * math.pi * square]
         bases = torch.stack(rows, 1) * present[:, None]
@@ -322,7 +325,7 @@ class Step:
         products = inner_products(near, sampling, motion.k, found.amplitude, found.cell, bases)
         shift = (shift * slope.conj()).sum(-1)
         pairs = ((value, value), (value, slope), (slope, value), (slope, slope), (difference, difference))
-        overlaps = [near.over_range(*pair) for pair in pairs]
+        overlaps = [(one.conj() @ other.mT)[near.trial, near.first, near.second] for one, other in pairs]
         return residual, Step(fit, range_m, near, products, bases @ bases.mT, overlaps, moments, shift, share)
 
     def after(self, noise: Tensor, sampling: Sampling, iteration: int) -> Fit:
@@ -450,7 +453,11 @@ class Step:
             [-u.imag, -u.real, (bent * overlap).real, -us.imag],
             [b.real, -b.imag, ub.imag, (flat * bend).real],
         ]
-        local = self.near.matrix(rows)
+        # row i and column j of the blocks, zero where two scatterers do not form a pair
+        near, count = self.near, self.near.shape[1]
+        local = a.real.new_zeros(near.shape[0], 4 * count, 4 * count)
+        for (i, row), j in itertools.product(enumerate(rows), range(4)):
+            local[near.trial, near.first + i * count, near.second + j * count] = row[j]
         diagonal = local.diagonal(dim1=-2, dim2=-1)
         # above the rounding of float64; zero without a scatterer, or with one range cell, which
         # does not determine range
