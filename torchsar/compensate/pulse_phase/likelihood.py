@@ -359,12 +359,28 @@ def deviation(information: Tensor) -> Tensor:
 
 
 def rms_of_pulses(x: Tensor, present: Tensor) -> Tensor:
-    """Compute the rms of x (trial, pulse) over the present pulses, shape (trial,)."""
+    """Compute the rms of values over the present pulses.
+
+    Args:
+        x: Values, shape (trial, pulse).
+        present: Pulses that were received, shape (trial, pulse), bool.
+
+    Returns:
+        The rms, shape (trial,).
+    """
     return ((x.square() * present).sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
 
 
 def without_line_matrix(n: int, device: torch.device) -> Tensor:
-    """Return the projection of n phases that removes their constant and linear part, (n, n)."""
+    """Return the projection of phases that removes their constant and linear part.
+
+    Args:
+        n: Number of phases.
+        device: Device of the result.
+
+    Returns:
+        The projection, shape (n, n), float64.
+    """
     pulse = torch.linspace(-1, 1, n, dtype=torch.float64, device=device)
     line = torch.linalg.qr(torch.stack([torch.ones_like(pulse), pulse], -1)).Q
     return torch.eye(n, dtype=torch.float64, device=device) - line @ line.mT

@@ -258,12 +258,21 @@ def solved(pull: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 class Step:
     """Gradient and curvature of the likelihood with respect to all unknowns, at a fit.
 
-    moments: (trial, scatterer, base), sums over pulses of base * conj(echo) * residual at the range
-    of the scatterer, for the bases 1, u, du/dk..., phi^2. shift: the same of base 1 with the
-    derivative of the envelope. share: gradient of the share of the periodic range response.
-    overlaps: inner product over range cells of the envelopes of each pair, its derivatives with
-    respect to the range of the second scatterer, of the first one, and of both, and that of the
-    derivatives of the envelopes with respect to this share.
+    Args:
+        fit: The fit.
+        range_m: Range of the scatterers in metres, shape (trial, scatterer).
+        near: Pairs of neighbouring scatterers.
+        products: Inner products of their echoes over slow time, see `inner_products`.
+        gram: Products of the bases 1, u, du/dk..., phi^2 of slow time, shape (trial, base, base).
+        overlaps: Inner product over range cells of the range responses of each pair, its
+            derivatives with respect to the range of the second scatterer, of the first one, and of
+            both, and that of the derivatives of the responses with respect to the share of the
+            periodic one.
+        moments: Sums over pulses of base * conj(echo) * residual at the range of the scatterer,
+            shape (trial, scatterer, base).
+        shift: The same of base 1 with the derivative of the range response, shape (trial,
+            scatterer).
+        share: Gradient of the share of the periodic range response, shape (trial,).
     """
 
     fit: Fit
