@@ -140,5 +140,9 @@ def test_too_few_cells_or_pulses_and_zeros_are_aligned() -> None:
     noise = torch.randn(2, 64, 64, generator=torch.Generator().manual_seed(7), dtype=torch.complex64)
     for rows in (noise[:, :4], noise[..., :5], 0 * noise, noise):
         found = displacement(rows, (rows != 0).any(1))
-        assert found.aligned.all() and torch.isfinite(found.jitter + found.migration).all()
+        assert (
+            (found.jitter < 0.25).all()
+            and (found.migration < 0.4).all()
+            and torch.isfinite(found.jitter + found.migration).all()
+        )
         assert not coherent_jitter(rows, (rows != 0).any(1)).any()

@@ -1,12 +1,10 @@
 """Autofocus: the phase error of every pulse, estimated from the range-compressed data alone."""
 
 from torchsar.compensate.pulse_phase.descent import maximum_contrast, minimum_entropy, sharpest_phase
-from torchsar.compensate.pulse_phase.fixed_point import entropy_fixed_point
-from torchsar.compensate.pulse_phase.gradient import Listed, Measured, Shrinking, pga, pga_sca
+from torchsar.compensate.pulse_phase.gradient import Listed, Measured, Shrinking, pga, pga_sca, sca
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.compensate.pulse_phase.linking import link_phases
-from torchsar.compensate.pulse_phase.recommended import autofocus
-from torchsar.compensate.pulse_phase.sca import sca
+from torchsar.compensate.pulse_phase.recommended import autofocus, entropy_fixed_point
 from torchsar.compensate.pulse_phase.stages import (
     Autofocus,
     CorrectPulsePhase,

@@ -25,8 +25,6 @@ LARGEST_JITTER, LARGEST_MIGRATION = 0.25, 0.4
 _SIGNIFICANT = 3.0
 # fewest range cells and pulses whose displacement is estimated; number of groups of pulses
 _LEAST_CELLS, _LEAST_PULSES, _GROUPS = 8, 8, 16
-# largest displacement between adjacent pulses of clutter, in cells, and the values that are tried
-_FARTHEST, _STEPS = 1.5, 61
 
 
 @dataclass(frozen=True)
@@ -40,11 +38,6 @@ class Displacement:
 
     jitter: Tensor
     migration: Tensor
-
-    @property
-    def aligned(self) -> Tensor:
-        """True where the jitter is below 0.25 cell and the migration below 0.4 cell, (trial,)."""
-        return (self.jitter < LARGEST_JITTER) & (self.migration < LARGEST_MIGRATION)
 
 
 @torch.no_grad()
@@ -141,7 +134,7 @@ def coherent_jitter(rows: Tensor, present: Tensor) -> Tensor:
     offset = _about_centroid(spectrum)
     products = spectrum[..., 1:] * spectrum[..., :-1].conj()
     both = present[:, 1:] & present[:, :-1]
-    steps = torch.linspace(-_FARTHEST, _FARTHEST, _STEPS, dtype=offset.dtype, device=rows.device)
+    steps = torch.linspace(-1.5, 1.5, 61, dtype=offset.dtype, device=rows.device)  # in cells
     slopes = []
     for half in (offset > 0, offset <= 0):
         turns = torch.exp(2j * torch.pi * steps[:, None] * offset[:, None]) * half[:, None]

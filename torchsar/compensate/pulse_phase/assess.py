@@ -134,7 +134,16 @@ def conclude(
 
 
 def settled(rows: Tensor, which: Tensor | slice, phase: Tensor) -> Tensor:
-    """Continue any method by three iterations of the entropy fixed point, see `Again`."""
+    """Continue any method by three iterations of the entropy fixed point, see `Again`.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        which: Not used, since all trials are continued in the same way.
+        phase: Phase to start from in rad, shape (trial, pulse).
+
+    Returns:
+        The phase in rad, shape (trial, pulse).
+    """
     return fixed_point(rows, phase, Run(LogAbove(2.5), AlongPulses(), 3, 1.8, 0.0))[0]
 
 
@@ -209,7 +218,14 @@ def gain_of_parts(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
 
 
 def halves_of_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Divide the rows (trial, range, pulse), sorted by energy, alternately into two halves."""
+    """Divide range cells, sorted by energy, alternately into two halves.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+
+    Returns:
+        The pulses of both halves.
+    """
     order = power_of(rows).sum(-1).argsort(-1, descending=True)
     one, other = (
         rows.gather(1, order[:, part::2].sort(-1).values[..., None].expand(-1, -1, rows.shape[-1])) for part in (0, 1)
@@ -218,10 +234,18 @@ def halves_of_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def halves_of_image(through: Through, rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
-    """Divide pulses into those of two halves of their image, of the shape of the rows.
+    """Divide pulses into those of two halves of their image.
 
     Range cells do not divide scatterers that migrate through them. Strips of four range lines of
     the image (fewer if there are less than eight), sorted by energy, are taken alternately.
+
+    Args:
+        through: Image formation.
+        rows: Pulses, shape (trial, range, pulse), complex.
+        phase: Phases that focus them in rad, shape (trial, pulse).
+
+    Returns:
+        The pulses of both halves, of the shape of the rows.
     """
     image = through.image(rotate(rows, phase))
     lines = image.shape[-1]

@@ -14,12 +14,6 @@ from torch import Tensor
 
 from torchsar.core import block_bytes_of, checked_samples, cis, is_plain, over_blocks, power_of, unit_level
 
-# largest rounding error of a start, far below the accuracy of any estimate
-_PHASE_ERROR_RAD = 1e-3
-
-# a method: (rows, present, phase to start from) -> phase, iterations
-Find = Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]]
-
 
 @dataclass(frozen=True)
 class Pulses:
@@ -139,7 +133,8 @@ def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | 
             f"{name}: start must hold one phase per pulse, shape {want} or (pulse,), got {tuple(start.shape)}"
         ) from None
     phase, working = wide.reshape(-1, pulses.n), pulses.rows.real.dtype
-    large = phase.detach().abs().amax(-1, keepdim=True) > _PHASE_ERROR_RAD / torch.finfo(working).eps
+    # rounding errors of 1e-3 rad are far below the accuracy of any estimate
+    large = phase.detach().abs().amax(-1, keepdim=True) > 1e-3 / torch.finfo(working).eps
     return torch.where(large, on_the_circle(phase.to(torch.float64)), phase).to(
         dtype=working, device=pulses.rows.device
     )
@@ -176,7 +171,11 @@ def by_blocks(
 
 
 def find_phases(
-    pulses: Pulses, find: Find, start: Tensor | None = None, tuned: Sequence[Tensor | float] = (), whole: bool = False
+    pulses: Pulses,
+    find: Callable[[Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor]],
+    start: Tensor | None = None,
+    tuned: Sequence[Tensor | float] = (),
+    whole: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Run an autofocus method on all trials, in blocks of trials that fit into the cache.
 
@@ -293,20 +292,6 @@ def or_one(x: Tensor) -> Tensor:
     return torch.where(x > 0, x, 1)
 
 
-def rising(x: Tensor) -> Tensor:
-    """Sort along the last dimension. On a CPU numpy does it many times as fast as torch.
-
-    Args:
-        x: Numbers, float32 or float64, any shape.
-
-    Returns:
-        The numbers in rising order, without derivatives.
-    """
-    if x.device.type == "cpu" and is_plain(x):
-        return torch.from_numpy(np.sort(x.detach().resolve_neg().numpy(), axis=-1))
-    return x.detach().sort(-1).values
-
-
 def without_lobes(image: Tensor) -> Tensor:
     """Weight the pulses of an image with a Hann window, so that side lobes do not count as noise.
 
@@ -337,7 +322,11 @@ def noise_power(rows: Tensor, present: Tensor, phase_rad: Tensor) -> Tensor:
     image = without_lobes(torch.fft.fft(rotate(rows, phase_rad.detach()), norm="ortho"))
     power = power_of(image)
     filled = (rows != 0).any(-1)
-    power = rising(torch.where(filled[..., None], power, torch.inf).flatten(1))
+    power = torch.where(filled[..., None], power, torch.inf).flatten(1)
+    if power.device.type == "cpu" and is_plain(power):  # numpy sorts many times as fast as torch
+        power = torch.from_numpy(np.sort(power.numpy(), axis=-1))
+    else:
+        power = power.sort(-1).values
     middle = (filled.sum(-1, keepdim=True) * rows.shape[-1] - 1).clamp_min(0) // 2
     median = torch.where(filled.any(-1), power.gather(-1, middle)[:, 0].to(torch.float64), 0)
     # the window that the pulses had in the image

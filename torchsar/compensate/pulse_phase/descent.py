@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -26,6 +26,8 @@ from torchsar.optim import Descent, adam, lbfgs
 Cost = Callable[[Tensor], Tensor]
 Objective = Literal["power_entropy", "amplitude_entropy", "contrast"] | Cost
 Method = Literal["lbfgs", "adam"]
+# phase (trial, pulse) -> cost (trial,), gradient (trial, pulse)
+_PhaseCost = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 # rms length of the first step, found by trial: shorter steps cost iterations, longer ones leave the
 # minimum near the start
@@ -117,15 +119,23 @@ def sharpest_phase(
     pulses = prepare(data, name)
     begin = starting_phase(start, pulses, name)
     continued = _OF_CONTRAST if objective == "contrast" else _OF_ENTROPY
-    cost, space = _cost_of(objective, mask, imaging, pulses), _space_of(basis, pulses)
+    cost, functions = _cost_of(objective, mask, imaging, pulses), _functions_of(basis, pulses)
     descend = _descent_of(method, steps, tolerance)
 
     def find(rows: Tensor, present: Tensor, which: Tensor | None) -> tuple[Tensor, Tensor]:
         assert which is not None
-        rows, own = rows.detach(), space.of(which)
-        first = pair_phase(rows, present) if begin is None else begin[which]
-        found = descend(_InCoordinates(cost(rows, which), own), own.coordinates(first))
-        return own.phase(found.x) if basis is not None else torch.where(present, found.x, first), found.steps
+        rows, own = rows.detach(), _of_trials(functions, which)
+        first, cost_of = pair_phase(rows, present) if begin is None else begin[which], cost(rows, which)
+        if own is None:
+            found = descend(cost_of, first)
+            return torch.where(present, found.x, first), found.steps
+
+        def of_weights(x: Tensor) -> tuple[Tensor, Tensor]:
+            value, gradient = cost_of(_summed(own, x))
+            return value, _projected(own, gradient)
+
+        found = descend(of_weights, _projected(own, first) / pulses.n)
+        return _summed(own, found.x), found.steps
 
     # the start passed to `find` is the indices of the trials of a block, because masks, starts and
     # basis functions may differ between trials
@@ -133,9 +143,13 @@ def sharpest_phase(
 
     def again(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
         """Continue without what the basis does not hold."""
-        held, from_ = space.of(which), phase[which]
-        at = from_ + held.phase(held.coordinates(at - from_))
-        return at + held.phase(held.coordinates(on_the_circle(fixed_point(rows, at, continued)[0] - at)))
+        own, from_ = _of_trials(functions, which), phase[which]
+
+        def held(change: Tensor) -> Tensor:
+            return change if own is None else _summed(own, _projected(own, change) / pulses.n)
+
+        at = from_ + held(at - from_)
+        return at + held(on_the_circle(fixed_point(rows, at, continued)[0] - at))
 
     return conclude(pulses, phase, taken, assess, again)
 
@@ -168,63 +182,28 @@ def maximum_contrast(data: Tensor, **options: Any) -> Estimate:
     return sharpest_phase(data, objective="contrast", **options)
 
 
-class _Space(Protocol):
-    """Coordinates (trial, n) of phases (trial, pulse) in which a descent moves.
+def _summed(functions: Tensor, x: Tensor) -> Tensor:
+    """Sums (trial, pulse) of functions (coordinate, pulse) or (trial, coordinate, pulse)."""
+    return (x[..., None, :] @ functions)[..., 0, :]
 
-    `of` selects trials; `projected` maps a gradient of phases to one of coordinates.
+
+def _projected(functions: Tensor, gradient: Tensor) -> Tensor:
+    """Gradient (trial, coordinate) by the weights of functions from that by phases."""
+    return (functions @ gradient[..., None])[..., 0]
+
+
+def _of_trials(x: Tensor | None, which: Tensor | slice) -> Tensor | None:
+    """Some of the trials of x, if it has a dimension of trials before two others."""
+    return x if x is None or x.ndim < 3 else x[which]
+
+
+def _functions_of(basis: Tensor | None, pulses: Pulses) -> Tensor | None:
+    """Functions of a basis that are orthogonal over the pulses and have unit mean square.
+
+    Raises ValueError if the basis is invalid.
     """
-
-    def of(self, which: Tensor | slice) -> _Space: ...
-
-    def phase(self, x: Tensor) -> Tensor: ...
-
-    def coordinates(self, phase_rad: Tensor) -> Tensor: ...
-
-    def projected(self, gradient: Tensor) -> Tensor: ...
-
-
-class _Free:
-    """Every pulse has a coordinate of its own."""
-
-    def of(self, which: Tensor | slice) -> _Free:
-        return self
-
-    def phase(self, x: Tensor) -> Tensor:
-        return x
-
-    def coordinates(self, phase_rad: Tensor) -> Tensor:
-        return phase_rad
-
-    def projected(self, gradient: Tensor) -> Tensor:
-        return gradient
-
-
-@dataclass(frozen=True)
-class _Spanned:
-    """Sums of functions (coordinate, pulse) or (trial, coordinate, pulse).
-
-    The functions are orthogonal over the pulses and have unit mean square.
-    """
-
-    functions: Tensor
-
-    def of(self, which: Tensor | slice) -> _Spanned:
-        return _Spanned(self.functions[which]) if self.functions.ndim > 2 else self
-
-    def phase(self, x: Tensor) -> Tensor:
-        return (x[..., None, :] @ self.functions)[..., 0, :]
-
-    def projected(self, gradient: Tensor) -> Tensor:
-        return (self.functions @ gradient[..., None])[..., 0]
-
-    def coordinates(self, phase_rad: Tensor) -> Tensor:
-        return self.projected(phase_rad) / phase_rad.shape[-1]
-
-
-def _space_of(basis: Tensor | None, pulses: Pulses) -> _Space:
-    """Coordinates for a basis; raises ValueError if the basis is invalid."""
     if basis is None:
-        return _Free()
+        return None
     if (
         _check_tensor(basis, "basis").is_complex()
         or basis.ndim < 2
@@ -241,7 +220,7 @@ def _space_of(basis: Tensor | None, pulses: Pulses) -> _Space:
             f"sharpest_phase: the {wide.shape[-2]} functions of basis must be finite and linearly "
             "independent; use orthogonal functions such as those of torchsar.core.legendre"
         )
-    return _Spanned((torch.linalg.qr(wide.mT).Q.mT * math.sqrt(pulses.n)).to(pulses.rows.real.dtype).contiguous())
+    return (torch.linalg.qr(wide.mT).Q.mT * math.sqrt(pulses.n)).to(pulses.rows.real.dtype).contiguous()
 
 
 def _check_tensor(x: Tensor, what: str) -> Tensor:
@@ -265,22 +244,6 @@ def _by_trial(x: Tensor, pulses: Pulses, what: str) -> Tensor:
         ) from None
 
 
-# phase (trial, pulse) -> cost (trial,), gradient (trial, pulse)
-_PhaseCost = Callable[[Tensor], tuple[Tensor, Tensor]]
-
-
-@dataclass(frozen=True)
-class _InCoordinates:
-    """A cost of phases as a cost of coordinates, with its gradient."""
-
-    cost: _PhaseCost
-    space: _Space
-
-    def __call__(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        cost, gradient = self.cost(self.space.phase(x))
-        return cost, self.space.projected(gradient)
-
-
 def _cost_of(
     objective: Objective, mask: Tensor | None, imaging: Imaging | None, pulses: Pulses
 ) -> Callable[[Tensor, Tensor], _PhaseCost]:
@@ -299,42 +262,35 @@ def _cost_of(
         )
     if objective == "power_entropy" and mask is None and imaging is None:
         return lambda rows, _: _PowerEntropy(rows, rows.conj().resolve_conj())
-    operator = _Centred() if imaging is None else Through(imaging)
+    image = _centred_image if imaging is None else Through(imaging).image
     if not isinstance(objective, str):
-        return lambda rows, _: _Derived(rows, operator, objective)
+        return lambda rows, _: _Derived(rows, image, objective)
     weights = None if mask is None else _by_trial(_check_tensor(mask, "mask").to(pulses.rows.device), pulses, "mask")
     cost = _COSTS[objective]
-
-    def of_trials(rows: Tensor, which: Tensor) -> _PhaseCost:
-        return _Derived(
-            rows, operator, partial(cost, mask=weights if weights is None or weights.ndim < 3 else weights[which])
-        )
-
-    return of_trials
+    return lambda rows, which: _Derived(rows, image, partial(cost, mask=_of_trials(weights, which)))
 
 
-def _descent_of(method: Method, steps: int | None, tolerance: float) -> Callable[[_InCoordinates, Tensor], Descent]:
+def _descent_of(method: Method, steps: int | None, tolerance: float) -> Callable[[_PhaseCost, Tensor], Descent]:
     """Descent by name with its options; raises ValueError if the method is unknown."""
     if method not in _METHODS:
         raise ValueError(f"sharpest_phase: method {method!r} is not known; choose one of {', '.join(_METHODS)}")
     run, options = _METHODS[method]
     if steps is not None:
         options = {**options, "steps": steps}
+    first = _STEP_RAD if method == "lbfgs" else None
     return lambda cost_of_x, start: run(
-        cost_of_x, start, with_gradient=True, gradient_tolerance=tolerance, **options, **_first_step(method, start)
+        cost_of_x,
+        start,
+        with_gradient=True,
+        gradient_tolerance=tolerance,
+        **options,
+        **({} if first is None else {"first_step": first * math.sqrt(start.shape[-1])}),
     )
 
 
-def _first_step(method: Method, start: Tensor) -> dict[str, float]:
-    """Option for the length of the first step, where the method has one."""
-    return {"first_step": _STEP_RAD * math.sqrt(start.shape[-1])} if method == "lbfgs" else {}
-
-
-class _Centred:
+def _centred_image(rows: Tensor) -> Tensor:
     """Image (trial, azimuth, range) of rows (trial, range, pulse) as by `azimuth_transform`."""
-
-    def image(self, rows: Tensor) -> Tensor:
-        return (centred_ifft(rows) * math.sqrt(rows.shape[-1])).mT
+    return (centred_ifft(rows) * math.sqrt(rows.shape[-1])).mT
 
 
 @dataclass(frozen=True)
@@ -342,29 +298,24 @@ class _Derived:
     """Any cost of the image, with its gradient by automatic differentiation."""
 
     rows: Tensor
-    operator: _Centred | Through
+    image: Callable[[Tensor], Tensor]
     cost: Cost
 
     def __call__(self, phase_rad: Tensor) -> tuple[Tensor, Tensor]:
         with torch.enable_grad():
             phase = phase_rad.detach().requires_grad_()
-            cost = self.cost(self.operator.image(rotate(self.rows, phase)))
-            _check_cost(cost, phase)
+            cost = self.cost(self.image(rotate(self.rows, phase)))
+            if not isinstance(cost, Tensor) or cost.shape != phase.shape[:-1] or not cost.requires_grad:
+                got = (
+                    f"{'' if cost.requires_grad else 'detached '}{cost.dtype} of shape {tuple(cost.shape)}"
+                    if isinstance(cost, Tensor)
+                    else type(cost).__name__
+                )
+                raise ValueError(
+                    f"sharpest_phase: the objective returned {got} for {len(phase)} images; it must return one real "
+                    "cost per image that is differentiable in the samples of the image"
+                )
             return cost.detach(), torch.autograd.grad(cost.sum(), phase)[0]
-
-
-def _check_cost(cost: Any, phase: Tensor) -> None:
-    """Raise ValueError unless an objective returned one differentiable real cost per image."""
-    if not isinstance(cost, Tensor) or cost.shape != phase.shape[:-1] or not cost.requires_grad:
-        got = (
-            f"{'' if cost.requires_grad else 'detached '}{cost.dtype} of shape {tuple(cost.shape)}"
-            if isinstance(cost, Tensor)
-            else type(cost).__name__
-        )
-        raise ValueError(
-            f"sharpest_phase: the objective returned {got} for {len(phase)} images; it must return one real "
-            "cost per image that is differentiable in the samples of the image"
-        )
 
 
 @dataclass(frozen=True)

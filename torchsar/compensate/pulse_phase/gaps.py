@@ -17,15 +17,6 @@ from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import LEAST_PULSES_OF_FACTORS, WIENER_FACTORS, Wiener
 from torchsar.core import host_value, power_of
 
-# Largest side lobe of missing pulses, relative to the main lobe, from which on they are filled in.
-# With 0.07, a gap of a sixteenth of the record, errors of 40 points were a sixth larger.
-_LOBE = 0.06
-# Lobes as high as the main lobe are images of the whole scene, as of every other pulse: they do not
-# change the sharpness.
-_REPEATED = 0.98
-# iterations that fill without changing phases
-_FIRST = 6
-
 
 def side_lobes(present: Tensor) -> Tensor:
     """Compute the largest side lobe that missing pulses make.
@@ -39,7 +30,9 @@ def side_lobes(present: Tensor) -> Tensor:
     """
     response = torch.fft.rfft(present.to(torch.float64)).abs()
     lobes = response[:, 1:] / or_one(response[:, :1])
-    return torch.where(lobes < _REPEATED, lobes, 0).amax(-1)
+    # lobes as high as the main lobe are images of the whole scene, as of every other pulse: they do
+    # not change the sharpness
+    return torch.where(lobes < 0.98, lobes, 0).amax(-1)
 
 
 def have_gaps(present: Tensor) -> Tensor:
@@ -51,7 +44,8 @@ def have_gaps(present: Tensor) -> Tensor:
     Returns:
         True where they do, shape (trial,).
     """
-    return side_lobes(present) > _LOBE
+    # with 0.07, a gap of a sixteenth of the record, errors of 40 points were a sixth larger
+    return side_lobes(present) > 0.06
 
 
 def longest_gap(present: Tensor) -> Tensor:
@@ -92,7 +86,7 @@ def across_gaps(rows: Tensor, phase_rad: Tensor, iterations: int, tolerance_rad:
     factors = WIENER_FACTORS if rows.shape[-1] >= LEAST_PULSES_OF_FACTORS else (1.0,)
     filled, phase = torch.zeros_like(rows), phase_rad
     active = torch.ones_like(phase[:, 0], dtype=torch.bool)
-    for number in range(-_FIRST, iterations):
+    for number in range(-6, iterations):  # the first six fill without changing phases
         pulses = torch.where(present[:, None], rotate(rows, phase), filled)
         image = along.image(pulses)
         power = power_of(image)

@@ -23,10 +23,6 @@ from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, occupied
 from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 from torchsar.core import cholesky_factor, cis, fft_lines, linear_solve, matrix_inverse, power_of
 
-_IN_BAND = 0.85  # share of the power in the band of a first guess
-_STEPS = 4  # Newton steps of the phases after each estimate of the spectrum
-# least density of an adapted spectrum relative to its mean, which rounding allows
-_LEAST_FLOOR = 1e-8
 PRIOR = 3 / math.pi**2  # information in 1/rad^2 of a phase that is uniform over a turn
 
 Smooth = Callable[[Tensor, Tensor], Tensor]
@@ -74,12 +70,8 @@ class Speckle:
         samples = present.sum(-1).to(torch.float64) * z.shape[-1]
         total = power_of(z).sum((-2, -1))
         z = z * torch.where(total > 0, samples / or_one(total), 1).sqrt()[:, None, None]
-        power = power_of(z).sum(-2)
-        groups = []
-        for inside in power_groups(power):
-            if bool(inside.any()):
-                own = z * inside[:, None, :]
-                groups.append((own, own @ own.mH, inside.sum(-1).to(torch.float64)))
+        kept = [inside for inside in power_groups(power_of(z).sum(-2)) if bool(inside.any())]
+        groups = [_group(z * inside[:, None, :], inside.sum(-1)) for inside in kept]
         return Speckle(groups, present, samples, occupied_band(fft_lines(rows)))
 
     def trials(self, at: Tensor) -> Speckle:
@@ -89,10 +81,8 @@ class Speckle:
 
     def cells(self, kept: Tensor) -> Speckle:
         """The scenes with some of the range cells, given as bools (trial, range)."""
-        groups = []
-        for own, *_ in self.groups:
-            some = own * kept[:, None, :]
-            groups.append((some, some @ some.mH, (some != 0).any(-2).sum(-1).to(torch.float64)))
+        parts = [own * kept[:, None, :] for own, *_ in self.groups]
+        groups = [_group(some, (some != 0).any(-2).sum(-1)) for some in parts]
         return Speckle(groups, self.present, self.present.sum(-1) * kept.sum(-1).to(torch.float64), self.independent)
 
     def blocks(self, size: int) -> Speckle:
@@ -104,10 +94,10 @@ class Speckle:
             return torch.cat([x, x.new_zeros(*x.shape[:dim], count * size - n, *x.shape[dim + 1 :])], dim)
 
         present = cut(self.present, 1).reshape(-1, size)
-        groups = []
-        for samples, _, cells in self.groups:
-            own = cut(samples, 1).reshape(-1, size, samples.shape[-1])
-            groups.append((own, own @ own.mH, cells.repeat_interleave(count)))
+        groups = [
+            _group(cut(own, 1).reshape(-1, size, own.shape[-1]), cells.repeat_interleave(count))
+            for own, _, cells in self.groups
+        ]
         samples = present.sum(-1) * self._cells.repeat_interleave(count)
         return Speckle(groups, present, samples, self.independent.repeat_interleave(count))
 
@@ -120,7 +110,7 @@ class Speckle:
         lag = torch.arange(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
         every = sum(products for _, products, _ in self.groups) / or_one(self._cells)[:, None, None]
         flat = torch.ones_like(every[:, 0])
-        band = _IN_BAND * torch.sinc(width[:, None] * lag) + (1 - _IN_BAND) * (lag == 0)
+        band = 0.85 * torch.sinc(width[:, None] * lag) + (1 - 0.85) * (lag == 0)  # share of power in the band
         lower, _ = self._factor(self._toeplitz(band.to(flat.dtype)))
         matrix = torch.cholesky_inverse(lower).mT * every
         return newton(matrix, _smallest(matrix, flat))
@@ -130,11 +120,8 @@ class Speckle:
 
         They are summed over the range cells, shape (trial, bin), at twice as many bins as pulses.
         """
-        powers = []
-        for own, *_ in self.groups:
-            spectrum = torch.fft.fft((own * u.conj()[..., None])[:, part], 2 * u.shape[-1], dim=-2)
-            powers.append(power_of(spectrum).sum(-1))
-        return powers
+        turned = ((own * u.conj()[..., None])[:, part] for own, *_ in self.groups)
+        return [power_of(torch.fft.fft(own, 2 * u.shape[-1], dim=-2)).sum(-1) for own in turned]
 
     def periodograms(self, u: Tensor, smooth: Smooth) -> list[Tensor]:
         """Smoothed mean periodograms of each group, without the phases of u."""
@@ -160,10 +147,9 @@ class Speckle:
             tones = torch.fft.fft(inverse.mT @ (own * u.conj()[..., None]), 2 * n, dim=-2)
             sums = torch.roll(torch.nn.functional.pad(lag_sums(inverse.mT * kept), (1, 0)), -n, -1)
             gain = torch.fft.fft(sums).real
+            # of the densities relative to the mean rounding allows 1e-8 at least
             power = power_of(tones).sum(-1) / gain.square()
-            spectra.append(
-                self._smoothed(power * self.present.sum(-1)[:, None], cells, smoothed_spectrum, _LEAST_FLOOR)
-            )
+            spectra.append(self._smoothed(power * self.present.sum(-1)[:, None], cells, smoothed_spectrum, 1e-8))
         return spectra
 
     def _smoothed(self, power: Tensor, cells: Tensor, smooth: Smooth, floor: float) -> Tensor:
@@ -191,12 +177,6 @@ class Speckle:
         """Log likelihood of the phases u minus that of white noise, shape (trial,)."""
         return self.samples - fit.constant - value_of(fit.matrix, u)
 
-    def information(self, fit: Fit) -> Tensor:
-        """Fisher information of the phases in 1/rad^2, shape (trial, pulse, pulse), if all range
-        cells are independent.
-        """
-        return self.summed(self.information_each(fit))
-
     def summed(self, each: list[Tensor]) -> Tensor:
         """Sum over all range cells of what each cell of a group adds."""
         return sum(
@@ -205,7 +185,7 @@ class Speckle:
         )
 
     def information_each(self, fit: Fit) -> list[Tensor]:
-        """Fisher information of the phases in a range cell of each group."""
+        """Fisher information of the phases in 1/rad^2 in a range cell of each group."""
         eye = torch.eye(self.present.shape[-1], dtype=torch.float64, device=self.present.device)
         covariances = [self._toeplitz(torch.fft.ifft(spectrum)) for spectrum in fit.spectra]
         return [2 * ((one * other).real - eye) for one, other in zip(fit.inverses, covariances, strict=True)]
@@ -269,6 +249,11 @@ class Speckle:
         return lower, 2 * torch.diagonal(lower, dim1=-2, dim2=-1).real.log().sum(-1)
 
 
+def _group(own: Tensor, cells: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """A group of `Speckle`: samples, their products summed over the cells, number of cells."""
+    return own, own @ own.mH, cells.to(torch.float64)
+
+
 def lag_sums(matrix: Tensor) -> Tensor:
     """Sum the elements (row, column) of equal row - column.
 
@@ -309,7 +294,7 @@ def _smallest(matrix: Tensor, start: Tensor) -> Tensor:
     return torch.where(size > 0, vector / or_one(size), 1)
 
 
-def newton(matrix: Tensor, u: Tensor, steps: int = _STEPS) -> Tensor:
+def newton(matrix: Tensor, u: Tensor, steps: int = 4) -> Tensor:
     """Lower u^H M u by damped Newton steps of the phases of u.
 
     Args:
@@ -374,12 +359,28 @@ def deviation(information: Tensor) -> Tensor:
 
 
 def rms_of_pulses(x: Tensor, present: Tensor) -> Tensor:
-    """Compute the rms of x (trial, pulse) over the present pulses, shape (trial,)."""
+    """Compute the rms of values over the present pulses.
+
+    Args:
+        x: Values, shape (trial, pulse).
+        present: Pulses that were received, shape (trial, pulse), bool.
+
+    Returns:
+        The rms, shape (trial,).
+    """
     return ((x.square() * present).sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
 
 
 def without_line_matrix(n: int, device: torch.device) -> Tensor:
-    """Return the projection of n phases that removes their constant and linear part, (n, n)."""
+    """Return the projection of phases that removes their constant and linear part.
+
+    Args:
+        n: Number of phases.
+        device: Device of the result.
+
+    Returns:
+        The projection, shape (n, n), float64.
+    """
     pulse = torch.linspace(-1, 1, n, dtype=torch.float64, device=device)
     line = torch.linalg.qr(torch.stack([torch.ones_like(pulse), pulse], -1)).Q
     return torch.eye(n, dtype=torch.float64, device=device) - line @ line.mT

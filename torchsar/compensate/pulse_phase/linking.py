@@ -237,7 +237,7 @@ def _refined(scene: Speckle, u: Tensor) -> tuple[Tensor, Fit]:
     where that makes the phases more likely.
     """
     spectra = scene.periodograms(u, smoothed_spectrum)
-    std = rms_of_pulses(deviation(scene.information(scene.fit(spectra))), scene.present)
+    std = rms_of_pulses(deviation(scene.summed(scene.information_each(scene.fit(spectra)))), scene.present)
     active = torch.arange(len(u), device=u.device)
     for _ in range(_REFINEMENTS):
         some, first = scene.trials(active), u[active]

@@ -92,6 +92,9 @@ def judged(scene: Speckle, u: Tensor, fit: Fit, still: bool) -> Judged:
         still: True if scatterers do not change and the caller confirms the phases, as by several
             starts; the Cramer-Rao bound then is the deviation.
 
+    Returns:
+        The deviation and what it rests on.
+
     Reference:
         White, Maximum likelihood estimation of misspecified models, Econometrica 50(1), 1982.
     """

@@ -40,25 +40,14 @@ def pair_products(rows: Tensor, present: Tensor) -> Tensor:
     """
     if bool(present.all()):
         return (rows[..., 1:] * rows[..., :-1].conj()).sum(-2)
-    before = previous_present(present)
+    # the last earlier pulse that holds samples; 0 where there is none
+    index = torch.arange(present.shape[-1], device=present.device)
+    before = torch.where(present, index, 0).cummax(-1).values[:, :-1]
     return torch.where(
         present[:, 1:],
         (rows[..., 1:] * rows.gather(-1, before[:, None, :].expand(-1, rows.shape[-2], -1)).conj()).sum(-2),
         0,
     )
-
-
-def previous_present(present: Tensor) -> Tensor:
-    """Find, for each pulse after the first, the last earlier pulse that holds samples.
-
-    Args:
-        present: False for pulses without samples, shape (trial, pulse), bool.
-
-    Returns:
-        The index of that pulse, shape (trial, pulse - 1); 0 where there is none.
-    """
-    index = torch.arange(present.shape[-1], device=present.device)
-    return torch.where(present, index, 0).cummax(-1).values[:, :-1]
 
 
 def running_sum(products: Tensor) -> Tensor:

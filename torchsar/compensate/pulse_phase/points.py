@@ -17,24 +17,8 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import noise_power, or_one, rotate, safe_angle
 from torchsar.core import cis, host_value, power_of, true_positions
 
-# Effective number of range cells over which the energy is spread, below which few points may
-# explain the pulses. With more, noise is as strong as they are, or they are many.
-FEW_ROWS = 16
-# fewest pulses: with fewer, lines explain what is no point
-_LEAST_PULSES = 32
 # Largest number of lines, of lines per pulse, and of the strongest range cells that count.
 _MOST_LINES, _OF_PULSES, _CELLS = 16, 1 / 8, 32
-# A range cell counts if its energy exceeds that of noise by so many deviations.
-_SEEN = 5.0
-# Largest power of what lines do not explain in powers of the noise, whose level errs by a few
-# percent.
-_EXPLAINED = 1.15
-# Least variance of the noise in mean powers: that of data without noise, which the rounds do not
-# explain any better.
-_LEAST_NOISE = 1e-8
-# Largest deviation in rad, due to noise, of the phases that the points tell beside those of one
-# range: energy of a second range, from the eigenvalues of the covariance over range.
-_SECOND_RANGE_RAD = 0.25
 # The phases stay where they start until lines explain all but this share of the energy without
 # noise: phases that make a line of one point out of ten hide the others.
 _HELD = 0.25
@@ -77,19 +61,25 @@ def phases_of_points(rows: Tensor, present: Tensor, phase_rad: Tensor) -> tuple[
         per trial that is True where they do.
     """
     energy = power_of(rows.detach()).sum(-1)
-    open_ = (energy.sum(-1).square() < FEW_ROWS * energy.square().sum(-1)) & (present.sum(-1) >= _LEAST_PULSES)
+    # With energy in more than 16 effective range cells noise is as strong as points are, or they
+    # are many; with fewer than 32 pulses lines explain what is no point.
+    open_ = (energy.sum(-1).square() < 16 * energy.square().sum(-1)) & (present.sum(-1) >= 32)
     phase, explained = phase_rad, torch.zeros_like(open_)
     at = true_positions(open_, host_value(open_.sum(), len(open_)))
     if not len(at):
         return phase, explained
     noise = noise_power(rows[at], present[at], phase[at])
-    noise = torch.maximum(noise, _LEAST_NOISE * energy[at].mean(-1).double() / rows.shape[-1])
+    # the least is that of data without noise, which the rounds do not explain any better
+    noise = torch.maximum(noise, 1e-8 * energy[at].mean(-1).double() / rows.shape[-1])
     fit = _Fit.begin(rows[at], present[at], phase[at], noise)
     open_ = open_.index_copy(0, at, fit.cells > 0)
     for lines in range(1, _MOST_LINES + 1):
         fit = fit.with_another_line()
-        found = (fit.rest() < _EXPLAINED) & fit.free & open_[at]
-        good = found & (fit.of_second_range() < _SECOND_RANGE_RAD)
+        # the level of the noise errs by a few percent
+        found = (fit.rest() < 1.15) & fit.free & open_[at]
+        # energy of a second range, from the eigenvalues of the covariance over range, must tell the
+        # phases to 0.25 rad
+        good = found & (fit.of_second_range() < 0.25)
         phase = phase.index_copy(0, at, torch.where(good[:, None], phase_rad[at] + fit.change, phase[at]))
         explained = explained.index_copy(0, at, explained[at] | good)
         open_ = open_.index_copy(0, at, open_[at] & ~found & (lines < (_OF_PULSES * present[at].sum(-1)).floor()))
@@ -141,7 +131,8 @@ class _Fit:
         pulses = present.sum(-1)
         power, strongest = power_of(rows).sum(-1).detach().sort(-1, descending=True)
         power, strongest = power[:, :_CELLS], strongest[:, :_CELLS]
-        seen = power > (noise * (pulses + _SEEN * pulses.sqrt()))[:, None]
+        # a range cell counts if its energy exceeds that of noise by five deviations
+        seen = power > (noise * (pulses + 5.0 * pulses.sqrt()))[:, None]
         cells = seen.sum(-1)
         most = max(1, host_value(cells.max(), strongest.shape[-1]))
         inside, strongest, power = seen[:, :most], strongest[:, :most], (power * seen)[:, :most]
@@ -163,7 +154,14 @@ class _Fit:
     def with_another_line(self) -> _Fit:
         """Add a line where the spectrum of the rest is largest, and fit all lines and phases."""
         change, bend, free, model = self.change, self.bend, self.free, self.model
-        lines = torch.cat([self.lines, self._strongest()[:, None]], -1)
+        n = _FINER * self.rows.shape[-1]
+        power = power_of(torch.fft.fft(self.left, n)).sum(-2)
+        top = power.argmax(-1, keepdim=True)
+        below, peak, above = (power.gather(-1, (top + k) % n)[:, 0] for k in (-1, 0, 1))
+        fall = 2 * peak - below - above
+        place = top[:, 0] + torch.where(fall > 0, (above - below) / (2 * torch.where(fall > 0, fall, 1)), 0)
+        strongest = 2 * math.pi / n * place.to(change.dtype)  # in rad per pulse
+        lines = torch.cat([self.lines, strongest[:, None]], -1)
         pulses = self.present.sum(-1)
         pulse = _numbers(self.present, change.dtype)
         ridge = _RIDGE * pulses[:, None, None] * torch.eye(lines.shape[-1], dtype=change.dtype, device=change.device)
@@ -202,16 +200,6 @@ class _Fit:
     def _straight(self, bend: Tensor) -> Tensor:
         """Return the rows without a bend."""
         return self.rows * cis(-bend[:, None, None] * self.curve)
-
-    def _strongest(self) -> Tensor:
-        """Doppler of the strongest line of what is not explained in rad per pulse, (trial,)."""
-        n = _FINER * self.rows.shape[-1]
-        power = power_of(torch.fft.fft(self.left, n)).sum(-2)
-        top = power.argmax(-1, keepdim=True)
-        below, peak, above = (power.gather(-1, (top + k) % n)[:, 0] for k in (-1, 0, 1))
-        fall = 2 * peak - below - above
-        place = top[:, 0] + torch.where(fall > 0, (above - below) / (2 * torch.where(fall > 0, fall, 1)), 0)
-        return 2 * math.pi / n * place.to(self.change.dtype)
 
     def _degrees(self, lines: int) -> Tensor:
         """Complex degrees of freedom that lines leave to the noise, (trial,)."""

@@ -1,9 +1,9 @@
-"""The recommended autofocus."""
+"""The recommended autofocus, and its second step alone, the entropy fixed point."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import torch
@@ -41,16 +41,12 @@ Scene = Literal["sparse", "points", "clutter", "auto"]
 # floor of the entropy fixed point in mean powers, found by trial: a lower floor includes noise, a
 # higher one excludes weak scatterers
 _FLOOR = 2.5
-# floor of the first iterations where noise is weak, and their number: without them one scene of two
-# hundred ended in a wrong minimum
-_FIRST_FLOOR, _FIRST_ITERATIONS = 5.0, 6
 # on scenes at 30 dB, 3 of 32 trials of the entropy fixed point ended in a local minimum without
 # over-relaxation and none with this one
 _RELAXATION = 1.8
 # Iterations across gaps for each of the third step: filled pulses grow slowly. A quarter of a
 # record of 40 points takes 60 to 100.
 _FILLING = 5
-_SLOPES = 48  # slopes tried over one turn per pulse, found by trial: spacing against time
 
 
 def autofocus(
@@ -162,13 +158,15 @@ def autofocus(
         return Run(Wiener(), imaging, count, factors, tolerance_rad)
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:
-        first = Run(
-            LogAbove(_first_floor(rows)),
-            AlongPulses(),
-            min(search, _FIRST_ITERATIONS),
-            _RELAXATION,
-            search_tolerance_rad,
-        )
+        # Noise is weak where less than half of the range cells hold the energy. A low floor of the
+        # first iterations then ends in a wrong minimum in one scene of two hundred; in strong
+        # noise, a high floor hides the target.
+        energy = power_of(rows.detach()).sum(-1)
+        tiny = torch.finfo(energy.dtype).tiny
+        share = energy / energy.sum(-1, keepdim=True).clamp_min(tiny)
+        filled = 1 / share.square().sum(-1).clamp_min(tiny) / rows.shape[-2]
+        floor = torch.where(filled < 0.5, 5.0, _FLOOR)[:, None, None].to(energy.dtype)
+        first = Run(LogAbove(floor), AlongPulses(), min(search, 6), _RELAXATION, search_tolerance_rad)
         begin = pair_phase(rows, present) if begin is None else begin
         phase, taken = in_turn(rows, begin, [first, iterations(AlongPulses())])
         explained = torch.zeros_like(present[:, 0])
@@ -177,9 +175,9 @@ def autofocus(
         phase, more = fixed_point(rows, phase, polishing(AlongPulses(2)))
         if through is None:
             phase = torch.where(explained[:, None], points, phase) if of_points else phase
-            filled = have_gaps(present) & ~explained & (polish > 0)
-            return _filled(rows, phase, phase, filled, _FILLING * polish, tolerance_rad / 10), taken + more
-        phase, last = _WithSlope(through, [iterations(through), polishing(through)])(rows, phase)
+            gaps = have_gaps(present) & ~explained & (polish > 0)
+            return _filled(rows, phase, phase, gaps, _FILLING * polish, tolerance_rad / 10), taken + more
+        phase, last = _with_slope(through, [iterations(through), polishing(through)], rows, phase)
         return phase, taken + more + last
 
     def again(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
@@ -194,6 +192,75 @@ def autofocus(
     phase, taken = find_phases(pulses, find, begin, whole=through is not None)
     sharpest = conclude(pulses, phase, taken, assess, again, through)
     return _with_linked(pulses, sharpest, assess) if scene == "auto" and through is None else sharpest
+
+
+def entropy_fixed_point(
+    data: Tensor,
+    *,
+    start: Tensor | None = None,
+    floors: Sequence[tuple[Tensor | float, int]] = ((5.0, 12), (2.0, 12)),
+    relaxation: Tensor | float = 1.8,
+    tolerance_rad: float = 1e-3,
+    imaging: Imaging | None = None,
+    assess: bool = True,
+) -> Estimate:
+    r"""Estimate the phase of each pulse by a fixed-point iteration that lowers the image entropy.
+
+    >>> import torch
+    >>> from torchsar.compensate import entropy_fixed_point
+    >>> points = torch.eye(8, dtype=torch.complex64).repeat(4, 1)  # of 32 pulses, 8 range cells
+    >>> entropy_fixed_point(points, assess=False)["phase_rad"].shape
+    torch.Size([32])
+
+    Each iteration forms the image and weights its cells with ln(max(p, floor) / floor), where p is
+    the power of a cell over the mean power. It transforms the weighted image back to pulses and
+    takes the phase of each pulse relative to the result. An iteration takes two transforms and,
+    unlike PGA, needs no peaks and no windows. Differentiable, also in the floors and the
+    relaxation, which may be tensors of one number.
+
+    Args:
+        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+        start: Phase to start from in rad, shape (..., pulse); by default that of the spatial
+            correlation algorithm (function `sca`). With this default the size of the phase errors
+            has no effect on the result.
+        floors: Pairs (floor, largest number of iterations), used one after another. A floor is a
+            multiple of the mean power. A trial proceeds to the next pair once its phase steps are
+            below `tolerance_rad`.
+        relaxation: Factor applied to the phase step. Above 1 it helps to pass local minima; at 2 or
+            more the iteration need not converge.
+        tolerance_rad: Phase step in rad, rms over the pulses, below which a trial ends its
+            iterations with a floor.
+        imaging: Image formation whose image is sharpened, by default a Fourier transform along
+            pulses; any object with the methods `image` and `adjoint` for profiles of shape (...,
+            pulse, range), such as `torchsar.focus.PolarOperator`.
+        assess: Whether to add the standard deviation and the outcome.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed. With `assess`, standard deviation,
+        quality, outcome and info as by `autofocus`.
+
+    Raises:
+        TypeError: If the data are not complex or the start is not a tensor.
+        ValueError: If the data are empty or not finite, the start does not have one phase per
+            pulse, or a floor, an iteration count or the relaxation is invalid.
+    """
+    pulses = prepare(data, "entropy_fixed_point")
+    if not floors or not all(floor > 0 and count >= 1 for floor, count in floors) or not 0 < relaxation < 2:
+        raise ValueError(
+            "entropy_fixed_point: floors must be pairs of a floor above 0 and a number of iterations of 1 or more, "
+            f"and relaxation must lie between 0 and 2, got floors {list(floors)} and relaxation {relaxation}"
+        )
+    through = None if imaging is None else Through(imaging)
+    operator = AlongPulses() if through is None else through
+    runs = [Run(LogAbove(floor), operator, count, relaxation, tolerance_rad) for floor, count in floors]
+
+    def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:
+        return in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
+
+    begin = starting_phase(start, pulses, "entropy_fixed_point")
+    tuned = (relaxation, *(floor for floor, _ in floors))
+    found = find_phases(pulses, find, begin, tuned, through is not None)
+    return conclude(pulses, *found, assess, through=through)
 
 
 def _filled(rows: Tensor, phase: Tensor, start: Tensor, gaps: Tensor, iterations: int, tolerance_rad: float) -> Tensor:
@@ -232,48 +299,29 @@ def _with_linked(pulses: Pulses, sharpest: Estimate, assess: bool) -> Estimate:
     )
 
 
-def _first_floor(rows: Tensor) -> Tensor:
-    """Floor of the first iterations, (trial, 1, 1).
-
-    It is higher where less than half of the range cells hold the energy, that is where noise is
-    weak. A low floor then ends in a wrong minimum in one scene of two hundred; in strong noise, a
-    high floor hides the target.
-    """
-    energy = power_of(rows.detach()).sum(-1)
-    share = energy / energy.sum(-1, keepdim=True).clamp_min(torch.finfo(energy.dtype).tiny)
-    filled = 1 / share.square().sum(-1).clamp_min(torch.finfo(energy.dtype).tiny) / rows.shape[-2]
-    return torch.where(filled < 0.5, _FIRST_FLOOR, _FLOOR)[:, None, None].to(energy.dtype)
-
-
-@dataclass(frozen=True)
-class _WithSlope:
+def _with_slope(through: Through, runs: list[Run], rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
     """Slope and phase with an image formation in which scatterers do not migrate.
 
     Finds the slope over one turn, the phase, the slope again, and the phase again.
     """
-
-    through: Through
-    runs: list[Run]
-
-    def __call__(self, rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
-        step = 2 * math.pi / _SLOPES
-        phase = self._best_slope(rows, phase, step, _SLOPES)
-        total = torch.zeros_like(phase[:, 0], dtype=torch.int64)
-        for _ in range(2):
-            phase = self._best_slope(rows, phase, step / 8, 17)
-            phase, taken = in_turn(rows, phase, self.runs)
-            total = total + taken
-        return self._best_slope(rows, self._best_slope(rows, phase, step / 8, 17), step / 64, 17), total
+    n = rows.shape[-1]
+    ramp = torch.arange(n, dtype=phase.dtype, device=phase.device) - (n - 1) / 2
 
     @torch.no_grad()
-    def _best_slope(self, rows: Tensor, phase: Tensor, step_rad: float, count: int) -> Tensor:
+    def best_slope(phase: Tensor, step_rad: float, count: int) -> Tensor:
         """The phase plus the slope, of `count` about its own, that gives the least entropy."""
-        n = rows.shape[-1]
-        ramp = torch.arange(n, dtype=phase.dtype, device=phase.device) - (n - 1) / 2
         best, least = phase, torch.full_like(phase[:, 0], torch.inf)
         for index in range(count):
             candidate = phase + (index - count // 2) * step_rad * ramp
-            cost = entropy(self.through.image(rotate(rows, candidate)))
+            cost = entropy(through.image(rotate(rows, candidate)))
             better = cost < least
             best, least = torch.where(better[:, None], candidate, best), torch.where(better, cost, least)
         return best
+
+    # 48 slopes over one turn per pulse, found by trial: spacing against time
+    step = 2 * math.pi / 48
+    phase, total = best_slope(phase, step, 48), torch.zeros_like(phase[:, 0], dtype=torch.int64)
+    for _ in range(2):
+        phase, taken = in_turn(rows, best_slope(phase, step / 8, 17), runs)
+        total = total + taken
+    return best_slope(best_slope(phase, step / 8, 17), step / 64, 17), total

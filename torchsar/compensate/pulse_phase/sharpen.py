@@ -24,8 +24,6 @@ Weights = Callable[[Tensor, Tensor], Tensor]
 # grows much. With fewer pulses than 24 an iteration removes more than 1.3 of some parts, up to 1.7
 # with 3, and the factors would not converge.
 WIENER_FACTORS, LEAST_PULSES_OF_FACTORS = (0.88, 3.75, 1.43), 24
-# iterations on an accelerator between two decisions whether to stop, by choice
-_LOOK = 4
 
 
 @dataclass(frozen=True)
@@ -50,11 +48,6 @@ class Run:
     iterations: int
     relaxation: Tensor | float | tuple[float, ...]
     tolerance_rad: float
-
-    @property
-    def is_divisible(self) -> bool:
-        """Whether some of the trials can go on without the others."""
-        return isinstance(self.imaging, AlongPulses) and not isinstance(self.relaxation, Tensor)
 
     def of(self, trials: Tensor) -> Run:
         """The settings of some of the trials, given by their positions."""
@@ -85,7 +78,7 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run, done: int = 0) -> tuple[T
     taken = torch.zeros_like(active, dtype=torch.int64)
     step_of = _Step.of(rows, run)
     # on an accelerator waiting for the decision costs as much as iterations that change nothing
-    every = 1 if rows.device.type == "cpu" else _LOOK
+    every = 1 if rows.device.type == "cpu" else 4
     factors = run.relaxation if isinstance(run.relaxation, tuple) else (run.relaxation,)
     for number in range(done + 1, run.iterations + 1):
         step = step_of(phase)
@@ -97,7 +90,8 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run, done: int = 0) -> tuple[T
         going = host_value(active.sum(), len(active))
         if not going:
             break
-        if 2 * going <= len(active) and run.is_divisible and not phase.requires_grad:
+        divisible = isinstance(run.imaging, AlongPulses) and not isinstance(run.relaxation, Tensor)
+        if 2 * going <= len(active) and divisible and not phase.requires_grad:
             some = true_positions(active, going)
             ended, more = fixed_point(rows[some], phase[some], run.of(some), number)
             return phase.index_copy(0, some, ended), taken.index_add(0, some, more)
@@ -265,20 +259,3 @@ def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, T
         phase, taken = fixed_point(rows, phase, run)
         total = total + taken
     return phase, total
-
-
-def settled(rows: Tensor, which: Tensor | slice, phase: Tensor) -> Tensor:
-    """Continue the estimation of a phase by four iterations of the entropy fixed point.
-
-    Autofocus methods use it to predict their accuracy, from the change of their result when it is
-    continued on all or on half of the range cells.
-
-    Args:
-        rows: Pulses, shape (trial, range, pulse), complex.
-        which: Which trials these are; not used, since all are continued in the same way.
-        phase: Phase to start from in rad, shape (trial, pulse).
-
-    Returns:
-        The phase in rad, shape (trial, pulse).
-    """
-    return fixed_point(rows, phase, Run(LogAbove(2.5), AlongPulses(), 4, 1.8, 0.0))[0]

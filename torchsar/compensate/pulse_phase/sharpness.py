@@ -11,10 +11,6 @@ from torchsar.compensate.pulse_phase.data import or_one, safe_angle
 from torchsar.core import cis, power_of
 from torchsar.metrics.phase import phase_rmse
 
-# difference of the entropies of a uniform row and of speckle, whose power has an exponential
-# distribution: 1 - Euler's constant
-SPECKLE_NATS = 1 - 0.5772156649015329
-
 
 def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     r"""Compute by how much the entropy of an image lies below that of speckle.
@@ -40,7 +36,10 @@ def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     entropy = torch.log(row.clamp_min(tiny)) - (power * torch.log(power.clamp_min(tiny))).sum(-1) / or_one(row)
     row, entropy = row.to(torch.float64), entropy.to(torch.float64)
     share = row / or_one(row.sum(-1, keepdim=True))
-    lack = share * torch.where(row > 0, math.log(image.shape[-1]) - SPECKLE_NATS - entropy, 0)
+    # that of speckle, whose power has an exponential distribution, is 1 - Euler's constant below
+    # that of a uniform row
+    speckle = math.log(image.shape[-1]) - (1 - 0.5772156649015329)
+    lack = share * torch.where(row > 0, speckle - entropy, 0)
     sharp = lack.sum(-1)
     return sharp, 1 / or_one(share.square().sum(-1)), sharp.square() / or_one(lack.square().sum(-1))
 

@@ -7,11 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-# details within so many standard deviations are taken for noise: among thousands of details about
-# one exceeds it by chance
-_THRESHOLD = 3.3
-_WINDOW = 4  # half width of the Hann window in bins
-
 
 def smoothed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
     """Smooth a mean periodogram by a Haar wavelet transform of its logarithm.
@@ -38,7 +33,8 @@ def smoothed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
         detail = (mean - shifted) / 2
         # neighbouring bins of the padded transform are not independent: two count as one
         std = scatter / math.sqrt(2 * max(1.0, 2 ** (level - 1)))
-        details.append(torch.where(detail.abs() > _THRESHOLD * std, detail, 0))
+        # among thousands of details about one exceeds 3.3 by chance
+        details.append(torch.where(detail.abs() > 3.3 * std, detail, 0))
         mean = (mean + shifted) / 2
     for level, detail in reversed(list(enumerate(details))):
         mean = (mean + detail + (mean - detail).roll(-(2**level), -1)) / 2
@@ -55,6 +51,6 @@ def windowed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
     Returns:
         The smoothed power, same shape.
     """
-    window = torch.hann_window(2 * _WINDOW + 3, periodic=False, dtype=power.dtype, device=power.device)[1:-1]
-    padded = torch.nn.functional.pad(power[:, None], (_WINDOW, _WINDOW), mode="circular")
+    window = torch.hann_window(11, periodic=False, dtype=power.dtype, device=power.device)[1:-1]
+    padded = torch.nn.functional.pad(power[:, None], (4, 4), mode="circular")
     return torch.nn.functional.conv1d(padded, (window / window.sum())[None, None])[:, 0]

@@ -5,19 +5,18 @@ The estimators provide the phase as `phase_rad` and leave the signal unchanged.
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from torchsar.compensate.pulse_phase.data import on_the_circle, rotate
 from torchsar.compensate.pulse_phase.descent import sharpest_phase
-from torchsar.compensate.pulse_phase.fixed_point import entropy_fixed_point
-from torchsar.compensate.pulse_phase.gradient import Kernel, Listed, Measured, Shrinking, Windows, pga, pga_sca
+from torchsar.compensate.pulse_phase.gradient import Kernel, Listed, Measured, Shrinking, Windows, pga, pga_sca, sca
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.compensate.pulse_phase.linking import link_phases
-from torchsar.compensate.pulse_phase.recommended import Scene, autofocus
-from torchsar.compensate.pulse_phase.sca import sca
+from torchsar.compensate.pulse_phase.recommended import Scene, autofocus, entropy_fixed_point
 from torchsar.core import Estimate, Signal, Stage, checked_samples, real_dtype, refuse_non_finite
 from torchsar.focus import TargetImage
 from torchsar.radar import FarField, InverseRadar, Spotlight
@@ -73,55 +72,63 @@ class CorrectPulsePhase(Stage):
         return signal.with_data(correct_pulse_phase(signal.data, phase_rad).contiguous())
 
 
-class Sca(Stage):
-    """Phase per pulse by the spatial correlation algorithm; see `sca`.
-
-    Args:
-        assess: Whether to add the standard deviation and the outcome.
-    """
+class _Estimator(Stage):
+    """An estimator of the phase of every pulse, by a function with options."""
 
     provides = ("phase_rad",)
     neutral = {"phase_rad": 0.0}
 
-    def __init__(self, assess: bool = True) -> None:
+    def __init__(self, find: Callable[..., Estimate], **options: Any) -> None:
         super().__init__()
-        self.assess = assess
+        self.find, self.options = find, options
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Returns:
-            `Estimate` by the function `sca` with `phase_rad` of shape (..., pulse), to be removed.
+            The `Estimate` of the function that the description of the stage names, with `phase_rad`
+            of shape (..., pulse), to be removed.
         """
-        return sca(signal.data, assess=self.assess)
+        return self.find(signal.data, **self.options)
 
 
-class LinkPhases(Stage):
-    """Phase per pulse of a homogeneous scene by maximum likelihood; see `link_phases`.
-
-    Args:
-        assess: Whether to add the standard deviation and the outcome.
-    """
-
-    provides = ("phase_rad",)
-    neutral = {"phase_rad": 0.0}
-
-    def __init__(self, assess: bool = True) -> None:
-        super().__init__()
-        self.assess = assess
+class _FromStart(_Estimator):
+    """An estimator that can start from a phase."""
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            start: Phase to start from in rad, shape (..., pulse), if it is known to about a radian.
+            start: Phase to start from in rad, shape (..., pulse); by default that of the function.
 
         Returns:
-            `Estimate` by the function `link_phases` with `phase_rad` of shape (..., pulse), to be
-            removed.
+            The `Estimate` of the function that the description of the stage names, with `phase_rad`
+            of shape (..., pulse), to be removed.
         """
-        return link_phases(signal.data, start=start, assess=self.assess)
+        return self.find(signal.data, start=start, **self.options)
+
+
+class Sca(_Estimator):
+    """Phase per pulse by the spatial correlation algorithm; see `sca`.
+
+    Args:
+        assess: Whether to add the standard deviation and the outcome.
+    """
+
+    def __init__(self, assess: bool = True) -> None:
+        super().__init__(sca, assess=assess)
+
+
+class LinkPhases(_FromStart):
+    """Phase per pulse of a homogeneous scene by maximum likelihood; see `link_phases`.
+
+    Args:
+        assess: Whether to add the standard deviation and the outcome.
+    """
+
+    def __init__(self, assess: bool = True) -> None:
+        super().__init__(link_phases, assess=assess)
 
 
 def windows_of(windows: Literal["shrinking", "measured"] | list[float]) -> Windows:
@@ -140,7 +147,7 @@ def windows_of(windows: Literal["shrinking", "measured"] | list[float]) -> Windo
     return Listed(tuple(windows))
 
 
-class Pga(Stage):
+class Pga(_FromStart):
     """Phase per pulse by phase gradient autofocus; see `pga`.
 
     Args:
@@ -153,9 +160,6 @@ class Pga(Stage):
         assess: Whether to add the standard deviation and the outcome.
     """
 
-    provides = ("phase_rad",)
-    neutral = {"phase_rad": 0.0}
-
     def __init__(
         self,
         kernel: Kernel = "lumv",
@@ -164,32 +168,17 @@ class Pga(Stage):
         patience: int = 6,
         assess: bool = True,
     ) -> None:
-        super().__init__()
-        self.kernel: Kernel = kernel
-        self.windows, self.iterations, self.patience, self.assess = windows_of(windows), iterations, patience, assess
-
-    def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
-
-        Args:
-            signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            start: Phase to start from in rad, shape (..., pulse); by default zero.
-
-        Returns:
-            `Estimate` by the function `pga` with `phase_rad` of shape (..., pulse), to be removed.
-        """
-        return pga(
-            signal.data,
-            kernel=self.kernel,
-            start=start,
-            windows=self.windows,
-            iterations=self.iterations,
-            patience=self.patience,
-            assess=self.assess,
+        super().__init__(
+            pga,
+            kernel=kernel,
+            windows=windows_of(windows),
+            iterations=iterations,
+            patience=patience,
+            assess=assess,
         )
 
 
-class PgaSca(Pga):
+class PgaSca(_Estimator):
     """Phase per pulse by phase gradient autofocus started from SCA; see `pga_sca`.
 
     Args:
@@ -210,26 +199,17 @@ class PgaSca(Pga):
         patience: int = 6,
         assess: bool = True,
     ) -> None:
-        super().__init__(kernel, windows, iterations, patience, assess)
-
-    def forward(self, signal: Signal) -> Estimate:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
-
-        Returns:
-            `Estimate` by the function `pga_sca` with `phase_rad` of shape (..., pulse), to be
-            removed.
-        """
-        return pga_sca(
-            signal.data,
-            kernel=self.kernel,
-            windows=self.windows,
-            iterations=self.iterations,
-            patience=self.patience,
-            assess=self.assess,
+        super().__init__(
+            pga_sca,
+            kernel=kernel,
+            windows=windows_of(windows),
+            iterations=iterations,
+            patience=patience,
+            assess=assess,
         )
 
 
-class EntropyFixedPoint(Stage):
+class EntropyFixedPoint(_FromStart):
     """Phase per pulse by the entropy fixed point; see `entropy_fixed_point`.
 
     Args:
@@ -245,9 +225,6 @@ class EntropyFixedPoint(Stage):
         ValueError: If `floors` and `iterations` differ in length.
     """
 
-    provides = ("phase_rad",)
-    neutral = {"phase_rad": 0.0}
-
     def __init__(
         self,
         floors: list[float] | tuple[float, ...] | nn.Parameter = (5.0, 2.0),
@@ -256,14 +233,13 @@ class EntropyFixedPoint(Stage):
         imaging: Imaging | None = None,
         assess: bool = True,
     ) -> None:
-        super().__init__()
+        super().__init__(entropy_fixed_point, imaging=imaging, assess=assess)
         if len(floors) != len(iterations):
             raise ValueError(
                 "EntropyFixedPoint: iterations must hold a number of iterations for each floor, got floors "
                 f"{list(floors)} and iterations {list(iterations)}"
             )
-        self.floors, self.iterations, self.relaxation, self.imaging = floors, iterations, relaxation, imaging
-        self.assess = assess
+        self.floors, self.iterations, self.relaxation = floors, iterations, relaxation
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
@@ -278,17 +254,10 @@ class EntropyFixedPoint(Stage):
             pulse), to be removed.
         """
         floors = tuple(zip(self.floors, self.iterations))
-        return entropy_fixed_point(
-            signal.data,
-            start=start,
-            floors=floors,
-            relaxation=self.relaxation,
-            imaging=self.imaging,
-            assess=self.assess,
-        )
+        return self.find(signal.data, start=start, floors=floors, relaxation=self.relaxation, **self.options)
 
 
-class Autofocus(Stage):
+class Autofocus(_FromStart):
     """Phase per pulse by the recommended autofocus; see `autofocus`.
 
     Args:
@@ -301,9 +270,6 @@ class Autofocus(Stage):
         assess: Whether to add the standard deviation and the outcome.
     """
 
-    provides = ("phase_rad",)
-    neutral = {"phase_rad": 0.0}
-
     def __init__(
         self,
         search: int = 120,
@@ -312,35 +278,7 @@ class Autofocus(Stage):
         scene: Scene = "sparse",
         assess: bool = True,
     ) -> None:
-        super().__init__()
-        self.search, self.polish, self.imaging, self.assess = search, polish, imaging, assess
-        self.scene: Scene = scene
-
-    def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
-
-        Args:
-            signal: Range-compressed pulses, shape (..., pulse, range), complex.
-            start: Phase to start from in rad, shape (..., pulse); by default that of the
-                spatial correlation algorithm (function `sca`).
-
-        Returns:
-            `Estimate` by the function `autofocus` with `phase_rad` of shape (..., pulse), to be
-            removed.
-        """
-        return autofocus(
-            signal.data,
-            start=start,
-            scene=self.scene,
-            search=self.search,
-            polish=self.polish,
-            imaging=self.imaging_of(signal),
-            assess=self.assess,
-        )
-
-    def imaging_of(self, signal: Signal) -> Imaging | None:
-        """Return the image formation for a signal."""
-        return self.imaging
+        super().__init__(autofocus, search=search, polish=polish, imaging=imaging, scene=scene, assess=assess)
 
 
 class TargetAutofocus(Autofocus):
@@ -372,36 +310,6 @@ class TargetAutofocus(Autofocus):
         super().__init__(search, polish, scene=scene, assess=assess)
         self.target = None if geometry is None else TargetImage(radar, geometry)
 
-    def imaging_of(self, signal: Signal) -> Imaging | None:
-        """Return the polar-format image formation for a signal, if the geometry is known."""
-        return None if self.target is None else self.target.operator(signal.data)
-
-
-class SharpestPhase(Stage):
-    """Phase per pulse of least image entropy or most contrast, by descent; see `sharpest_phase`.
-
-    Args:
-        objective: "power_entropy" or "amplitude_entropy" (minimised), or "contrast" (maximised).
-        method: Gradient descent: "lbfgs", or "adam" for rough objectives.
-        steps: Largest number of steps.
-        assess: Whether to add the standard deviation and the outcome.
-    """
-
-    provides = ("phase_rad",)
-    neutral = {"phase_rad": 0.0}
-
-    def __init__(
-        self,
-        objective: Literal["power_entropy", "amplitude_entropy", "contrast"] = "power_entropy",
-        method: Literal["lbfgs", "adam"] = "lbfgs",
-        steps: int = 100,
-        assess: bool = True,
-    ) -> None:
-        super().__init__()
-        self.objective: Literal["power_entropy", "amplitude_entropy", "contrast"] = objective
-        self.method: Literal["lbfgs", "adam"] = method
-        self.steps, self.assess = steps, assess
-
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
@@ -411,9 +319,28 @@ class SharpestPhase(Stage):
                 spatial correlation algorithm (function `sca`).
 
         Returns:
-            `Estimate` by the function `sharpest_phase` with `phase_rad` of shape (..., pulse), to
-            be removed.
+            `Estimate` by the function `autofocus` with `phase_rad` of shape (..., pulse), to be
+            removed.
         """
-        return sharpest_phase(
-            signal.data, objective=self.objective, method=self.method, steps=self.steps, start=start, assess=self.assess
-        )
+        imaging = None if self.target is None else self.target.operator(signal.data)
+        return self.find(signal.data, start=start, **{**self.options, "imaging": imaging})
+
+
+class SharpestPhase(_FromStart):
+    """Phase per pulse of least image entropy or most contrast, by descent; see `sharpest_phase`.
+
+    Args:
+        objective: "power_entropy" or "amplitude_entropy" (minimised), or "contrast" (maximised).
+        method: Gradient descent: "lbfgs", or "adam" for rough objectives.
+        steps: Largest number of steps.
+        assess: Whether to add the standard deviation and the outcome.
+    """
+
+    def __init__(
+        self,
+        objective: Literal["power_entropy", "amplitude_entropy", "contrast"] = "power_entropy",
+        method: Literal["lbfgs", "adam"] = "lbfgs",
+        steps: int = 100,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(sharpest_phase, objective=objective, method=method, steps=steps, assess=assess)

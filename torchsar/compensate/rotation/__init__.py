@@ -17,16 +17,23 @@ from torchsar.compensate.rotation.entropy_search import (
     newton_rotation,
     search_rotation,
 )
-from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
-from torchsar.compensate.rotation.recommended import coarse_rotation, phase_fit_rotation, uneven_rotation
-from torchsar.compensate.rotation.stages import (
+from torchsar.compensate.rotation.image_entropy import (
+    EntropyObjective,
+    ImageEntropy,
+    RotationParameters,
+    Unknowns,
+    k_name,
+)
+from torchsar.compensate.rotation.recommended import (
     CoarseRotation,
     PhaseFitRotation,
     RotationAutofocus,
     UnevenRotation,
+    coarse_rotation,
+    phase_fit_rotation,
     rotating_autofocus,
+    uneven_rotation,
 )
-from torchsar.compensate.rotation.unknowns import RotationParameters, Unknowns, k_name
 
 __all__ = [
     "ChirpletClean",

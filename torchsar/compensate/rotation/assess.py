@@ -19,18 +19,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.couplings import Neighbours
-from torchsar.compensate.rotation.histories import Histories, histories_of, refined_by_histories
-from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
-from torchsar.compensate.rotation.peaks import threshold
-from torchsar.compensate.rotation.scatterers import LEAST_EXPLAINED, Fit, Scatterers, Step, explained_share
-from torchsar.compensate.rotation.unknowns import k_name
-from torchsar.core import Outcome, worst
+from torchsar.compensate.rotation.histories import Histories, histories_of, refined_by_histories, threshold
+from torchsar.compensate.rotation.image_entropy import k_name
+from torchsar.compensate.rotation.motion import Motion, Sampling, image_of, warped_time
+from torchsar.compensate.rotation.scatterers import LEAST_EXPLAINED, Fit, Step, explained_share, solved
+from torchsar.core import Estimate, Outcome, worst
+from torchsar.focus.warped_sums import slow_times
 from torchsar.metrics import entropy
 
 # largest phase error, in rad rms, of a scatterer at the edge of the target: it then still has a
@@ -38,41 +37,12 @@ from torchsar.metrics import entropy
 MOST_PHASE_ERROR_RAD = math.sqrt(-math.log(0.8))
 _LEAST_SCATTERERS = 3  # fewer do not determine the rotation reliably, a convention
 _CLEAR = 1.3  # power over the detection threshold that noise alone exceeds in one of 1000 images
-# least power of the scatterers in a quarter of the aperture over that in the quarter of most power:
-# noise at the detection threshold gives 0.25
-_LEAST_LIT = 0.35
-_LEAST_FREE = 0.1  # degrees of freedom of a fit that few scatterers could not contradict
-_LEAST_ORDER = 3  # least order of the rotation with which another is compared, that of the paper
-_REFINED = 2  # refinements of a rotation to be judged: enough for an image that is still blurred
-# relative error of the rate up to which it scales images, a convention, and the standard deviations
-# that it must exceed: a rate that is found too large also looks too accurate
-_RATE_TOLERANCE, _SURE = 0.1, 2.7
-# Doppler and range cells over which scatterers share errors of the model, found by trial: those of
-# a few scatterers side by side in Doppler are large, with opposite signs
-_SHARED_LINES, _SHARED_CELLS = 8.0, 2.0
 # scatterers that outweigh the variance that the noise explains: a variance that a few of them show
 # is uncertain by a factor, found by trial
 _FEW = 2.0
-_LEAST_SHARES = 1.3  # independent scatterers that show the rate; one alone may be a peak of the noise
 
 
-class Judged(NamedTuple):
-    """Assessment of estimated rotations.
-
-    Args:
-        outcome: Codes of `Outcome`, shape (trial,).
-        quality: Quality from 0 to 1, shape (trial,).
-        std: Standard deviations by the name of the value.
-        info: Further figures by name.
-    """
-
-    outcome: Tensor
-    quality: Tensor
-    std: Mapping[str, Tensor]
-    info: Mapping[str, Tensor]
-
-
-def judged_motion(rows: Tensor, sampling: Sampling, motion: Motion) -> Judged:
+def judged_motion(rows: Tensor, sampling: Sampling, motion: Motion, value: Mapping[str, Tensor]) -> Estimate:
     """Assess the relative derivatives of the rotation rate of a rotation.
 
     The rotation is refined by the histories of bright scatterers, and compared with the result. The
@@ -84,14 +54,16 @@ def judged_motion(rows: Tensor, sampling: Sampling, motion: Motion) -> Judged:
         rows: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
         motion: Rotation to be judged.
+        value: Values of the estimate by name.
 
     Returns:
-        The assessment. Its quality is the relative decrease of exp(entropy) of the image due to the
-        compensation; info holds `phase_error_rad`, `scatterers` and the entropies.
+        The assessed estimate. Its quality is the relative decrease of
+        exp(entropy) of the image due to the compensation; info holds `phase_error_rad`,
+        `scatterers` and the entropies.
     """
-    third = replace(motion, k=torch.nn.functional.pad(motion.k, (0, max(0, _LEAST_ORDER - 1 - motion.k.shape[-1]))))
+    third = replace(motion, k=torch.nn.functional.pad(motion.k, (0, max(0, 2 - motion.k.shape[-1]))))
     refined = third
-    for _ in range(_REFINED):
+    for _ in range(2):  # enough for an image that is still blurred
         refined = refined_by_histories(rows, sampling, refined)
     found = histories_of(rows, sampling, refined)
     error, reasons = _questioned(sampling, third, refined, found)
@@ -101,12 +73,12 @@ def judged_motion(rows: Tensor, sampling: Sampling, motion: Motion) -> Judged:
         *reasons,
         (Outcome.PARTS_DISAGREE, error >= MOST_PHASE_ERROR_RAD),
         (Outcome.NOISE, found.level < _CLEAR),
-        _empty(rows),
+        (Outcome.EMPTY, (rows == 0).flatten(1).all(-1)),
     )
-    return Judged(outcome, quality, {}, info)
+    return Estimate(value, {}, quality, outcome, info)
 
 
-def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit) -> Judged:
+def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit, value: Mapping[str, Tensor]) -> Estimate:
     """Assess a joint fit of a rotation and its scatterers.
 
     The step that the fit would take next is computed. Its curvature and the noise give a covariance
@@ -119,24 +91,34 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit) -> Judged:
         rows: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
         fit: The fit.
+        value: Values of the estimate by name.
 
     Returns:
-        The assessment. Its quality is the share of the energy above the noise that the scatterers
+        The assessed estimate. Its quality is the share of the energy above the noise that the
+        scatterers
         explain.
     """
     found, motion, order = fit.scatterers, fit.motion, fit.motion.k.shape[-1]
     explained, accounted = explained_share(rows, fit)
     near = replace(Neighbours.find(found.amplitude, found.cell), shape=found.cell.shape)
-    reduced = Step.of(rows, sampling, fit, near, found.amplitude.shape[-1])[1].reduced(robust=True)
-    change, inverse, lost = reduced.solved()
+    _, equations = Step.of(rows, sampling, fit, near, found.amplitude.shape[-1])
+    _, pull, curvature = equations.reduced(robust=True)
+    change, inverse, lost = solved(pull, curvature)
     tiny = torch.finfo(torch.float64).tiny
     covariance = inverse / 2 * fit.noise[:, None, None]
     predicted = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(tiny)
     # shares of the scatterers in what is known about each parameter, and what each asks for
-    alike, power = _alike(found), found.amplitude.abs().square()
-    shares = torch.einsum("bpij,bin,bjn->bpn", reduced.curvature, inverse, inverse)
+    # How far the errors of scatterers depend on each other, 0 to 1: those a few resolution cells
+    # apart, 8 in Doppler and 2 in range, share what the model does not describe; by trial: errors
+    # of a few scatterers side by side in Doppler are large, with opposite signs.
+    lines, cells = (
+        ((x[:, :, None] - x[:, None]) / reach).square() for x, reach in ((found.cell, 8.0), (found.row, 2.0))
+    )
+    used, power = (found.amplitude != 0).double(), found.amplitude.abs().square()
+    alike = torch.exp(-(lines + cells) / 2) * used[:, :, None] * used[:, None]
+    shares = torch.einsum("bpij,bin,bjn->bpn", curvature, inverse, inverse)
     shares = shares / shares.sum(1, keepdim=True).clamp_min(tiny)
-    own = (reduced.pull - torch.einsum("bpij,bj->bpi", reduced.curvature, change)) @ inverse
+    own = (pull - torch.einsum("bpij,bj->bpi", curvature, change)) @ inverse
     seen = (own * (alike @ own)).sum(1) / predicted
     number = 1 / (shares * (alike @ shares)).sum(1).clamp_min(tiny)
     wider = (number * seen + _FEW + number.clamp_max(predicted.shape[-1])) / (
@@ -144,7 +126,7 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit) -> Judged:
     ) + change.square() / predicted
     wider = wider.sqrt() / accounted.clamp_min(1e-6)[:, None]
     covariance = covariance * wider[:, :, None] * wider[:, None] + torch.diag_embed(torch.where(lost, math.inf, 0.0))
-    std = _standard_deviations(motion, covariance, fit.free_centre)
+    std = _standard_deviations(motion, covariance, fit.change.shape[-1] > order + 1)
     step = (fit.change.abs() / predicted.sqrt()).amax(-1)
     # a step below three deviations, or that changes phases by less than 0.01 rad, is small
     moving = (step > 3) & (step * (fit.noise / (2 * power.sum(-1) * sampling.pulses).clamp_min(tiny)).sqrt() > 0.01)
@@ -152,21 +134,19 @@ def judged_fit(rows: Tensor, sampling: Sampling, fit: Fit) -> Judged:
     error, reasons = _questioned(sampling, motion, motion, histories_of(rows, sampling, motion))
     outcome = worst(
         *reasons,
-        (Outcome.INEXACT, (_SURE * std["omega_rad_s"] >= _RATE_TOLERANCE * motion.omega_rad_s) | (motion.w <= 0)),
+        # An error of 10 % of the rate up to which it scales images, a convention, must exceed 2.7
+        # standard deviations: a rate that is found too large also looks too accurate.
+        (Outcome.INEXACT, (2.7 * std["omega_rad_s"] >= 0.1 * motion.omega_rad_s) | (motion.w <= 0)),
         # histories are less accurate than the fit
         (Outcome.PARTS_DISAGREE, error >= 2 * MOST_PHASE_ERROR_RAD),
         (Outcome.MISFIT, explained < LEAST_EXPLAINED),
         (Outcome.NOT_CONVERGED, moving),
-        (Outcome.TOO_FEW, (found.count < _LEAST_SCATTERERS) | (number[:, order] < _LEAST_SHARES)),
+        # one independent scatterer that shows the rate may be a peak of the noise
+        (Outcome.TOO_FEW, (found.count < _LEAST_SCATTERERS) | (number[:, order] < 1.3)),
         (Outcome.NOISE, level < _CLEAR),
-        _empty(rows),
+        (Outcome.EMPTY, (rows == 0).flatten(1).all(-1)),
     )
-    return Judged(outcome, explained, std, _entropies(rows, sampling, motion)[0])
-
-
-def _empty(rows: Tensor) -> tuple[Outcome, Tensor]:
-    """Trials without samples other than zero."""
-    return Outcome.EMPTY, (rows == 0).flatten(1).all(-1)
+    return Estimate(value, std, explained, outcome, _entropies(rows, sampling, motion)[0])
 
 
 def _questioned(
@@ -182,33 +162,22 @@ def _questioned(
     # few scatterers cannot disagree: what the samples of each show counts as well
     own = lag * torch.einsum("bpij,bpkj->bik", found.pull, found.pull)
     pull = found.pull.sum(-1)
-    free = count / (count - found.inverse.shape[-1]).clamp_min(_LEAST_FREE)
+    free = count / (count - found.inverse.shape[-1]).clamp_min(0.1)  # degrees of freedom of the fit
     covariance = found.inverse @ (pull.mT @ pull * free[:, None, None] + own) @ found.inverse
     edge = 2 * math.pi * torch.where(found.used, found.cells.abs(), 0).amax(-1)
-    warped = Warped.of(judged.k, sampling.times(judged.k.device), sampling.duration_s)
-    line = torch.stack([torch.ones_like(warped.u), warped.u - warped.u.mean(-1, keepdim=True)], 1)
+    _, u, slopes = warped_time(
+        judged.k, slow_times(sampling.pulses, sampling.prf_hz, judged.k.device), sampling.duration_s
+    )
+    line = torch.stack([torch.ones_like(u), u - u.mean(-1, keepdim=True)], 1)
     line = line / line.square().sum(-1, keepdim=True).sqrt()
-    curves = warped.slopes - (warped.slopes @ line.mT) @ line
+    curves = slopes - (slopes @ line.mT) @ line
     size, change = curves @ curves.mT / sampling.pulses, refined.k - judged.k + found.change[:, :order]
     moved = torch.einsum("bi,bij,bj->b", change, size, change).clamp_min(0)
     unsure = (size * covariance[:, :order, :order]).sum((-2, -1)).clamp_min(0)
     few = (count < _LEAST_SCATTERERS) | (edge <= 2 * math.pi)
-    dark = found.least_lit < _LEAST_LIT
+    dark = found.least_lit < 0.35  # noise at the detection threshold gives 0.25
     error = torch.nan_to_num(edge * (moved + unsure).sqrt(), math.inf, math.inf)
     return torch.where(few | dark, math.inf, error), [(Outcome.MISFIT, dark), (Outcome.TOO_FEW, few)]
-
-
-def _alike(found: Scatterers) -> Tensor:
-    """How far the errors of scatterers depend on each other, (trial, scatterer, scatterer), 0..1.
-
-    Scatterers a few resolution cells apart share what the model does not describe.
-    """
-    lines, rows = (
-        ((x[:, :, None] - x[:, None]) / reach).square()
-        for x, reach in ((found.cell, _SHARED_LINES), (found.row, _SHARED_CELLS))
-    )
-    used = (found.amplitude != 0).double()
-    return torch.exp(-(lines + rows) / 2) * used[:, :, None] * used[:, None]
 
 
 def _entropies(rows: Tensor, sampling: Sampling, motion: Motion) -> tuple[dict[str, Tensor], Tensor]:

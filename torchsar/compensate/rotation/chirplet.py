@@ -29,8 +29,9 @@ from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.radar import InverseRadar
 
-_PARTS = 4  # samples that a segment keeps in the fine search, found by trial: reach against time
-_PAD = 2  # zero-padding of the transforms: a peak between two bins loses little power
+# samples that a segment keeps in the fine search, found by trial: reach against time; zero-padding
+# of the transforms: a peak between two bins loses little power
+_PARTS, _PAD = 4, 2
 
 
 @names_arguments
@@ -103,17 +104,25 @@ def chirplet_clean(
         aperture.
     """
     data = checked_samples(data, "chirplet_clean", "pulse, range")
-    _check(data, prf_hz, atoms, sweep, floor_db)
-    n = data.shape[-2]
-    data = data.detach()
-    level = level_of(data)
-    rows = (data / level).mT.contiguous()
-    search = _Search.of(n, sweep, rows)
-    energy, tones, found = _energy(rows), torch.zeros_like(rows), []
+    if data.shape[-2] < 16:
+        raise ValueError(
+            "chirplet_clean: data must have at least 16 pulses and one range cell, shape (..., pulse, range), got "
+            f"shape {tuple(data.shape)}"
+        )
+    if not (prf_hz > 0 and atoms >= 1 and 0 < sweep <= 1 and floor_db > 0):
+        raise ValueError(
+            "chirplet_clean: prf_hz and floor_db must be positive, atoms 1 or more, and sweep above 0 and at most 1, "
+            f"got prf_hz {prf_hz}, floor_db {floor_db}, atoms {atoms} and sweep {sweep}"
+        )
+    n, level = data.shape[-2], level_of(data.detach())
+    rows = (data.detach() / level).mT.contiguous()
+    time = torch.arange(n, dtype=torch.float64, device=rows.device) - (n - 1) / 2
+    energy, tones, found = power_of(rows).sum((-2, -1)), torch.zeros_like(rows), []
     peak = torch.zeros(rows.shape[:-2], dtype=real_dtype(rows.dtype), device=rows.device)
     for _ in range(atoms):
-        frequency, rate = search.strongest(rows)
-        chirp = search.chirp(frequency, rate, rows.dtype)
+        frequency, rate = _coarse(rows, time, sweep)
+        frequency, rate = _fine(rows * _chirp(frequency, rate, time, rows.dtype).conj(), frequency, rate)
+        chirp = _chirp(frequency, rate, time, rows.dtype)
         amplitude = (rows * chirp.conj()).mean(-1)
         rows = rows - amplitude[..., None] * chirp
         peak = torch.maximum(peak, amplitude.abs().amax(-1))
@@ -121,7 +130,7 @@ def chirplet_clean(
     frequency, rate, amplitude = (torch.stack(parts, -2) for parts in zip(*found, strict=True))
     shown = torch.where(amplitude.abs() > peak[..., None, None] * 10 ** (-floor_db / 20), amplitude, 0)
     for f, a in zip(frequency.unbind(-2), shown.unbind(-2), strict=True):
-        tones = tones + a[..., None] * linear_phasor(-f, -search.middle, n, rows.dtype)
+        tones = tones + a[..., None] * linear_phasor(-f, -(n - 1) / 2, n, rows.dtype)
     even = torch.zeros(0, dtype=torch.float64, device=rows.device)
     image = matched_fourier(tones.mT.contiguous(), even, prf_hz, lines=DopplerLines(oversampling, lines))
     return Chirplets(
@@ -129,109 +138,65 @@ def chirplet_clean(
         frequency * prf_hz,
         rate * prf_hz**2,
         amplitude * level,
-        _energy(rows) / torch.where(energy > 0, energy, 1),
+        power_of(rows).sum((-2, -1)) / torch.where(energy > 0, energy, 1),
     )
 
 
-@dataclass(frozen=True)
-class _Search:
-    """Search for the strongest chirp of each row (..., pulse).
+# In the functions below frequencies are in cycles per pulse, rates in cycles per pulse squared, and
+# times are counted in pulses from the middle of the aperture.
 
-    Frequencies are in cycles per pulse, rates in cycles per pulse squared, times from the middle of
-    the aperture.
+
+def _chirp(frequency: Tensor, rate: Tensor, time: Tensor, dtype: torch.dtype) -> Tensor:
+    """exp(-2j pi (f t + r t^2 / 2)), (..., pulse)."""
+    return unit_phasor(-(frequency[..., None] * time + rate[..., None] * (0.5 * time.square())), dtype)
+
+
+def _segments(n: int) -> tuple[int, int]:
+    """Number of segments of n pulses, and of pulses in one of their `_PARTS` samples."""
+    segments = max(4, 2 ** round(math.log2(n) / 2))
+    return segments, -(-n // (_PARTS * segments))
+
+
+def _coarse(rows: Tensor, time: Tensor, sweep: float) -> tuple[Tensor, Tensor]:
+    """Frequency and rate of most power, summed over segments without their phases."""
+    n = rows.shape[-1]
+    segments, part = _segments(n)
+    # a chirp half of a step away drifts by half a Doppler cell of the segments
+    step, bins = segments / n**2, _PAD * _PARTS * part
+    count = math.ceil(sweep / n / step)
+    best = torch.full(rows.shape[:-1], -1.0, dtype=real_dtype(rows.dtype), device=rows.device)
+    frequency, rate = torch.zeros_like(best, dtype=torch.float64), torch.zeros_like(best, dtype=torch.float64)
+    for value in step * torch.arange(-count, count + 1, dtype=torch.float64, device=rows.device):
+        turned = rows * _chirp(torch.zeros_like(value), value, time, rows.dtype).conj()
+        parts = torch.nn.functional.pad(turned, (0, segments * _PARTS * part - n)).unflatten(-1, (segments, -1))
+        power, index = power_of(torch.fft.ifft(parts, bins, norm="forward")).sum(-2).max(-1)
+        better = power > best
+        best = torch.where(better, power, best)
+        frequency = torch.where(better, ((index + bins // 2) % bins - bins // 2).double() / bins, frequency)
+        rate = torch.where(better, value, rate)
+    return frequency, rate
+
+
+def _fine(rows: Tensor, frequency: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
+    """The coarse frequency and rate, corrected by the strongest of a grid of chirps.
+
+    The rows have their coarse chirp removed and are decimated. The grid spans the whole aperture;
+    its maximum is interpolated by a parabola.
     """
-
-    n: int
-    segments: int
-    part: int
-    rates: Tensor
-
-    @staticmethod
-    def of(n: int, sweep: float, like: Tensor) -> _Search:
-        """Build the search for the strongest chirp of each range cell.
-
-        Args:
-            n: Number of pulses.
-            sweep: Largest chirp rate, as in `chirplet_clean`.
-            like: Tensor on the device of the data.
-
-        Returns:
-            The search, with its coarse rates.
-        """
-        segments = max(4, 2 ** round(math.log2(n) / 2))
-        # a chirp half of a step away drifts by half a Doppler cell of the segments
-        step = segments / n**2
-        count = math.ceil(sweep / n / step)
-        rates = step * torch.arange(-count, count + 1, dtype=torch.float64, device=like.device)
-        return _Search(n, segments, -(-n // (_PARTS * segments)), rates)
-
-    @property
-    def middle(self) -> float:
-        """Index of the middle of the aperture."""
-        return (self.n - 1) / 2
-
-    @property
-    def times(self) -> Tensor:
-        """Times of the pulses from the middle of the aperture."""
-        return torch.arange(self.n, dtype=torch.float64, device=self.rates.device) - self.middle
-
-    def chirp(self, frequency: Tensor, rate: Tensor, dtype: torch.dtype) -> Tensor:
-        """exp(-2j pi (f t + r t^2 / 2)), (..., pulse)."""
-        t = self.times
-        return unit_phasor(-(frequency[..., None] * t + rate[..., None] * (0.5 * t.square())), dtype)
-
-    def strongest(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Frequency and rate (...,) of the strongest chirp, float64."""
-        frequency, rate = self._coarse(rows)
-        return self._fine(rows * self.chirp(frequency, rate, rows.dtype).conj(), frequency, rate)
-
-    def _segmented(self, rows: Tensor, parts: int) -> Tensor:
-        """Rows padded with zeros, as (..., parts, pulse)."""
-        length = self.segments * _PARTS * self.part
-        return torch.nn.functional.pad(rows, (0, length - self.n)).unflatten(-1, (parts, -1))
-
-    def _coarse(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Frequency and rate of most power, summed over segments without their phases."""
-        best = torch.full(rows.shape[:-1], -1.0, dtype=real_dtype(rows.dtype), device=rows.device)
-        frequency, rate = torch.zeros_like(best, dtype=torch.float64), torch.zeros_like(best, dtype=torch.float64)
-        bins = _PAD * _PARTS * self.part
-        for value in self.rates:
-            parts = self._segmented(rows * self.chirp(torch.zeros_like(value), value, rows.dtype).conj(), self.segments)
-            spectrum = torch.fft.ifft(parts, bins, norm="forward")
-            power, index = power_of(spectrum).sum(-2).max(-1)
-            better = power > best
-            best = torch.where(better, power, best)
-            frequency = torch.where(better, _signed(index.to(torch.float64), bins) / bins, frequency)
-            rate = torch.where(better, value, rate)
-        return frequency, rate
-
-    def _fine(self, rows: Tensor, frequency: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """The coarse frequency and rate, corrected by the strongest of a grid of chirps.
-
-        The rows have their coarse chirp removed and are decimated. The grid spans the whole
-        aperture; its maximum is interpolated by a parabola.
-        """
-        count = _PARTS * self.segments
-        thin = self._segmented(rows, count).sum(-1)
-        t = (torch.arange(count, dtype=torch.float64, device=rows.device) + 0.5) * self.part - 0.5 - self.middle
-        width = math.ceil(0.375 * self.segments)
-        rates = (2.0 / self.n**2) * torch.arange(-width, width + 1, dtype=torch.float64, device=rows.device)
-        bins = 2 * _PAD * count
-        spectrum = torch.fft.ifft(
-            thin[..., None, :] * unit_phasor(rates[:, None] * (0.5 * t.square()), rows.dtype), bins, norm="forward"
-        )
-        power = power_of(spectrum)
-        flat = power.flatten(-2).argmax(-1)
-        row, column = flat // bins, flat % bins
-        along_f, along_r = take(power, row, -2), take(power.mT, column, -2)
-        f = (_signed(column.to(torch.float64), bins) + _vertex(along_f, column, True)) / (bins * self.part)
-        r = rates[row] + _vertex(along_r, row, False) * (2.0 / self.n**2)
-        return frequency + f, rate + r
-
-
-def _signed(index: Tensor, n: int) -> Tensor:
-    """FFT index 0..n-1 as -n/2..n/2-1."""
-    return torch.where(index >= n / 2, index - n, index)
+    n = rows.shape[-1]
+    segments, part = _segments(n)
+    count = _PARTS * segments
+    thin = torch.nn.functional.pad(rows, (0, count * part - n)).unflatten(-1, (count, -1)).sum(-1)
+    t = (torch.arange(count, dtype=torch.float64, device=rows.device) + 0.5) * part - n / 2
+    width, bins = math.ceil(0.375 * segments), 2 * _PAD * count
+    rates = (2.0 / n**2) * torch.arange(-width, width + 1, dtype=torch.float64, device=rows.device)
+    turned = thin[..., None, :] * unit_phasor(rates[:, None] * (0.5 * t.square()), rows.dtype)
+    power = power_of(torch.fft.ifft(turned, bins, norm="forward"))
+    flat = power.flatten(-2).argmax(-1)
+    row, column = flat // bins, flat % bins
+    along_f, along_r = take(power, row, -2), take(power.mT, column, -2)
+    f = ((column + bins // 2) % bins - bins // 2 + _vertex(along_f, column, True)) / (bins * part)
+    return frequency + f, rate + rates[row] + _vertex(along_r, row, False) * (2.0 / n**2)
 
 
 def _vertex(values: Tensor, index: Tensor, circular: bool) -> Tensor:
@@ -246,25 +211,6 @@ def _vertex(values: Tensor, index: Tensor, circular: bool) -> Tensor:
     bend = left - 2 * middle + right
     inside = (bend < 0) & (circular | ((index > 0) & (index < n - 1)))
     return torch.where(inside, 0.5 * (left - right) / torch.where(bend < 0, bend, -1), 0).clamp(-0.5, 0.5)
-
-
-def _energy(rows: Tensor) -> Tensor:
-    """Energy of the rows of each trial."""
-    return power_of(rows).sum((-2, -1))
-
-
-def _check(data: Tensor, prf_hz: float, atoms: int, sweep: float, floor_db: float) -> None:
-    """Raise TypeError or ValueError for invalid data or options."""
-    if data.shape[-2] < 16:
-        raise ValueError(
-            "chirplet_clean: data must have at least 16 pulses and one range cell, shape (..., pulse, range), got "
-            f"shape {tuple(data.shape)}"
-        )
-    if not (prf_hz > 0 and atoms >= 1 and 0 < sweep <= 1 and floor_db > 0):
-        raise ValueError(
-            "chirplet_clean: prf_hz and floor_db must be positive, atoms 1 or more, and sweep above 0 and at most 1, "
-            f"got prf_hz {prf_hz}, floor_db {floor_db}, atoms {atoms} and sweep {sweep}"
-        )
 
 
 class ChirpletClean(Stage):
@@ -293,14 +239,8 @@ class ChirpletClean(Stage):
         lines: int | None = None,
     ) -> None:
         super().__init__()
-        self.radar = radar
-        self.options = {
-            "atoms": atoms,
-            "sweep": sweep,
-            "floor_db": floor_db,
-            "oversampling": oversampling,
-            "lines": lines,
-        }
+        self.radar, self.oversampling = radar, oversampling
+        self.options = {"atoms": atoms, "sweep": sweep, "floor_db": floor_db, "lines": lines}
 
     def forward(self, signal: Signal) -> Signal:
         """Form the image of a signal of axes (pulse, range).
@@ -308,7 +248,7 @@ class ChirpletClean(Stage):
         Returns:
             The image of axes (azimuth, range), with the Doppler in Hz along azimuth.
         """
-        image = chirplet_clean(signal.data, self.radar.prf_hz, **self.options).image
+        image = chirplet_clean(signal.data, self.radar.prf_hz, oversampling=self.oversampling, **self.options).image
         pulse, range_ = signal.axes
-        step = 1 / (self.options["oversampling"] * pulse.n * pulse.step)
+        step = 1 / (self.oversampling * pulse.n * pulse.step)
         return Signal(image, (Axis("azimuth", image.shape[-2], -(image.shape[-2] // 2) * step, step, "Hz"), range_))

@@ -23,20 +23,12 @@ from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.focus.transforms import Gridding
 from torchsar.metrics import entropy
 
-# limits of the number of sections, found by trial: more follow the rate more closely, fewer resolve
-# Doppler better
-MOST_SECTIONS, LEAST_SECTIONS = 28, 8
 _OCTAVES = 3.5  # Doppler below the edge of the band that is used, found by trial
 _STEPS_PER_UNIT = 200  # steps per unit of the logarithm of Doppler: half a percent each
 _WIDEST = 1.4  # largest logarithm of a ratio of rates that is searched: a factor of 4
-_GRID = 0.07  # step of the search, in logarithms of rates at the middle and the end of the aperture
-_BLUR = 0.03  # blur of the correlations on the grid, about half its step, so that no peak is missed
-_KEPT = 6  # candidates of the grid that are refined, found by trial: reliability against time
-_ROUNDS = 10  # refinements, each of which halves the step: to 0.0001 of a rate
-_ROWS = 16  # range cells of most energy that are used, found by trial: accuracy against time
-# numbers of sections of compensated data, and the largest logarithm of a ratio of rates that is
-# then left, found by trial
-_FEWER_SECTIONS, _LEFT = (6, 4, 4), 0.35
+# step of the search, in logarithms of rates at the middle and the end of the aperture; candidates
+# of this grid that are refined, found by trial: reliability against time
+_GRID, _KEPT = 0.07, 6
 _LEAST_RATE = 0.1  # least rate over that at the start; slower targets would nearly reverse
 
 
@@ -60,16 +52,26 @@ def coarse_warp(data: Tensor, prf_hz: float) -> Tensor:
     Returns:
         k1 in 1/s and k2 in 1/s^2, shape (trial, 2), float64.
     """
-    pulses, rows = data.shape[1], _brightest(data, _ROWS)
-    wanted = min(MOST_SECTIONS, max(LEAST_SECTIONS, round(math.sqrt(pulses) / 2)))
+    pulses, rows = data.shape[1], data
+    # the range cells of most energy, found by trial: accuracy against time
+    if data.shape[-1] > 16:
+        order = data.abs().square().sum(1).topk(16, -1).indices
+        rows = torch.gather(data, 2, order[:, None].expand(-1, pulses, -1))
+    # found by trial: more sections follow the rate more closely, fewer resolve Doppler better
+    wanted = min(28, max(8, round(math.sqrt(pulses) / 2)))
     sections = max(4, min(wanted, pulses // 8))
+    duration_s = pulses / prf_hz
+    times = numbers_on(data.device, duration_s / 2, duration_s)
     k = _change_of_rate(rows, prf_hz, sections, _WIDEST)
     image = _image(rows, prf_hz, k)
-    for fewer in _FEWER_SECTIONS:
+    # numbers of sections, and the largest logarithm of a ratio of rates that is left; by trial
+    for fewer in (6, 4, 4):
         if fewer < sections:
             # pulses at equal steps of the rotation angle: those of a uniform rotation if k is right
             even = torch.fft.fft(torch.fft.ifftshift(image, dim=1), dim=1, norm="forward")
-            other = _corrected(k, _change_of_rate(even, prf_hz, fewer, _LEFT), pulses / prf_hz)
+            left = _change_of_rate(even, prf_hz, fewer, 0.35)
+            at = duration_s * warp(times, k) / warp(times[1:], k)
+            other = _third_order(warp_rate(times, k) * warp_rate(at, left), duration_s)
             formed = _image(rows, prf_hz, other)
             # longer sections suffer more from phase errors of the pulses
             better = entropy(formed) < entropy(image)
@@ -98,18 +100,29 @@ def _change_of_rate(rows: Tensor, prf_hz: float, sections: int, widest: float) -
         """The `count` best of candidates (trial, candidate, 2), per trial."""
         k = _third_order(torch.exp(candidates), duration_s)
         rate = torch.log(warp_rate(middles, k).clamp_min(_LEAST_RATE))
-        score = _agreement(table, rate[..., second] - rate[..., first]).to(torch.float64)
+        # the sum of the correlations of all pairs at these shifts; through four points: a maximum
+        # between steps is not moved to one of them
+        reach = (table.shape[-1] - 1) // 2
+        shift = (rate[..., second] - rate[..., first]) * _STEPS_PER_UNIT + reach
+        shift = shift.clamp(1, 2 * reach - 1 - 1e-3)
+        whole = shift.floor().long()
+        x, flat = (shift - whole).to(table.dtype), table.flatten(1)
+        position = (torch.arange(table.shape[1], device=shift.device) * table.shape[-1] + whole).flatten(1)
+        a, b, c, d = (torch.gather(flat, 1, position + step).view(shift.shape) for step in (-1, 0, 1, 2))
+        score = b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a)))
+        score = score.sum(-1).to(torch.float64)
         score = torch.where(warp_rate(times, k).amin(-1) > _LEAST_RATE, score, -math.inf)
         return torch.gather(candidates, 1, score.topk(count, -1).indices[..., None].expand(-1, -1, 2))
 
     step = torch.arange(-widest, widest + 1e-9, _GRID, **like)
     best = torch.cartesian_prod(step, step).expand(rows.shape[0], -1, -1)
-    best = best_of(best, _correlations(products, _BLUR), _KEPT)
+    # a blur of about half a step of the grid, so that no peak is missed
+    best = best_of(best, _correlations(products, 0.03), _KEPT)
     # the maximum is flat: rounding in single precision would move it
     table = _correlations(products.to(torch.complex128), 0.0)
     nearby = torch.cartesian_prod(*2 * [torch.linspace(-1, 1, 5, **like)])
     size, kept = _GRID, _KEPT
-    for _ in range(_ROUNDS):
+    for _ in range(10):  # each refinement halves the step: to 0.0001 of a rate
         kept = max(1, kept // 2)
         best = best_of((best[:, :, None] + size * nearby).flatten(1, 2), table, kept)
         size /= 2
@@ -129,28 +142,9 @@ def _correlations(transform: Tensor, blur: float) -> Tensor:
     return torch.cat([table[..., -reach:], table[..., : reach + 1]], -1)
 
 
-def _agreement(table: Tensor, log_ratio: Tensor) -> Tensor:
-    """Sum (trial, candidate) of the correlations of pairs at a shift (trial, candidate, pair)."""
-    reach = (table.shape[-1] - 1) // 2
-    shift = (log_ratio * _STEPS_PER_UNIT + reach).clamp(1, 2 * reach - 1 - 1e-3)
-    whole = shift.floor().long()
-    x, flat = (shift - whole).to(table.dtype), table.flatten(1)
-    position = (torch.arange(table.shape[1], device=shift.device) * table.shape[-1] + whole).flatten(1)
-    a, b, c, d = (torch.gather(flat, 1, position + step).view(shift.shape) for step in (-1, 0, 1, 2))
-    # through four points: a maximum between steps is not moved to one of them
-    return (b + 0.5 * x * (c - a + x * (2 * a - 5 * b + 4 * c - d + x * (3 * (b - c) + d - a)))).sum(-1)
-
-
 def _image(rows: Tensor, prf_hz: float, k: Tensor) -> Tensor:
     """Image (trial, line, range) of a rotation that changes by k."""
     return matched_fourier(rows, k, prf_hz, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS))
-
-
-def _corrected(k: Tensor, left: Tensor, duration_s: float) -> Tensor:
-    """k1 and k2 (trial, 2) of a rotation whose rate changes by `left` once k is compensated."""
-    times = numbers_on(k.device, duration_s / 2, duration_s)
-    even = duration_s * warp(times, k) / warp(times[1:], k)
-    return _third_order(warp_rate(times, k) * warp_rate(even, left), duration_s)
 
 
 def _third_order(rates: Tensor, duration_s: float) -> Tensor:
@@ -160,14 +154,6 @@ def _third_order(rates: Tensor, duration_s: float) -> Tensor:
     middle, end = rates.unbind(-1)
     k2 = 4 * (end - 2 * middle + 1) / duration_s**2
     return torch.stack([(end - 1) / duration_s - k2 * duration_s / 2, k2], -1)
-
-
-def _brightest(data: Tensor, count: int) -> Tensor:
-    """The range cells of most energy, (trial, pulse, count)."""
-    if data.shape[-1] <= count:
-        return data
-    order = data.abs().square().sum(1).topk(count, -1).indices
-    return torch.gather(data, 2, order[:, None].expand(-1, data.shape[1], -1))
 
 
 def _log_spectra(data: Tensor, length: int) -> Tensor:

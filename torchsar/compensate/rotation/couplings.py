@@ -1,4 +1,12 @@
-"""Inner products of the echoes of neighbouring scatterers, for joint least-squares estimation."""
+"""Range responses of scatterers, and inner products of the echoes of neighbouring ones.
+
+The band of the pulses is flat and fills the sampled band. Two responses are then possible, and they
+agree near their peak. Where a pulse of finite length is compressed as a whole, the response is a
+sinc, whose side lobes leave the range window. Where the window is a Fourier transform of as many
+samples as it has cells, the side lobes return at the other end of the window. Cropped windows lie
+between the two. The response of a recording is therefore described as a mixture of the two, and
+the share of the periodic one is found from the data.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +18,14 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.motion import Sampling
+from torchsar.core import cis
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.focus.transforms import Gridding
 
 # Doppler cells beyond which the coupling of scatterers is neglected, found by trial: accuracy of a
-# step against time
-_NEAR_CELLS = 64
-# more Doppler cells from which two scatterers may come that near in later steps: in each of seven
-# they move by at most 0.3; those from farther away are not coupled
-_MARGIN_CELLS = 5
-# added, relative, to what a scatterer tells about itself and the rotation: the curvature stays
-# positive definite where scatterers nearly cancel each other, and one alone is damped by no more
-_RIDGE = 1e-3
-_TABLE = 16  # steps of the table per Doppler cell, enough for linear interpolation
+# step against time; steps of the table per Doppler cell, enough for linear interpolation
+_NEAR_CELLS, _TABLE = 64, 16
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,8 @@ class Neighbours:
             are left out of `shape`.
         """
         used, n = amplitude != 0, cell.shape[1]
-        near = (cell[:, :, None] - cell[:, None]).abs() < _NEAR_CELLS + _MARGIN_CELLS
+        # they may come that near in later steps: in each of seven they move by at most 0.3 cells
+        near = (cell[:, :, None] - cell[:, None]).abs() < _NEAR_CELLS + 5
         near = (near & used[:, :, None] & used[:, None]).flatten()
         number = torch.arange(1, n + 1, device=cell.device)
         pairs, width = torch.stack([near.sum(), (used * number).amax()]).tolist() if len(near) else (0, 0)
@@ -68,25 +71,6 @@ class Neighbours:
         return Neighbours(
             index // (n * n), index // n % n, index % n, torch.Size([cell.shape[0], min(n, max(1, width))])
         )
-
-    def matrix(self, blocks: list[list[Tensor]]) -> Tensor:
-        """Assemble a matrix of blocks, each of which has one entry for each pair of scatterers.
-
-        Args:
-            blocks: The blocks, as a list of n rows of n blocks. A block is given by the entries of
-                its pairs, shape (pair,): that of a pair (p, q) stands in row p and column q of the
-                block.
-
-        Returns:
-            The matrix, shape (trial, n * scatterer, n * scatterer); zero where two scatterers do
-            not form a pair.
-        """
-        count, n = self.shape[1], len(blocks)
-        result = blocks[0][0].new_zeros(self.shape[0], n * count, n * count)
-        for i, row in enumerate(blocks):
-            for j, values in enumerate(row):
-                result[self.trial, self.first + i * count, self.second + j * count] = values
-        return result
 
     def per_scatterer(self, values: Tensor) -> Tensor:
         """Sum values of pairs over all pairs with the same first scatterer.
@@ -100,17 +84,34 @@ class Neighbours:
         flat = values.new_zeros(self.shape[0] * self.shape[1], values.shape[-1])
         return flat.index_add(0, self.trial * self.shape[1] + self.first, values).unflatten(0, self.shape)
 
-    def over_range(self, first: Tensor, second: Tensor) -> Tensor:
-        """Compute inner products over range of functions of the two scatterers of each pair.
 
-        Args:
-            first: Functions of the first scatterers, shape (trial, scatterer, range), complex.
-            second: Functions of the second scatterers, same shape.
+def envelopes(share: Tensor, row: Tensor, cells: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the responses to scatterers in all range cells.
 
-        Returns:
-            The sums of conj(first) * second for each pair, shape (pair,).
-        """
-        return (first.conj() @ second.mT)[self.trial, self.first, self.second]
+    Args:
+        share: Share of the periodic response, from 0 to 1, shape (trial,), float64; the rest is
+            that of a sinc.
+        row: Range of the scatterers in range cells, shape (trial, scatterer), float64.
+        cells: Number of range cells of the window.
+
+    Returns:
+        The response in each range cell, of unit peak, its derivative with respect to the range of
+        the scatterer in cells, and that with respect to the share; shape (trial, scatterer, range)
+        each, complex128.
+    """
+    cell = torch.arange(cells, dtype=row.dtype, device=row.device)
+    x = cell - row[..., None]
+    sinc, near = torch.sinc(x), x.abs() < 1e-4
+    # near the peak the slope follows from the series: the error of either form is below 1e-10
+    slope = torch.where(near, math.pi**2 / 3 * x, (sinc - torch.cos(math.pi * x)) / torch.where(near, 1, x))
+    # the periodic response is the mean of the FFT frequencies of as many samples
+    frequency = 2 * math.pi * (cell - cells // 2) / cells
+    phasor, lines = cis(row[..., None] * -frequency) / cells, cis(torch.outer(frequency, cell))
+    periodic = phasor @ lines
+    difference = periodic - sinc
+    weight = share[:, None, None]
+    of_periodic = (phasor * (-1j * frequency)) @ lines
+    return sinc + weight * difference, slope + weight * (of_periodic - slope), difference
 
 
 def inner_products(
@@ -141,25 +142,19 @@ def inner_products(
     # a separation just below the limit rounds to the last entry
     whole = position.floor().long().clamp_max(2 * _NEAR_CELLS * _TABLE - 1)
     weight = amplitude[near.trial, near.first].conj() * amplitude[near.trial, near.second]
-    weight = torch.where(coupled, weight * (1 + _RIDGE * (near.first == near.second)), 0)
+    # A part of 1e-3 is added to what a scatterer tells about itself and the rotation: the curvature
+    # stays positive definite where scatterers nearly cancel each other, and one alone is damped by
+    # no more.
+    weight = torch.where(coupled, weight * (1 + 1e-3 * (near.first == near.second)), 0)
     index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
-    table = _product_tables(sampling, k, bases)
-    low, high = table[near.trial, whole], table[near.trial, whole + 1]
-    values = ((low + (position - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
-    return {pair: value for (n, m), value in zip(index, values) for pair in {(n, m), (m, n)}}
-
-
-def _product_tables(sampling: Sampling, k: Tensor, bases: Tensor) -> Tensor:
-    """Sums over pulses of b_n b_m exp(2j pi c u), m >= n, (trial, step, product).
-
-    The steps are 1 / _TABLE of a Doppler cell c.
-    """
+    # sums over pulses of b_n b_m exp(2j pi c u), m >= n, at steps of 1 / _TABLE of a Doppler cell c
     first, second = torch.triu_indices(bases.shape[1], bases.shape[1], device=bases.device)
     scale = bases.abs().amax(-1, keepdim=True).clamp_min(1e-300)
     unit = bases / scale
     products = (unit[:, first] * unit[:, second]).mT.to(torch.complex128)
-    lines = 2 * _NEAR_CELLS * _TABLE + 2
-    table = matched_fourier(
-        products, k, sampling.prf_hz, lines=DopplerLines(_TABLE, lines), transform=Gridding(6)
-    ) * math.sqrt(sampling.pulses)
-    return table[:, 1:] * (scale[:, first] * scale[:, second]).mT
+    lines = DopplerLines(_TABLE, 2 * _NEAR_CELLS * _TABLE + 2)
+    table = matched_fourier(products, k, sampling.prf_hz, lines=lines, transform=Gridding(6))[:, 1:]
+    table = table * math.sqrt(sampling.pulses) * (scale[:, first] * scale[:, second]).mT
+    low, high = table[near.trial, whole], table[near.trial, whole + 1]
+    values = ((low + (position - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
+    return {pair: value for (n, m), value in zip(index, values) for pair in {(n, m), (m, n)}}

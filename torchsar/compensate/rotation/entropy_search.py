@@ -8,33 +8,33 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.assess import judged_motion
-from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
+from torchsar.compensate.rotation.image_entropy import (
+    EntropyObjective,
+    ImageEntropy,
+    k_name,
+    uniform_rotation,
+    values_of,
+)
 from torchsar.compensate.rotation.motion import Motion, each
-from torchsar.compensate.rotation.unknowns import RotationParameters, k_name, uniform_rotation, values_of
 from torchsar.core import Draws, Estimate, Outcome, Signal, Stage, worst
 from torchsar.optim import Descent, Searched, differential_evolution, genetic, grid_search, lbfgs, newton
 from torchsar.radar import InverseRadar
 
 Vector = Sequence[float] | Tensor
 
-# share of the width of a box from its edge within which a minimum is taken to lie outside, a
-# convention
-_EDGE = 1e-3
-# relative change of the entropy at which a descent ends, near its rounding
-_ROUNDING = {torch.complex64: 1e-8, torch.complex128: 1e-9}
-_FIRST_STEP = 0.3  # first step of a descent in units of the unknowns, of about a radian each
 # what the stages minimise by default: the published unknowns; a more accurate transform for
 # Newton's method, which needs second derivatives; unknowns with uncorrelated errors for a descent
-_PUBLISHED = EntropyObjective()
-_FOR_NEWTON = EntropyObjective(taps=6)
-_FOR_DESCENT = EntropyObjective(variables="shape")
+_PUBLISHED, _FOR_NEWTON, _FOR_DESCENT = (
+    EntropyObjective(),
+    EntropyObjective(taps=6),
+    EntropyObjective(variables="shape"),
+)
 
 
 def search_rotation(
@@ -114,9 +114,7 @@ def genetic_rotation(
     Reference:
         Remote Sens. 2025, 17, 3447, section 3.3.
     """
-    low, high = _box(figure, low, high)
-    found = genetic(figure, low, high, draws=draws, **options)
-    return _of_box(figure, found, low, high, assess, best_entropy_nats=found.history)
+    return _in_box(figure, genetic, low, high, assess, draws=draws, **options)
 
 
 def evolve_rotation(
@@ -141,9 +139,7 @@ def evolve_rotation(
     Raises:
         ValueError: If there is not one bound per unknown, or an option is invalid.
     """
-    low, high = _box(figure, low, high)
-    found = differential_evolution(figure, low, high, draws=draws, **options)
-    return _of_box(figure, found, low, high, assess, best_entropy_nats=found.history)
+    return _in_box(figure, differential_evolution, low, high, assess, draws=draws, **options)
 
 
 def newton_rotation(
@@ -178,7 +174,7 @@ def newton_rotation(
     """
     x, unit = _scaled(figure, start)
     found = newton(lambda z: figure.single(z * unit), x, damped=damped, steps=steps)
-    return _of_descent(figure, found, unit, ~found.ok, steps, assess)
+    return _of_descent(figure, found, unit, found.ok, steps, assess)
 
 
 def descend_rotation(
@@ -221,13 +217,76 @@ def descend_rotation(
         with_gradient,
         x,
         steps=steps,
-        first_step=_FIRST_STEP,
+        first_step=0.3,  # in units of the unknowns, of about a radian each
         gradient_tolerance=tolerance,
-        value_tolerance=_ROUNDING[figure.dtype],
+        value_tolerance=1e-8 if figure.dtype == torch.complex64 else 1e-9,  # near the rounding of the entropy
         with_gradient=True,
     )
     # its own verdict also reports infeasible candidates on its path
-    return _of_descent(figure, found, unit, ~torch.isfinite(found.cost), steps, assess)
+    return _of_descent(figure, found, unit, torch.isfinite(found.cost), steps, assess)
+
+
+def descent_near_truth(
+    data: Tensor,
+    omega_rad_s: Tensor,
+    warp_k: Tensor,
+    *,
+    order: int,
+    yc_m: float | None,
+    assess: bool = True,
+    **known: Any,
+) -> Estimate:
+    """Estimate a rotation by a descent of the image entropy that starts at 0.95 of the true values.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range).
+        omega_rad_s: True rotation rate at the first pulse in rad/s, shape (...,).
+        warp_k: True derivatives k1, k2, ... of the rotation rate at the first pulse, divided by
+            that rate, in 1/s, 1/s^2, ..., shape (..., coefficient).
+        order: As in `uneven_rotation`.
+        yc_m: Range centre deviation in metres; None is 0.
+        assess: False leaves out the assessment.
+        known: The arguments wavelength_m, prf_hz and range_m of `uneven_rotation`.
+
+    Returns:
+        The `Estimate` that the function `descend_rotation` returns.
+    """
+    objective = ImageEntropy(data, EntropyObjective(order=order, yc_m=yc_m or 0.0, variables="shape"), **known)
+    return descend_rotation(objective, objective.start(0.95 * omega_rad_s, 0.95 * warp_k, None), assess=assess)
+
+
+def genetic_near_truth(
+    data: Tensor,
+    omega_rad_s: Tensor,
+    warp_k: Tensor,
+    *,
+    order: int,
+    yc_m: float | None,
+    assess: bool = True,
+    **known: Any,
+) -> Estimate:
+    """Estimate a rotation by a genetic algorithm that searches within 10 % of the true values.
+
+    The image entropy is minimised with 10 individuals in 4 generations.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range).
+        omega_rad_s: True rotation rate at the first pulse in rad/s, shape (...,).
+        warp_k: True derivatives k1, k2, ... of the rotation rate at the first pulse, divided by
+            that rate, in 1/s, 1/s^2, ..., shape (..., coefficient).
+        order: As in `uneven_rotation`.
+        yc_m: Range centre deviation in metres; None is 0.
+        assess: False leaves out the assessment.
+        known: The arguments wavelength_m, prf_hz and range_m of `uneven_rotation`.
+
+    Returns:
+        The `Estimate` that the function `genetic_rotation` returns.
+    """
+    objective = ImageEntropy(data, EntropyObjective(order=order, yc_m=yc_m or 0.0, variables="raw"), **known)
+    centre = torch.cat([omega_rad_s[..., None], warp_k], -1)
+    box = 0.1 * torch.where(centre != 0, centre.abs(), 1)
+    size = {"population": 10, "generations": 4}  # short enough to compare
+    return genetic_rotation(objective, centre - box, centre + box, draws=Draws(1), assess=assess, **size)
 
 
 def _scaled(figure: ImageEntropy, start: Tensor) -> tuple[Tensor, Tensor]:
@@ -241,20 +300,30 @@ def _scaled(figure: ImageEntropy, start: Tensor) -> tuple[Tensor, Tensor]:
     return x / unit, unit
 
 
+def _in_box(
+    figure: ImageEntropy, search: Callable[..., Searched], low: Vector, high: Vector, assess: bool, **options: Any
+) -> Estimate:
+    """Estimate from a search with options between two vectors of bounds."""
+    low, high = (figure.spread(figure.unknowns.vector(bound, what)) for bound, what in ((low, "low"), (high, "high")))
+    found = search(figure, low, high, **options)
+    return _of_box(figure, found, low, high, assess, best_entropy_nats=found.history)
+
+
 def _of_box(figure: ImageEntropy, found: Searched, low: Tensor, high: Tensor, assess: bool, **info: Tensor) -> Estimate:
     """Estimate from a search in a box."""
     width = high - low
-    edge = (torch.minimum(found.x - low, high - found.x) <= _EDGE * width) & (width > 0)
+    # a minimum so near the edge is taken to lie outside, a convention
+    edge = (torch.minimum(found.x - low, high - found.x) <= 1e-3 * width) & (width > 0)
     doubts = worst((Outcome.NOT_CONVERGED, ~found.ok), (Outcome.OUTSIDE_SEARCH, edge.any(-1)))
     info |= {"evaluations": found.evaluations, "on_edge": edge}
     return _estimate(figure, found.x, found.cost, doubts, info, assess)
 
 
 def _of_descent(
-    figure: ImageEntropy, found: Descent, unit: Tensor, diverged: Tensor, steps: int, assess: bool
+    figure: ImageEntropy, found: Descent, unit: Tensor, finite: Tensor, steps: int, assess: bool
 ) -> Estimate:
     """Estimate from a descent."""
-    doubts = worst((Outcome.NOT_CONVERGED, diverged | ~(found.converged | (found.steps < steps))))
+    doubts = Outcome.of(finite & (found.converged | (found.steps < steps)), Outcome.NOT_CONVERGED)
     info = {"evaluations": found.evaluations, "iterations": found.steps, "converged": found.converged}
     return _estimate(figure, found.x * unit, found.cost, doubts, info, assess)
 
@@ -272,39 +341,29 @@ def _estimate(
         return Estimate(value, outcome=Outcome.NOT_ASSESSED.like(cost), info=info)
     before = figure.uncompensated()
     cost = torch.where(torch.isfinite(cost), cost, before)
-    outcome, error = _judged(figure, rotation)
-    outcome = torch.maximum(outcome, torch.maximum(doubts, worst((Outcome.NOT_CONVERGED, ~rotation.feasible))))
-    info |= {"entropy_nats": cost, "uncompensated_entropy_nats": before, "phase_error_rad": error}
-    return Estimate(value, quality=(1 - torch.exp(cost - before)).clamp(0, 1), outcome=outcome, info=info)
-
-
-def _judged(figure: ImageEntropy, rotation: RotationParameters) -> tuple[Tensor, Tensor]:
-    """Outcomes and phase errors (...,) of rotations, as bright scatterers show them."""
     w = rotation.omega_rad_s.square().reshape(-1)
     k = rotation.warp_k.reshape(len(w), -1)
     motion = Motion(k, w, w * rotation.yc_m.reshape(-1), torch.zeros_like(w))
     with torch.no_grad():
         parts = [
-            judged_motion(figure.rows[i], figure.sampling, each(lambda x, i=i: x[i], motion))
+            judged_motion(figure.rows[i], figure.sampling, each(lambda x, i=i: x[i], motion), {})
             for i in figure.blocks(len(w))
         ]
-    outcome = torch.cat([part.outcome for part in parts]).reshape(figure.trials)
-    return outcome, torch.cat([part.info["phase_error_rad"] for part in parts]).reshape(figure.trials)
-
-
-def _box(figure: ImageEntropy, low: Vector, high: Vector) -> tuple[Tensor, Tensor]:
-    """Both bounds as vectors of every trial."""
-    return figure.spread(figure.unknowns.vector(low, "low")), figure.spread(figure.unknowns.vector(high, "high"))
+    outcome = torch.maximum(torch.cat([part.outcome for part in parts]).reshape(figure.trials), doubts)
+    outcome = torch.maximum(outcome, Outcome.of(rotation.feasible, Outcome.NOT_CONVERGED))
+    error = torch.cat([part.info["phase_error_rad"] for part in parts]).reshape(figure.trials)
+    info |= {"entropy_nats": cost, "uncompensated_entropy_nats": before, "phase_error_rad": error}
+    return Estimate(value, quality=(1 - torch.exp(cost - before)).clamp(0, 1), outcome=outcome, info=info)
 
 
 class _Search(Stage):
     """A search for the rotation that minimises an image entropy, by one of the functions above."""
 
     def __init__(
-        self, radar: InverseRadar, objective: EntropyObjective, find: Callable[..., Estimate], assess: bool
+        self, radar: InverseRadar, objective: EntropyObjective, find: Callable[..., Estimate], **options: Any
     ) -> None:
         super().__init__()
-        self.radar, self.objective, self.find, self.assess = radar, objective, find, assess
+        self.radar, self.objective, self.find, self.options = radar, objective, find, options
         self.provides = (
             "warp_k",
             *(k_name(i) for i in range(1, objective.order)),
@@ -337,7 +396,7 @@ class _Search(Stage):
         Returns:
             The `Estimate` of the function that the description of the stage names.
         """
-        return self.find(self.figure(signal, yc_m), assess=self.assess)
+        return self.find(self.figure(signal, yc_m), **self.options)
 
 
 class RotationSearch(_Search):
@@ -379,7 +438,7 @@ class RotationSearch(_Search):
                 f"low {list(low)}, high {list(high)} and counts {list(counts)}"
             )
         axes = [torch.linspace(a, b, n, dtype=torch.float64) for a, b, n in zip(low, high, counts, strict=True)]
-        super().__init__(radar, objective, partial(search_rotation, axes=axes, limit=limit), assess)
+        super().__init__(radar, objective, search_rotation, axes=axes, limit=limit, assess=assess)
 
 
 class RotationGenetic(_Search):
@@ -417,9 +476,9 @@ class RotationGenetic(_Search):
         seed: int = 1,
         assess: bool = True,
     ) -> None:
-        rules = {"population": population, "generations": generations, "elites": elites, "selection": selection}
+        size = {"population": population, "generations": generations, "elites": elites}
         box = {"low": tuple(low), "high": tuple(high), "draws": Draws(seed)}
-        super().__init__(radar, objective, partial(genetic_rotation, **box, **rules), assess)
+        super().__init__(radar, objective, genetic_rotation, **box, **size, selection=selection, assess=assess)
 
 
 class RotationEvolution(_Search):
@@ -455,9 +514,9 @@ class RotationEvolution(_Search):
         seed: int = 1,
         assess: bool = True,
     ) -> None:
-        rules = {"population": population, "generations": generations, "strategy": strategy}
+        size = {"population": population, "generations": generations}
         box = {"low": tuple(low), "high": tuple(high), "draws": Draws(seed)}
-        super().__init__(radar, objective, partial(evolve_rotation, **box, **rules), assess)
+        super().__init__(radar, objective, evolve_rotation, **box, **size, strategy=strategy, assess=assess)
 
 
 class _Descending(_Search):
@@ -472,9 +531,9 @@ class _Descending(_Search):
         objective: EntropyObjective,
         start: list[float] | None,
         find: Callable[..., Estimate],
-        assess: bool,
+        **options: Any,
     ) -> None:
-        super().__init__(radar, objective, find, assess)
+        super().__init__(radar, objective, find, **options)
         self.names = (*(("omega",) if objective.range_term else ()), "k1, k2, ...")
         wanted = objective.order - 1 + objective.range_term
         if start is not None and len(start) != wanted:
@@ -517,7 +576,7 @@ class _Descending(_Search):
                 f"connect {'omega_rad_s and ' if self.objective.range_term else ''}warp_k from an earlier estimator"
             )
         figure = self.figure(signal, yc_m)
-        return self.find(figure, figure.start(omega, k, yc_m), assess=self.assess)
+        return self.find(figure, figure.start(omega, k, yc_m), **self.options)
 
 
 class RotationNewton(_Descending):
@@ -552,7 +611,7 @@ class RotationNewton(_Descending):
         steps: int = 20,
         assess: bool = True,
     ) -> None:
-        super().__init__(radar, objective, start, partial(newton_rotation, damped=damped, steps=steps), assess)
+        super().__init__(radar, objective, start, newton_rotation, damped=damped, steps=steps, assess=assess)
 
 
 class RotationDescent(_Descending):
@@ -588,4 +647,4 @@ class RotationDescent(_Descending):
         steps: int = 60,
         assess: bool = True,
     ) -> None:
-        super().__init__(radar, objective, start, partial(descend_rotation, steps=steps), assess)
+        super().__init__(radar, objective, start, descend_rotation, steps=steps, assess=assess)

@@ -1,8 +1,9 @@
-"""Refinement of an estimated rotation from the phase histories of bright isolated scatterers.
+"""Bright scatterers, and refinement of an estimated rotation from their phase histories.
 
-The history of a scatterer is its signal over the aperture. It is cut out of the image by a window
-about the scatterer and transformed back to slow time. If the rotation is estimated without error,
-the phase of the history is a straight line. Errors add a curved phase:
+Scatterers are local maxima of an image above the noise and above the side lobes of their
+neighbours. The history of a scatterer is its signal over the aperture. It is cut out of the image
+by a window about the scatterer and transformed back to slow time. If the rotation is estimated
+without error, the phase of the history is a straight line. Errors add a curved phase:
 
 - an error dk of a relative derivative k of the rotation rate adds -2 pi c (du/dk) dk, where c is
 the Doppler cell of the scatterer. The warped time phi is the rotation angle over the rate at the
@@ -25,24 +26,88 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, chosen, image_of
-from torchsar.compensate.rotation.peaks import Peaks, find_peaks, noise_power, threshold
+from torchsar.compensate.rotation.motion import Motion, Sampling, chosen, image_of, warped_time
+from torchsar.core import cis
 from torchsar.core.warp import warp, warp_rate
+from torchsar.focus.warped_sums import slow_times
 
-_OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
-# least amplitude of an isolated scatterer over the largest one within its window, found by trial
-_ISOLATED = 0.5
-_COUNT, HALF_CELLS = 128, 24  # largest number of scatterers, and half width of a window in Doppler cells
-_ENDS = 16  # a window smears a history at both ends by 1/16 of its length, which is left out
-_ROBUST_ROUNDS = 3  # reweighted fits, found by trial: enough to exclude outliers
-# eigenvalue of a normal matrix of unit diagonal below which its direction is not determined: above
-# the rounding of float64, below any real information
-_NO_INFORMATION = 1e-7
-# power over that of the brightest pixel below which side lobes are to be expected more than 24
-# cells away
-_FAINTEST = 1e-3
-_SHARE_LOST = 0.01  # share of an unknown in such a direction beyond which it is not determined
+OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
+HALF_CELLS = 24  # half width of a window in Doppler cells
+
+
+def noise_power(power: Tensor) -> Tensor:
+    """Estimate the mean power of circular Gaussian noise in an image from the median of its power.
+
+    Assumes that scatterers leave most of the image empty.
+
+    Args:
+        power: Power of the image, shape (trial, line, range).
+
+    Returns:
+        The noise power, shape (trial,).
+    """
+    every = power.flatten(1)
+    # of 65536 pixels: its error is then below a percent
+    return every[:, :: max(1, every.shape[-1] // (1 << 16))].median(-1).values / math.log(2)
+
+
+def threshold(pixels: int) -> float:
+    """Compute the detection threshold that noise alone exceeds in about one of ten images.
+
+    Args:
+        pixels: Number of pixels of an image.
+
+    Returns:
+        The threshold, as a ratio of power to mean noise power.
+    """
+    return math.log(pixels) + 2.5
+
+
+def find_peaks(
+    power: Tensor, floor: Tensor, count: int, share: float, lines: int, cells: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Find local maxima of an image above the noise.
+
+    A maximum that is weak compared with the brightest pixel near it is left out, because it may be
+    a side lobe. Weak scatterers near strong ones are thus found only after the strong ones are
+    subtracted from the data.
+
+    Args:
+        power: Power of the image, shape (trial, line, range).
+        floor: Least power of a peak, shape (trial,).
+        count: Largest number of peaks.
+        share: Least amplitude of a peak, as a fraction of the largest amplitude in its
+            neighbourhood.
+        lines: Half width of the neighbourhood in lines.
+        cells: Half width of the neighbourhood in range cells.
+
+    Returns:
+        Power of the peaks, brightest first, 0 in the places that a trial with fewer peaks does not
+        fill; their image lines, int64; and their range cells, int64; shape (trial, peak) each.
+    """
+    n_line, n_cell = power.shape[1:]
+    along, across = pad(power, (0, 0, 1, 1)), pad(power, (1, 1, 0, 0))
+    maximum = (
+        (power >= along[:, :-2]) & (power > along[:, 2:]) & (power >= across[..., :-2]) & (power > across[..., 2:])
+    )
+    maxima = torch.where(maximum & (power > floor[:, None, None]), power, 0).flatten(1)
+    # four local maxima are examined for each peak that is wanted, found by trial
+    level, index = maxima.topk(min(4 * count, maxima.shape[-1]), -1)
+    line, cell = index // n_cell, index % n_cell
+    offsets = torch.cartesian_prod(
+        torch.arange(-lines, lines + 1, device=power.device), torch.arange(-cells, cells + 1, device=power.device)
+    )
+    near_line, near_cell = line[..., None] + offsets[:, 0], cell[..., None] + offsets[:, 1]
+    inside = (near_line >= 0) & (near_line < n_line) & (near_cell >= 0) & (near_cell < n_cell)
+    near = torch.gather(
+        power.flatten(1), 1, (near_line.clamp(0, n_line - 1) * n_cell + near_cell.clamp(0, n_cell - 1)).flatten(1)
+    ).view(inside.shape)
+    around = torch.where(inside, near, 0).amax(-1)
+    kept = torch.where((level > 0) & (level >= share**2 * around), level, 0)
+    found, order = kept.topk(min(count, kept.shape[-1]), -1)
+    return found, torch.gather(line, 1, order), torch.gather(cell, 1, order)
 
 
 class Histories(NamedTuple):
@@ -109,51 +174,41 @@ def histories_of(
     Returns:
         The histories and the change of the rotation.
     """
-    image = image_of(data, sampling, motion, oversampling=_OVERSAMPLING)
+    image = image_of(data, sampling, motion, oversampling=OVERSAMPLING)
     power = image.abs().square()
     least = threshold(power[0].numel())
-    resolved = _unambiguous(motion, sampling, image.shape[1])[..., None]
+    # Lines whose Doppler the pulse rate resolves at every time. The fastest rotation limits
+    # them; beyond them scatterers of the other end of the band return.
+    times, lines = slow_times(sampling.pulses, sampling.prf_hz, motion.k.device), image.shape[1]
+    fastest = warp_rate(times, motion.k).amax(-1) * sampling.duration_s
+    whole = warp(times.new_full((1,), sampling.duration_s), motion.k)[..., 0]
+    doppler = torch.arange(lines, device=times.device) - lines // 2
+    resolved = (doppler.abs() * (fastest / whole)[:, None] <= lines / 2)[..., None]
     speckle = torch.where(resolved, power, math.nan).nanmedian(1, keepdim=True).values / math.log(2)
     brightest, noise = power.amax((-2, -1)), noise_power(power) * least
-    floor = torch.maximum(speckle * least, _FAINTEST * brightest[:, None, None])
+    # side lobes below 1e-3 of the brightest pixel are to be expected more than 24 cells away
+    floor = torch.maximum(speckle * least, 1e-3 * brightest[:, None, None])
     clear = torch.where(resolved & (power > floor), power, 0)
-    peaks = find_peaks(clear, noise, _COUNT, _ISOLATED, 2 * half_cells, 1)
-    cells, used = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING, peaks.power > 0
-    history, u = _windowed(image, peaks, half_cells)
-    bases = _bases(motion, sampling, cells, sampling.range_m(peaks.cell), u, free_centre)
-    keep = slice(max(1, len(u) // _ENDS), -max(1, len(u) // _ENDS))
-    history = history[..., keep]
+    # up to 128 scatterers, of at least half of the largest amplitude within the window; by trial
+    peak, line, cell = find_peaks(clear, noise, 128, 0.5, 2 * half_cells, 1)
+    cells, used = (line - image.shape[1] // 2) / OVERSAMPLING, peak > 0
+    # the histories of windows about the peaks, (trial, peak, 2 half_cells), and u of their samples
+    offsets = torch.arange(-half_cells * OVERSAMPLING, half_cells * OVERSAMPLING, device=image.device)
+    row = line[..., None] + offsets
+    index = row.clamp(0, lines - 1) * image.shape[2] + cell[..., None]
+    near = torch.gather(image.flatten(1), 1, index.flatten(1)).view(index.shape)
+    window = torch.where((row >= 0) & (row < lines), near, 0).to(torch.complex128)
+    u = (torch.arange(2 * half_cells, dtype=torch.float64, device=image.device) + 0.5) / (2 * half_cells)
+    history = window @ cis(-2 * math.pi / OVERSAMPLING * offsets[:, None] * u)
+    bases = _bases(motion, sampling, cells, sampling.range_m(cell), u, free_centre)
+    # a window smears a history at both ends by 1/16 of its length, which is left out
+    ends = max(1, len(u) // 16)
+    history, bases = history[..., ends:-ends], bases[..., ends:-ends]
     seen = torch.stack([part.mean(-1).abs().square() for part in history.tensor_split(4, -1)], -1)
     seen = (seen * used[..., None]).sum(1)
     tiny = torch.finfo(power.dtype).tiny
     level, least_lit = brightest / noise.clamp_min(tiny), seen.amin(-1) / seen.amax(-1).clamp_min(tiny)
-    return Histories(cells, used, level, least_lit, *_fitted(history, bases[..., keep], used))
-
-
-def _unambiguous(motion: Motion, sampling: Sampling, lines: int) -> Tensor:
-    """Lines (trial, line) whose Doppler the pulse rate resolves at every time of the aperture.
-
-    The fastest rotation limits them. Beyond them scatterers of the other end of the band return.
-    """
-    times = sampling.times(motion.k.device)
-    fastest = warp_rate(times, motion.k).amax(-1) * sampling.duration_s
-    whole = warp(times.new_full((1,), sampling.duration_s), motion.k)[..., 0]
-    line = torch.arange(lines, device=times.device) - lines // 2
-    return line.abs() * (fastest / whole)[:, None] <= lines / 2
-
-
-def _windowed(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Tensor]:
-    """Histories (trial, peak, 2 half_cells) of windows about peaks, and u of their samples."""
-    lines = torch.arange(2 * half_cells * _OVERSAMPLING, device=image.device) - half_cells * _OVERSAMPLING
-    row = peaks.line[..., None] + lines
-    inside = (row >= 0) & (row < image.shape[1])
-    index = row.clamp(0, image.shape[1] - 1) * image.shape[2] + peaks.cell[..., None]
-    window = torch.where(inside, torch.gather(image.flatten(1), 1, index.flatten(1)).view(index.shape), 0).to(
-        torch.complex128
-    )
-    u = (torch.arange(2 * half_cells, dtype=torch.float64, device=image.device) + 0.5) / (2 * half_cells)
-    angle = -2 * math.pi / _OVERSAMPLING * lines[:, None] * u
-    return window @ torch.polar(torch.ones_like(angle), angle), u
+    return Histories(cells, used, level, least_lit, *_fitted(history, bases, used))
 
 
 def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u: Tensor, free_centre: bool) -> Tensor:
@@ -161,22 +216,18 @@ def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u
 
     The unknowns are k1, k2, ..., w, and v if it is free.
     """
-    warped = Warped.of(motion.k, _times_at(u, motion.k, sampling.duration_s), sampling.duration_s)
-    square = 2 * math.pi * sampling.turns_per_square * warped.phi.square()[:, None]
-    rows = [-2 * math.pi * cells[..., None] * slope[:, None] for slope in warped.slopes.unbind(1)]
+    duration_s, k = sampling.duration_s, motion.k
+    whole = warp(u.new_full((1,), duration_s), k)
+    times = (u * duration_s).expand(len(k), -1)
+    for _ in range(8):  # Newton steps to the times of equal warped time
+        times = (times - (warp(times, k) - u * whole) / warp_rate(times, k)).clamp(0, duration_s)
+    phi, _, slopes = warped_time(k, times, duration_s)
+    square = 2 * math.pi * (1 / sampling.wavelength_m) * phi.square()[:, None]
+    rows = [-2 * math.pi * cells[..., None] * slope[:, None] for slope in slopes.unbind(1)]
     rows.append((range_m + motion.centre_m[:, None])[..., None] * square)
     if free_centre:
         rows.append(square.expand(-1, cells.shape[-1], -1))
     return torch.stack(rows, -2)
-
-
-def _times_at(u: Tensor, k: Tensor, duration_s: float) -> Tensor:
-    """Times (trial, sample) at which the normalised warp is u, by Newton steps."""
-    whole = warp(u.new_full((1,), duration_s), k)
-    time = (u * duration_s).expand(k.shape[0], -1)
-    for _ in range(8):
-        time = (time - (warp(time, k) - u * whole) / warp_rate(time, k)).clamp(0, duration_s)
-    return time
 
 
 def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -194,7 +245,7 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> tuple[Tensor, Tenso
     angle = angle - (weight * angle).sum(-1, keepdim=True) / total
     difference = difference - (weight[..., None, :] * difference).sum(-1, keepdim=True) / total[..., None]
     change, inverse, pull = angle.new_zeros(bases.shape[0], bases.shape[2]), angle.new_zeros(0), angle.new_zeros(0)
-    for _ in range(_ROBUST_ROUNDS):
+    for _ in range(3):  # reweighted fits, found by trial: enough to exclude outliers
         weighted = difference * weight[..., None, :]
         inverse = inverted(torch.einsum("bpij,bpkj->bik", weighted, difference))[0]
         change = (inverse @ torch.einsum("bpij,bpj->bi", weighted, angle)[..., None])[..., 0]
@@ -224,8 +275,9 @@ def inverted(normal: Tensor) -> tuple[Tensor, Tensor]:
     root = torch.where(scale > 0, scale, 1).rsqrt()
     unit = normal * root[:, :, None] * root[:, None]
     one = torch.eye(unit.shape[-1], dtype=unit.dtype, device=unit.device)
-    poles = [_NO_INFORMATION * cmath.exp(1j * cmath.pi * turn) for turn in (0.25, 0.75)]
+    # the limit of what counts as known is above the rounding of float64, below any real information
+    poles = [1e-7 * cmath.exp(1j * cmath.pi * turn) for turn in (0.25, 0.75)]
     inverse = torch.linalg.inv_ex(torch.stack([unit - pole * one for pole in poles])).inverse.real.mean(0)
-    # diagonal of the projection to the directions that are left out
-    lost = ~(1 - (unit * inverse).sum(-1) <= _SHARE_LOST)  # also where it is no number
+    # diagonal of the projection to the directions that are left out, a share of an unknown of 0.01
+    lost = ~(1 - (unit * inverse).sum(-1) <= 0.01)  # also where it is no number
     return inverse * root[:, :, None] * root[:, None], lost

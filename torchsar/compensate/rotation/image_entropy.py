@@ -1,4 +1,4 @@
-"""Entropy of the image as a function of the rotation, for many candidates at once.
+"""Unknowns of a rotation, and the entropy of the image as their function, for many candidates.
 
 For each candidate rotation, the phase that depends on the range of a scatterer is removed (if the
 settings say so), the image is formed by the matched Fourier transform
@@ -7,20 +7,251 @@ settings say so), the image is formed by the matched Fourier transform
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.motion import Sampling
-from torchsar.compensate.rotation.unknowns import RotationParameters, Unknowns, Variables
 from torchsar.core import Signal, block_bytes_of, checked_samples, power_of, unit_level
 from torchsar.core.arguments import names_arguments
+from torchsar.core.warp import k_of_shape, least_rate, shape_of, warp
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier, range_phase
 from torchsar.focus.transforms import Gridding
 from torchsar.radar import InverseRadar
+
+Variables = Literal["raw", "shape"]
+
+
+class RotationParameters(NamedTuple):
+    """Parameters of the rotation of a target, one set per trial.
+
+    Args:
+        omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,).
+        warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+            1/s^2, ..., shape (..., order - 1); 0 where the rotation is not feasible.
+        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+            rotation centre), shape (...,).
+        feasible: True where the rotation neither stops nor reverses, shape (...,), bool.
+    """
+
+    omega_rad_s: Tensor
+    warp_k: Tensor
+    yc_m: Tensor
+    feasible: Tensor
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """The unknowns of a search for the rotation of a target, as vectors of shape (..., n).
+
+    With the variables "raw" a vector holds the rotation rate omega at the first pulse (rad/s), its
+    relative derivatives k1, k2, ... (1/s, 1/s^2, ...), and the range centre deviation yc (m): a
+    cell at range y lies at y + yc from the rotation centre. With the variables "shape" it holds the
+    total rotation angle A over the aperture (rad), the Legendre coefficients q2, q3, ... of the
+    rotation angle over time (`torchsar.core.warp.shape_of`), and yc. Estimation errors of k1 and k2
+    are correlated: the error of k1 is about -T/2 times that of k2, with the length T of the
+    aperture. Those of q2 and q3 are not.
+
+    Args:
+        duration_s: Duration of the aperture in seconds.
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
+        range_term: True compensates the phase that depends on the range of a scatterer. Otherwise
+            omega (or A) and yc do not affect the entropy and are not unknowns.
+        yc: True makes the range centre deviation an unknown; otherwise it is known a priori.
+        variables: "raw" or "shape".
+
+    Raises:
+        ValueError: If there is nothing to search for, `yc` is an unknown without the range term, or
+            `variables` is neither "raw" nor "shape".
+    """
+
+    duration_s: float
+    order: int = 3
+    range_term: bool = True
+    yc: bool = False
+    variables: Variables = "raw"
+
+    def __post_init__(self) -> None:
+        least = 1 if self.range_term else 2
+        if self.order < least:
+            raise ValueError(
+                f"order must be {least} or more{'' if self.range_term else ' without the range term'}, got "
+                f"{self.order}: such a rotation has no unknowns to search for"
+            )
+        if self.yc and not self.range_term:
+            raise ValueError(
+                "yc_m must be known if range_term is False, because the range centre deviation affects the range "
+                "term alone; give yc_m, or set range_term to True"
+            )
+        if self.variables not in ("raw", "shape"):
+            raise ValueError(f"variables must be 'raw' or 'shape', got {self.variables!r}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One name per unknown, with its unit."""
+        raw = self.variables == "raw"
+        first = ("omega_rad_s" if raw else "angle_rad",) if self.range_term else ()
+        return (
+            *first,
+            *(k_name(i) if raw else f"q{i + 1}" for i in range(1, self.order)),
+            *(("yc_m",) if self.yc else ()),
+        )
+
+    def turn(self, x: Tensor, yc_m: Tensor) -> RotationParameters:
+        """Convert vectors of unknowns to the rotations that they describe.
+
+        Differentiable where the rotation is feasible.
+
+        Args:
+            x: Unknowns, shape (..., n).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), shape (...,), used if it is not an unknown.
+
+        Returns:
+            The rotation.
+        """
+        first = 1 if self.range_term else 0
+        size, k = x[..., 0] if first else torch.zeros_like(x[..., 0]), x[..., first : first + self.order - 1]
+        yc = x[..., -1] if self.yc else yc_m.expand(x.shape[:-1])
+        finite = torch.isfinite(x).all(-1)
+        k = torch.where(finite[..., None], k, 0)
+        if self.variables == "shape":
+            # the warp grows at the first pulse if 1 + sum q_j P_j'(-1) > 0, with
+            # P_j'(-1) = -(-1)^j j (j + 1) / 2; below 1e-6, k, relative to that, would be infinite
+            j = torch.arange(2, k.shape[-1] + 2, dtype=k.dtype, device=k.device)
+            slope = torch.where(j.remainder(2) == 0, -0.5, 0.5) * j * (j + 1)
+            grows = 1 + (k * slope).sum(-1) > 1e-6
+            finite, k = finite & grows, k_of_shape(torch.where(grows[..., None], k, 0), self.duration_s)
+        feasible = finite & (least_rate(k, self.duration_s) > 0)
+        k = torch.where(feasible[..., None], k, 0)
+        size = torch.where(feasible, size, 0)
+        return RotationParameters(
+            size / self._phi(k) if self.variables == "shape" else size, k, torch.where(feasible, yc, 0), feasible
+        )
+
+    def at(self, omega_rad_s: Tensor, warp_k: Tensor, yc_m: Tensor) -> Tensor:
+        """Convert rotations to vectors of unknowns; the inverse of `turn`.
+
+        Args:
+            omega_rad_s: Rotation rate in rad/s, shape (...,).
+            warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+                1/s^2, ..., shape (..., order - 1).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), shape (...,).
+
+        Returns:
+            The unknowns, shape (..., n).
+        """
+        size = omega_rad_s * self._phi(warp_k) if self.variables == "shape" else omega_rad_s
+        k = shape_of(warp_k, self.duration_s) if self.variables == "shape" else warp_k
+        columns = [*((size,) if self.range_term else ()), *k.unbind(-1), *((yc_m,) if self.yc else ())]
+        return torch.stack(torch.broadcast_tensors(*columns), -1)
+
+    def units(self, x: Tensor, wavelength_m: float, extent_m: float, n_pulse: int) -> Tensor:
+        """Compute a scale for each unknown: the change that alters phases by about a radian.
+
+        The phases are those of scatterers at the edge of the target, which is assumed to be as wide
+        as the pulse rate allows. The change of the rotation rate (or of the angle) is limited to
+        its value in `x`, that of yc to `extent_m`.
+
+        Args:
+            x: Unknowns, shape (..., n).
+            wavelength_m: Wavelength in metres.
+            extent_m: Extent of the target in range in metres.
+            n_pulse: Number of pulses.
+
+        Returns:
+            The changes, positive, shape (..., n).
+        """
+        raw, t = self.variables == "raw", self.duration_s
+        # of a raw unknown: the k_i that makes q_(i+1) = 1 where all others are 0 and small
+        scales = [
+            math.factorial(2 * i + 2) / (2 * math.factorial(i + 1) * t**i) if raw else 1 for i in range(1, self.order)
+        ]
+        k = [torch.full_like(x[..., 0], scale * (4 / n_pulse)) for scale in scales]
+        if not self.range_term:
+            return torch.stack(k, -1)
+        size = torch.where(x[..., 0] != 0, x[..., 0].abs(), 1)
+        angle = size * t if raw else size
+        depth = wavelength_m / (2 * math.pi * angle.square())
+        return torch.stack(
+            [size * (depth / extent_m).clamp_max(1), *k, *((depth.clamp_max(extent_m),) if self.yc else ())], -1
+        )
+
+    def vector(self, values: Sequence[float] | Tensor, what: str) -> Tensor:
+        """Convert numbers, one per unknown, to a vector, and check how many they are.
+
+        Args:
+            values: The numbers, shape (..., n).
+            what: Name of the argument for the error message.
+
+        Returns:
+            The vector, shape (..., n), float64.
+
+        Raises:
+            ValueError: If there is not one value per unknown.
+        """
+        x = torch.as_tensor(values, dtype=torch.float64)
+        if x.ndim == 0 or x.shape[-1] != len(self.names):
+            raise ValueError(
+                f"{what} must hold the {len(self.names)} values {', '.join(self.names)}, got "
+                f"{x.shape[-1] if x.ndim else 1}"
+            )
+        return x
+
+    def _phi(self, k: Tensor) -> Tensor:
+        """phi(T), (...,)."""
+        return warp(torch.full((1,), self.duration_s, dtype=k.dtype, device=k.device), k)[..., 0]
+
+
+def k_name(i: int) -> str:
+    """Return the name, with its unit, of the relative derivative k_i of the rotation rate.
+
+    Args:
+        i: Order of the derivative, from 1.
+
+    Returns:
+        The name: k1_per_s, k2_per_s2, and so on.
+    """
+    return f"k{i}_per_s{i if i > 1 else ''}"
+
+
+def values_of(omega_rad_s: Tensor, warp_k: Tensor, yc_m: Tensor) -> dict[str, Tensor]:
+    """Name the parameters of a rotation as an estimate does.
+
+    Args:
+        omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,).
+        warp_k: Relative derivatives k1, k2, ... of the rotation rate in 1/s, 1/s^2, ..., shape
+            (..., order - 1).
+        yc_m: Range centre deviation in metres, shape (...,).
+
+    Returns:
+        `omega_rad_s`, `yc_m`, `warp_k`, and each entry of `warp_k` as `k1_per_s`, `k2_per_s2`, ...
+    """
+    named = {k_name(i): k for i, k in enumerate(warp_k.unbind(-1), 1)}
+    return {"omega_rad_s": omega_rad_s, "yc_m": yc_m, "warp_k": warp_k, **named}
+
+
+def uniform_rotation(radar: InverseRadar, names: Iterable[str], yc_m: Tensor | float | None) -> Mapping[str, Any]:
+    """Return the rotation that is assumed where it cannot be estimated.
+
+    Args:
+        radar: Radar parameters.
+        names: Names of the parameters of the rotation.
+        yc_m: Range centre deviation in metres that is known a priori; None for an unknown one.
+
+    Returns:
+        Values by name: the nominal `omega_rad_s` of the radar (0 if there is none), the known
+        `yc_m` (0 if there is none), and 0 for all others.
+    """
+    known = {"omega_rad_s": radar.rotation_rad_s or 0.0, "yc_m": 0.0 if yc_m is None else yc_m}
+    return {name: known.get(name, 0.0) for name in names}
 
 
 @names_arguments
@@ -105,7 +336,10 @@ class ImageEntropy:
             data.shape[-2] / prf_hz, objective.order, objective.range_term, yc_m is None, objective.variables
         )
         self.trials, self.dtype = data.shape[:-2], data.dtype
-        self.rows = _normalised(data.detach()).reshape(-1, *data.shape[-2:])
+        unit = unit_level(data.detach())
+        rms = power_of(unit).mean((-2, -1), keepdim=True).sqrt()
+        # at unit rms, squares neither underflow nor overflow
+        self.rows = (unit / torch.where(rms > 0, rms, 1)).reshape(-1, *data.shape[-2:])
         known = torch.as_tensor(0.0 if yc_m is None else yc_m, dtype=torch.float64, device=data.device).detach()
         self._yc = known.expand(self.trials).reshape(-1)
 
@@ -158,13 +392,14 @@ class ImageEntropy:
         Returns:
             The entropies in nats, shape (...,), and their gradients, shape (..., n).
         """
-        rows = x.detach().reshape(-1, x.shape[-1])
-        pairs = [
-            _value_and_gradient(lambda part_x, part=part: self._cost(part, part_x, 1), rows[part])
-            for part in self.blocks(len(rows), 1)
-        ]
-        cost, gradient = (torch.cat(parts) for parts in zip(*pairs, strict=True))
-        return cost.reshape(x.shape[:-1]), gradient.reshape(x.shape)
+        rows, costs, gradients = x.detach().reshape(-1, x.shape[-1]), [], []
+        for part in self.blocks(len(rows), 1):
+            with torch.enable_grad():
+                own = rows[part].requires_grad_()
+                cost = self._cost(part, own, 1)
+                gradients += torch.autograd.grad(cost.sum(), own)
+            costs.append(cost.detach())
+        return torch.cat(costs).reshape(x.shape[:-1]), torch.cat(gradients).reshape(x.shape)
 
     def turn(self, x: Tensor) -> RotationParameters:
         """Convert vectors of unknowns to the rotations that they describe.
@@ -252,8 +487,7 @@ class ImageEntropy:
             The blocks.
         """
         size = self.rows[0].numel() * self.rows.element_size() * max(1.0, self.objective.oversampling)
-        height = max(1, int(4 * block_bytes_of(self.rows.device) // size))
-        whole = rows if count == 1 else count
+        height, whole = max(1, int(4 * block_bytes_of(self.rows.device) // size)), rows if count == 1 else count
         for begin in range(0, rows, max(1, whole)):
             yield from (slice(i, min(i + height, begin + whole)) for i in range(begin, begin + whole, height))
 
@@ -272,35 +506,14 @@ class ImageEntropy:
                 rotation.warp_k,
                 rotation.yc_m,
             )
-        return torch.where(rotation.feasible, self._entropy(pulses, rotation.warp_k), torch.inf)
-
-    def _entropy(self, pulses: Tensor, k: Tensor) -> Tensor:
-        """Entropy of the image of pulses without their range term."""
-        image = self.objective
-        lines, transform = DopplerLines(image.oversampling, image.lines), Gridding(image.taps)
-        return _entropy(matched_fourier(pulses, k, self.sampling.prf_hz, lines=lines, transform=transform))
-
-
-def _entropy(image: Tensor) -> Tensor:
-    """-sum p ln p with p = |I|^2 / sum |I|^2, of images (..., line, range) of about unit level."""
-    power = torch.view_as_real(image).square().sum(-1)
-    total = power.sum((-2, -1), dtype=torch.float64)
-    inner = (power * torch.log(power.clamp_min(torch.finfo(power.dtype).tiny))).sum((-2, -1), dtype=torch.float64)
-    safe = torch.where(total > 0, total, 1)
-    return torch.log(safe) - inner / safe
-
-
-def _value_and_gradient(cost: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
-    """Value and gradient of a cost."""
-    with torch.enable_grad():
-        x = x.detach().requires_grad_()
-        value = cost(x)
-        (gradient,) = torch.autograd.grad(value.sum(), x)
-    return value.detach(), gradient
-
-
-def _normalised(data: Tensor) -> Tensor:
-    """Each trial over its root mean square, so that squares neither underflow nor overflow."""
-    unit = unit_level(data)
-    rms = power_of(unit).mean((-2, -1), keepdim=True).sqrt()
-    return unit / torch.where(rms > 0, rms, 1)
+        lines, transform = (
+            DopplerLines(self.objective.oversampling, self.objective.lines),
+            Gridding(self.objective.taps),
+        )
+        image = matched_fourier(pulses, rotation.warp_k, self.sampling.prf_hz, lines=lines, transform=transform)
+        # -sum p ln p with p = |I|^2 / sum |I|^2, of images of about unit level
+        power = torch.view_as_real(image).square().sum(-1)
+        total = power.sum((-2, -1), dtype=torch.float64)
+        logs = torch.log(power.clamp_min(torch.finfo(power.dtype).tiny))
+        inner, safe = (power * logs).sum((-2, -1), dtype=torch.float64), torch.where(total > 0, total, 1)
+        return torch.where(rotation.feasible, torch.log(safe) - inner / safe, torch.inf)

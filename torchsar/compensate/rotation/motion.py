@@ -22,7 +22,6 @@ from torchsar.focus.transforms import Gridding
 from torchsar.focus.warped_sums import slow_times
 
 SEARCH_EPS = 1e-3  # accuracy of the transform in estimates; images use a better one
-_LEAST_PULSES = 8  # least number of pulses, a convention
 
 
 def each(change: Callable[..., Tensor], *objects: Any) -> Any:
@@ -93,10 +92,10 @@ class Sampling:
             ValueError: If there are fewer than 8 pulses, a number is not positive, or the range
                 axis has another length or is not evenly spaced.
         """
-        if data.shape[-2] < _LEAST_PULSES:
+        if data.shape[-2] < 8:
             raise ValueError(
-                f"{name} works on samples (..., pulse, range) of at least {_LEAST_PULSES} pulses and "
-                f"one range cell, got the shape {tuple(data.shape)}"
+                f"{name} works on samples (..., pulse, range) of at least 8 pulses and one range cell, got "
+                f"the shape {tuple(data.shape)}"
             )
         for what, value in (("wavelength_m", wavelength_m), ("prf_hz", prf_hz)):
             if not (math.isfinite(value) and value > 0):
@@ -122,26 +121,6 @@ class Sampling:
     def duration_s(self) -> float:
         """Duration of the aperture in seconds."""
         return self.pulses / self.prf_hz
-
-    @property
-    def turns_per_square(self) -> float:
-        """Factor of the phase that depends on the range of a scatterer: 1 / wavelength (1/m).
-
-        At range y (m) from the rotation centre, a rotation by the angle a (rad) changes this phase
-        by a^2 y / wavelength turns.
-        """
-        return 1 / self.wavelength_m
-
-    def times(self, device: torch.device) -> Tensor:
-        """Compute the slow times of the pulses in seconds, shape (pulse,).
-
-        Args:
-            device: Device of the result.
-
-        Returns:
-            The times, from 0 at the first pulse.
-        """
-        return slow_times(self.pulses, self.prf_hz, device)
 
     def range_m(self, cell: Tensor) -> Tensor:
         """Convert range cells to range in metres.
@@ -178,22 +157,6 @@ class Motion:
     w: Tensor
     v: Tensor
     centre_m: Tensor
-
-    @staticmethod
-    def of_unknown_rate(k: Tensor, centre_m: Tensor | None = None) -> Motion:
-        """Describe a rotation of which only k1, k2, ... are known: its rate is set to zero.
-
-        Args:
-            k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
-                1/s^2, ..., shape (trial, order - 1).
-            centre_m: Range centre deviation yc known a priori, in metres (a cell at range y lies at
-                y + yc from the rotation centre), shape (trial,); by default 0.
-
-        Returns:
-            The rotation.
-        """
-        zero = k.new_zeros(k.shape[0])
-        return Motion(k, zero, zero, zero if centre_m is None else centre_m)
 
     @property
     def omega_rad_s(self) -> Tensor:
@@ -233,7 +196,8 @@ class Motion:
         """
         ends = sampling.range_m(numbers_on(self.w.device, 0.0, sampling.cells - 1.0))
         whole = warp(numbers_on(self.w.device, sampling.duration_s), self.k)
-        turns = sampling.turns_per_square * (self.w[:, None] * ends + self.offset[:, None]).abs() * whole.square()
+        # a rotation by the angle a changes the phase at range y by a^2 y / wavelength turns
+        turns = 1 / sampling.wavelength_m * (self.w[:, None] * ends + self.offset[:, None]).abs() * whole.square()
         return torch.isfinite(self.k).all(-1) & (turns < sampling.pulses / 4).all(-1)
 
     def moved(self, change: Tensor) -> Motion:
@@ -251,42 +215,25 @@ class Motion:
         return Motion(self.k + k, self.w + w[:, 0], self.v + v.sum(-1), self.centre_m)
 
 
-@dataclass(frozen=True)
-class Warped:
-    """Warped time of a target with non-uniform rotation, at m times.
+def warped_time(k: Tensor, times_s: Tensor, duration_s: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Evaluate the warped time t + k1 t^2 / 2 + k2 t^3 / 6 + ... of a target at m times t.
 
     Args:
-        phi: Warped time t + k1 t^2 / 2 + k2 t^3 / 6 + ... in seconds, shape (trial, m).
-        u: phi over its value at the end of the aperture, shape (trial, m).
-        slopes: Derivatives du/dk_i, shape (trial, order - 1, m).
+        k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s, 1/s^2,
+            ..., shape (trial, order - 1).
+        times_s: Times in seconds, shape (m,) or (trial, m).
+        duration_s: Duration T of the aperture in seconds.
+
+    Returns:
+        The warped time phi in seconds, shape (trial, m); u, which is phi over its value at the end
+        of the aperture, shape (trial, m); and the derivatives du/dk_i, shape (trial, order - 1, m).
     """
-
-    phi: Tensor
-    u: Tensor
-    slopes: Tensor
-
-    @staticmethod
-    def of(k: Tensor, times_s: Tensor, duration_s: float) -> Warped:
-        """Evaluate the warped time t + k1 t^2 / 2 + k2 t^3 / 6 + ... at given times t.
-
-        Args:
-            k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
-                1/s^2, ..., shape (trial, order - 1).
-            times_s: Times in seconds, shape (m,) or (trial, m).
-            duration_s: Duration T of the aperture in seconds.
-
-        Returns:
-            The warped time, its normalised value, and the derivatives with respect to k.
-        """
-        end = numbers_on(k.device, duration_s)
-        whole, phi = warp(end, k), warp(times_s, k)
-        u = phi / whole
-        rows = [
-            (times_s ** (i + 2) - u * duration_s ** (i + 2)) / (math.factorial(i + 2) * whole)
-            for i in range(k.shape[-1])
-        ]
-        slopes = torch.stack(rows, -2) if rows else u.new_zeros((*u.shape[:-1], 0, u.shape[-1]))
-        return Warped(phi, u, slopes)
+    whole, phi = warp(numbers_on(k.device, duration_s), k), warp(times_s, k)
+    u = phi / whole
+    slopes = [
+        (times_s ** (i + 2) - u * duration_s ** (i + 2)) / (math.factorial(i + 2) * whole) for i in range(k.shape[-1])
+    ]
+    return phi, u, torch.stack(slopes, -2) if slopes else u.new_zeros((*u.shape[:-1], 0, u.shape[-1]))
 
 
 def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Tensor) -> Tensor:
@@ -305,7 +252,7 @@ def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Te
     Returns:
         The data without this phase, shape (trial, pulse, range), complex.
     """
-    square = -sampling.turns_per_square * phi.square()
+    square = -1 / sampling.wavelength_m * phi.square()
     fine, coarse = phasor_tables(
         square * (motion.w[:, None] * sampling.step_m), sampling.first_m / sampling.step_m, sampling.cells, data.dtype
     )
@@ -326,7 +273,7 @@ def image_of(data: Tensor, sampling: Sampling, motion: Motion, oversampling: flo
     Returns:
         The image, shape (trial, line, range), with zero Doppler in the middle.
     """
-    phi = warp(sampling.times(data.device), motion.k)
+    phi = warp(slow_times(sampling.pulses, sampling.prf_hz, data.device), motion.k)
     return matched_fourier(
         without_range_term(data, sampling, motion, phi),
         motion.k,

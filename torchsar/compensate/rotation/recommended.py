@@ -1,17 +1,30 @@
-"""The recommended estimator of non-uniform rotation, and estimators of its first steps alone."""
+"""The recommended estimator of non-uniform rotation, and estimators of its first steps alone.
+
+And the autofocus of a target that rotates.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from torchsar.compensate.pulse_phase import autofocus
+from torchsar.compensate.pulse_phase.assess import conclude
+from torchsar.compensate.pulse_phase.data import find_phases, prepare, refuse_odd_counts, starting_phase
+from torchsar.compensate.pulse_phase.imaging import Through
+from torchsar.compensate.pulse_phase.pairs import pair_phase
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
 from torchsar.compensate.rotation.assess import judged_fit, judged_motion
 from torchsar.compensate.rotation.coarse import coarse_warp
 from torchsar.compensate.rotation.histories import HALF_CELLS, refined_by_histories
-from torchsar.compensate.rotation.motion import Motion, Sampling, each
+from torchsar.compensate.rotation.image_entropy import k_name, uniform_rotation, values_of
+from torchsar.compensate.rotation.motion import SEARCH_EPS, Motion, Sampling, each
 from torchsar.compensate.rotation.scatterers import (
     LEAST_EXPLAINED,
     MOST,
@@ -19,11 +32,11 @@ from torchsar.compensate.rotation.scatterers import (
     Fit,
     explained_share,
     fit_scatterers,
-    usual_count,
 )
-from torchsar.compensate.rotation.unknowns import values_of
 from torchsar.core import (
     Estimate,
+    Signal,
+    Stage,
     block_bytes_of,
     checked_samples,
     level_of,
@@ -32,13 +45,10 @@ from torchsar.core import (
     settle,
 )
 from torchsar.core.warp import k_of_shape, shape_of
-
-# size of a block of trials over the size that is best for one operation, found by trial
-_BLOCKS = 8
-HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
-
-Found = Motion | Fit
-Part = Callable[[Tensor, Sampling, Tensor | None], Found]
+from torchsar.focus.image_lines import DopplerLines
+from torchsar.focus.matched_fourier import MatchedFourierOperator, range_phase
+from torchsar.focus.transforms import Gridding
+from torchsar.radar import InverseRadar
 
 
 def uneven_rotation(
@@ -106,21 +116,29 @@ def uneven_rotation(
         ValueError: If the data, the range axis or `yc_m` are invalid, or a number is not a whole
             number of 1 or more.
     """
-    _check_counts("uneven_rotation", 1, order=order, rounds=rounds, scatterers=1 if scatterers is None else scatterers)
+    refuse_odd_counts(
+        "uneven_rotation", 1, order=order, rounds=rounds, scatterers=1 if scatterers is None else scatterers
+    )
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Fit:
         options = {"free_centre": known is None}
-        motion = refined_by_histories(rows, sampling, _start(rows, sampling, order, known), **options)
-        fit = fit_scatterers(rows, sampling, motion, **options, count=scatterers, rounds=rounds)
+        motion = refined_by_histories(rows, sampling, _start(order, rows, sampling, known), **options)
+        # a fit of one scatterer for 1000 samples costs as much as about thirty images
+        count = min(MOST, max(128, sampling.pulses * sampling.cells // 1000)) if scatterers is None else scatterers
+        fit = fit_scatterers(rows, sampling, motion, **options, count=count, rounds=rounds)
         if scatterers is None:
             # many more scatterers than usual leave most of the energy unexplained
-            count = usual_count(sampling)
             poor = explained_share(rows, fit)[0] < LEAST_EXPLAINED
             at = (poor & (2 * fit.scatterers.count > count)).nonzero()[:, 0]
             if len(at):
                 start, count = each(lambda x: x[at], fit.motion), min(MOST, 2 * count)
                 again = fit_scatterers(rows[at], sampling, start, **options, count=count, rounds=rounds)
-                fit = fit.replaced(at, again)
+                width = max(x.scatterers.cell.shape[-1] for x in (fit, again))
+                wide = [
+                    replace(x, scatterers=each(lambda y: pad(y, (0, width - y.shape[-1])), x.scatterers))
+                    for x in (fit, again)
+                ]
+                fit = each(lambda x, y: x.index_copy(0, at, y), *wide)
         return fit
 
     return _over_trials("uneven_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
@@ -167,12 +185,8 @@ def coarse_rotation(
         ValueError: If the data, the range axis or `yc_m` are invalid, or the order is not a whole
             number of 1 or more.
     """
-    _check_counts("coarse_rotation", 1, order=order)
-
-    def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
-        return _start(rows, sampling, order, known)
-
-    return _over_trials("coarse_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
+    refuse_odd_counts("coarse_rotation", 1, order=order)
+    return _over_trials("coarse_rotation", partial(_start, order), assess, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
 def phase_fit_rotation(
@@ -183,7 +197,7 @@ def phase_fit_rotation(
     range_m: Tensor,
     order: int = 3,
     yc_m: Tensor | float | None = None,
-    steps: int = HISTORY_STEPS,
+    steps: int = 4,
     half_cells: int = HALF_CELLS,
     assess: bool = True,
 ) -> Estimate:
@@ -202,7 +216,8 @@ def phase_fit_rotation(
             rotation.
         yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
             rotation centre), if known a priori, a number or shape (...,); None estimates it.
-        steps: Number of times that the least-squares fit to the phase histories is repeated.
+        steps: Number of times that the least-squares fit to the phase histories is repeated;
+            four are enough to converge.
         half_cells: Half width of the windows about scatterers in Doppler cells, at least 4.
         assess: False leaves out the assessment.
 
@@ -219,11 +234,11 @@ def phase_fit_rotation(
         TypeError: If the data are not complex.
         ValueError: If the data, the range axis or `yc_m` are invalid, or a number is too small.
     """
-    _check_counts("phase_fit_rotation", 1, order=order, steps=steps)
-    _check_counts("phase_fit_rotation", 4, half_cells=half_cells)
+    refuse_odd_counts("phase_fit_rotation", 1, order=order, steps=steps)
+    refuse_odd_counts("phase_fit_rotation", 4, half_cells=half_cells)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
-        motion = _start(rows, sampling, order, known)
+        motion = _start(order, rows, sampling, known)
         for _ in range(steps):
             motion = refined_by_histories(rows, sampling, motion, free_centre=known is None, half_cells=half_cells)
         return motion
@@ -231,7 +246,7 @@ def phase_fit_rotation(
     return _over_trials("phase_fit_rotation", find, assess, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
-def _start(rows: Tensor, sampling: Sampling, order: int, known: Tensor | None) -> Motion:
+def _start(order: int, rows: Tensor, sampling: Sampling, known: Tensor | None) -> Motion:
     """The coarse warp in `order` terms, with rate zero."""
     k = (
         coarse_warp(rows, sampling.prf_hz)
@@ -240,12 +255,13 @@ def _start(rows: Tensor, sampling: Sampling, order: int, known: Tensor | None) -
     )
     if order == 2:
         k = k_of_shape(shape_of(k, sampling.duration_s)[:, :1], sampling.duration_s)
-    return Motion.of_unknown_rate(torch.nn.functional.pad(k, (0, max(0, order - 3))), known)
+    zero = k.new_zeros(len(k))
+    return Motion(pad(k, (0, max(0, order - 3))), zero, zero, zero if known is None else known)
 
 
 def _over_trials(
     name: str,
-    find: Part,
+    find: Callable[[Tensor, Sampling, Tensor | None], Motion | Fit],
     assess: bool,
     data: Tensor,
     wavelength_m: float,
@@ -257,10 +273,16 @@ def _over_trials(
     data = checked_samples(data, name, "pulse, range")
     sampling = Sampling.of(name, data, wavelength_m, prf_hz, range_m)
     trials, rows = data.shape[:-2], data.detach().reshape(-1, *data.shape[-2:])
-    known = (
-        None if yc_m is None else _centre(name, torch.as_tensor(yc_m, dtype=torch.float64, device=data.device), trials)
-    )
-    height = max(1, _BLOCKS * block_bytes_of(data.device) // (rows[0].numel() * rows.element_size()))
+    known = None if yc_m is None else torch.as_tensor(yc_m, dtype=torch.float64, device=data.device)
+    if known is not None:
+        refuse_non_finite(known, f"{name}: yc_m")
+        if known.ndim and known.shape != trials:
+            raise ValueError(
+                f"{name}: yc_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(known.shape)}"
+            )
+        known = known.expand(trials).reshape(-1)
+    # eight times the size that is best for one operation, found by trial
+    height = max(1, 8 * block_bytes_of(data.device) // (rows[0].numel() * rows.element_size()))
     parts: dict[int, Estimate] = {}
 
     @torch.no_grad()
@@ -269,43 +291,272 @@ def _over_trials(
         level = level_of(rows[part])
         some = rows[part] / level
         found = find(some, sampling, None if known is None else known[part])
-        parts[first] = _estimate(some, sampling, found, level[:, 0, 0].double(), assess)
+        fit = isinstance(found, Fit)
+        motion = found.motion if fit else found
+        motion = replace(motion, **{name: settle(getattr(motion, name), 0.0)[0] for name in ("k", "w", "v")})
+        value, info = values_of(motion.omega_rad_s, motion.k, motion.yc_m), {}
+        if fit:
+            noise_power = found.noise * level[:, 0, 0].double().square()
+            info = {"scatterers": found.scatterers.count, "noise_power": noise_power, "steps": found.steps}
+        parts[first] = Estimate(value, info=info)
+        if assess:
+            judged = judged_fit(some, sampling, found, value) if fit else judged_motion(some, sampling, motion, value)
+            parts[first] = replace(judged, info={**judged.info, **info})
 
     starts = range(0, rows.shape[0], height)
     over_blocks(work, starts, rows)
     return Estimate.joined([parts[first] for first in starts], trials)
 
 
-def _estimate(rows: Tensor, sampling: Sampling, found: Found, level: Tensor, assess: bool) -> Estimate:
-    """Estimate from a rotation or a joint fit of data that are divided by their level."""
-    motion, info = found.motion if isinstance(found, Fit) else found, {}
-    motion = replace(motion, **{name: settle(getattr(motion, name), 0.0)[0] for name in ("k", "w", "v")})
-    value = values_of(motion.omega_rad_s, motion.k, motion.yc_m)
-    if isinstance(found, Fit):
-        info = {
-            "scatterers": found.scatterers.count,
-            "noise_power": found.noise * level.square(),
-            "steps": found.steps,
-        }
-    if not assess:
-        return Estimate(value, info=info)
-    fit = isinstance(found, Fit)
-    judged = judged_fit(rows, sampling, found) if fit else judged_motion(rows, sampling, motion)
-    return Estimate(value, judged.std, judged.quality, judged.outcome, {**judged.info, **info})
+class _Rotation(Stage):
+    """An estimator of the rotation; a connected yc_m takes precedence over its own.
 
+    yc_m: the range centre deviation (m) known a priori, or None to estimate it.
+    """
 
-def _check_counts(name: str, least: int, **counts: int) -> None:
-    """Raise ValueError unless numbers are integers of at least `least`."""
-    for what, count in counts.items():
-        if isinstance(count, bool) or not isinstance(count, int) or count < least:
-            raise ValueError(f"{name}: {what} must be a whole number of {least} or more, got {count!r}")
+    def __init__(
+        self,
+        radar: InverseRadar,
+        order: int,
+        yc_m: float | None,
+        find: Callable[..., Estimate],
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        if order < 1:
+            raise ValueError(f"order of the rotation must be 1 (uniform rotation) or more, got {order}")
+        self.radar, self.order, self.yc_m, self.find, self.options = radar, order, yc_m, find, options
+        self.provides = ("omega_rad_s", "warp_k", "yc_m", *(k_name(i) for i in range(1, order)))
+        self.neutral = uniform_rotation(radar, self.provides, yc_m)
 
+    def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
+        """Estimate the rotation from a signal of axes (pulse, range).
 
-def _centre(name: str, yc_m: Tensor, trials: torch.Size) -> Tensor:
-    """The range centre deviation known a priori for every trial, (trial,)."""
-    refuse_non_finite(yc_m, f"{name}: yc_m")
-    if yc_m.ndim and yc_m.shape != trials:
-        raise ValueError(
-            f"{name}: yc_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(yc_m.shape)}"
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), known a priori, shape (...,).
+
+        Returns:
+            The `Estimate` of the function that the description of the stage names.
+        """
+        return self.find(
+            signal.data,
+            wavelength_m=self.radar.wavelength_m,
+            prf_hz=1 / signal.axis("pulse").step,
+            range_m=signal.axis("range").values(torch.device("cpu")),  # only their spacing is read, by the host
+            order=self.order,
+            yc_m=self.yc_m if yc_m is None else yc_m,
+            **self.options,
         )
-    return yc_m.expand(trials).reshape(-1)
+
+
+class UnevenRotation(_Rotation):
+    """Non-uniform rotation by the recommended estimator; see `uneven_rotation`.
+
+    Provides `omega_rad_s` (rotation rate at the first pulse), `warp_k` (its relative derivatives)
+    with its entries `k1_per_s`, `k2_per_s2`, ..., and `yc_m` (range centre deviation).
+
+    Args:
+        radar: Radar parameters.
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
+        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+            rotation centre), if known a priori; None estimates it.
+        scatterers: Largest number of scatterers that are fitted, by default as in
+            `uneven_rotation`.
+        rounds: Largest number of maximum-likelihood steps.
+        assess: False leaves out the assessment.
+
+    Raises:
+        ValueError: If the order is below 1.
+    """
+
+    def __init__(
+        self,
+        radar: InverseRadar,
+        order: int = 3,
+        yc_m: float | None = None,
+        scatterers: int | None = None,
+        rounds: int = ROUNDS,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(radar, order, yc_m, uneven_rotation, scatterers=scatterers, rounds=rounds, assess=assess)
+
+
+class CoarseRotation(_Rotation):
+    """Relative derivatives k1 and k2 of the rotation rate, without the rate; see `coarse_rotation`.
+
+    They are found from the Doppler spectra of short sections of the aperture.
+
+    Args:
+        radar: Radar parameters.
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
+        assess: False leaves out the assessment.
+
+    Raises:
+        ValueError: If the order is below 1.
+    """
+
+    def __init__(self, radar: InverseRadar, order: int = 3, assess: bool = True) -> None:
+        super().__init__(radar, order, None, coarse_rotation, assess=assess)
+
+
+class PhaseFitRotation(_Rotation):
+    """Non-uniform rotation from the phase histories of bright scatterers; see `phase_fit_rotation`.
+
+    Args:
+        radar: Radar parameters.
+        order: Degree of the polynomial of time that describes the rotation angle; 1 is uniform
+            rotation.
+        yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+            rotation centre), if known a priori; None estimates it.
+        steps: Number of times that the least-squares fit to the phase histories is repeated.
+        half_cells: Half width of the windows about scatterers in Doppler cells.
+        assess: False leaves out the assessment.
+
+    Raises:
+        ValueError: If the order is below 1.
+    """
+
+    def __init__(
+        self,
+        radar: InverseRadar,
+        order: int = 3,
+        yc_m: float | None = None,
+        steps: int = 4,
+        half_cells: int = HALF_CELLS,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(radar, order, yc_m, phase_fit_rotation, steps=steps, half_cells=half_cells, assess=assess)
+
+
+class RotationAutofocus(Stage):
+    """Phase error of each pulse of a rotating target, common to all its scatterers.
+
+    Provides `phase_rad`. If another stage provides `warp_k`, the phases are found by
+    `rotating_autofocus`, otherwise by `autofocus`.
+
+    The phase of every pulse is free and therefore also takes up the effect of the range centre
+    deviation yc. If an estimator of the rotation alternates with this stage, give it a fixed yc.
+
+    Args:
+        radar: Radar parameters.
+        search: Largest number of fixed-point iterations that minimise the image entropy, with and
+            without a rotation.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
+        assess: False leaves out the assessment.
+    """
+
+    provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
+
+    def __init__(self, radar: InverseRadar, search: int = 60, polish: int = 20, assess: bool = True) -> None:
+        super().__init__()
+        self.radar, self.options = radar, {"search": search, "polish": polish, "assess": assess}
+
+    def forward(
+        self,
+        signal: Signal,
+        phase_rad: Tensor | None = None,
+        omega_rad_s: Tensor | None = None,
+        warp_k: Tensor | None = None,
+        yc_m: Tensor | None = None,
+    ) -> Estimate:
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            phase_rad: Phase to start from in rad, shape (..., pulse).
+            omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,); without it the
+                phase that depends on the range of a scatterer is not compensated.
+            warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+                1/s^2, ..., shape (..., order - 1).
+            yc_m: Range centre deviation yc in metres (a cell at range y lies at y + yc from the
+                rotation centre), shape (...,); by default 0.
+
+        Returns:
+            `phase_rad` of shape (..., pulse), to be removed: the estimate of `rotating_autofocus`,
+            or of `autofocus` if `warp_k` is None.
+
+        Raises:
+            TypeError: If the data are not complex or the start is not a tensor.
+            ValueError: As from the two functions.
+        """
+        if warp_k is None:
+            return autofocus(signal.data, start=phase_rad, **self.options)
+        prf_hz, data = 1 / signal.axis("pulse").step, signal.data
+        if omega_rad_s is not None:
+            data = range_phase(
+                data,
+                signal.axis("range").values(data.device),
+                self.radar.wavelength_m,
+                prf_hz,
+                omega_rad_s,
+                warp_k,
+                0.0 if yc_m is None else yc_m,
+            )
+        k = warp_k.expand(*signal.trials, warp_k.shape[-1]).reshape(-1, warp_k.shape[-1])
+        return rotating_autofocus(data, prf_hz, k, phase_rad, **self.options)
+
+
+def rotating_autofocus(
+    data: Tensor,
+    prf_hz: float,
+    warp_k: Tensor,
+    start: Tensor | None = None,
+    search: int = 60,
+    polish: int = 20,
+    assess: bool = True,
+) -> Estimate:
+    """Estimate the phase error of each pulse of a target whose non-uniform rotation is known.
+
+    The phases are those with which the image, formed by the matched Fourier transform for this
+    rotation, is sharpest.
+
+    Args:
+        data: Range-compressed pulses from which `range_phase` has removed the phase that depends on
+            the range of a scatterer, shape (..., pulse, range), complex.
+        prf_hz: Pulse repetition frequency in Hz.
+        warp_k: Relative derivatives k1, k2, ... of the rotation rate at the first pulse in 1/s,
+            1/s^2, ..., shape (trial, order - 1), with all trial dimensions of the data as one.
+        start: Phase to start from in rad, shape (..., pulse); by default that of the spatial
+            correlation algorithm (function `sca`): the phases
+            between adjacent pulses, added up.
+        search: Largest number of fixed-point iterations that minimise the image entropy.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
+        assess: False leaves out the assessment.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation, quality and
+        info as from `autofocus`. Outcomes: EMPTY, SINGULAR, NOISE if the image is less than 1.5
+        times as sharp as autofocus makes noise, and INEXACT if the Strehl ratio predicted from the
+        standard deviation is below 0.8.
+
+    Raises:
+        TypeError: If the data are not complex or the start is not a tensor.
+        ValueError: If the data are empty or not finite, the start does not have one phase per
+            pulse, or a number of iterations is not a whole number of 0 or more.
+    """
+    pulses = prepare(data, "rotating_autofocus", empty=False)
+    refuse_odd_counts("rotating_autofocus", 0, search=search, polish=polish)
+    through = Through(
+        MatchedFourierOperator(
+            warp_k, pulses.n, prf_hz, dtype=data.dtype, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS)
+        )
+    )
+    # the last floor of `entropy_fixed_point` and the relaxation of `autofocus`
+    runs = [Run(LogAbove(2.0), through, search, 1.8, 0.01), Run(Wiener(), through, polish, 1.0, 1e-3)]
+
+    def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:
+        return in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
+
+    def continued(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
+        return fixed_point(rows, at, replace(runs[1], iterations=6))[0]
+
+    with torch.no_grad():
+        begin = starting_phase(start, pulses, "rotating_autofocus")
+        return conclude(pulses, *find_phases(pulses, find, begin, whole=True), assess, continued, through)

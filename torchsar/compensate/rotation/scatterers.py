@@ -16,54 +16,32 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
-from torchsar.compensate.rotation.couplings import Neighbours, inner_products
-from torchsar.compensate.rotation.histories import inverted
-from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, chosen, each, image_of
-from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
-from torchsar.compensate.rotation.range_response import Envelopes, envelopes
+from torchsar.compensate.pulse_phase.data import or_one
+from torchsar.compensate.rotation.couplings import Neighbours, envelopes, inner_products
+from torchsar.compensate.rotation.histories import OVERSAMPLING, find_peaks, inverted, noise_power, threshold
+from torchsar.compensate.rotation.motion import Motion, Sampling, chosen, each, image_of, warped_time
 from torchsar.core import power_of, real_dtype, reduced_turns, settle
 from torchsar.core.warp import least_rate
+from torchsar.focus.warped_sums import slow_times
 
-_OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
-# a new scatterer has at least this share of the largest amplitude within so many lines and range
-# cells, found by trial: side lobes are excluded until their scatterer is subtracted
-_SHARE, _LINES, _CELLS = 0.5, 24, 2
 MOST, ROUNDS = 800, 12  # largest number of scatterers, number of steps; accuracy against time
-_FEWEST = 128  # default number of scatterers on small data, found by trial
-# samples of the data per scatterer, so that a fit costs as much as about thirty images
-_SAMPLES_EACH = 1000
 # rounds that search for further scatterers, and the share of their number up to which they do: the
 # brightest alone bring the motion near, and the rounds between let it converge
 _SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
 _SEARCHED = max(_SEARCHES)
-_BLOCK_BYTES = 1 << 19  # phasors of a block of pulses that fit into the cache
-_GROUP = 16  # pulses over which the phase of an echo changes by a few turns
-_APART = 0.5  # Doppler and range cells within which scatterers are not resolved
-_BRIGHT = 0.1  # share of the largest amplitude from which a scatterer limits a step, found by trial
+# phasors of a block of pulses that fit into the cache; pulses over which the phase of an echo
+# changes by a few turns
+_BLOCK_BYTES, _GROUP = 1 << 19, 16
 _STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
-_RIDGE = 1e-9  # added to the diagonal, relative: above the rounding of a matrix of float64
-_ALIKE = 1e-6  # share of the energy of an echo by which the two range responses have to differ
-_LEAST_RATE = 0.05  # least rate over that at the start; slower motions would nearly reverse
-# standard deviations by which the phase of a scatterer may differ before it loses weight, found by
-# trial
-_AGREES = 5.0
-# power of errors of the model over that of the brightest scatterer, found by trial: weaker noise
-# does not limit the fit, and residuals below it are no scatterers and no evidence against one
-_MODEL = 1e-4
 # least share of the energy above the noise that the scatterers explain, found by trial: a lower
 # share accepts wrong focus, a higher one rejects targets of many faint scatterers
 LEAST_EXPLAINED = 0.5
-_LOOK = 2  # rounds after which an accelerator is asked whether all trials have ended
-_SETTLED = 0.2  # steps of the motion below this share of its standard deviation end a trial
 
 
 @dataclass(frozen=True)
@@ -86,7 +64,7 @@ class Scatterers:
         return (self.amplitude != 0).sum(-1)
 
     def apart(self) -> Scatterers:
-        """Remove scatterers that lie within the resolution of a brighter one.
+        """Remove scatterers within half a Doppler cell and half a range cell of a brighter one.
 
         The amplitudes of two unresolved scatterers would grow without limit, with opposite phases,
         and bias the rotation.
@@ -95,8 +73,8 @@ class Scatterers:
             The scatterers, with zero amplitude for those removed.
         """
         level = self.amplitude.abs()
-        near = ((self.cell[:, :, None] - self.cell[:, None]).abs() < _APART) & (
-            (self.row[:, :, None] - self.row[:, None]).abs() < _APART
+        near = ((self.cell[:, :, None] - self.cell[:, None]).abs() < 0.5) & (
+            (self.row[:, :, None] - self.row[:, None]).abs() < 0.5
         )
         beside = (near & (level[:, None] > level[:, :, None])).any(-1)
         return replace(self, amplitude=torch.where(beside, 0, self.amplitude))
@@ -128,28 +106,6 @@ class Fit:
     settled: Tensor
     change: Tensor
 
-    @property
-    def free_centre(self) -> bool:
-        """True if the range of the rotation centre is estimated."""
-        return self.change.shape[-1] > self.motion.k.shape[-1] + 1
-
-    def replaced(self, at: Tensor, other: Fit) -> Fit:
-        """Replace trials by those of another fit.
-
-        Args:
-            at: Numbers of the trials, shape (n,).
-            other: Fit of these n trials.
-
-        Returns:
-            The fit of all trials.
-        """
-        width = max(fit.scatterers.cell.shape[-1] for fit in (self, other))
-        wide = [
-            replace(fit, scatterers=each(lambda x: pad(x, (0, width - x.shape[-1])), fit.scatterers))
-            for fit in (self, other)
-        ]
-        return each(lambda x, y: x.index_copy(0, at, y), *wide)
-
 
 def explained_share(data: Tensor, fit: Fit) -> tuple[Tensor, Tensor]:
     """Compute how much of the energy of the data a fit explains.
@@ -170,25 +126,13 @@ def explained_share(data: Tensor, fit: Fit) -> tuple[Tensor, Tensor]:
     return explained, 1 - (1 - explained) * above / whole
 
 
-def usual_count(sampling: Sampling) -> int:
-    """Compute the largest number of scatterers by default: one for every 1000 samples of a trial.
-
-    Args:
-        sampling: Sampling of the data.
-
-    Returns:
-        The number, within 128..800.
-    """
-    return min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH))
-
-
 def fit_scatterers(
     data: Tensor,
     sampling: Sampling,
     start: Motion,
     *,
+    count: int,
     free_centre: bool = True,
-    count: int | None = None,
     rounds: int = ROUNDS,
 ) -> Fit:
     """Fit the rotation of a target and all its scatterers by maximum likelihood.
@@ -201,16 +145,14 @@ def fit_scatterers(
         data: Range-compressed pulses, shape (trial, pulse, range), complex.
         sampling: Sampling of the data.
         start: Rotation to start from.
+        count: Largest number of scatterers.
         free_centre: True also estimates the range of the rotation centre; False keeps that of
             `start`.
-        count: Largest number of scatterers; by default one for every 1000 samples of a trial,
-            within 128..800.
         rounds: Largest number of steps.
 
     Returns:
         The fit: rotation, scatterers and noise power.
     """
-    count = usual_count(sampling) if count is None else count
     present, device = (data != 0).any(-1), data.device
     empty = start.k.new_zeros(len(data), 0)
     fit = Fit(
@@ -227,8 +169,15 @@ def fit_scatterers(
         share, noise, new = _SEARCHES.get(iteration), fit.noise, None
         if share or iteration > _SEARCHED:
             # the residual of the last search was larger: the fit had not converged
-            image = image_of(residual, sampling, fit.motion, oversampling=_OVERSAMPLING if share else 1)
-            floor, noise = _noise(power_of(image), sampling, fit, present)
+            image = image_of(residual, sampling, fit.motion, oversampling=OVERSAMPLING if share else 1)
+            power = power_of(image)
+            brightest = power.flatten(1).amax(-1, keepdim=True) / sampling.pulses
+            brightest = torch.cat([fit.scatterers.amplitude.abs().square(), brightest], -1).amax(-1)
+            # Of a pixel; missing pulses add no noise. Errors of the model have 1e-4 of the power of
+            # the brightest scatterer, found by trial: weaker noise does not limit the fit, and
+            # residuals below it are no scatterers and no evidence against one.
+            floor = torch.maximum(noise_power(power).double(), 1e-4 * brightest)
+            noise = torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
             new = _new_scatterers(image, floor, sampling.pulses, fit, math.ceil(count * share)) if share else None
         if step is not None:
             fit = step.after(noise, sampling, iteration)
@@ -238,7 +187,7 @@ def fit_scatterers(
             used = each(lambda x, width=near.shape[1]: x[:, :width], found)
             fit = replace(fit, scatterers=used, noise=noise)
         # no trial settles before the search is over; an accelerator should not wait in every round
-        looks = iteration > _SEARCHED and (device.type == "cpu" or iteration % _LOOK == 0)
+        looks = iteration > _SEARCHED and (device.type == "cpu" or iteration % 2 == 0)
         if iteration == rounds or (looks and bool(fit.settled.all())):
             break
         residual, step = Step.of(data, sampling, fit, near, count)
@@ -249,24 +198,13 @@ def _new_scatterers(image: Tensor, floor: Tensor, pulses: int, fit: Fit, bound: 
     """Scatterers that clearly exceed the residual: up to `bound` per trial, with the known ones."""
     power = power_of(image)
     least = (floor * threshold(power[0].numel())).to(power.dtype)
-    peaks = find_peaks(power, least, bound, _SHARE, _LINES, _CELLS).first(bound - fit.scatterers.count)
-    value = torch.gather(image.flatten(1), 1, peaks.line * image.shape[2] + peaks.cell).to(torch.complex128)
-    cell = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING
-    return Scatterers(torch.where(peaks.power > 0, value / math.sqrt(pulses), 0), cell, peaks.cell.to(torch.float64))
-
-
-def _noise(power: Tensor, sampling: Sampling, fit: Fit, present: Tensor) -> tuple[Tensor, Tensor]:
-    """Noise power of a pixel and of a sample, (trial,) each.
-
-    power: that of the image of the residual. The noise power of a sample is at most that of the
-    fit.
-    """
-    brightest = torch.cat(
-        [fit.scatterers.amplitude.abs().square(), power.flatten(1).amax(-1, keepdim=True) / sampling.pulses], -1
-    )
-    # of a pixel; missing pulses add no noise
-    floor = torch.maximum(noise_power(power).double(), _MODEL * brightest.amax(-1))
-    return floor, torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
+    # of at least half of the largest amplitude within 24 lines and 2 range cells, found by trial:
+    # side lobes are excluded until their scatterer is subtracted
+    peak, line, row = find_peaks(power, least, bound, 0.5, 24, 2)
+    wanted = torch.arange(peak.shape[-1], device=power.device) < (bound - fit.scatterers.count)[:, None]
+    value = torch.gather(image.flatten(1), 1, line * image.shape[2] + row).to(torch.complex128)
+    cell = (line - image.shape[1] // 2) / OVERSAMPLING
+    return Scatterers(torch.where(wanted & (peak > 0), value / math.sqrt(pulses), 0), cell, row.to(torch.float64))
 
 
 def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
@@ -298,41 +236,43 @@ def _blocks(data: Tensor, scatterers: int) -> Iterator[tuple[slice, slice]]:
         yield slice(trial, trial + some), slice(first, first + height)
 
 
-class Reduced(NamedTuple):
-    """Gauss-Newton equations of the rotation, without the unknowns of the scatterers.
+def solved(pull: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Solve the Gauss-Newton equations of the rotation, see `Step.reduced`.
 
     Args:
-        joint: The unknowns of the scatterers per unit of each parameter of the rotation, and, in
-            the last column, for an unchanged rotation, shape (trial, 4 scatterer, parameter + 1).
         pull: Gradient of the likelihood that each scatterer contributes, shape (trial, scatterer,
             parameter).
         curvature: Curvature that each scatterer contributes, shape (trial, scatterer, parameter,
             parameter).
+
+    Returns:
+        The change of the parameters, shape (trial, parameter); the inverse of the whole curvature,
+        shape (trial, parameter, parameter); and True for parameters that the data do not determine,
+        shape (trial, parameter).
     """
-
-    joint: Tensor
-    pull: Tensor
-    curvature: Tensor
-
-    def solved(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Solve the equations.
-
-        Returns:
-            The change of the parameters, shape (trial, parameter); the inverse of the whole
-            curvature, shape (trial, parameter, parameter); and True for parameters that the data do
-            not determine, shape (trial, parameter).
-        """
-        inverse, lost = inverted(self.curvature.sum(1))
-        return (inverse @ self.pull.sum(1)[..., None])[..., 0], inverse, lost
+    inverse, lost = inverted(curvature.sum(1))
+    return (inverse @ pull.sum(1)[..., None])[..., 0], inverse, lost
 
 
 @dataclass(frozen=True)
 class Step:
     """Gradient and curvature of the likelihood with respect to all unknowns, at a fit.
 
-    moments: (trial, scatterer, base), sums over pulses of base * conj(echo) * residual at the range
-    of the scatterer, for the bases 1, u, du/dk..., phi^2. shift: the same of base 1 with the
-    derivative of the envelope. share: gradient of the share of the periodic range response.
+    Args:
+        fit: The fit.
+        range_m: Range of the scatterers in metres, shape (trial, scatterer).
+        near: Pairs of neighbouring scatterers.
+        products: Inner products of their echoes over slow time, see `inner_products`.
+        gram: Products of the bases 1, u, du/dk..., phi^2 of slow time, shape (trial, base, base).
+        overlaps: Inner product over range cells of the range responses of each pair, its
+            derivatives with respect to the range of the second scatterer, of the first one, and of
+            both, and that of the derivatives of the responses with respect to the share of the
+            periodic one.
+        moments: Sums over pulses of base * conj(echo) * residual at the range of the scatterer,
+            shape (trial, scatterer, base).
+        shift: The same of base 1 with the derivative of the range response, shape (trial,
+            scatterer).
+        share: Gradient of the share of the periodic range response, shape (trial,).
     """
 
     fit: Fit
@@ -340,7 +280,7 @@ class Step:
     near: Neighbours
     products: Mapping[tuple[int, int], Tensor]
     gram: Tensor
-    envelopes: Envelopes
+    overlaps: Sequence[Tensor]
     moments: Tensor
     shift: Tensor
     share: Tensor
@@ -363,21 +303,23 @@ class Step:
             The residual, shape (trial, pulse, range), and the gradient and curvature for the step.
         """
         motion, found, present = fit.motion, fit.scatterers, (data != 0).any(-1)
-        warped = Warped.of(motion.k, sampling.times(data.device), sampling.duration_s)
-        square = sampling.turns_per_square * warped.phi.square()
-        rows = [torch.ones_like(warped.u), warped.u, *warped.slopes.unbind(1), 2 * math.pi * square]
+        phi, u, slopes = warped_time(
+            motion.k, slow_times(sampling.pulses, sampling.prf_hz, data.device), sampling.duration_s
+        )
+        square = 1 / sampling.wavelength_m * phi.square()
+        rows = [torch.ones_like(u), u, *slopes.unbind(1), 2 * math.pi * square]
         bases = torch.stack(rows, 1) * present[:, None]
         range_m = sampling.range_m(found.row)
-        turns = torch.stack([warped.u, -square], -1)
+        turns = torch.stack([u, -square], -1)
         right = torch.stack([found.cell, motion.w[:, None] * range_m + motion.offset[:, None]], -2)
-        around = envelopes(fit.response, found.row, sampling.cells)
-        weighted = (found.amplitude[..., None] * around.value).conj().to(data.dtype).resolve_conj()
-        back = around.value.mH.to(data.dtype).resolve_conj()
+        value, slope, difference = envelopes(fit.response, found.row, sampling.cells)
+        weighted = (found.amplitude[..., None] * value).conj().to(data.dtype).resolve_conj()
+        back = value.mH.to(data.dtype).resolve_conj()
         # the bases are almost linearly dependent: with orthonormal ones the small part that shows
         # the rotation is not lost in rounding
         orthonormal, mixed = torch.linalg.qr(bases.mT)
         orthonormal = orthonormal.mT.to(data.real.dtype)
-        residual, shift = torch.empty_like(data), data.new_zeros(around.value.shape)
+        residual, shift = torch.empty_like(data), data.new_zeros(value.shape)
         moments = bases.new_zeros(*bases.shape[:2], 2 * found.cell.shape[-1])
         for some, part in _blocks(data, count):
             echoes = _phasors(turns[some, part], right[some], data.dtype)  # conjugate, of unit amplitude
@@ -388,10 +330,12 @@ class Step:
             shift[some] += echoes.mT @ rest
         moments = torch.view_as_complex((mixed.mT @ moments).unflatten(-1, (-1, 2))).mT
         shift = shift.to(torch.complex128)
-        share = (found.amplitude.conj() * (shift * around.difference.conj()).sum(-1)).real.sum(-1)
+        share = (found.amplitude.conj() * (shift * difference.conj()).sum(-1)).real.sum(-1)
         products = inner_products(near, sampling, motion.k, found.amplitude, found.cell, bases)
-        shift = (shift * around.slope.conj()).sum(-1)
-        return residual, Step(fit, range_m, near, products, bases @ bases.mT, around, moments, shift, share)
+        shift = (shift * slope.conj()).sum(-1)
+        pairs = ((value, value), (value, slope), (slope, value), (slope, slope), (difference, difference))
+        overlaps = [(one.conj() @ other.mT)[near.trial, near.first, near.second] for one, other in pairs]
+        return residual, Step(fit, range_m, near, products, bases @ bases.mT, overlaps, moments, shift, share)
 
     def after(self, noise: Tensor, sampling: Sampling, iteration: int) -> Fit:
         """Take the Gauss-Newton step.
@@ -408,12 +352,16 @@ class Step:
             The fit after the step.
         """
         old, found, late = self.fit, self.fit.scatterers, iteration >= _SEARCHED
-        reduced = self.reduced(late)
-        change, inverse, lost = reduced.solved()
-        change = change * self._within_reach(reduced.joint, change)
+        joint, pull, curvature = self.reduced(late)
+        change, inverse, lost = solved(pull, curvature)
+        change = change * self._within_reach(joint, change)
         if late:
-            change = change * _without_reversal(old.change, change, reduced.curvature.sum(1))
-        own = reduced.joint[..., -1] - (reduced.joint[..., :-1] @ change[..., None])[..., 0]
+            # Steps that go back a part of the last one would go back and forth, since the curvature
+            # is an approximation. The factor, at least a half, ends a geometric sequence of steps.
+            whole = curvature.sum(1)
+            size, back = (torch.einsum("bi,bij,bj->b", old.change, whole, x) for x in (old.change, change))
+            change = change / (1 - (back / or_one(size)).nan_to_num(0.0).clamp(-1, 0))[:, None]
+        own = joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]
         grow, turn, line, row = own.unflatten(-1, (4, -1)).unbind(-2)
         moved = Scatterers(
             found.amplitude * torch.complex(1 + grow, turn),
@@ -422,17 +370,23 @@ class Step:
         )
         motion = old.motion.moved(change)
         valid = torch.isfinite(change).all(-1) & motion.possible(sampling)
-        valid = valid & (least_rate(motion.k, sampling.duration_s) > _LEAST_RATE)
+        # slower motions would nearly reverse
+        valid = valid & (least_rate(motion.k, sampling.duration_s) > 0.05)
         std = (inverse.diagonal(dim1=-2, dim2=-1).clamp_min(0) / 2).sqrt() * noise.sqrt()[:, None]
         std = torch.where(lost, math.inf, std).clamp_min(torch.finfo(torch.float64).tiny)
-        small = (change.abs() / std).amax(-1) <= _SETTLED
-        new = Fit(motion, moved.apart(), self._changed_response(), noise, old.steps, old.settled, change)
+        small = (change.abs() / std).amax(-1) <= 0.2
+        # Least squares for the share of the periodic range response. Both responses are the same
+        # where scatterers lie in the middle of their cells, as all do after the first search: the
+        # share then stays as it is, instead of following rounding.
+        energy = (self.products[(0, 0)] * (self.overlaps[4] + 1e-6 * self.overlaps[0])).real[:, None]
+        share = torch.nan_to_num(self.share / self.near.per_scatterer(energy).sum((-2, -1)), 0.0, 0.0, 0.0)
+        new = Fit(motion, moved.apart(), (old.response + share).clamp(0, 1), noise, old.steps, old.settled, change)
         # where the step is not possible, the fit stays; trials that have ended are not counted on
         new = replace(chosen(valid, new, old), noise=noise, change=torch.where(valid[:, None], change, math.inf))
         new = replace(new, steps=old.steps + 1, settled=valid & small & (iteration > _SEARCHED))
         return chosen(old.settled, old, new)
 
-    def reduced(self, robust: bool) -> Reduced:
+    def reduced(self, robust: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Eliminate the unknowns of the scatterers.
 
         Args:
@@ -440,17 +394,19 @@ class Step:
                 rotation, as that of several scatterers in one resolution cell does.
 
         Returns:
-            The equations of the rotation.
+            The unknowns of the scatterers per unit of each parameter of the rotation, and, in the
+            last column, for an unchanged rotation, shape (trial, 4 scatterer, parameter + 1); and
+            the gradient and the curvature of the rotation, see `solved`.
         """
         slopes, solve = self._slopes(), _solver(self._local())
         found = self._without_scatterers(slopes, solve)
         if not robust:
             return found
-        change = found.solved()[0]
-        change = change * self._within_reach(found.joint, change)
+        change = solved(*found[1:])[0]
+        change = change * self._within_reach(found[0], change)
         return self._without_scatterers(slopes * self._agreement(slopes, change)[..., None, None], solve)
 
-    def _without_scatterers(self, slopes: Tensor, solve: Callable[[Tensor], Tensor]) -> Reduced:
+    def _without_scatterers(self, slopes: Tensor, solve: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """The equations of the rotation for these coefficients of its parameters."""
         conjugate = self.fit.scatterers.amplitude.conj()
         cross, shared = self._shared(slopes)
@@ -460,7 +416,7 @@ class Step:
         joint = solve(right)
         lost = torch.einsum("brpi,brpj->bpij", joint[..., :-1].unflatten(1, (4, -1)), right.unflatten(1, (4, -1)))
         pull = torch.einsum("bpin,bpn->bpi", slopes, turned.imag) - lost[..., -1]
-        return Reduced(joint, pull, shared - lost[..., :-1])
+        return joint, pull, shared - lost[..., :-1]
 
     def _agreement(self, slopes: Tensor, change: Tensor) -> Tensor:
         """Weights 0..1 (trial, scatterer) by how well the phase of a scatterer fits the step.
@@ -478,21 +434,25 @@ class Step:
         size = torch.where(power > 0, 2 * size / self.fit.noise[:, None], torch.nan)
         # errors that all scatterers share, as those of pulse phases, must not favour weak ones
         usual = (size.nanmedian(-1, keepdim=True).values / curved.shape[-1]).nan_to_num(1.0).clamp_min(1)
-        return 1 / (1 + (size / (usual * _AGREES**2)).nan_to_num(0.0))
+        # a phase may differ by 5 standard deviations before it loses weight, found by trial
+        return 1 / (1 + (size / (usual * 5.0**2)).nan_to_num(0.0))
 
     def _within_reach(self, joint: Tensor, change: Tensor) -> Tensor:
-        """Factor (trial, 1) of a change that limits the Doppler by which it moves scatterers."""
+        """Factor (trial, 1) of a change that limits the Doppler by which it moves scatterers.
+
+        Those of a tenth of the largest amplitude or more count, found by trial.
+        """
         line = (joint[..., :-1] @ change[..., None])[..., 0].unflatten(-1, (4, -1))[:, 2].abs()
         level = self.fit.scatterers.amplitude.abs()
-        bright = level > _BRIGHT * level.amax(-1, keepdim=True)
-        return (_STEP / _or_one(torch.where(bright, line, 0).amax(-1, keepdim=True))).clamp_max(1)
+        bright = level > 0.1 * level.amax(-1, keepdim=True)
+        return (_STEP / or_one(torch.where(bright, line, 0).amax(-1, keepdim=True))).clamp_max(1)
 
     def _local(self) -> Tensor:
         """Gauss-Newton curvature of the scatterers' unknowns, (trial, 4 scatterer, 4 scatterer).
 
         The unknowns are relative amplitude, phase, Doppler cell and range cell.
         """
-        overlap, slope, back, bend = self._overlaps
+        overlap, slope, back, bend, _ = self.overlaps
         products = self.products
         flat, line, bent = products[(0, 0)], 2 * math.pi * products[(0, 1)], 4 * math.pi**2 * products[(1, 1)]
         a, u, s, us, b, ub = (x * y for x, y in itertools.product((overlap, slope, back), (flat, line)))
@@ -502,55 +462,16 @@ class Step:
             [-u.imag, -u.real, (bent * overlap).real, -us.imag],
             [b.real, -b.imag, ub.imag, (flat * bend).real],
         ]
-        local = self.near.matrix(rows)
+        # row i and column j of the blocks, zero where two scatterers do not form a pair
+        near, count = self.near, self.near.shape[1]
+        local = a.real.new_zeros(near.shape[0], 4 * count, 4 * count)
+        for (i, row), j in itertools.product(enumerate(rows), range(4)):
+            local[near.trial, near.first + i * count, near.second + j * count] = row[j]
         diagonal = local.diagonal(dim1=-2, dim2=-1)
-        # zero without a scatterer, or with one range cell, which does not determine range
-        diagonal += torch.where(diagonal > 0, _RIDGE * diagonal, 1.0)
+        # above the rounding of float64; zero without a scatterer, or with one range cell, which
+        # does not determine range
+        diagonal += torch.where(diagonal > 0, 1e-9 * diagonal, 1.0)
         return local
-
-    @cached_property
-    def _overlaps(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Inner product over range cells of the envelopes of each pair, and its derivatives.
-
-        The derivatives are those with respect to the range of the second scatterer, of the first
-        one, and of both.
-        """
-        value, slope = self.envelopes.value, self.envelopes.slope
-        factors = ((value, value), (value, slope), (slope, value), (slope, slope))
-        return tuple(self.near.over_range(*pair) for pair in factors)  # pyright: ignore[reportReturnType]
-
-    def _changed_response(self) -> Tensor:
-        """Fit the share of the periodic range response to the residual by least squares.
-
-        Both responses are the same where scatterers lie in the middle of their cells, as all do
-        after the first search: the share then stays as it is, instead of following rounding.
-        """
-        apart = self.near.over_range(self.envelopes.difference, self.envelopes.difference)
-        energy = (self.products[(0, 0)] * (apart + _ALIKE * self._overlaps[0])).real[:, None]
-        change = torch.nan_to_num(self.share / self.near.per_scatterer(energy).sum((-2, -1)), 0.0, 0.0, 0.0)
-        return (self.fit.response + change).clamp(0, 1)
-
-    def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
-        """Curvature between scatterers and common unknowns, and of the common unknowns.
-
-        (trial, 4 scatterer, unknown) and, as sums over the pairs of each scatterer, (trial,
-        scatterer, unknown, unknown).
-        """
-        near, bases, (overlap, _, back, _) = self.near, range(2, slopes.shape[-1]), self._overlaps
-        columns = slopes[near.trial, near.second].unbind(-1)[2:]
-
-        def summed(base: int, part: Callable[[Tensor], Tensor], envelopes: Tensor = overlap) -> Tensor:
-            weighted = (part(self.products[(base, n)] * envelopes)[:, None] * columns[n - 2] for n in bases)
-            return near.per_scatterer(sum(weighted, torch.zeros_like(columns[0])))
-
-        parts = [
-            -summed(0, torch.imag),
-            summed(0, torch.real),
-            -2 * math.pi * summed(1, torch.real),
-            -summed(0, torch.imag, back),
-        ]
-        shared = torch.stack([summed(base, torch.real) for base in bases], -1)
-        return torch.cat(parts, 1), torch.einsum("bpin,bpjn->bpij", slopes[..., 2:], shared)
 
     def _slopes(self) -> Tensor:
         """Coefficients of the bases in the phase per unit of each common unknown.
@@ -565,15 +486,27 @@ class Step:
         slopes[..., order + 1 :, -1] = 1
         return slopes
 
+    def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
+        """Curvature between scatterers and common unknowns, and of the common unknowns.
 
-def _without_reversal(last: Tensor, change: Tensor, normal: Tensor) -> Tensor:
-    """Factor (trial, 1) of a step that goes back a part of the last one.
+        (trial, 4 scatterer, unknown) and, as sums over the pairs of each scatterer, (trial,
+        scatterer, unknown, unknown).
+        """
+        near, bases, (overlap, _, back, *_) = self.near, range(2, slopes.shape[-1]), self.overlaps
+        columns = slopes[near.trial, near.second].unbind(-1)[2:]
 
-    Such steps would go back and forth, since the curvature is an approximation. The factor is that
-    which ends a geometric sequence of steps, at least a half.
-    """
-    size, back = (torch.einsum("bi,bij,bj->b", last, normal, x) for x in (last, change))
-    return 1 / (1 - (back / _or_one(size)).nan_to_num(0.0).clamp(-1, 0))[:, None]
+        def summed(base: int, part: Callable[[Tensor], Tensor], envelopes: Tensor = overlap) -> Tensor:
+            weighted = (part(self.products[(base, n)] * envelopes)[:, None] * columns[n - 2] for n in bases)
+            return near.per_scatterer(sum(weighted, torch.zeros_like(columns[0])))
+
+        parts = [
+            -summed(0, torch.imag),
+            summed(0, torch.real),
+            -2 * math.pi * summed(1, torch.real),
+            -summed(0, torch.imag, back),
+        ]
+        shared = torch.stack([summed(base, torch.real) for base in bases], -1)
+        return torch.cat(parts, 1), torch.einsum("bpin,bpjn->bpij", slopes[..., 2:], shared)
 
 
 def _solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:
@@ -591,8 +524,3 @@ def _solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:
         return torch.where((info != 0)[:, None, None], alone.flatten(1, 2), joint)
 
     return solve
-
-
-def _or_one(x: Tensor) -> Tensor:
-    """Values that are positive, and 1 in place of the others."""
-    return torch.where(x > 0, x, 1)

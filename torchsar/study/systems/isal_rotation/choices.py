@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation import coarse_rotation, phase_fit_rotation, uneven_rotation
-from torchsar.compensate.rotation.baselines import descent_near_truth, genetic_near_truth
+from torchsar.compensate.rotation.entropy_search import descent_near_truth, genetic_near_truth
 from torchsar.core import Draws, Estimate
 from torchsar.core.warp import cut_warp, warp
 from torchsar.focus import DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
