@@ -28,7 +28,7 @@ from torchsar.multichannel import (
     moving_point_velocity,
 )
 from torchsar.multichannel.velocity.bank import bank_search
-from torchsar.multichannel.velocity.illumination import SeenAperture
+from torchsar.multichannel.velocity.aperture import SeenAperture
 from torchsar.multichannel.velocity.likelihood import PointLikelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, moved, noise_beside, phase_slopes, point_phasor
 from torchsar.scene import KSea, Pattern

@@ -1,5 +1,7 @@
 """Azimuth focusing of a moving point with the exact range history of an airborne receiver.
 
+`known_motion_chain` builds the chain of stages that leads to it.
+
 Reference:
     Remote Sens. 2020, 12, 1703, sections 4.1 and 4.3. The filter is the exact spectrum of the
     hyperbolic range history, including an along-track position y0 of the point at slow time zero.
@@ -8,11 +10,25 @@ Reference:
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchsar.core import Axis, Signal, Stage, centred_ifft, checked_samples, per_trial, real_dtype, unit_phasor
+from torchsar.core import (
+    Axis,
+    Chain,
+    Signal,
+    Stage,
+    centred_ifft,
+    checked_samples,
+    per_trial,
+    real_dtype,
+    unit_phasor,
+    use,
+)
+from torchsar.multichannel.migration import CorrectMigration, Migration
 from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.reconstruct import Rebuild, Reconstruct
 from torchsar.multichannel.response import doppler_centre_hz
+from torchsar.multichannel.transmit import CompressChannels, RemoveTransmitRange
 from torchsar.radar import BistaticRadar
 
 
@@ -158,3 +174,43 @@ def image_axis(radar: BistaticRadar, doppler: Axis) -> Axis:
     """
     time = doppler.dual()
     return Axis("azimuth", time.n, time.start * radar.speed_m_s, time.step * radar.speed_m_s, "m")
+
+
+def known_motion_chain(
+    radar: BistaticRadar,
+    rebuild: Rebuild,
+    bandwidth_hz: float | None = None,
+    migration: Migration | None = None,
+    order: int | None = None,
+    full: bool = False,
+    follow: bool = True,
+) -> Chain:
+    """Build the chain of stages from channels to the images of points of known motion.
+
+    When it is run, the chain needs the motion of each point by the names `given.u_r_m_s`,
+    `given.u_a_m_s`, `given.y0_m` and `given.range_m`, each of shape (trial,): slant-range and
+    along-track speed in m/s, along-track position and closest range in metres.
+
+    Args:
+        radar: Radar parameters.
+        rebuild: Reconstruction of the Doppler bands.
+        bandwidth_hz: Width of the Doppler band that is focused in Hz; None for the whole
+            reconstructed band.
+        migration: Correction of range migration; None for azimuth-only data.
+        order: Highest power of slow time in the transmit range that is removed from the phase; None
+            for all.
+        full: Whether the data are full chirps, which are then compressed in range first.
+        follow: Whether the migration is corrected with the known motion, instead of that of a point
+            at rest.
+
+    Returns:
+        The chain.
+    """
+    known = {name: f"given.{name}" for name in ("u_r_m_s", "u_a_m_s", "y0_m")}
+    stages: dict[str, nn.Module] = {"compress": CompressChannels(radar, "flat")} if full else {}
+    stages["remove"] = RemoveTransmitRange(radar, order)
+    if migration is not None:
+        stages["correct"] = use(CorrectMigration(radar, migration), **(known if follow else {}))
+    stages["rebuild"] = use(Reconstruct(radar, rebuild), **known)
+    stages["focus"] = use(FocusAzimuth(radar, bandwidth_hz), **known, range_m="given.range_m")
+    return Chain(**stages)

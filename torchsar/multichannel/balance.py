@@ -33,8 +33,8 @@ from torchsar.core import (
     unit_phasor,
 )
 from torchsar.multichannel.balance_assess import BalanceFit, assessed_balance
-from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.clutter_fit import ClutterModel, hann
+from torchsar.multichannel.motion import checked_channels
 from torchsar.multichannel.response import ElementPattern, Prior
 from torchsar.radar import BistaticRadar
 

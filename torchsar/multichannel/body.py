@@ -17,13 +17,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Outcome, linear_phasor, unit_level, worst
+from torchsar.core import Outcome, unit_level, worst
 from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import smooth_length
-from torchsar.multichannel.check import checked_channels
 from torchsar.multichannel.chip import Chip, Extraction, Picture, centred_motion, chip_about
-from torchsar.multichannel.migration import Frame
-from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.migration import Frame, envelope_phasor
+from torchsar.multichannel.motion import PointMotion, checked_channels
 from torchsar.multichannel.velocity.model import point_phasor
 
 _TINY = 1e-100  # floor of divisors, far from the overflow of reciprocals
@@ -280,24 +279,14 @@ def body_echo(body: Body, frame: Frame, everything: bool = False) -> Tensor:
         Echo, complex128 (channel, pulse, range).
     """
     chip, picture = body.chip, body.picture
-    if everything:
-        deramped = chip.segments.back(chip.cells)
-    else:
-        deramped = chip.model(picture)
+    deramped = chip.segments.back(chip.cells) if everything else chip.model(picture)
     full = torch.zeros(
         len(frame.range_m), frame.radar.channels, chip.segments.n, dtype=deramped.dtype, device=deramped.device
     )
     full[torch.isin(frame.range_m, chip.range_m)] = deramped * chip.lit
     ramped = full.movedim(0, -1) * point_phasor(frame.radar, chip.motion, frame.time_s, torch.complex128)[..., None]
-    return _shifted_back(ramped, frame, chip.motion)
-
-
-def _shifted_back(data: Tensor, frame: Frame, motion: PointMotion) -> Tensor:
-    """Undo `StaticBulk`: shift lines along range by the history of the motion."""
-    n = data.shape[-1]
-    turns = -frame.path_m(motion) / (frame.radar.range_step_m * n)
-    phasor = torch.fft.ifftshift(linear_phasor(turns, -(n // 2), n, data.dtype), dim=-1)
-    return torch.fft.ifft(torch.fft.fft(data) * phasor)
+    phasor = envelope_phasor(-frame.path_m(chip.motion), frame.radar, ramped)
+    return torch.fft.ifft(torch.fft.fft(ramped) * phasor)
 
 
 def body_image(body: Body, position_m: Tensor, extraction: Extraction) -> Tensor:

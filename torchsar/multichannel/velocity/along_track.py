@@ -19,16 +19,12 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, unit_phasor
 from torchsar.focus.nufft import smooth_length
-from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.velocity.aperture import Aperture, Kept
+from torchsar.multichannel.motion import Number, PointMotion, checked_channels
+from torchsar.multichannel.velocity.aperture import Aperture, Kept, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
-from torchsar.multichannel.velocity.illumination import seen_aperture
 from torchsar.multichannel.velocity.interferometry import tone_frequency
-from torchsar.multichannel.velocity.model import Found, noise_beside, point_phasor, quality_of
+from torchsar.multichannel.velocity.model import TINY, Found, noise_beside, point_phasor, quality_of
 from torchsar.radar import BistaticRadar
-
-_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 
 
 def along_track_velocity(
@@ -133,7 +129,7 @@ def _best(
     at, step = power.argmax(0), offsets[1] - offsets[0]
     inner = at.clamp(1, len(offsets) - 2)
     low, middle, high = (power.gather(0, (inner + shift)[None])[0] for shift in (-1, 0, 1))
-    curvature = (low - 2 * middle + high).clamp_max(-_TINY)
+    curvature = (low - 2 * middle + high).clamp_max(-TINY)
     edge = at != inner
     peak = offsets[inner] + step * (0.5 * (low - high) / curvature).clamp(-1, 1)
     return _Top(centre + torch.where(edge, offsets[at], peak), middle, -curvature / step.square(), edge)
@@ -158,7 +154,7 @@ def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture
     weight = aperture.weight(radar, motion, time_s)
     deramped = data * point_phasor(radar, motion, time_s, data.dtype).conj() * weight[..., None, :]
     spectrum = torch.fft.fft(deramped, smooth_length(4 * data.shape[-1])).abs().square().sum(-2)
-    return spectrum.amax(-1) / weight.square().sum(-1).clamp_min(_TINY)
+    return spectrum.amax(-1) / weight.square().sum(-1).clamp_min(TINY)
 
 
 def _assessed(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture, top: _Top) -> Estimate:
@@ -167,7 +163,7 @@ def _assessed(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture:
     lit = (weight != 0).expand(data.shape)
     noise = ((data.abs().square() * lit).sum((-2, -1)) - top.energy).clamp_min(0) / lit.sum((-2, -1)).clamp_min(1)
     beside = _noise_beside(data, radar, motion, weight).diagonal(dim1=-2, dim2=-1).mean(-1)
-    variance = torch.where(top.energy > 0, beside / top.curvature.clamp_min(_TINY), torch.inf)
+    variance = torch.where(top.energy > 0, beside / top.curvature.clamp_min(TINY), torch.inf)
     found = Found(motion, top.energy.sqrt(), noise, variance[..., None, None], top.energy, ("u_a_m_s",))
     outcome, _ = outcome_of_point(data, radar, found, aperture, [(Outcome.OUTSIDE_SEARCH, top.edge)])
     return Estimate(
@@ -185,7 +181,7 @@ def _noise_beside(data: Tensor, radar: BistaticRadar, motion: PointMotion, weigh
     deramped = data * point_phasor(radar, motion, time_s, data.dtype).conj()
     tone_hz = tone_frequency(deramped * weight, radar.prf_hz)
     still = deramped * unit_phasor(-tone_hz[..., None, None] * time_s, data.dtype)
-    amplitude = (still * weight).sum(-1, keepdim=True) / weight.square().sum(-1, keepdim=True).clamp_min(_TINY)
+    amplitude = (still * weight).sum(-1, keepdim=True) / weight.square().sum(-1, keepdim=True).clamp_min(TINY)
     return noise_beside(still - amplitude * weight, weight, amplitude, radar.channels + 2)
 
 

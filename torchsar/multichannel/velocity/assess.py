@@ -17,8 +17,7 @@ from torch import Tensor
 from torchsar.core import Outcome, unit_level, unit_phasor, worst
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.velocity.aperture import Aperture, Kept
-from torchsar.multichannel.velocity.illumination import lit_as_expected
+from torchsar.multichannel.velocity.aperture import Aperture, Kept, lit_as_expected
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
 from torchsar.multichannel.velocity.model import DETECTED_DB, Found, point_phasor
 from torchsar.multichannel.velocity.whitening import Whitening

@@ -18,12 +18,11 @@ from torch import Tensor
 
 from torchsar.core import Estimate
 from torchsar.focus.nufft import smooth_length
-from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.velocity.aperture import Aperture
+from torchsar.multichannel.motion import PointMotion, checked_channels
+from torchsar.multichannel.velocity.aperture import Aperture, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
-from torchsar.multichannel.velocity.illumination import seen_aperture
 from torchsar.multichannel.velocity.model import (
+    TINY,
     Found,
     centred_slopes,
     chosen,
@@ -37,7 +36,6 @@ from torchsar.radar import BistaticRadar
 # Zero padding: the parabola then errs by at most 0.004 of a Doppler cell, without padding by 0.23.
 _PAD = 4
 _STARTS = 9  # chosen: 3 m/s from the next one, the cubic phase loses at most 1 dB of the tone
-_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 
 
 def interferometry(
@@ -162,7 +160,7 @@ def tone_frequency(tones: Tensor, rate_hz: float) -> Tensor:
     power = torch.fft.fft(tones, length).abs().square().sum(-2)
     at = power.argmax(-1, keepdim=True)
     low, middle, high = (power.gather(-1, (at + shift) % length)[..., 0] for shift in (-1, 0, 1))
-    bend = (low - 2 * middle + high).clamp_max(-_TINY)
+    bend = (low - 2 * middle + high).clamp_max(-TINY)
     fine = (0.5 * (low - high) / bend).clamp(-0.5, 0.5)
     position = at[..., 0] + fine
     return torch.remainder(position + length / 2, length).sub(length / 2) * (rate_hz / length)
@@ -178,7 +176,7 @@ def _slope(values: Tensor, position_m: Tensor) -> Tensor:
         rough = first / position_m.diff()[0]
     else:
         weight = step.abs() * position_m.diff()
-        rough = (torch.angle(step) * weight).sum(-1) / (weight * position_m.diff()).sum(-1).clamp_min(_TINY)
+        rough = (torch.angle(step) * weight).sum(-1) / (weight * position_m.diff()).sum(-1).clamp_min(TINY)
     return rough + _straight(values * torch.exp(-1j * rough[..., None] * position_m), position_m)
 
 
@@ -186,16 +184,16 @@ def _straight(values: Tensor, position_m: Tensor) -> Tensor:
     """Return the slope of small phases by weighted least squares about their mean."""
     phase = torch.angle(values * values.sum(-1, keepdim=True).conj())
     weight = values.abs()
-    total = weight.sum(-1, keepdim=True).clamp_min(_TINY)
+    total = weight.sum(-1, keepdim=True).clamp_min(TINY)
     centred = position_m - (weight * position_m).sum(-1, keepdim=True) / total
-    return (weight * centred * phase).sum(-1) / (weight * centred.square()).sum(-1).clamp_min(_TINY)
+    return (weight * centred * phase).sum(-1) / (weight * centred.square()).sum(-1).clamp_min(TINY)
 
 
 def _fit_at(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor, time_s: Tensor) -> Found:
     """Return the fit at a motion, with covariances of u_r and y0 from tone and slope."""
     weight = weight[..., None, :]
     illuminated = (weight != 0).expand(data.shape)
-    energy_of_weight = weight.square().expand(data.shape).sum((-2, -1)).clamp_min(_TINY)
+    energy_of_weight = weight.square().expand(data.shape).sum((-2, -1)).clamp_min(TINY)
     deramped = data * point_phasor(radar, motion, time_s, data.dtype).conj()
     amplitude = (weight * deramped).sum((-2, -1)) / energy_of_weight
     energy = amplitude.abs().square() * energy_of_weight

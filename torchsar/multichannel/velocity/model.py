@@ -17,7 +17,7 @@ UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")
 # Detection threshold over all samples, -15 dB per sample with three channels and 810 pulses: below
 # it the strongest tone is often one of noise.
 DETECTED_DB = 19.0
-_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
+TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _ROUNDING = 1e-13  # added to the unit diagonal of normal matrices
 # chosen: Doppler cells on either side in which the noise of a point is measured; standard
 # deviations then scatter by 12 %
@@ -84,7 +84,7 @@ def centred_slopes(slopes: Tensor, weight: Tensor) -> Tensor:
         Weighted derivatives, same shape as `slopes`.
     """
     power = weight.square()[..., None, :, :]
-    total = slopes.shape[-2] * power.sum((-2, -1), keepdim=True).clamp_min(_TINY)
+    total = slopes.shape[-2] * power.sum((-2, -1), keepdim=True).clamp_min(TINY)
     return weight[..., None, :, :] * (slopes - (power * slopes).sum((-2, -1), keepdim=True) / total)
 
 
@@ -134,7 +134,7 @@ def energy_ratio_db(energy: Tensor, noise_power: Tensor) -> Tensor:
     Returns:
         Ratios in dB, the broadcast shape.
     """
-    return 10 * torch.log10((energy / noise_power.clamp_min(torch.finfo(torch.float64).tiny)).clamp(1e-30, 1e30))
+    return 10 * torch.log10((energy / noise_power.clamp_min(TINY)).clamp(1e-30, 1e30))
 
 
 def covariance_of(normal: Tensor, noise_power: Tensor) -> Tensor:
@@ -173,7 +173,7 @@ def noise_beside(left: Tensor, weight: Tensor, amplitude: Tensor, fitted: int) -
     """
     n = left.shape[-1]
     energy = weight.square().sum((-2, -1))
-    cells = energy.square() / weight.square().square().sum((-2, -1)).clamp_min(_TINY) / n  # per bin
+    cells = energy.square() / weight.square().square().sum((-2, -1)).clamp_min(TINY) / n  # per bin
     inside = torch.fft.fftfreq(n, 1 / n, dtype=torch.float64, device=left.device).abs() * cells[..., None] <= _BESIDE
     turned = (left * torch.polar(torch.ones_like(amplitude.abs()), -amplitude.angle())).imag
     spectrum = torch.fft.fft(weight * turned) * inside[..., None, :]

@@ -12,15 +12,12 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome
-from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.velocity.aperture import Aperture, Dwell
+from torchsar.multichannel.motion import Number, PointMotion, checked_channels
+from torchsar.multichannel.velocity.aperture import Aperture, Dwell, SeenAperture, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.bank import Search, bank_search
-from torchsar.multichannel.velocity.illumination import SeenAperture, seen_aperture
-from torchsar.multichannel.velocity.likelihood import maximum_likelihood
-from torchsar.multichannel.velocity.model import UNKNOWNS, Found, estimate_of, point_phasor
-from torchsar.multichannel.velocity.several import fitted_together, joined
+from torchsar.multichannel.velocity.likelihood import fitted_together, joined, maximum_likelihood
+from torchsar.multichannel.velocity.model import TINY, UNKNOWNS, Found, estimate_of, point_phasor
 from torchsar.multichannel.velocity.whitening import Whitening, sample_whitening
 from torchsar.radar import BistaticRadar
 
@@ -36,7 +33,6 @@ _CLEAR_SHARE, _OVERLAP = 0.05, 8.0
 # Least energy of such a point over that of the first: the model of the echo of a wide chirp leaves
 # 0.001 of the energy of the point itself.
 _LEAST_HIDDEN = 0.002
-_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _PASSES = 2  # of their fit: the second has the expected amplitudes at the positions found
 _OTHERS = 3  # points fitted besides the strongest, by choice: each takes a search of its own
 
@@ -209,7 +205,7 @@ class _Job:
         points, left = found.motion.each(lambda value: value.expand(tried.shape)[..., None]), whole.left(found)
         for _ in range(_OTHERS):
             further = replace(whole, data=left).found(None)
-            share = further.energy / left.abs().square().sum((-2, -1)).clamp_min(_TINY)
+            share = further.energy / left.abs().square().sum((-2, -1)).clamp_min(TINY)
             tried = tried & (share > _POINT_SHARE)
             if not bool(tried.any()):
                 break

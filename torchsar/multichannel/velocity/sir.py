@@ -26,6 +26,7 @@ from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offset
 from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.interferometry import interfered
+from torchsar.multichannel.velocity.model import TINY
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
 
@@ -276,7 +277,7 @@ class SignalIntensityRatio(Stage):
             )
 
         def cost(u_r_m_s: Tensor) -> Tensor:
-            return -torch.log(intensity(u_r_m_s).total.ratio.clamp_min(torch.finfo(torch.float64).tiny))
+            return -torch.log(intensity(u_r_m_s).total.ratio.clamp_min(TINY))
 
         reach = (self.search_m_s[1] - self.search_m_s[0]) / 2
         coarse, costs = grid_minimum(cost, start, reach, 2 * round(reach / self.step_m_s) + 1)
@@ -347,4 +348,4 @@ def _left_out(bins: Intensity) -> Tensor:
     n = bins.energy_in.shape[-1]
     group = torch.arange(n, device=bins.energy_in.device) % _GROUPS
     kept = (group[:, None] != torch.arange(_GROUPS, device=group.device)).to(torch.float64)
-    return torch.log(bins.summed(kept).ratio.clamp_min(torch.finfo(torch.float64).tiny))
+    return torch.log(bins.summed(kept).ratio.clamp_min(TINY))

@@ -23,8 +23,7 @@ from torch import Tensor
 
 from torchsar.core import cholesky_factor, matrix_inverse
 from torchsar.core.arguments import names_arguments
-from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.motion import PointMotion, checked_channels
 from torchsar.multichannel.response import shared_response
 from torchsar.radar import BistaticRadar
 
