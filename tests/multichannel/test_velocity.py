@@ -27,8 +27,8 @@ from torchsar.multichannel import (
     maximum_likelihood,
     moving_point_velocity,
 )
-from torchsar.multichannel.velocity.bank import bank_search
 from torchsar.multichannel.velocity.aperture import SeenAperture
+from torchsar.multichannel.velocity.bank import bank_search
 from torchsar.multichannel.velocity.likelihood import PointLikelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, moved, noise_beside, phase_slopes, point_phasor
 from torchsar.scene import KSea, Pattern

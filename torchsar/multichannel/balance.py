@@ -27,13 +27,13 @@ from torchsar.core import (
     Stage,
     checked_samples,
     fft_lines,
-    linear_phasor,
     refuse_non_finite_values,
     unit_level,
     unit_phasor,
 )
 from torchsar.multichannel.balance_assess import BalanceFit, assessed_balance
 from torchsar.multichannel.clutter_fit import ClutterModel, hann
+from torchsar.multichannel.migration import envelope_phasor
 from torchsar.multichannel.motion import checked_channels
 from torchsar.multichannel.response import ElementPattern, Prior
 from torchsar.radar import BistaticRadar
@@ -82,22 +82,37 @@ def correct_balance(
                 f"shape {tuple(value.shape)}"
             )
     factor = (unit_phasor(-phase_rad / (2 * math.pi), torch.complex128) * 10 ** (-gain_db / 20)).to(data.dtype)
-    if not with_range:
-        if delay_s is not None and bool(delay_s.any()):
-            raise ValueError(
-                "delay_s must be None or zero for data without a range axis, along which delays act; leave delay_s out"
-            )
-        return data * factor[..., None]
-    balanced = data * factor[..., None, None]
-    return balanced if delay_s is None else torch.fft.ifft(torch.fft.fft(balanced) * _advance(delay_s, radar, data))
+    delay_s = None if delay_s is None else delay_s[..., None]
+    return without_errors(data, radar, factor[..., None], delay_s, with_range)
 
 
-def _advance(delay_s: Tensor, radar: BistaticRadar, data: Tensor) -> Tensor:
-    """Return exp(+j 2 pi fr delay), (..., channel, 1, range frequency), FFT order."""
-    n = data.shape[-1]
-    return torch.fft.ifftshift(linear_phasor(delay_s * (radar.sampling_hz / n), -(n // 2), n, data.dtype), dim=-1)[
-        ..., None, :
-    ]
+def without_errors(
+    data: Tensor, radar: BistaticRadar, factor: Tensor, delay_s: Tensor | None, with_range: bool
+) -> Tensor:
+    """Multiply channels by a factor and advance their envelopes in range time.
+
+    Args:
+        data: Channels, shape (..., channel, pulse, range), or (..., channel, pulse), complex.
+        radar: Radar parameters.
+        factor: Factor, which broadcasts to (..., channel, pulse), complex.
+        delay_s: Delay in seconds, as `factor`, or None.
+        with_range: Whether the data have a range axis.
+
+    Returns:
+        Data of the same shape.
+
+    Raises:
+        ValueError: If data without a range axis have a delay.
+    """
+    if with_range:
+        data = data * factor[..., None]
+        phasor = None if delay_s is None else envelope_phasor(delay_s * radar.wave_speed_m_s, radar, data)
+        return data if phasor is None else torch.fft.ifft(torch.fft.fft(data) * phasor)
+    if delay_s is not None and bool(delay_s.any()):
+        raise ValueError(
+            "delay_s must be None or zero for data without a range axis, along which delays act; leave delay_s out"
+        )
+    return data * factor
 
 
 def estimate_balance(

@@ -91,7 +91,7 @@ class Frame:
     def _moved_m(self, reference: PointMotion, range_m: Tensor, walks: float) -> Tensor:
         """Return the range history R_m(t) - R0 of the reference motion at given closest ranges.
 
-        Its derivative times slow time and `walks` is subtracted. Shape (..., channel, pulse, range).
+        Its derivative times slow time and `walks` is subtracted. (..., channel, pulse, range)
         """
         time_s, channel_m = self.time_s[:, None], self.radar.channels_at(self.time_s.device)[:, None, None]
         u_r, u_a, y0 = (x[..., None, None, None] for x in (reference.u_r_m_s, reference.u_a_m_s, reference.y0_m))

@@ -17,7 +17,8 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, linear_phasor, unit_phasor, worst
+from torchsar.core import Estimate, Outcome, Signal, Stage, unit_phasor, worst
+from torchsar.multichannel.balance import without_errors
 from torchsar.radar import BistaticRadar
 
 # The maximum of samples interpolated four times lies within an eighth of a sample of the peak.
@@ -139,19 +140,7 @@ def remove_synchronisation(
                 f"{tuple(value.shape)}"
             )
     turn = unit_phasor(-phase_rad.to(torch.float64) / (2 * math.pi), data.dtype)[..., None, :]
-    if not with_range:
-        if delay_s is not None and bool((delay_s != 0).any()):
-            raise ValueError(
-                "delay_s must be None or zero for data without a range axis, along which delays act; leave delay_s out"
-            )
-        return data * turn
-    if delay_s is None:
-        return data * turn[..., None]
-    n = data.shape[-1]
-    advance = torch.fft.ifftshift(linear_phasor(delay_s * (radar.sampling_hz / n), -(n // 2), n, data.dtype), dim=-1)[
-        ..., None, :, :
-    ]
-    return torch.fft.ifft(torch.fft.fft(data * turn[..., None]) * advance)
+    return without_errors(data, radar, turn, None if delay_s is None else delay_s[..., None, :], with_range)
 
 
 class EstimateSynchronisation(Stage):
