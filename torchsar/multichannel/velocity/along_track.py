@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, unit_phasor
 from torchsar.focus.nufft import smooth_length
-from torchsar.multichannel.motion import Number, PointMotion, checked_channels
+from torchsar.multichannel.motion import PointMotion, checked_channels
 from torchsar.multichannel.velocity.aperture import Aperture, Kept, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.interferometry import tone_frequency
@@ -183,27 +183,3 @@ def _noise_beside(data: Tensor, radar: BistaticRadar, motion: PointMotion, weigh
     still = deramped * unit_phasor(-tone_hz[..., None, None] * time_s, data.dtype)
     amplitude = (still * weight).sum(-1, keepdim=True) / weight.square().sum(-1, keepdim=True).clamp_min(TINY)
     return noise_beside(still - amplitude * weight, weight, amplitude, radar.channels + 2)
-
-
-def motion_from(
-    radar: BistaticRadar, data: Tensor, u_r_m_s: Number, u_a_m_s: Number, y0_m: Number, range_m: Number | None
-) -> PointMotion:
-    """Return the motion of the point in each trial of the data from velocities and positions.
-
-    Args:
-        radar: Radar parameters.
-        data: Channels, shape (..., channel, pulse).
-        u_r_m_s: Slant-range speed in m/s, closing positive.
-        u_a_m_s: Along-track speed in m/s.
-        y0_m: Along-track position at t = 0 in metres.
-        range_m: Closest range in metres, None for the reference range of the radar.
-
-    Returns:
-        Motion with parameters of shape (...,).
-
-    Raises:
-        ValueError: If the motion is impossible, see `PointMotion.of`.
-    """
-    return PointMotion.of(radar, data, u_r_m_s, u_a_m_s, y0_m, range_m).each(
-        lambda value: value.expand(data.shape[:-2])
-    )

@@ -162,31 +162,26 @@ def tone_frequency(tones: Tensor, rate_hz: float) -> Tensor:
     low, middle, high = (power.gather(-1, (at + shift) % length)[..., 0] for shift in (-1, 0, 1))
     bend = (low - 2 * middle + high).clamp_max(-TINY)
     fine = (0.5 * (low - high) / bend).clamp(-0.5, 0.5)
-    position = at[..., 0] + fine
-    return torch.remainder(position + length / 2, length).sub(length / 2) * (rate_hz / length)
+    return torch.remainder(at[..., 0] + fine + length / 2, length).sub(length / 2) * (rate_hz / length)
 
 
 def _slope(values: Tensor, position_m: Tensor) -> Tensor:
     """Return the phase slope in rad/m of values (..., channel) over the channel positions."""
     order = position_m.argsort()
     values, position_m = values[..., order], position_m[order]
-    step = values[..., 1:] * values[..., :-1].conj()
-    first = torch.angle((step / position_m.diff()).sum(-1)) if len(set(position_m.diff().tolist())) == 1 else None
-    if first is not None:
-        rough = first / position_m.diff()[0]
+    step, gap_m = values[..., 1:] * values[..., :-1].conj(), position_m.diff()
+    if len(set(gap_m.tolist())) == 1:
+        rough = torch.angle((step / gap_m).sum(-1)) / gap_m[0]
     else:
-        weight = step.abs() * position_m.diff()
-        rough = (torch.angle(step) * weight).sum(-1) / (weight * position_m.diff()).sum(-1).clamp_min(TINY)
-    return rough + _straight(values * torch.exp(-1j * rough[..., None] * position_m), position_m)
-
-
-def _straight(values: Tensor, position_m: Tensor) -> Tensor:
-    """Return the slope of small phases by weighted least squares about their mean."""
+        weight = step.abs() * gap_m
+        rough = (torch.angle(step) * weight).sum(-1) / (weight * gap_m).sum(-1).clamp_min(TINY)
+    # the phases that remain are small: weighted least squares about their mean
+    values = values * torch.exp(-1j * rough[..., None] * position_m)
     phase = torch.angle(values * values.sum(-1, keepdim=True).conj())
     weight = values.abs()
     total = weight.sum(-1, keepdim=True).clamp_min(TINY)
     centred = position_m - (weight * position_m).sum(-1, keepdim=True) / total
-    return (weight * centred * phase).sum(-1) / (weight * centred.square()).sum(-1).clamp_min(TINY)
+    return rough + (weight * centred * phase).sum(-1) / (weight * centred.square()).sum(-1).clamp_min(TINY)
 
 
 def _fit_at(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor, time_s: Tensor) -> Found:
@@ -202,15 +197,9 @@ def _fit_at(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Ten
     ).clamp_min(1)
     level = amplitude[..., None, None]
     beside = noise_beside(deramped - level * weight, weight, level, 3)
-    slopes = centred_slopes(_linear_slopes(radar, motion, time_s), weight)
-    return Found(motion, amplitude, noise, covariance_in(beside, slopes, amplitude), energy, ("u_r_m_s", "y0_m"))
-
-
-def _linear_slopes(radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
-    """Return the derivatives by u_r and y0 of tone and phase slope, (..., 2, channel, pulse).
-
-    Other effects of u_r and y0 on the phase, which the estimate does not use, are left out.
-    """
+    # derivatives by u_r and y0 of tone and phase slope; their other effects are not used
     v, near = (x[..., None, None] for x in (motion.along_m_s, motion.range_m))
     by_y0 = (v * time_s - radar.channels_at(time_s.device)[:, None]) / near
-    return 2 * math.pi / radar.wavelength_m * torch.stack([time_s.expand_as(by_y0), by_y0], -3)
+    slopes = 2 * math.pi / radar.wavelength_m * torch.stack([time_s.expand_as(by_y0), by_y0], -3)
+    slopes = centred_slopes(slopes, weight)
+    return Found(motion, amplitude, noise, covariance_in(beside, slopes, amplitude), energy, ("u_r_m_s", "y0_m"))

@@ -7,8 +7,9 @@ known covariance. In white noise the estimate reaches the Cramer-Rao bound of
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -61,19 +62,6 @@ class PointFit:
     normal: Tensor
 
 
-class Likelihood(Protocol):
-    """Likelihood of the motion of one or several points."""
-
-    @property
-    def data(self) -> Tensor:
-        """Channels, shape (..., channel, pulse), complex128."""
-        ...
-
-    def fit(self, motion: PointMotion) -> PointFit:
-        """Return the least-squares amplitudes for a motion, with derivatives by the unknowns."""
-        ...
-
-
 def maximum_likelihood(
     data: Tensor,
     radar: BistaticRadar,
@@ -118,8 +106,7 @@ def maximum_likelihood(
     data = checked_channels(data, radar, "maximum_likelihood")
     problem = PointLikelihood.of(data, radar, start, aperture, unknowns, whitening)
     motion = start.each(lambda value: value.expand(data.shape[:-2]))
-    fit = problem.fit(motion)
-    motion, fit = climbed(problem, motion, fit, unknowns, steps)
+    motion, fit = _climbed(problem.data, problem.fit, motion, unknowns, steps)
     return Found(motion, fit.amplitude, problem.noise_power(fit), problem.covariance(motion, fit), fit.energy, unknowns)
 
 
@@ -250,37 +237,37 @@ def _coloured(data: Tensor, model: Tensor, tilted: Tensor, columns: Tensor) -> P
     return PointFit(amplitude, power * total + changed, gradient, power[..., None, None] * normal)
 
 
-def climbed(
-    problem: Likelihood, motion: PointMotion, fit: PointFit, unknowns: tuple[str, ...], steps: int
+def _climbed(
+    data: Tensor, fit_at: Callable[[PointMotion], PointFit], motion: PointMotion, unknowns: tuple[str, ...], steps: int
 ) -> tuple[PointMotion, PointFit]:
     """Take Gauss-Newton steps until none of the trials gains by a step.
 
     Args:
-        problem: Likelihood of one point, or of several that are fitted together.
+        data: Data to which one point, or several together, are fitted, (..., channel, pulse).
+        fit_at: Fit for a motion, with the unknowns of all points in its gradient.
         motion: Starting motion, shape (...,), or (..., point) for several points.
-        fit: Fit for this motion, with the unknowns of all points in its gradient.
         unknowns: Names of the parameters to estimate.
         steps: Largest number of steps.
 
     Returns:
         Motion after the steps, and the fit for it.
     """
-    channels, samples = problem.data.shape[-2:]
-    total = problem.data.abs().square().sum((-2, -1))
+    fit = fit_at(motion)
+    total = data.abs().square().sum((-2, -1))
     stuck = torch.zeros_like(fit.energy, dtype=torch.bool)  # no part of the step gained anything
     for _ in range(steps):
         step = solved(fit.normal, fit.gradient[..., None])[..., 0]
-        noise = (total - fit.energy).clamp_min(0) / (channels * samples)
+        noise = (total - fit.energy).clamp_min(0) / data.shape[-2:].numel()
         pending = ~stuck & ((step * fit.gradient).sum(-1) > _LEAST_GAIN * noise + _LEAST_SHARE * fit.energy)
         if not bool(pending.any()):
             break
-        motion, fit, failed = _stepped(problem, motion, fit, unknowns, step, pending)
+        motion, fit, failed = _stepped(fit_at, motion, fit, unknowns, step, pending)
         stuck = stuck | failed
     return motion, fit
 
 
 def _stepped(
-    problem: Likelihood,
+    fit_at: Callable[[PointMotion], PointFit],
     motion: PointMotion,
     fit: PointFit,
     unknowns: tuple[str, ...],
@@ -295,7 +282,7 @@ def _stepped(
     step = _bounded(step.reshape(*motion.u_r_m_s.shape, len(unknowns)), motion, unknowns)
     for halvings in range(_HALVINGS):
         there = moved(begin, 0.5**halvings * step, unknowns)
-        fit_there = problem.fit(there)
+        fit_there = fit_at(there)
         better = pending & (fit_there.energy > before)
 
         def improved(new: Tensor, old: Tensor, better: Tensor = better) -> Tensor:
@@ -319,26 +306,9 @@ def _bounded(step: Tensor, motion: PointMotion, unknowns: tuple[str, ...]) -> Te
     return step * reach.clamp_max(1.0)[..., None]
 
 
-@dataclass(frozen=True)
-class Together:
-    """Points fitted together, per trial.
-
-    Args:
-        motion: Motions, shape (..., point).
-        found: Fit of the strongest point, whose covariance contains the effect of the others.
-        others: Echo of the others, shape (..., channel, pulse).
-        left: Data without the points, shape (..., channel, pulse).
-    """
-
-    motion: PointMotion
-    found: Found
-    others: Tensor
-    left: Tensor
-
-
 def fitted_together(
     data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, unknowns: tuple[str, ...]
-) -> Together:
+) -> tuple[PointMotion, Found, Tensor, Tensor]:
     """Find the motions of several points of highest likelihood in white noise, near a start.
 
     Args:
@@ -350,14 +320,15 @@ def fitted_together(
         unknowns: Names of the parameters to estimate; the others keep the values of the start.
 
     Returns:
-        The fit, with the noise power and the covariance in the noise of all samples.
+        Motions, shape (..., point). Fit of the strongest point, with the noise power and the
+        covariance in the noise of all samples, which contains the effect of the others. Echo of the
+        others, and data without any point, shape (..., channel, pulse).
     """
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     weight = aperture.weight(radar, start, time_s)[..., None, :]
-    problem, motion = _Points(data, radar, weight, time_s, unknowns), start
-    fit = problem.fit(motion)
-    motion, fit = climbed(problem, motion, fit, unknowns, _STEPS)
-    echoes = fit.amplitude[..., None, None] * problem.echo(motion)
+    fit_at = partial(_fit_of_points, data, radar, weight, time_s, unknowns)
+    motion, fit = _climbed(data, fit_at, start, unknowns, _STEPS)
+    echoes = fit.amplitude[..., None, None] * weight * point_phasor(radar, motion, time_s, torch.complex128)
     left = data - echoes.sum(-3)
     noise = left.abs().square().mean((-2, -1))
     count = len(unknowns)
@@ -373,61 +344,28 @@ def fitted_together(
         take(energy, first),
         unknowns,
     )
-    return Together(motion, found, echoes.sum(-3) - take(echoes, first, -3), left)
+    return motion, found, echoes.sum(-3) - take(echoes, first, -3), left
 
 
-def joined(points: PointMotion, further: PointMotion) -> PointMotion:
-    """Append a motion (...,) to motions (..., point).
-
-    Args:
-        points: Motions of points, shape (..., point).
-        further: Motion of one more point, shape (...,).
-
-    Returns:
-        Motions of all points.
-    """
-    return points.each(lambda these, one: torch.cat([these, one[..., None]], -1), further)
-
-
-@dataclass(frozen=True)
-class _Points:
-    """Likelihood of the motions of several points in white noise.
-
-    Args:
-        data: Channels, shape (..., channel, pulse), complex128.
-        radar: Radar parameters.
-        weight: Expected amplitudes, shape (..., point, 1, pulse).
-        time_s: Slow time in seconds, float64 (pulse,).
-        unknowns: Names of the parameters to estimate.
-    """
-
-    data: Tensor
-    radar: BistaticRadar
-    weight: Tensor
-    time_s: Tensor
-    unknowns: tuple[str, ...]
-
-    def fit(self, motion: PointMotion) -> PointFit:
-        """Return the least-squares amplitudes for motions (..., point), see `PointFit`."""
-        echo = self.echo(motion)
-        x, s = self.data.flatten(-2), echo.flatten(-2)
-        gram = s.conj() @ s.mT
-        amplitude = solved(gram, s.conj() @ x[..., None])[..., 0]
-        left = x - (amplitude[..., None, :] @ s)[..., 0, :]
-        slopes = phase_slopes(self.radar, motion, self.time_s, self.unknowns)
-        columns = (amplitude[..., None, None, None] * 1j * slopes * echo[..., None, :, :]).flatten(-2).flatten(-3, -2)
-        # without the parts that other amplitudes would take up
-        columns = columns - solved(gram, s.conj() @ columns.mT).mT @ s
-        return PointFit(
-            amplitude,
-            x.abs().square().sum(-1) - left.abs().square().sum(-1),
-            (columns.conj() @ left[..., None])[..., 0].real,
-            (columns.conj() @ columns.mT).real,
-        )
-
-    def echo(self, motion: PointMotion) -> Tensor:
-        """Return the echoes of unit amplitude of the points, (..., point, channel, pulse)."""
-        return self.weight * point_phasor(self.radar, motion, self.time_s, torch.complex128)
+def _fit_of_points(
+    data: Tensor, radar: BistaticRadar, weight: Tensor, time_s: Tensor, unknowns: tuple[str, ...], motion: PointMotion
+) -> PointFit:
+    """Fit the amplitudes of points with motions (..., point) and weights (..., point, 1, pulse)."""
+    echo = weight * point_phasor(radar, motion, time_s, torch.complex128)
+    x, s = data.flatten(-2), echo.flatten(-2)
+    gram = s.conj() @ s.mT
+    amplitude = solved(gram, s.conj() @ x[..., None])[..., 0]
+    left = x - (amplitude[..., None, :] @ s)[..., 0, :]
+    slopes = phase_slopes(radar, motion, time_s, unknowns)
+    columns = (amplitude[..., None, None, None] * 1j * slopes * echo[..., None, :, :]).flatten(-2).flatten(-3, -2)
+    # without the parts that other amplitudes would take up
+    columns = columns - solved(gram, s.conj() @ columns.mT).mT @ s
+    return PointFit(
+        amplitude,
+        x.abs().square().sum(-1) - left.abs().square().sum(-1),
+        (columns.conj() @ left[..., None])[..., 0].real,
+        (columns.conj() @ columns.mT).real,
+    )
 
 
 def explained_energy(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torchsar.multichannel.motion import Number, PointMotion, checked_channels
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell, SeenAperture, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.bank import Search, bank_search
-from torchsar.multichannel.velocity.likelihood import fitted_together, joined, maximum_likelihood
+from torchsar.multichannel.velocity.likelihood import fitted_together, maximum_likelihood
 from torchsar.multichannel.velocity.model import TINY, UNKNOWNS, Found, estimate_of, point_phasor
 from torchsar.multichannel.velocity.whitening import Whitening, sample_whitening
 from torchsar.radar import BistaticRadar
@@ -207,12 +207,11 @@ class _Job:
                 break
             clear = (share > _CLEAR_SHARE) & (further.energy > _LEAST_HIDDEN * found.energy)
             hidden = hidden | (tried & clear & self._overlap(found.motion, further.motion))
-            points = joined(points, further.motion)
+            points = points.each(lambda these, one: torch.cat([these, one[..., None]], -1), further.motion)
             for _ in range(_PASSES):
-                fit = fitted_together(self.data, self.radar, points, self.expected, self.unknowns)
-                points, left = fit.motion, fit.left
+                points, own, others, left = fitted_together(self.data, self.radar, points, self.expected, self.unknowns)
             done = tried & ~sample_whitening(left, self.radar).coloured
-            found, job, tried = _chosen_fit(fit.found, found, done), job.without(fit.others, done), tried & ~done
+            found, job, tried = _chosen_fit(own, found, done), job.without(others, done), tried & ~done
             hidden = hidden & ~done
         return job, found, hidden
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsar.core import Estimate, Outcome, Signal, Stage, take, unit_level
 from torchsar.multichannel.motion import Number, PointMotion, checked_channels
 from torchsar.multichannel.reconstruct import refuse_shifted
-from torchsar.multichannel.velocity.along_track import along_track_velocity, motion_from
+from torchsar.multichannel.velocity.along_track import along_track_velocity
 from torchsar.multichannel.velocity.aperture import Aperture, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.bank import Search
@@ -159,7 +159,8 @@ class _Velocity(Stage):
     ) -> tuple[Tensor, BistaticRadar, PointMotion, Aperture]:
         """Return data, radar, starting motion and aperture for an estimator that needs a start."""
         data, range_m = self.line(signal)
-        return data, self.radar, motion_from(self.radar, data, u_r_m_s, u_a_m_s, y0_m, range_m), self.aperture
+        motion = PointMotion.of(self.radar, data, u_r_m_s, u_a_m_s, y0_m, range_m)
+        return data, self.radar, motion.each(lambda value: value.expand(data.shape[:-2])), self.aperture
 
 
 class Interferometry(_Velocity):
