@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -153,24 +152,6 @@ def doppler_centre_hz(radar: BistaticRadar, motion: PointMotion, left_k1_m_s: fl
     return (motion.u_r_m_s - left_k1_m_s) / radar.wavelength_m
 
 
-class Prior(Protocol):
-    """Expected power of the echoes over Doppler."""
-
-    def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
-        """Return the expected power relative to its peak.
-
-        Args:
-            offset_hz: Doppler relative to the Doppler centre in Hz, any shape.
-            radar: Radar parameters.
-            motion: Motion of the point, shape (...,).
-
-        Returns:
-            Power ratio. Its shape is (...,) followed by the shape of `offset_hz`, or only the
-            latter if the power does not depend on the motion.
-        """
-        ...
-
-
 @names_arguments
 @dataclass(frozen=True)
 class ElementPattern:
@@ -183,7 +164,16 @@ class ElementPattern:
     """
 
     def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
-        """Return the antenna pattern over Doppler as a power ratio, see `Prior.power`."""
+        """Return the expected power relative to its peak: the antenna pattern over Doppler.
+
+        Args:
+            offset_hz: Doppler relative to the Doppler centre in Hz, any shape.
+            radar: Radar parameters.
+            motion: Motion of the point, shape (...,).
+
+        Returns:
+            Power ratio, (...,) followed by the shape of `offset_hz`.
+        """
         return torch.sinc(radar.element_m * offset_hz / motion.along_m_s[(...,) + (None,) * offset_hz.ndim]).square()
 
 
@@ -206,35 +196,12 @@ class FlatBand:
             raise ValueError(f"bandwidth_hz of a flat band must be positive, got {self.bandwidth_hz}")
 
     def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
-        """Return 1 inside the band and 0 outside, see `Prior.power`."""
+        """Return 1 inside the band and 0 outside, in the shape of `offset_hz`."""
         return (offset_hz.abs() <= self.bandwidth_hz / 2).to(torch.float64)
 
 
-class Rebuild(Protocol):
-    """Reconstruction method: the number of Doppler bands and the weights that separate them."""
-
-    @property
-    def bands(self) -> int:
-        """Number of reconstructed Doppler bands."""
-        ...
-
-    def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
-        """Return the weights that combine the spectra of the channels to Doppler bands.
-
-        Args:
-            radar: Radar parameters.
-            motion: Motion of the points, shape (...,).
-            n_pulse: Number of pulses.
-
-        Returns:
-            Weights, complex128 (..., band, channel), or (..., n_pulse, band, channel) where they
-            differ between bins.
-        """
-        ...
-
-    def refusal(self, channels: int) -> str | None:
-        """Return why the method cannot work with this number of channels, or None if it can."""
-        ...
+# Expected power of the echoes over Doppler.
+Prior = ElementPattern | FlatBand
 
 
 def _check_bands(bands: int) -> None:
@@ -333,6 +300,10 @@ class MinimumMeanSquare:
     def refusal(self, channels: int) -> str | None:
         """Return None, since a prior lets any number of channels separate the bands."""
         return None
+
+
+# Reconstruction method: the number of Doppler bands and the weights that separate them.
+Rebuild = LeastSquares | MinimumMeanSquare
 
 
 def clutter_covariance(

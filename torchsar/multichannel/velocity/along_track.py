@@ -12,7 +12,7 @@ Reference:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -92,37 +92,29 @@ def along_track_velocity(
     count = 2 * max(1, round(half_m_s / step_m_s)) + 1
     offsets = torch.linspace(-half_m_s, half_m_s, count, dtype=torch.float64, device=data.device)
     step = 2 * half_m_s / (count - 1)
-    top = _best(data, radar, start, aperture, centre, offsets)
-    aperture, uneven = seen_aperture(data, radar, replace(start, u_a_m_s=top.u_a_m_s), aperture)
+    u_a, energy, curvature, ended = _best(data, radar, start, aperture, centre, offsets)
+    aperture, uneven = seen_aperture(data, radar, replace(start, u_a_m_s=u_a), aperture)
     if bool(uneven.any()):
-        top = _best(data, radar, start, aperture, centre, offsets)
-    ended = top.edge
+        u_a, energy, curvature, ended = _best(data, radar, start, aperture, centre, offsets)
     # the ends of the aperture move with u_a from pulse to pulse: they are kept from here on
-    seen = Kept(aperture.weight(radar, replace(start, u_a_m_s=top.u_a_m_s), time_s))
+    seen = Kept(aperture.weight(radar, replace(start, u_a_m_s=u_a), time_s))
     for _ in range(fine):
         step = 2 * step / 5
         offsets = step * torch.arange(-2, 3, dtype=torch.float64, device=data.device)
-        top = _best(data, radar, start, seen, top.u_a_m_s, offsets)
-    found = torch.where(top.energy > 0, top.u_a_m_s.clamp(centre - half_m_s, centre + half_m_s), centre)
+        u_a, energy, curvature, _ = _best(data, radar, start, seen, u_a, offsets)
+    found = torch.where(energy > 0, u_a.clamp(centre - half_m_s, centre + half_m_s), centre)
     if not assess:
         return Estimate({"u_a_m_s": found})
-    return _assessed(data, radar, replace(start, u_a_m_s=found), seen, replace(top, edge=ended))
-
-
-@dataclass(frozen=True)
-class _Top:
-    """Maximum of tone energies over a grid: position, height, curvature, end of grid."""
-
-    u_a_m_s: Tensor
-    energy: Tensor
-    curvature: Tensor
-    edge: Tensor
+    return _assessed(data, radar, replace(start, u_a_m_s=found), seen, energy, curvature, ended)
 
 
 def _best(
     data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, centre: Tensor, offsets: Tensor
-) -> _Top:
-    """Find the maximum over the grid centre + offsets, refined by a parabola."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Find the maximum over the grid centre + offsets, refined by a parabola.
+
+    Returns its position, height and curvature, and whether it lies at an end of the grid.
+    """
     power = torch.stack(
         [tone_power(data, radar, replace(start, u_a_m_s=centre + offset), aperture) for offset in offsets]
     )
@@ -132,7 +124,7 @@ def _best(
     curvature = (low - 2 * middle + high).clamp_max(-TINY)
     edge = at != inner
     peak = offsets[inner] + step * (0.5 * (low - high) / curvature).clamp(-1, 1)
-    return _Top(centre + torch.where(edge, offsets[at], peak), middle, -curvature / step.square(), edge)
+    return centre + torch.where(edge, offsets[at], peak), middle, -curvature / step.square(), edge
 
 
 def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
@@ -157,29 +149,29 @@ def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture
     return spectrum.amax(-1) / weight.square().sum(-1).clamp_min(TINY)
 
 
-def _assessed(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture, top: _Top) -> Estimate:
+def _assessed(
+    data: Tensor,
+    radar: BistaticRadar,
+    motion: PointMotion,
+    aperture: Aperture,
+    energy: Tensor,
+    curvature: Tensor,
+    ended: Tensor,
+) -> Estimate:
     """Add standard deviation and outcome to the maximum."""
-    weight = aperture.weight(radar, motion, radar.pulse_axis(data.shape[-1]).values(data.device))[..., None, :]
-    lit = (weight != 0).expand(data.shape)
-    noise = ((data.abs().square() * lit).sum((-2, -1)) - top.energy).clamp_min(0) / lit.sum((-2, -1)).clamp_min(1)
-    beside = _noise_beside(data, radar, motion, weight).diagonal(dim1=-2, dim2=-1).mean(-1)
-    variance = torch.where(top.energy > 0, beside / top.curvature.clamp_min(TINY), torch.inf)
-    found = Found(motion, top.energy.sqrt(), noise, variance[..., None, None], top.energy, ("u_a_m_s",))
-    outcome, _ = outcome_of_point(data, radar, found, aperture, [(Outcome.OUTSIDE_SEARCH, top.edge)])
-    return Estimate(
-        {"u_a_m_s": motion.u_a_m_s},
-        {"u_a_m_s": variance.sqrt()},
-        quality_of(found.snr_db),
-        outcome,
-        info={"snr_db": found.snr_db},
-    )
-
-
-def _noise_beside(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor) -> Tensor:
-    """Return the noise beside the tone, see `noise_beside`; each channel has its amplitude."""
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
+    weight = aperture.weight(radar, motion, time_s)[..., None, :]
+    lit = (weight != 0).expand(data.shape)
+    noise = ((data.abs().square() * lit).sum((-2, -1)) - energy).clamp_min(0) / lit.sum((-2, -1)).clamp_min(1)
     deramped = data * point_phasor(radar, motion, time_s, data.dtype).conj()
     tone_hz = tone_frequency(deramped * weight, radar.prf_hz)
     still = deramped * unit_phasor(-tone_hz[..., None, None] * time_s, data.dtype)
+    # each channel has its amplitude
     amplitude = (still * weight).sum(-1, keepdim=True) / weight.square().sum(-1, keepdim=True).clamp_min(TINY)
-    return noise_beside(still - amplitude * weight, weight, amplitude, radar.channels + 2)
+    beside = noise_beside(still - amplitude * weight, weight, amplitude, radar.channels + 2)
+    spread = beside.diagonal(dim1=-2, dim2=-1).mean(-1) / curvature.clamp_min(TINY)
+    variance = torch.where(energy > 0, spread, torch.inf)
+    found = Found(motion, energy.sqrt(), noise, variance[..., None, None], energy, ("u_a_m_s",))
+    outcome, _ = outcome_of_point(data, radar, found, aperture, [(Outcome.OUTSIDE_SEARCH, ended)])
+    std, info = {"u_a_m_s": variance.sqrt()}, {"snr_db": found.snr_db}
+    return Estimate({"u_a_m_s": motion.u_a_m_s}, std, quality_of(found.snr_db), outcome, info)

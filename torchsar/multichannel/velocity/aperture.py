@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -21,26 +20,6 @@ _LEAST_SHARE = 0.8
 # in a dark part rarely reaches it where the point is detected
 _DARK = 0.35
 _FINE = 32  # chosen: parts of the profile, whose ends then lie within 2 % of the aperture
-
-
-class Aperture(Protocol):
-    """Expected amplitude of the echo of a point over slow time.
-
-    It is centred on the time at which the point is at broadside.
-    """
-
-    def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
-        """Return the expected amplitude of the echo of a point in each pulse.
-
-        Args:
-            radar: Radar parameters.
-            motion: Motion of the point, shape (...,).
-            time_s: Slow time in seconds, float64 (pulse,).
-
-        Returns:
-            Amplitude, float64 (..., pulse).
-        """
-        ...
 
 
 @names_arguments
@@ -67,8 +46,17 @@ class Dwell:
             )
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
-        """Return 1 within the duration and 0 outside, see `Aperture.weight`."""
-        since = time_s - _abeam_s(motion)[..., None]
+        """Return the expected amplitude of the echo of a point in each pulse.
+
+        Args:
+            radar: Radar parameters.
+            motion: Motion of the point, shape (...,).
+            time_s: Slow time in seconds, float64 (pulse,).
+
+        Returns:
+            1 within the duration and 0 outside, float64 (..., pulse).
+        """
+        since = time_s - (motion.y0_m / motion.along_m_s).detach()[..., None]  # broadside
         return (since.abs() < self.duration_s / 2).to(torch.float64)
 
 
@@ -82,7 +70,7 @@ class ElementBeam:
     """
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
-        """Return the pattern over slow time, see `Aperture.weight`.
+        """Return the pattern over slow time, see `Dwell.weight`.
 
         Not differentiable in the motion.
         """
@@ -99,13 +87,8 @@ class Kept:
     amplitude: Tensor
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
-        """Return the expected amplitude, see `Aperture.weight`."""
+        """Return the expected amplitude, see `Dwell.weight`."""
         return self.amplitude
-
-
-def _abeam_s(motion: PointMotion) -> Tensor:
-    """Return the time in seconds at which a point is at broadside."""
-    return (motion.y0_m / motion.along_m_s).detach()
 
 
 @dataclass(frozen=True)
@@ -121,9 +104,13 @@ class SeenAperture:
     profile: Tensor
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
-        """Return the expected amplitude times the profile, see `Aperture.weight`."""
+        """Return the expected amplitude times the profile, see `Dwell.weight`."""
         more = max(0, motion.trial_dims + 1 - self.profile.ndim)  # several hypotheses per trial
         return self.aperture.weight(radar, motion, time_s) * self.profile[(..., *[None] * more, slice(None))]
+
+
+# Expected amplitude of the echo of a point, centred on the time at which it is at broadside.
+Aperture = Dwell | ElementBeam | Kept | SeenAperture
 
 
 @torch.no_grad()
