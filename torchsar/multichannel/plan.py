@@ -17,7 +17,7 @@ from torchsar.core import Signal, Stage, block_bytes_of, unit_phasor
 from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.azimuth import azimuth_filter, image_axis
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import check_condition, doppler_axis, refuse_shifted
+from torchsar.multichannel.reconstruct import check_condition, doppler_axis, refuse_channels, refuse_shifted
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_centre_hz, doppler_offsets, shared_response
 from torchsar.radar import BistaticRadar
 
@@ -52,9 +52,7 @@ class AzimuthPlan:
         dtype: torch.dtype = torch.complex64,
     ) -> None:
         rebuild = LeastSquares() if rebuild is None else rebuild
-        why = rebuild.refusal(radar.channels)
-        if why is not None:
-            raise ValueError(why)
+        refuse_channels(radar, rebuild)
         if motion.u_r_m_s.ndim or motion.u_a_m_s.ndim or motion.y0_m.ndim or motion.range_m.ndim:
             raise ValueError(
                 "a plan serves one motion, got a motion with trial dimensions; use Reconstruct and FocusAzimuth "

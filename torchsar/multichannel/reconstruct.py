@@ -88,38 +88,34 @@ def reconstruct_lines(
             or there are too few channels for the bands.
     """
     data = checked_samples(data, "reconstruct_lines", "channel, pulse, range", finite=False)
-    _check_channels(data, radar, rebuild)
-    n, dtype = data.shape[-2], data.dtype
-    spectrum = fft_lines(_demodulated(data, radar, motion, rebuild.bands, left_k1_m_s))
-    # pulse 0 was sampled n // 2 pulses before slow time zero
-    late = linear_phasor(torch.tensor(n // 2 / n, dtype=torch.float64, device=data.device), 0.0, n, dtype)
-    spectrum = (
-        spectrum * (shared_response(radar, motion, n, rebuild.bands, dtype, left_k1_m_s).conj() * late)[..., None]
-    )
-    return _combined(spectrum, rebuild.weights(radar, motion, n).to(dtype) * rebuild.bands, motion.trial_dims)
-
-
-def _demodulated(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int, left_k1_m_s: float) -> Tensor:
-    """Demodulate data so that their FFT begins with the lowest bin of the lowest band."""
-    n = data.shape[-2]
-    turns = -doppler_centre_hz(radar, motion, left_k1_m_s) / radar.prf_hz - first_bin(n, bands) % n / n
-    return data * linear_phasor(turns, -(n // 2), n, data.dtype)[..., None, :, None]
-
-
-def _combined(spectrum: Tensor, weights: Tensor, trial_dims: int) -> Tensor:
-    """Combine spectra (..., channel, pulse, range) by weights to (..., band * pulse, range)."""
-    if weights.ndim == trial_dims + 2:
-        return (weights @ spectrum.flatten(-2)).unflatten(-1, spectrum.shape[-2:]).flatten(-3, -2)
-    return (weights @ spectrum.transpose(-3, -2)).transpose(-3, -2).flatten(-3, -2)
-
-
-def _check_channels(data: Tensor, radar: BistaticRadar, rebuild: Rebuild) -> None:
-    """Raise ValueError unless the data have the channels of the radar and enough for the bands."""
     if data.shape[-3] != radar.channels:
         raise ValueError(
             f"reconstruction expects {radar.channels} channels as in the radar's channel_m, got data "
             f"with {data.shape[-3]}; select the same channels in radar and data"
         )
+    refuse_channels(radar, rebuild)
+    n, dtype = data.shape[-2], data.dtype
+    # the FFT of the demodulated data begins with the lowest bin of the lowest band
+    turns = -doppler_centre_hz(radar, motion, left_k1_m_s) / radar.prf_hz - first_bin(n, rebuild.bands) % n / n
+    spectrum = fft_lines(data * linear_phasor(turns, -(n // 2), n, dtype)[..., None, :, None])
+    # pulse 0 was sampled n // 2 pulses before slow time zero
+    late = linear_phasor(torch.tensor(n // 2 / n, dtype=torch.float64, device=data.device), 0.0, n, dtype)
+    spectrum = (
+        spectrum * (shared_response(radar, motion, n, rebuild.bands, dtype, left_k1_m_s).conj() * late)[..., None]
+    )
+    weights = rebuild.weights(radar, motion, n).to(dtype) * rebuild.bands
+    if weights.ndim == motion.trial_dims + 2:
+        return (weights @ spectrum.flatten(-2)).unflatten(-1, spectrum.shape[-2:]).flatten(-3, -2)
+    return (weights @ spectrum.transpose(-3, -2)).transpose(-3, -2).flatten(-3, -2)
+
+
+def refuse_channels(radar: BistaticRadar, rebuild: Rebuild) -> None:
+    """Raise ValueError if the radar has too few channels for a reconstruction.
+
+    Args:
+        radar: Radar parameters.
+        rebuild: Reconstruction method.
+    """
     why = rebuild.refusal(radar.channels)
     if why is not None:
         raise ValueError(why)
@@ -150,9 +146,7 @@ class Reconstruct(Stage):
         if rebuild is not None and not hasattr(rebuild, "refusal"):
             raise TypeError(f"rebuild must be LeastSquares(bands) or MinimumMeanSquare(...), got {rebuild!r}")
         self.radar, self.rebuild, self.range_m = radar, rebuild or LeastSquares(), range_m
-        why = self.rebuild.refusal(radar.channels)
-        if why is not None:
-            raise ValueError(why)
+        refuse_channels(radar, self.rebuild)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Signal:
         """Reconstruct the full Doppler band with the velocities of each trial.
@@ -179,13 +173,9 @@ class Reconstruct(Stage):
         motion = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         check_condition(self.radar, motion, self.rebuild, signal.data.dtype)
         refuse_shifted(self.radar, signal.axis("pulse"))
-        n = signal.axis("pulse").n
-        doppler = doppler_axis(self.radar, n, self.rebuild.bands)
-        if "range" in signal.names:
-            return Signal(
-                reconstruct_lines(signal.data, self.radar, motion, self.rebuild), (doppler, signal.axis("range"))
-            )
-        return Signal(reconstruct(signal.data, self.radar, motion, self.rebuild), (doppler,))
+        doppler = doppler_axis(self.radar, signal.axis("pulse").n, self.rebuild.bands)
+        made = reconstruct_lines if "range" in signal.names else reconstruct
+        return Signal(made(signal.data, self.radar, motion, self.rebuild), (doppler, *signal.axes[2:]))
 
 
 def refuse_shifted(radar: BistaticRadar, pulse: Axis) -> None:

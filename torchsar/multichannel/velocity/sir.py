@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, take
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines
+from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines, refuse_channels
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
 from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.multichannel.velocity.assess import outcome_of_point
@@ -52,47 +52,26 @@ class Intensity:
     """Energies and summed amplitudes of a spectrum inside and outside the processed band.
 
     Args:
-        energy_in: Energy inside the band, shape (...,).
-        energy_out: Energy outside the band, shape (...,).
-        amplitude_in: Sum of the amplitudes inside the band, shape (...,).
-        amplitude_out: Sum of the amplitudes outside the band, shape (...,).
-        bins_in: Number of samples inside the band.
-        bins_out: Number of samples outside the band.
+        energy: Energies inside and outside the band, shape (2, ...).
+        amplitude: Sums of the amplitudes inside and outside the band, shape (2, ...).
+        bins: Numbers of samples inside and outside the band.
     """
 
-    energy_in: Tensor
-    energy_out: Tensor
-    amplitude_in: Tensor
-    amplitude_out: Tensor
-    bins_in: int
-    bins_out: int
-
-    @property
-    def total(self) -> Intensity:
-        """Energies and amplitudes summed over their last dimension."""
-        return self._each(lambda x: x.sum(-1))
+    energy: Tensor
+    amplitude: Tensor
+    bins: tuple[int, int]
 
     def summed(self, weight: Tensor) -> Intensity:
         """Return weighted sums over the last dimension, with weights (last, group).
 
-        The energies and amplitudes of the result have the shape (..., group).
+        The energies and amplitudes of the result have the shape (2, ..., group).
         """
-        return self._each(lambda x: x @ weight)
-
-    def _each(self, change: Callable[[Tensor], Tensor]) -> Intensity:
-        return Intensity(
-            change(self.energy_in),
-            change(self.energy_out),
-            change(self.amplitude_in),
-            change(self.amplitude_out),
-            self.bins_in,
-            self.bins_out,
-        )
+        return Intensity(self.energy @ weight, self.amplitude @ weight, self.bins)
 
     @property
     def power_ratio(self) -> Tensor:
         """Ratio Gamma 1 of the energies inside and outside the band, Eq. (37); 0 for zero data."""
-        return self.energy_in / self.energy_out.clamp_min(torch.finfo(self.energy_out.dtype).tiny)
+        return self.energy[0] / self.energy[1].clamp_min(TINY)
 
     @property
     def amplitude_ratio(self) -> Tensor:
@@ -100,8 +79,7 @@ class Intensity:
 
         It is 0 for zero data.
         """
-        outside = self.amplitude_out.clamp_min(torch.finfo(self.amplitude_out.dtype).tiny)
-        return self.bins_out / self.bins_in * self.amplitude_in / outside
+        return self.bins[1] / self.bins[0] * self.amplitude[0] / self.amplitude[1].clamp_min(TINY)
 
     @property
     def ratio(self) -> Tensor:
@@ -126,28 +104,30 @@ def signal_intensity(
         bandwidth_hz: Processed Doppler bandwidth in Hz.
 
     Returns:
-        Energies and summed amplitudes of shape (...,).
+        Energies and summed amplitudes of shape (2, ...).
 
     Raises:
         ValueError: If the reconstructed band does not exceed `bandwidth_hz`, or there are fewer
             channels than the reconstruction needs.
     """
-    return _intensity_of_bins(data, radar, motion, rebuild, bandwidth_hz).total
+    bins = _intensity_of_bins(data, radar, motion, rebuild, bandwidth_hz)
+    return Intensity(bins.energy.sum(-1), bins.amplitude.sum(-1), bins.bins)
 
 
 def _intensity_of_bins(
     data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float
 ) -> Intensity:
-    """Return the intensities of each alias frequency, (..., pulse); see `signal_intensity`."""
+    """Return the intensities of each alias frequency, (2, ..., pulse); see `signal_intensity`."""
     refuse_full_band(radar, rebuild, bandwidth_hz)
     n = data.shape[-2]
     spectrum = reconstruct_lines(data, radar, motion, rebuild)
     inside = doppler_offsets(n, rebuild.bands, radar.prf_hz, data.device).abs() <= bandwidth_hz / 2
     amplitude = spectrum.abs().to(torch.float64)
     lines = [line.sum(-1).unflatten(-1, (rebuild.bands, n)) for line in (amplitude.square(), amplitude)]
-    within, without = ([(line * mask.view(rebuild.bands, n)).sum(-2) for line in lines] for mask in (inside, ~inside))
+    masks = [mask.view(rebuild.bands, n) for mask in (inside, ~inside)]
+    energy, total = (torch.stack([(line * mask).sum(-2) for mask in masks]) for line in lines)
     samples = int(inside.sum()) * data.shape[-1]
-    return Intensity(within[0], without[0], within[1], without[1], samples, inside.numel() * data.shape[-1] - samples)
+    return Intensity(energy, total, (samples, inside.numel() * data.shape[-1] - samples))
 
 
 def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float) -> None:
@@ -236,9 +216,7 @@ class SignalIntensityRatio(Stage):
                 "search_m_s must be (least, largest) velocity with at least two steps of step_m_s between them, got "
                 f"search_m_s={self.search_m_s} and step_m_s={step_m_s}"
             )
-        why = self.rebuild.refusal(radar.channels)
-        if why is not None:
-            raise ValueError(why)
+        refuse_channels(radar, self.rebuild)
         refuse_full_band(radar, self.rebuild, bandwidth_hz)
 
     def forward(self, signal: Signal, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
@@ -271,13 +249,12 @@ class SignalIntensityRatio(Stage):
         start = torch.full(signal.trials, middle, dtype=torch.float64, device=lines.device)
         check_condition(self.radar, self._motion(lines, start, u_a_m_s, y0_m), self.rebuild, lines.dtype)
 
-        def intensity(u_r_m_s: Tensor) -> Intensity:
-            return _intensity_of_bins(
-                lines, self.radar, self._motion(lines, u_r_m_s, u_a_m_s, y0_m), self.rebuild, self.bandwidth_hz
-            )
+        def intensity(u_r_m_s: Tensor, of_bins=_intensity_of_bins) -> Intensity:
+            motion = self._motion(lines, u_r_m_s, u_a_m_s, y0_m)
+            return of_bins(lines, self.radar, motion, self.rebuild, self.bandwidth_hz)
 
         def cost(u_r_m_s: Tensor) -> Tensor:
-            return -torch.log(intensity(u_r_m_s).total.ratio.clamp_min(TINY))
+            return -torch.log(intensity(u_r_m_s, signal_intensity).ratio.clamp_min(TINY))
 
         reach = (self.search_m_s[1] - self.search_m_s[0]) / 2
         coarse, costs = grid_minimum(cost, start, reach, 2 * round(reach / self.step_m_s) + 1)
@@ -345,7 +322,7 @@ def _slope_and_bend(intensity: Callable[[Tensor], Intensity], value: Tensor, ste
 
 def _left_out(bins: Intensity) -> Tensor:
     """Return log Gamma (..., group) of all alias frequencies but those of one group."""
-    n = bins.energy_in.shape[-1]
-    group = torch.arange(n, device=bins.energy_in.device) % _GROUPS
+    n = bins.energy.shape[-1]
+    group = torch.arange(n, device=bins.energy.device) % _GROUPS
     kept = (group[:, None] != torch.arange(_GROUPS, device=group.device)).to(torch.float64)
     return torch.log(bins.summed(kept).ratio.clamp_min(TINY))
