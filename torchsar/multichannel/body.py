@@ -26,28 +26,17 @@ from torchsar.multichannel.motion import PointMotion, checked_channels
 from torchsar.multichannel.velocity.model import point_phasor
 
 _TINY = 1e-100  # floor of divisors, far from the overflow of reciprocals
-# Brightest lines used for the sharpness of an image, found by trial: 4 to 16 lines give the same
-# velocities, 16 take a quarter more time.
-_LINES_USED = 8
 # convention: two overlapping segments of two pulses
 _LEAST_PULSES = 4
-# Gauss-Newton steps of u_r: a third one changes it by a hundredth of its standard deviation at most
-_FIT_STEPS = 2
 # Largest predicted standard deviation of a reliable body, found by trial: of 200 pairs of ships in
 # one place, 35 were below it, 1.1 deviations off in the rms, one by more than 5. Ships on a sea
 # stay below 0.13. u_r displaces a body by about 20 m per m/s.
-_USABLE_M_S = 0.3
 # Least mean of the bright pixels of a reliable body: sea alone stays below 18 in 15 trials, a ship
 # that is weak but visible (4 dB in the frames of the tests) reaches 7000.
-_CREDIBLE = 40.0
+_USABLE_M_S, _CREDIBLE = 0.3, 40.0
 # A grid search takes 40 steps to either side of its middle (0.5 m/s in a search of +-20 m/s, as in
 # `Search`) and is repeated _GRIDS times, each time with a tenth of the step about the best point.
 _GRID_HALF, _GRID_REFINEMENT, _GRIDS = 40, 10, 3
-# Candidate motions evaluated together: 81 at once take two thirds of the time and nine times the
-# memory.
-_MOTIONS_AT_ONCE = 9
-# Fraction of the half width of the search: a velocity beyond it counts as at the end of the search.
-_INSIDE = 0.98
 # Rounds over the whole search; later rounds search near the velocities found, since the motion then
 # changes by little. Trades time against the number of rounds.
 _WIDE_ROUNDS = 2
@@ -130,33 +119,26 @@ def find_body(
     for number in range(rounds):
         u_r, std = _closing_speed(chip, image_s, image_m, half if number < _WIDE_ROUNDS else _NEAR_U_R_M_S)
         motion = PointMotion.imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
-        if not _inside_frame(frame, motion, extraction):
+        reach = extraction.range_m / 2  # of a body about its middle, which the lines must contain
+        if not frame.range_m[0] + reach <= motion.range_m <= frame.range_m[-1] - reach:
             return _body_of(chip, std, half, lost=True)
         moved = chip_about(data, frame, motion, extraction)
         if not len(moved.time_s[moved.lit]):  # the motion has left every pulse of the record
             return _body_of(chip, std, half, lost=True)
-        u_a = _along_speed(
-            moved,
-            extraction,
-            u_a_half_m_s if number < _WIDE_ROUNDS else _NEAR_U_A_M_S,
-        )
+        u_a = _along_speed(moved, u_a_half_m_s if number < _WIDE_ROUNDS else _NEAR_U_A_M_S)
         chip = chip_about(data, frame, PointMotion.imaged_at(frame.radar, data, u_r, u_a, image_s, image_m), extraction)
-        image_s, image_m, motion = _centred(chip, image_s, image_m)
+        motion = centred_motion(chip)
+        if motion is not chip.motion:
+            image_s, image_m = float(motion.image_s), float(motion.closest_m)
         chip = chip_about(data, frame, motion, extraction)
     u_r, std = _closing_speed(chip, image_s, image_m, _LAST_U_R_M_S)
-    for _ in range(_FIT_STEPS):
+    for _ in range(2):  # a third step changes u_r by a hundredth of its standard deviation at most
         motion = PointMotion.imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
         chip = chip_about(data, frame, motion, extraction)
-        fit = chip.fit(chip.picture(), image_s, image_m)
-        u_r, std = u_r + fit.step_m_s.clamp(-_LAST_U_R_M_S, _LAST_U_R_M_S), fit.std_m_s
+        step, std, _ = chip.fit(chip.picture(), image_s, image_m)
+        u_r = u_r + step.clamp(-_LAST_U_R_M_S, _LAST_U_R_M_S)
     motion = PointMotion.imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
     return _body_of(chip_about(data, frame, motion, extraction), std, half)
-
-
-def _inside_frame(frame: Frame, motion: PointMotion, extraction: Extraction) -> bool:
-    """Test whether the lines of the frame contain a body of this motion with a margin."""
-    reach = extraction.range_m / 2
-    return bool((frame.range_m[0] + reach <= motion.range_m) & (motion.range_m <= frame.range_m[-1] - reach))
 
 
 def _body_of(chip: Chip, std: Tensor, half_m_s: float, lost: bool = False) -> Body:
@@ -164,7 +146,8 @@ def _body_of(chip: Chip, std: Tensor, half_m_s: float, lost: bool = False) -> Bo
     picture = chip.picture()
     bright = picture.bright
     level = (picture.level * bright).sum() / bright.sum().clamp_min(1)
-    inside = (chip.motion.u_r_m_s.abs() < _INSIDE * half_m_s) & (not lost)
+    # a velocity in the last part of the search counts as at its end
+    inside = (chip.motion.u_r_m_s.abs() < 0.98 * half_m_s) & (not lost)
     outcome = worst(
         (Outcome.NOISE, ~(level > _CREDIBLE)),
         (Outcome.OUTSIDE_SEARCH, ~inside),
@@ -186,7 +169,7 @@ def _closing_speed(chip: Chip, image_s: float, image_m: float, half_m_s: float) 
                         chip.radar, chip.cells, part, chip.motion.u_a_m_s.expand(part.shape), image_s, image_m
                     )
                 )
-                for part in u_r.split(_MOTIONS_AT_ONCE)
+                for part in u_r.split(9)  # 81 at once take two thirds of the time and nine times the memory
             ]
         )
         shift, curvature = _peak(energy)
@@ -202,7 +185,7 @@ def _peak(values: Tensor) -> tuple[Tensor, Tensor]:
     return inner - len(values) // 2 + (0.5 * (high - low) / curvature).clamp(-1, 1), curvature
 
 
-def _along_speed(chip: Chip, extraction: Extraction, half_m_s: float) -> Tensor:
+def _along_speed(chip: Chip, half_m_s: float) -> Tensor:
     """Return the u_a within half_m_s of that of the chip with the sharpest image.
 
     Sharpness is the mean square of the intensities over their squared mean.
@@ -213,8 +196,9 @@ def _along_speed(chip: Chip, extraction: Extraction, half_m_s: float) -> Tensor:
     echo = chip.echo(chip.cells)[:, chip.lit] * torch.hann_window(
         len(time_s), dtype=torch.float64, device=time_s.device
     )
+    # the brightest lines: by trial, 4 to 16 give the same velocities, 16 take a quarter more time;
     # squares of squares must fit into single precision
-    echo = unit_level(echo[echo.abs().square().sum(-1).topk(min(_LINES_USED, len(echo))).indices])
+    echo = unit_level(echo[echo.abs().square().sum(-1).topk(min(8, len(echo))).indices])
     back = point_phasor(radar, motion, time_s, torch.complex128)[0]
     middle, step = motion.u_a_m_s, half_m_s / _GRID_HALF
     for _ in range(_GRIDS):
@@ -230,16 +214,6 @@ def _along_speed(chip: Chip, extraction: Extraction, half_m_s: float) -> Tensor:
         shift, _ = _peak(picture.square().sum((-2, -1)) / picture.sum((-2, -1)).square().clamp_min(_TINY))
         middle, step = middle + step * shift, step / _GRID_REFINEMENT
     return middle
-
-
-def _centred(chip: Chip, image_s: float, image_m: float) -> tuple[float, float, PointMotion]:
-    """Return the imaged slow time and range of the middle of the bright pixels, and its motion."""
-    motion = centred_motion(chip)
-    return (
-        (image_s, image_m, chip.motion)
-        if motion is chip.motion
-        else (float(motion.image_s), float(motion.closest_m), motion)
-    )
 
 
 def known_body(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Body:

@@ -32,22 +32,14 @@ from torchsar.multichannel.velocity.model import point_phasor
 from torchsar.radar import BistaticRadar
 
 _TINY = 1e-100  # floor of divisors, far from the overflow of reciprocals
-# Range cells left out beside a body, whose side lobes reach there. Found by trial: 2 to 12 cells
-# give the same velocities.
-_GUARD_CELLS = 6
 # Lines beside a body are left out beyond this many standard deviations of their energies, which are
 # 1.48 times the median deviation of a normal distribution. Found by trial: 4 to 8 leave out lines
 # that hold other ships, and no sea.
 _OUTLIER, _OUTLIER_ROUNDS, _MAD_TO_STD = 6.0, 3, 1.4826
-# difference of u_r for its derivative, far below any standard deviation
-_SPEED_STEP_M_S = 1e-3
 _LEAST_LINES = 12  # convention: fewest lines beside a body for the covariance of the sea
-_LOADING = 1e-5  # relative to the mean power: keeps the covariance of noise-free data invertible
 # Intensities in units of the residual sea and noise of a pixel, all found by trial. Pixels of a
 # body exceed _BRIGHT (4 to 30 give the same velocities) and this share of the brightest pixel.
 _BRIGHT, _BRIGHT_SHARE = 12.0, 0.01
-# Pixels above this are subtracted with a body: less removes sea as well, more leaves some body.
-_CLEAR = 2.0
 
 
 @names_arguments
@@ -249,12 +241,13 @@ class Chip:
             Echo, complex128 (line, channel, pulse), zero in pulses in which no part of the body is
             illuminated.
         """
-        clear = picture.amplitude * (picture.level > _CLEAR)
+        # by trial: a lower level removes sea as well, a higher one leaves some of the body
+        clear = picture.amplitude * (picture.level > 2.0)
         spectrum = torch.zeros(len(clear), self.radar.channels, self.segments.n, dtype=clear.dtype, device=clear.device)
         spectrum[..., picture.index] = clear[:, None] * self.steering(self.motion, picture.tone_hz).mT
         return torch.fft.ifft(spectrum) * self.lit
 
-    def fit(self, picture: Picture, image_s: float, image_m: float) -> Fit:
+    def fit(self, picture: Picture, image_s: float, image_m: float) -> tuple[Tensor, Tensor, Tensor]:
         """Fit u_r to the echo of an image of the body, in which each pixel has a tone of its own.
 
         The phases that `energy` gives a cell are those of the middle of its Doppler bin, up to half
@@ -267,6 +260,19 @@ class Chip:
 
         Returns:
             One Gauss-Newton step of the maximum-likelihood fit, with a free amplitude in each cell.
+
+            The change of u_r that explains more of the data, in m/s.
+
+            The predicted standard deviation of u_r in m/s: that of sea and noise times the misfit,
+            since an error of the model is the same in all cells of a scatterer and does not
+            average; or the scatter of the steps that single range lines and segments ask for, if
+            that is more; or the standard deviation between the speeds of range lines, beyond that
+            of sea and noise, if that is still more: lines of one body have one speed, and where
+            they have not, two bodies overlap, and u_r lies between their speeds.
+
+            The misfit, the energy that is left of the bright cells for each free dimension,
+            relative to the covariance of sea and noise: 1 if scatterers of one velocity explain
+            them.
         """
         made = self.segments.of(self.model(picture))
         backed = torch.einsum("sfmn,lnsf->lmsf", self.inverse, made)
@@ -276,9 +282,10 @@ class Chip:
             """Return the part of cells that no amplitude of the model explains."""
             return cells - ((backed.conj() * cells).sum(1) / level.clamp_min(_TINY))[:, None] * made
 
-        speed = self.motion.u_r_m_s + _SPEED_STEP_M_S
+        step_m_s = 1e-3  # for the derivative, far below any standard deviation
+        speed = self.motion.u_r_m_s + step_m_s
         there = PointMotion.imaged_at(self.radar, self.cells, speed, self.motion.u_a_m_s, image_s, image_m)
-        turns = (self.motion.y0_m - there.y0_m) / (_SPEED_STEP_M_S * self.radar.wavelength_m * there.range_m)
+        turns = (self.motion.y0_m - there.y0_m) / (step_m_s * self.radar.wavelength_m * there.range_m)
         slope = across(2j * math.pi * turns * self.radar.channels_at(made.device)[:, None, None] * made)
         pull = torch.einsum("lmsf,sfmn->lnsf", slope.conj(), self.inverse)
         curvature = (pull * slope).sum().real.clamp_min(_TINY)
@@ -294,7 +301,7 @@ class Chip:
         apart = (by_line.square() / share.clamp_min(_TINY)).sum() - step.sum().square()
         apart = apart - twice * (share > 0).sum() / curvature
         std = torch.sqrt(twice / curvature) * misfit.clamp_min(1.0)
-        return Fit(step.sum(), torch.maximum(std, torch.maximum(scatter, apart).sqrt()), misfit)
+        return step.sum(), torch.maximum(std, torch.maximum(scatter, apart).sqrt()), misfit
 
     def echo(self, cells: Tensor) -> Tensor:
         """Return the most likely deramped echo of scatterers that move as the middle of the body.
@@ -320,27 +327,6 @@ class Chip:
         inside = (hz.abs() <= self.tone_hz.abs().max()).nonzero()[:, 0]
         own, others = (torch.fft.fft(self.echo(cells))[:, inside] for cells in (self.cells, self.beside))
         return Picture(own, others.abs().square().mean().clamp_min(_TINY), hz[inside], inside)
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Fit of the slant-range speed to the echo of an image of a body.
-
-    Args:
-        step_m_s: Change of u_r that explains more of the data, in m/s.
-        std_m_s: Predicted standard deviation of u_r in m/s: that of sea and noise times `misfit`,
-            since an error of the model is the same in all cells of a scatterer and does not
-            average; or the scatter of the steps that single range lines and segments ask for, if
-            that is more; or the standard deviation between the speeds of range lines, beyond that
-            of sea and noise, if that is still more: lines of one body have one speed, and where
-            they have not, two bodies overlap, and u_r lies between their speeds.
-        misfit: Energy that is left of the bright cells for each free dimension, relative to the
-            covariance of sea and noise: 1 if scatterers of one velocity explain them.
-    """
-
-    step_m_s: Tensor
-    std_m_s: Tensor
-    misfit: Tensor
 
 
 @dataclass(frozen=True)
@@ -372,8 +358,7 @@ class Picture:
         They exceed 12 times the mean intensity of the residual sea and noise, and 1 % of the
         brightest pixel.
         """
-        level = self.level
-        return level > torch.maximum(level.new_tensor(_BRIGHT), _BRIGHT_SHARE * level.max())
+        return self.level > (_BRIGHT_SHARE * self.level.max()).clamp_min(_BRIGHT)
 
 
 def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Chip:
@@ -394,16 +379,14 @@ def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
         ValueError: If the data have no range cell of the body, or fewer than 12 beside it.
     """
     off = (frame.range_m - motion.range_m).abs()
-    guard_m = _GUARD_CELLS * frame.radar.range_step_m
-    body, beside = (near.nonzero()[:, 0] for near in (off <= extraction.range_m, off > extraction.range_m + guard_m))
+    # side lobes of the body reach the cells left out; by trial, 2 to 12 give the same velocities
+    guarded_m = extraction.range_m + 6 * frame.radar.range_step_m
+    body, beside = (near.nonzero()[:, 0] for near in (off <= extraction.range_m, off > guarded_m))
     if not len(body) or len(beside) < _LEAST_LINES:
-        counts = (
-            f"{len(body)} cells within {extraction.range_m:g} m of "
-            f"its range of {float(motion.range_m):.0f} m and {len(beside)} beside it"
-        )
         raise ValueError(
             f"the data must hold range cells of the body and at least {_LEAST_LINES} beside it for the covariance of "
-            f"the sea, got {counts}; give more range cells or a smaller extraction"
+            f"the sea, got {len(body)} cells within {extraction.range_m:g} m of its range of "
+            f"{float(motion.range_m):.0f} m and {len(beside)} beside it; give more range cells or a smaller extraction"
         )
     lit = (
         frame.time_s - motion.y0_m / motion.along_m_s
@@ -469,7 +452,8 @@ def _inverse_covariance(chip: Chip) -> Tensor:
     aligned = chip.beside.movedim(1, -1) * turn.conj()
     covariance = torch.einsum("lsfm,lsfn->smn", aligned, aligned.conj()) / (aligned.shape[0] * aligned.shape[2])
     level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1).clamp_min(_TINY)
-    covariance = covariance + _LOADING * level[:, None, None] * torch.eye(
+    # the diagonal keeps the covariance of noise-free data invertible
+    covariance = covariance + 1e-5 * level[:, None, None] * torch.eye(
         covariance.shape[-1], dtype=covariance.dtype, device=covariance.device
     )
     return turn[..., :, None] * matrix_inverse(covariance)[:, None] * turn.conj()[..., None, :]

@@ -68,14 +68,11 @@ class PointMotion:
                 or the range is not positive.
         """
         near = radar.reference_range_m if range_m is None else range_m
-        motion = PointMotion(
-            per_trial(u_r_m_s, 0, like),
-            per_trial(u_a_m_s, 0, like),
-            per_trial(y0_m, 0, like),
-            per_trial(near, 0, like),
-            radar.speed_m_s,
-        )
-        _check_motion(motion)
+        values = (per_trial(value, 0, like) for value in (u_r_m_s, u_a_m_s, y0_m, near))
+        motion = PointMotion(*values, speed_m_s=radar.speed_m_s)
+        finite = [torch.isfinite(getattr(motion, name)).all() for name in _VALUES]
+        possible = [(value.detach() > 0).all() for value in (motion.along_m_s, motion.range_m)]
+        check_value(torch.stack(finite + possible).all(), lambda fine: None if fine else _refuse(motion))
         return motion
 
     @staticmethod
@@ -168,8 +165,7 @@ class PointMotion:
         rest, the along-track position y0 at t = 0, the slant-range speed u_r, the along-track speed
         v of the receiver relative to the point, and V^2 = v^2 + u_r^2.
         """
-        cross = self.along_m_s * self.range_m - self.u_r_m_s * self.y0_m
-        return cross / self.square_m2_s2.sqrt()
+        return (self.along_m_s * self.range_m - self.u_r_m_s * self.y0_m) / self.square_m2_s2.sqrt()
 
     def position_m(self, image_s: Tensor) -> Tensor:
         """Return the along-track position y0 at t = 0 of a point that appears at a given slow time.
@@ -188,13 +184,6 @@ class PointMotion:
             Remote Sens. 2020, 12, 1703, Eq. (30), which is printed with the opposite sign.
         """
         return (self.square_m2_s2 * image_s - self.u_r_m_s * self.range_m) / self.along_m_s
-
-
-def _check_motion(motion: PointMotion) -> None:
-    """Raise ValueError for motions that are not finite, overtake the receiver or have no range."""
-    finite = [torch.isfinite(getattr(motion, name)).all() for name in _VALUES]
-    possible = [(value.detach() > 0).all() for value in (motion.along_m_s, motion.range_m)]
-    check_value(torch.stack(finite + possible).all(), lambda fine: None if fine else _refuse(motion))
 
 
 def _refuse(motion: PointMotion) -> None:

@@ -16,7 +16,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -30,7 +31,7 @@ from torchsar.multichannel.chip import Extraction
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.response import LeastSquares, Rebuild, band_matrix, first_bin, shared_response
-from torchsar.multichannel.stationary import StationaryImage
+from torchsar.multichannel.stationary import StationaryImage, stationary_axis
 from torchsar.multichannel.velocity.whitening import line_whitening
 from torchsar.radar import BistaticRadar
 
@@ -105,9 +106,9 @@ class SceneImage:
     conventional: Signal
     rest: Signal
     fused: Signal
-    bodies: list[Body] = field(default_factory=list)
-    estimate: Estimate | None = None
-    data: Signal | None = None
+    bodies: list[Body]
+    estimate: Estimate
+    data: Signal
 
 
 class ImageMovers(Stage):
@@ -188,20 +189,17 @@ class ImageMovers(Stage):
         if known is not None:
             remaining, bodies = self._extract_known(remaining, known)
         else:
-            for image in self._detection_images(signal):
-                remaining, bodies = self._extract_detected(remaining, image, bodies)
+            remaining, bodies = self._extract_detected(remaining, self.image, bodies)
+            if self.detector.suppressed_m_s:
+                speeds_m_s = self.detector.suppressed_m_s
+                shown = partial(suppressed_image, radar=self.radar, image=self.image, speeds_m_s=speeds_m_s)
+                remaining, bodies = self._extract_detected(remaining, shown, bodies)
         rest = self.image(remaining)
         fused = rest
         for body in bodies:
             if self._moves(body):
                 fused = placed(fused, body, self.extraction)
         return SceneImage(conventional, rest, fused, bodies, self._estimate(bodies, signal.data), remaining)
-
-    def _detection_images(self, signal: Signal):
-        """Yield imaging functions: the conventional image, then images with suppressed sea."""
-        yield self.image
-        if self.detector.suppressed_m_s:
-            yield lambda data: suppressed_image(data, self.radar, self.image, self.detector.suppressed_m_s)
 
     def _extract_detected(self, remaining: Signal, image_of, bodies: list[Body]) -> tuple[Signal, list[Body]]:
         """Detect targets and remove those that move, strongest first, until none is new."""
@@ -214,7 +212,10 @@ class ImageMovers(Stage):
             ):
                 continue
             visited.append(candidate)
-            body = self._body(remaining, candidate)
+            lines, frame = self._lines(remaining, candidate.range_m)
+            image_s, image_m = candidate.azimuth_m / self.radar.speed_m_s, candidate.range_m
+            data = remaining.data[..., lines]
+            body = find_body(data, frame, image_s, image_m, self.extraction, u_a_half_m_s=self.u_a_half_m_s)
             if not bool(body.ok) or any(self._side_lobe(body, other) for other in bodies):
                 continue
             bodies.append(body)
@@ -303,18 +304,6 @@ class ImageMovers(Stage):
         lines = slice(max(0, at - half), min(axis.n, at + half))
         frame = Frame.of(self.radar, signal)
         return lines, replace(frame, range_m=frame.range_m[lines])
-
-    def _body(self, signal: Signal, detection: Detection) -> Body:
-        """Find the body of a detection."""
-        lines, frame = self._lines(signal, detection.range_m)
-        return find_body(
-            signal.data[..., lines],
-            frame,
-            detection.azimuth_m / self.radar.speed_m_s,
-            detection.range_m,
-            self.extraction,
-            u_a_half_m_s=self.u_a_half_m_s,
-        )
 
     def _removed(self, signal: Signal, body: Body) -> Signal:
         """Return the data without the echo of a body."""
@@ -411,26 +400,21 @@ class MoversImage(Stage):
         Raises:
             ValueError: If some of the four values are missing, or as in `ImageMovers`.
         """
-        values = [u_r_m_s, u_a_m_s, y0_m, range_m]
-        known = [None if x is None else x.to(torch.float64).expand(*signal.trials, x.shape[-1]) for x in values]
-        if any(x is None for x in known) != all(x is None for x in known):
+        values = [x for x in (u_r_m_s, u_a_m_s, y0_m, range_m) if x is not None]
+        if len(values) not in (0, 4):
             raise ValueError(
                 "known targets need all of u_r_m_s, u_a_m_s, y0_m and range_m, got only some of them; "
                 "connect all four, or none to detect the targets"
             )
         frames = signal.data.reshape(-1, *signal.data.shape[-3:])
-        rows = [None if x is None else x.reshape(len(frames), -1) for x in known]
-        made = [
-            self.flow(Signal(frame, signal.axes), self._motions(frame, [None if x is None else x[i] for x in rows]))
-            for i, frame in enumerate(frames)
-        ]
-
-        def stacked(images: list[Signal]) -> Tensor:
-            return torch.stack([image.data for image in images]).unflatten(0, signal.trials or (1,))
-
+        known = [x.to(torch.float64).expand(*signal.trials, x.shape[-1]).reshape(len(frames), -1) for x in values]
+        made = []
+        for frame, *of_frame in zip(frames, *known, strict=True):
+            pairs = zip(*of_frame, strict=True)
+            motions = [PointMotion.of(self.flow.radar, frame.real, *pair) for pair in pairs] if known else None
+            made.append(self.flow(Signal(frame, signal.axes), motions))
         parts = []
         for one in made:
-            assert one.estimate is not None
             info = {**one.estimate.info, "rest": one.rest.data, "conventional": one.conventional.data}
             tables = (one.estimate.value, one.estimate.std, info)
             value, std, info = ({name: x[None] for name, x in table.items()} for table in tables)
@@ -438,15 +422,8 @@ class MoversImage(Stage):
             if not self.assess:
                 outcome = torch.where(info["level"] > 0, Outcome.NOT_ASSESSED, outcome)
             parts.append(Estimate(value, std, one.estimate.quality[None], outcome, info))
-        fused = stacked([one.fused for one in made])
-        image = Signal(fused if signal.trials else fused[0], made[0].fused.axes)
-        return image, Estimate.joined(parts, signal.trials)
-
-    def _motions(self, frame: Tensor, values: list[Tensor | None]) -> list[PointMotion] | None:
-        """Motions of all targets of one frame, None where they are not known."""
-        numbers = [x for x in values if x is not None]
-        pairs = zip(*numbers, strict=True)
-        return [PointMotion.of(self.flow.radar, frame.real, *of_one) for of_one in pairs] if numbers else None
+        fused = torch.stack([one.fused.data for one in made]).view(*signal.trials, *made[0].fused.data.shape)
+        return Signal(fused, made[0].fused.axes), Estimate.joined(parts, signal.trials)
 
 
 def suppressed_image(
@@ -476,16 +453,14 @@ def suppressed_image(
     data = signal.data.movedim(-1, -3)
     whitening = line_whitening(data, radar, samples=_BINS_AVERAGED * data.shape[-3])
     backed = whitening.expanded(data.shape[-3]).backed(data.to(torch.complex128)).movedim(-3, -1).to(signal.data.dtype)
-    best, shown = None, None
+    best = signal.data.real.new_zeros(())
     for speed in speeds_m_s:
-        matched = image.focused(
-            _matched(backed, radar, PointMotion.of(radar, signal.data.real, speed), image.rebuild.bands), signal
-        )
-        level = matched.data.abs().square()
-        level = level / level.median().clamp_min(torch.finfo(level.dtype).tiny)
-        best, shown = level if best is None else torch.maximum(best, level), matched
-    assert best is not None and shown is not None
-    return shown.with_data(best.sqrt().to(signal.data.dtype))
+        motion = PointMotion.of(radar, signal.data.real, speed)
+        shown = image.focused(_matched(backed, radar, motion, image.rebuild.bands), signal)
+        level = shown.data.abs().square()
+        best = torch.maximum(best, level / level.median().clamp_min(torch.finfo(level.dtype).tiny))
+    axes = (stationary_axis(radar, signal.axis("pulse"), image.rebuild.bands), signal.axis("range"))
+    return Signal(best.sqrt().to(signal.data.dtype), axes)
 
 
 def _matched(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:

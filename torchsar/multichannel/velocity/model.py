@@ -118,23 +118,9 @@ class Found:
 
     @property
     def snr_db(self) -> Tensor:
-        """SNR of the point over all its samples in dB, limited to +-300 dB."""
-        return energy_ratio_db(self.energy, self.noise_power)
-
-
-def energy_ratio_db(energy: Tensor, noise_power: Tensor) -> Tensor:
-    """Return the ratio of an energy to a noise power in dB.
-
-    The ratio is limited to +-300 dB, and is -300 dB where energy and noise power are zero.
-
-    Args:
-        energy: Energies, any shape, float64.
-        noise_power: Noise powers in the same unit, a shape that broadcasts.
-
-    Returns:
-        Ratios in dB, the broadcast shape.
-    """
-    return 10 * torch.log10((energy / noise_power.clamp_min(TINY)).clamp(1e-30, 1e30))
+        """SNR of the point over all its samples in dB, -300 dB for zeros, limited to +-300 dB."""
+        ratio = self.energy / self.noise_power.clamp_min(TINY)
+        return 10 * torch.log10(ratio.clamp(1e-30, 1e30))
 
 
 def covariance_of(normal: Tensor, noise_power: Tensor) -> Tensor:

@@ -179,14 +179,6 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES)
     total = products.new_zeros(*products.shape[:-1], (n - 1) * groups // n + 1).index_add(-1, group, products).sum(-4)
     size = total.real.new_zeros(total.shape[-1]).index_add(0, group, total.real.new_ones(n)) * count
     covariance = (total / size).movedim(-1, -3)
-    covariance, log_det, coloured = _or_white(covariance, size)
-    inverse = matrix_inverse(cholesky_factor(covariance))
-    return Whitening(inverse[..., group, :, :] * ramp.conj().mT[..., None, :], log_det, coloured)
-
-
-def _or_white(covariance: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return loaded or white covariances, the log determinant, and which trials are coloured."""
-    channels = covariance.shape[-1]
     eye = torch.eye(channels, dtype=covariance.dtype, device=covariance.device)
     level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1)
     power = (level * size).sum(-1) / size.sum()
@@ -196,8 +188,7 @@ def _or_white(covariance: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]
     white = channels * torch.log(power) * size.sum()
     chance = _EVIDENCE * channels**2 * len(size) / 2
     plain = (white - log_det < chance) | ~(level.amax(-1) > 0)
-    return (
-        torch.where(plain[..., None, None, None], power[..., None, None, None] * eye, loaded),
-        torch.where(plain, white, log_det),
-        ~plain,
-    )
+    covariance = torch.where(plain[..., None, None, None], power[..., None, None, None] * eye, loaded)
+    inverse = matrix_inverse(cholesky_factor(covariance))
+    factor = inverse[..., group, :, :] * ramp.conj().mT[..., None, :]
+    return Whitening(factor, torch.where(plain, white, log_det), ~plain)
