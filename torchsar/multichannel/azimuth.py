@@ -145,19 +145,15 @@ class FocusAzimuth(Stage):
             Image with the axes (azimuth[, range]) in metres.
         """
         lines, doppler = "range" in signal.names, signal.axis("doppler")
-        near = self._range(signal) if range_m is None else range_m
+        near = self.radar.reference_range_m if range_m is None else range_m
+        if range_m is None and lines:
+            across, energy = signal.axis("range"), signal.data.detach().abs().square().sum(-2)
+            near = across.start + across.step * energy.argmax(-1).to(torch.float64)
         u_r, u_a, y0, near = (per_trial(value, int(lines), signal.data) for value in (u_r_m_s, u_a_m_s, y0_m, near))
         motion = PointMotion.of(self.radar, signal.data, u_r, u_a, y0, near)
         data = signal.data.mT if lines else signal.data
         image = focus_azimuth(data, doppler.values(data.device), self.radar, motion, self.bandwidth_hz)
         return Signal(image.mT if lines else image, (image_axis(self.radar, doppler), *signal.axes[1:]))
-
-    def _range(self, signal: Signal) -> Number:
-        """Return the range of the strongest line, or the reference range without a range axis."""
-        if "range" not in signal.names:
-            return self.radar.reference_range_m
-        across = signal.axis("range")
-        return across.start + across.step * signal.data.detach().abs().square().sum(-2).argmax(-1).to(torch.float64)
 
 
 def image_axis(radar: BistaticRadar, doppler: Axis) -> Axis:

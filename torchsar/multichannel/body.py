@@ -20,12 +20,11 @@ from torch import Tensor
 from torchsar.core import Outcome, unit_level, worst
 from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import smooth_length
-from torchsar.multichannel.chip import Chip, Extraction, Picture, centred_motion, chip_about
+from torchsar.multichannel.chip import TINY, Chip, Extraction, Picture, centred_motion, chip_about
 from torchsar.multichannel.migration import Frame, envelope_phasor
 from torchsar.multichannel.motion import PointMotion, checked_channels
 from torchsar.multichannel.velocity.model import point_phasor
 
-_TINY = 1e-100  # floor of divisors, far from the overflow of reciprocals
 # convention: two overlapping segments of two pulses
 _LEAST_PULSES = 4
 # Largest predicted standard deviation of a reliable body, found by trial: of 200 pairs of ships in
@@ -39,8 +38,7 @@ _USABLE_M_S, _CREDIBLE = 0.3, 40.0
 _GRID_HALF, _GRID_REFINEMENT, _GRIDS = 40, 10, 3
 # Rounds over the whole search; later rounds search near the velocities found, since the motion then
 # changes by little. Trades time against the number of rounds.
-_WIDE_ROUNDS = 2
-_NEAR_U_R_M_S, _NEAR_U_A_M_S, _LAST_U_R_M_S = 2.0, 1.0, 1.0
+_WIDE_ROUNDS, _NEAR_U_R_M_S, _NEAR_U_A_M_S, _LAST_U_R_M_S = 2, 2.0, 1.0, 1.0
 
 
 @names_arguments
@@ -181,7 +179,7 @@ def _peak(values: Tensor) -> tuple[Tensor, Tensor]:
     """Return the position of the maximum from the middle, in steps, and its curvature."""
     inner = values.argmax().clamp(1, len(values) - 2)
     low, top, high = values[inner + torch.arange(-1, 2, device=values.device)]
-    curvature = (2 * top - low - high).clamp_min(_TINY)
+    curvature = (2 * top - low - high).clamp_min(TINY)
     return inner - len(values) // 2 + (0.5 * (high - low) / curvature).clamp(-1, 1), curvature
 
 
@@ -211,7 +209,7 @@ def _along_speed(chip: Chip, half_m_s: float) -> Tensor:
             .square()
             .to(torch.float64)
         )
-        shift, _ = _peak(picture.square().sum((-2, -1)) / picture.sum((-2, -1)).square().clamp_min(_TINY))
+        shift, _ = _peak(picture.square().sum((-2, -1)) / picture.sum((-2, -1)).square().clamp_min(TINY))
         middle, step = middle + step * shift, step / _GRID_REFINEMENT
     return middle
 

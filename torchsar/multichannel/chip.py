@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,7 +32,7 @@ from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.model import point_phasor
 from torchsar.radar import BistaticRadar
 
-_TINY = 1e-100  # floor of divisors, far from the overflow of reciprocals
+TINY = 1e-100  # floor of divisors, far from the overflow of reciprocals
 # Lines beside a body are left out beyond this many standard deviations of their energies, which are
 # 1.48 times the median deviation of a normal distribution. Found by trial: 4 to 8 leave out lines
 # that hold other ships, and no sea.
@@ -86,26 +87,14 @@ class Segments:
     rows: Tensor
 
     @property
-    def hop(self) -> int:
-        """Number of pulses from one segment to the next, half the length of a segment."""
-        return self.length // 2
-
-    def window(self) -> Tensor:
-        """Return the Hann window of a segment, float64 (length,)."""
-        return torch.hann_window(self.length, dtype=torch.float64, device=self.bins.device)
+    def _windows(self) -> dict[str, Any]:
+        """Arguments of the transforms in both directions."""
+        window = torch.hann_window(self.length, dtype=torch.float64, device=self.bins.device)
+        return {"n_fft": self.length, "hop_length": self.length // 2, "window": window, "onesided": False}
 
     def of(self, x: Tensor) -> Tensor:
         """Return the short-time spectra (..., segment, tone) of complex128 data (..., pulse)."""
-        made = torch.stft(
-            x.flatten(0, -2),
-            self.length,
-            self.hop,
-            window=self.window(),
-            center=True,
-            pad_mode="constant",
-            onesided=False,
-            return_complex=True,
-        )
+        made = torch.stft(x.flatten(0, -2), **self._windows, pad_mode="constant", return_complex=True)
         return made[:, self.bins][..., self.rows].mT.unflatten(0, x.shape[:-1])
 
     def back(self, cells: Tensor) -> Tensor:
@@ -114,19 +103,14 @@ class Segments:
         This is the inverse of `of`; segments and FFT bins that were left out count as zero.
         """
         full = torch.zeros(
-            cells.shape[:-2].numel(), self.length, self.n // self.hop + 1, dtype=cells.dtype, device=cells.device
+            cells.shape[:-2].numel(),
+            self.length,
+            self.n // (self.length // 2) + 1,
+            dtype=cells.dtype,
+            device=cells.device,
         )
         full[:, self.bins[:, None], self.rows] = cells.flatten(0, -3).mT
-        made = torch.istft(
-            full,
-            self.length,
-            self.hop,
-            window=self.window(),
-            center=True,
-            onesided=False,
-            length=self.n,
-            return_complex=True,
-        )
+        made = torch.istft(full, **self._windows, length=self.n, return_complex=True)
         return made.unflatten(0, cells.shape[:-2])
 
 
@@ -200,7 +184,7 @@ class Chip:
         """Return R^-1 a (..., segment, tone, channel) and a^H R^-1 a (..., segment, tone)."""
         steering = self.steering(motion, self.tone_hz)
         weight = torch.einsum("sfmn,...fn->...sfm", self.inverse, steering)
-        return weight, (steering[..., None, :, :].conj() * weight).sum(-1).real.clamp_min(_TINY)
+        return weight, (steering[..., None, :, :].conj() * weight).sum(-1).real.clamp_min(TINY)
 
     def energy(self, motions: PointMotion) -> Tensor:
         """Return the energy of the data that scatterers with each candidate motion explain.
@@ -280,7 +264,7 @@ class Chip:
 
         def across(cells: Tensor) -> Tensor:
             """Return the part of cells that no amplitude of the model explains."""
-            return cells - ((backed.conj() * cells).sum(1) / level.clamp_min(_TINY))[:, None] * made
+            return cells - ((backed.conj() * cells).sum(1) / level.clamp_min(TINY))[:, None] * made
 
         step_m_s = 1e-3  # for the derivative, far below any standard deviation
         speed = self.motion.u_r_m_s + step_m_s
@@ -288,17 +272,17 @@ class Chip:
         turns = (self.motion.y0_m - there.y0_m) / (step_m_s * self.radar.wavelength_m * there.range_m)
         slope = across(2j * math.pi * turns * self.radar.channels_at(made.device)[:, None, None] * made)
         pull = torch.einsum("lmsf,sfmn->lnsf", slope.conj(), self.inverse)
-        curvature = (pull * slope).sum().real.clamp_min(_TINY)
+        curvature = (pull * slope).sum().real.clamp_min(TINY)
         left = across(self.cells - made)
         bright = level > _BRIGHT
         count = (bright.sum() * (self.radar.channels - 1)).clamp_min(1)
         misfit = (self.whitened(left) * bright).sum() / count
         # every pulse lies in two segments, so that the curvature, and the segments, count it twice
-        twice = self.segments.length / self.segments.hop
+        twice = 2
         step = (pull * left).sum(1).real / curvature
         by_line, share = step.sum((-2, -1)), (pull * slope).sum((1, 2, 3)).real / curvature
         scatter = by_line.square().sum() + twice * step.sum((0, -1)).square().sum()
-        apart = (by_line.square() / share.clamp_min(_TINY)).sum() - step.sum().square()
+        apart = (by_line.square() / share.clamp_min(TINY)).sum() - step.sum().square()
         apart = apart - twice * (share > 0).sum() / curvature
         std = torch.sqrt(twice / curvature) * misfit.clamp_min(1.0)
         return step.sum(), torch.maximum(std, torch.maximum(scatter, apart).sqrt()), misfit
@@ -326,7 +310,7 @@ class Chip:
         hz = torch.fft.fftfreq(n, 1 / self.radar.prf_hz, dtype=torch.float64, device=self.lit.device)
         inside = (hz.abs() <= self.tone_hz.abs().max()).nonzero()[:, 0]
         own, others = (torch.fft.fft(self.echo(cells))[:, inside] for cells in (self.cells, self.beside))
-        return Picture(own, others.abs().square().mean().clamp_min(_TINY), hz[inside], inside)
+        return Picture(own, others.abs().square().mean().clamp_min(TINY), hz[inside], inside)
 
 
 @dataclass(frozen=True)
@@ -451,7 +435,7 @@ def _inverse_covariance(chip: Chip) -> Tensor:
     turn = chip.steering(chip.motion, chip.tone_hz)
     aligned = chip.beside.movedim(1, -1) * turn.conj()
     covariance = torch.einsum("lsfm,lsfn->smn", aligned, aligned.conj()) / (aligned.shape[0] * aligned.shape[2])
-    level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1).clamp_min(_TINY)
+    level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1).clamp_min(TINY)
     # the diagonal keeps the covariance of noise-free data invertible
     covariance = covariance + 1e-5 * level[:, None, None] * torch.eye(
         covariance.shape[-1], dtype=covariance.dtype, device=covariance.device

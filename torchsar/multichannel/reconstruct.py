@@ -241,29 +241,18 @@ def check_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild,
         return
     found = condition_number(radar, motion, rebuild.bands)
     limit = SINGULAR if dtype == torch.complex128 else SINGULAR_SINGLE
-    if host_value((found > limit).all(), False):
-        then = (
-            f"so that {rebuild.bands} bands cannot be separated; rebuild fewer bands, use "
-            "MinimumMeanSquare, or change the pulse rate"
-        )
-        raise ValueError(_condition_message(radar, motion, rebuild.bands, float(found.min()), then))
-    worst = host_largest(found, 0.0)
-    if worst > POOR:
-        warnings.warn(
-            _condition_message(
-                radar,
-                motion,
-                rebuild.bands,
-                worst,
-                "so that noise and errors of the velocity grow; rebuild fewer bands, or use MinimumMeanSquare",
-            ),
-            stacklevel=3,
-        )
-
-
-def _condition_message(radar: BistaticRadar, motion: PointMotion, bands: int, worst: float, then: str) -> str:
-    """Return the message about an ill-conditioned reconstruction."""
-    found = condition_number(radar, motion, bands)
+    singular, worst = host_value((found > limit).all(), False), host_largest(found, 0.0)
+    if not singular and not worst > POOR:
+        return
     speed = motion.effective_m_s.detach().expand(found.shape).flatten()[int(found.flatten().argmax())]
-    where = f"at a pulse rate of {radar.prf_hz:g} Hz and a speed past the target of {float(speed):.4g} m/s"
-    return f"{where} the channels sample nearly the same positions (condition number {worst:.3g}), {then}"
+    seen = (
+        f"at a pulse rate of {radar.prf_hz:g} Hz and a speed past the target of {float(speed):.4g} m/s the channels "
+        f"sample nearly the same positions (condition number {float(found.min()) if singular else worst:.3g}), so that"
+    )
+    if singular:
+        raise ValueError(
+            f"{seen} {rebuild.bands} bands cannot be separated; rebuild fewer bands, use MinimumMeanSquare, or change "
+            "the pulse rate"
+        )
+    then = "noise and errors of the velocity grow; rebuild fewer bands, or use MinimumMeanSquare"
+    warnings.warn(f"{seen} {then}", stacklevel=3)

@@ -45,7 +45,6 @@ FAINT_RAD = 0.3
 # Samples over the aperture, the Doppler band and half the search interval: maxima of smooth curves
 # are found closely enough for a limit.
 _POINTS = 65
-_GEO_RANGE_M = 3.9e7  # slant range of a geosynchronous transmitter
 
 Estimator = Literal["sir", "ati", "ml", "whitened"]
 
@@ -617,7 +616,8 @@ def _replica_share(radar: BistaticRadar, use: MultichannelUse, phase_rad: Tensor
 def _precision_rows(radar: BistaticRadar, tolerance_rad: float) -> Iterable[Requirement]:
     """Yield the rows of ranges in single precision."""
     wave = 2 * math.pi / radar.wavelength_m
-    for name, range_m in (("transmit", _GEO_RANGE_M), ("receive", radar.reference_range_m)):
+    # the slant range of a geosynchronous transmitter, and that of the receiver
+    for name, range_m in (("transmit", 3.9e7), ("receive", radar.reference_range_m)):
         single = wave * range_m * 2.0**-24
         yield Requirement(
             f"{name} range in float32",

@@ -29,11 +29,6 @@ from torchsar.radar import BistaticRadar
 SINGULAR, SINGULAR_SINGLE = 1e6, 1e4
 # Above this a warning is given: the noise gain of three bands of three channels is then 6.5 dB.
 POOR = 5.0
-# Damping relative to the largest eigenvalue of the normal matrix: it acts on singular values below
-# 1 / SINGULAR of the largest.
-_TINY = SINGULAR**-2
-# Doppler bands that contain clutter illuminated through an antenna pattern
-_CLUTTER_BANDS = 5
 
 
 def first_bin(n_pulse: int, bands: int) -> int:
@@ -243,7 +238,8 @@ class LeastSquares:
         """
         matrix = band_matrix(radar, motion, self.bands)
         normal = matrix.mH @ matrix
-        floor = _TINY * self.bands * radar.channels
+        # it acts on singular values below 1 / SINGULAR of the largest
+        floor = SINGULAR**-2 * self.bands * radar.channels
         return linear_solve(normal + floor * torch.eye(self.bands, dtype=normal.dtype, device=normal.device), matrix.mH)
 
     def refusal(self, channels: int) -> str | None:
@@ -345,7 +341,7 @@ def noise_and_clutter(radar: BistaticRadar, lit_s: float | None, n_pulse: int, p
     """
     band = None if lit_s is None else radar.speed_m_s**2 * lit_s / (radar.wavelength_m * radar.reference_range_m)
     prior = ElementPattern() if band is None else FlatBand(band)
-    clutter = clutter_covariance(radar, prior, n_pulse, _CLUTTER_BANDS)
+    clutter = clutter_covariance(radar, prior, n_pulse, bands=5)  # which the clutter of a pattern fills
     level = 10 ** (torch.as_tensor(power_db, dtype=torch.float64) / 10)
     mean = clutter.diagonal(dim1=-2, dim2=-1).real.mean()
     return clutter * (level[..., None, None, None] / mean) + torch.eye(radar.channels, dtype=clutter.dtype)

@@ -38,16 +38,13 @@ from torchsar.radar import BistaticRadar
 Removal = Literal["subtract", "zero"]
 # Found by trial: velocities within this difference count as equal. A larger value rejects targets
 # beside a ship, a smaller one accepts side lobes of the ship as targets.
-_SAME_VELOCITY_M_S = 5.0
 # Level of range side lobes relative to those of one point of the mean level, found by trial: a body
 # has many points, and its brightest ones exceed the mean.
-_SIDE_LOBES = 20.0
+_SAME_VELOCITY_M_S, _SIDE_LOBES = 5.0, 20.0
 # Range lines to either side of a body that are processed with it: 6 guard cells, and 28 lines for
 # the covariance of the sea. Found by trial: 20 to 80 give the same velocities, 80 take 1.4 times
 # the time; the lines must also hold the range migration of the body.
 _LINES_BESIDE = 34
-_BINS_AVERAGED = 4  # neighbouring Doppler bins over which the covariance of all lines is averaged
-_HALF_QUALITY_LEVEL = 100.0  # level (20 dB) at which the quality of a target is one half: convention
 
 
 @names_arguments
@@ -332,7 +329,7 @@ class ImageMovers(Stage):
         return Estimate(
             value,
             {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])},
-            level / (_HALF_QUALITY_LEVEL + level),
+            level / (100.0 + level),  # convention: one half at 20 dB
             outcome,
             info={"level": level},
         )
@@ -451,8 +448,9 @@ def suppressed_image(
         Remote Sens. 2020, 12, 1703, section 4.3 (clutter suppression via Doppler filtering).
     """
     data = signal.data.movedim(-1, -3)
-    whitening = line_whitening(data, radar, samples=_BINS_AVERAGED * data.shape[-3])
-    backed = whitening.expanded(data.shape[-3]).backed(data.to(torch.complex128)).movedim(-3, -1).to(signal.data.dtype)
+    # averaged over all lines and four neighbouring Doppler bins
+    whitening = line_whitening(data, radar, samples=4 * data.shape[-3])
+    backed = whitening.backed(data.to(torch.complex128)).movedim(-3, -1).to(signal.data.dtype)
     best = signal.data.real.new_zeros(())
     for speed in speeds_m_s:
         motion = PointMotion.of(radar, signal.data.real, speed)

@@ -13,13 +13,14 @@ from torchsar.multichannel.velocity.model import TINY, point_phasor
 from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
-_PARTS = 8  # chosen: each has 10 dB at the SNR of 19 dB from which on a point counts as detected
+# chosen: each of 8 parts has 10 dB at the SNR of 19 dB from which on a point counts as detected,
+# and the ends of 32 parts of the profile lie within 2 % of the aperture
+_PARTS, _FINE = 8, 32
 # found by trial: noise at this SNR lowers the share to 0.93, an aperture lit for 75 % to 0.75
 _LEAST_SHARE = 0.8
 # chosen: amplitude relative to that of the strongest part below which a part counts as dark; noise
 # in a dark part rarely reaches it where the point is detected
 _DARK = 0.35
-_FINE = 32  # chosen: parts of the profile, whose ends then lie within 2 % of the aperture
 
 
 @names_arguments

@@ -164,7 +164,9 @@ def _best_tone(
     bins = torch.arange(-half, min(half + 1, length - half), device=prepared.device)
     spectrum = torch.fft.fft(tones, length)[..., bins]
     shift = bins.to(torch.float64) * (rate_hz / length) * scale / motion.along_m_s[..., None]
-    aligned = _aligned(spectrum, radar, shift / scale)
+    # channels with the phases of a point; the slope is in turns per metre of channel position
+    channels = zip(spectrum.unbind(-2), radar.channel_m, strict=True)
+    aligned = sum((x * unit_phasor(shift / scale * dx, x.dtype) for x, dx in channels), spectrum.new_zeros(()))
     energy = weight.square().sum(-1) * radar.channels if whitening is None else _whitened_energy(model, whitening)
     power = aligned.abs().square().to(torch.float64) / energy.clamp_min(torch.finfo(torch.float32).tiny)[..., None]
     power = torch.where(shift.abs() <= reach_m, power, -torch.inf).flatten(-2)
@@ -197,16 +199,6 @@ def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor,
         return tones, prf_hz
     whole = tones.shape[-1] // factor * factor
     return tones[..., :whole].unflatten(-1, (-1, factor)).sum(-1), prf_hz / factor
-
-
-def _aligned(spectrum: Tensor, radar: BistaticRadar, slope: Tensor) -> Tensor:
-    """Add channels (..., channel, bin) with the phases of a point; slope (..., bin) is its position
-    over wavelength and range, in turns per metre of channel position.
-    """
-    total = torch.zeros_like(spectrum[..., 0, :])
-    for i, dx in enumerate(radar.channel_m):
-        total = total + spectrum[..., i, :] * unit_phasor(slope * dx, spectrum.dtype)
-    return total
 
 
 def _whitened_energy(model: Tensor, whitening: Whitening) -> Tensor:

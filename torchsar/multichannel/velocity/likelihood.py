@@ -38,7 +38,6 @@ _HALVINGS = 4  # trials of a step: whole, half, quarter, eighth; then it is omit
 # Predicted gain of energy below which no step is taken, relative to the noise of a sample (a step
 # of 3e-4 standard deviations) and to the energy that is explained already (rounding).
 _LEAST_GAIN, _LEAST_SHARE = 1e-7, 1e-13
-_STEPS = 8  # Gauss-Newton steps, found by trial: points 10 dB apart have converged
 
 
 @dataclass(frozen=True)
@@ -327,7 +326,7 @@ def fitted_together(
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     weight = aperture.weight(radar, start, time_s)[..., None, :]
     fit_at = partial(_fit_of_points, data, radar, weight, time_s, unknowns)
-    motion, fit = _climbed(data, fit_at, start, unknowns, _STEPS)
+    motion, fit = _climbed(data, fit_at, start, unknowns, 8)  # by trial: points 10 dB apart converge
     echoes = fit.amplitude[..., None, None] * weight * point_phasor(radar, motion, time_s, torch.complex128)
     left = data - echoes.sum(-3)
     noise = left.abs().square().mean((-2, -1))

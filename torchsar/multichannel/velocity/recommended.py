@@ -23,18 +23,15 @@ from torchsar.radar import BistaticRadar
 
 # Aperture of the first search: integration time of Remote Sens. 2020, 12, 1703, Table 1.
 _COARSE_S = 4.5
-_ROUNDS = 2  # refinements of the residual covariance
 # Least share of the energy of a further point in what is left: clutter that fills 800 Doppler cells
-# gives 0.01 to its strongest tone; a point just detected in noise gives 0.03.
-_POINT_SHARE = 0.02
-# Share from which it is a point rather than clutter, and Doppler cells within which it then bends
-# the fit unless it is separated, by choice.
-_CLEAR_SHARE, _OVERLAP = 0.05, 8.0
-# Least energy of such a point over that of the first: the model of the echo of a wide chirp leaves
-# 0.001 of the energy of the point itself.
-_LEAST_HIDDEN = 0.002
-_PASSES = 2  # of their fit: the second has the expected amplitudes at the positions found
-_OTHERS = 3  # points fitted besides the strongest, by choice: each takes a search of its own
+# gives 0.01 to its strongest tone; a point just detected in noise gives 0.03. Share from which it
+# is a point rather than clutter, and Doppler cells within which it then bends the fit unless it is
+# separated, by choice. Least energy of such a point over that of the first: the model of the echo
+# of a wide chirp leaves 0.001 of the energy of the point itself.
+_POINT_SHARE, _CLEAR_SHARE, _OVERLAP, _LEAST_HIDDEN = 0.02, 0.05, 8.0, 0.002
+# Refinements of the residual covariance; points fitted besides the strongest, by choice: each takes
+# a search of its own; passes of their fit: the second has the amplitudes at the positions found.
+_ROUNDS, _OTHERS, _PASSES = 2, 3, 2
 
 
 def moving_point_velocity(

@@ -35,15 +35,6 @@ _TOLERANCE_M_S = 1e-4  # of the maximum, well below the 0.06 m/s of error withou
 # Found by trial: with a fixed half step of 0.5 m/s, errors are 0.6, 0.75 and 1.0 of the prediction
 # at 10, 13 and 17 dB per sample; with 1 m/s they are 1.0, 1.2 and 1.8.
 _FIRST_M_S, _CURVE_M_S = 0.75, (0.4, 1.5)
-# The second half step is that at which the maximum has fallen by this many standard deviations of
-# the noise of ln Gamma. Found by trial: predictions then hold within 10 % from 10 to 25 dB.
-_FALL = 1.8
-# Systematic error without noise, from echoes beyond the reconstructed bands, relative to lambda
-# PRF: 0.035 m/s rms over velocities and positions, up to 0.06 m/s, of 43 m/s.
-_REST = 8e-4
-# Predicted deviations by which the interferometric speed of the strongest point may differ by
-# chance, by convention.
-_UNLIKELY = 2.0
 _GROUPS = 16  # of the jackknife: 8 and 32 groups give the same standard deviation within 6 %
 
 
@@ -264,7 +255,9 @@ class SignalIntensityRatio(Stage):
         value = torch.where(has_data, fine.clamp(low, high), middle)
         if not self.assess:
             return Estimate({"u_r_m_s": value}, info={"log_ratio": -costs})
-        std = _standard_deviation(intensity, fine, _REST * self.radar.ambiguous_velocity_m_s)
+        # Systematic error without noise, from echoes beyond the reconstructed bands: 0.035 m/s rms
+        # over velocities and positions, up to 0.06 m/s, of lambda PRF = 43 m/s.
+        std = _standard_deviation(intensity, fine, 8e-4 * self.radar.ambiguous_velocity_m_s)
         quality = torch.where(has_data, 1 - torch.exp(costs.amin(-1) - costs.median(-1).values), 0.0).clamp(0, 1)
         ended = (coarse - low).abs().minimum((coarse - high).abs()) <= self.step_m_s / 2
         reasons = [(Outcome.NOISE, ~(quality >= self.least_quality)), (Outcome.OUTSIDE_SEARCH, ended)]
@@ -285,7 +278,8 @@ class SignalIntensityRatio(Stage):
         apart = (motion.u_r_m_s - tone.motion.u_r_m_s).abs()
         within = torch.full_like(apart > 0, not self.bounded)
         outcome, info = outcome_of_point(line, radar, tone, aperture, reasons, lambda _: within, assumed=True)
-        return torch.where(apart > _UNLIKELY * std, apart, std), outcome, info
+        # by chance they differ by up to two predicted deviations, by convention
+        return torch.where(apart > 2.0 * std, apart, std), outcome, info
 
     def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
         """Return the motion with a candidate of u_r."""
@@ -302,7 +296,9 @@ def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor,
     step = torch.full_like(value, _FIRST_M_S)
     spread, bend = _slope_and_bend(intensity, value, step)
     noise = math.sqrt(2) * step * spread  # of log Gamma at one speed
-    step = torch.where(bend > 0, (2 * _FALL * noise / torch.where(bend > 0, bend, 1)).sqrt(), math.inf)
+    # The second half step is that at which the maximum has fallen by 1.8 standard deviations of the
+    # noise of ln Gamma. Found by trial: predictions then hold within 10 % from 10 to 25 dB.
+    step = torch.where(bend > 0, (2 * 1.8 * noise / torch.where(bend > 0, bend, 1)).sqrt(), math.inf)
     spread, bend = _slope_and_bend(intensity, value, step.clamp(*_CURVE_M_S))
     std = torch.where(bend > 0, spread / torch.where(bend > 0, bend, 1), math.inf)
     return torch.hypot(std, torch.full_like(std, rest_m_s))

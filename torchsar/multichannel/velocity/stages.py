@@ -340,8 +340,7 @@ class GradientVelocity(LikelihoodVelocity):
             ValueError: If the data have other channels than the radar or fewer than 4 pulses, or
                 slow time is not zero at pulse n // 2.
         """
-        begun = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
-        return gradient_likelihood(*begun, self.unknowns, assess=self.assess)
+        return gradient_likelihood(*self.begin(signal, u_r_m_s, u_a_m_s, y0_m), self.unknowns, assess=self.assess)
 
 
 class MovingPointVelocity(_Velocity):

@@ -44,30 +44,20 @@ def walk_ambiguity(
         deviations of the energy of a line of noise. Third, the index of the strongest line.
     """
     numbers = torch.arange(-most, most + 1, dtype=torch.float64, device=data.device)
+    migration = migration or Keystone(whole_swath=False)
     energies = torch.stack(
         [
-            _line_energy(correct_migration(data, frame, reference, migration or Keystone(whole_swath=False), number))
+            correct_migration(data, frame, reference, migration, number).abs().to(torch.float64).square().sum((-3, -2))
             for number in numbers
         ]
     )
     strongest, line = energies.max(-1)
     best, margin = best_of(-strongest, numbers[(...,) + (None,) * (strongest.ndim - 1)].expand(strongest.shape))
-    noise_std = _noise_std(energies[most])
+    # the energies of lines with noise alone, by their median absolute deviation
+    middle = energies[most].median(-1, keepdim=True).values
+    spread = 1.4826 * (energies[most] - middle).abs().median(-1).values
+    noise_std = spread.clamp_min(1e-12 * middle[..., 0]).clamp_min(TINY)
     return best, margin / noise_std, line.gather(0, (best + most).long()[None])[0]
-
-
-def _line_energy(data: Tensor) -> Tensor:
-    """Return the energy of each range line, (..., range)."""
-    return data.abs().to(torch.float64).square().sum((-3, -2))
-
-
-def _noise_std(energy: Tensor) -> Tensor:
-    """Return the standard deviation of the energies of lines (..., range) with noise alone.
-
-    It is estimated from their median absolute deviation.
-    """
-    middle = energy.median(-1, keepdim=True).values
-    return (1.4826 * (energy - middle).abs().median(-1).values).clamp_min(1e-12 * middle[..., 0]).clamp_min(TINY)
 
 
 class WalkAmbiguity(Stage):
