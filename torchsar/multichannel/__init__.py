@@ -5,7 +5,14 @@ stationary scene is reconstructed from the channels with zero velocity, that of 
 the velocity of the target.
 """
 
-from torchsar.multichannel.azimuth import FocusAzimuth, azimuth_filter, focus_azimuth, known_motion_chain
+from torchsar.multichannel.azimuth import (
+    AzimuthPlan,
+    FocusAzimuth,
+    FocusPlan,
+    azimuth_filter,
+    focus_azimuth,
+    known_motion_chain,
+)
 from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
 from torchsar.multichannel.body import Body, body_echo, find_body
 from torchsar.multichannel.chip import Extraction
@@ -19,7 +26,6 @@ from torchsar.multichannel.migration import (
     correct_migration,
 )
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.plan import AzimuthPlan, FocusPlan
 from torchsar.multichannel.reconstruct import Reconstruct, reconstruct, reconstruct_lines
 from torchsar.multichannel.requirements import MultichannelUse, multichannel_limits, multichannel_requirements
 from torchsar.multichannel.response import (

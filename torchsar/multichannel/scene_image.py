@@ -182,31 +182,28 @@ class ImageMovers(Stage):
                 "exceeds the swath; give more lines, or a smaller extraction",
                 stacklevel=3,
             )
-        remaining, bodies = signal, []
         if known is not None:
-            remaining, bodies = self._extract_known(remaining, known)
+            remaining, bodies = self._extract_known(signal, known)
         else:
-            remaining, bodies = self._extract_detected(remaining, self.image, bodies)
+            remaining, bodies = self._extract_detected(signal, self.image, [])
             if self.detector.suppressed_m_s:
                 speeds_m_s = self.detector.suppressed_m_s
                 shown = partial(suppressed_image, radar=self.radar, image=self.image, speeds_m_s=speeds_m_s)
                 remaining, bodies = self._extract_detected(remaining, shown, bodies)
-        rest = self.image(remaining)
-        fused = rest
-        for body in bodies:
-            if self._moves(body):
-                fused = placed(fused, body, self.extraction)
+        rest = fused = self.image(remaining)
+        for body in filter(self._moves, bodies):
+            fused = placed(fused, body, self.extraction)
         return SceneImage(conventional, rest, fused, bodies, self._estimate(bodies, signal.data), remaining)
 
     def _extract_detected(self, remaining: Signal, image_of, bodies: list[Body]) -> tuple[Signal, list[Body]]:
         """Detect targets and remove those that move, strongest first, until none is new."""
         bodies, visited = list(bodies), [self._apparent_position(body) for body in bodies]
-        candidates = self.detector.found(image_of(remaining))
+        candidates, apart_m = self.detector.found(image_of(remaining)), self.detector.apart_m
         while candidates and len(bodies) < self.detector.most:
             candidate = candidates.pop(0)
-            if not self._inside_frame(candidate, remaining) or any(
-                self._same_target(candidate, other) for other in visited
-            ):
+            away = [(abs(candidate.azimuth_m - x.azimuth_m), abs(candidate.range_m - x.range_m)) for x in visited]
+            known = any(along < apart_m[0] / 2 and across < apart_m[1] for along, across in away)
+            if known or not self._inside_frame(candidate, remaining):
                 continue
             visited.append(candidate)
             lines, frame = self._lines(remaining, candidate.range_m)
@@ -249,13 +246,6 @@ class ImageMovers(Stage):
         return (
             axis.start + walk <= detection.range_m <= axis.stop - walk - curvature
             and pulse.start < abeam_s < pulse.stop
-        )
-
-    def _same_target(self, a: Detection, b: Detection) -> bool:
-        """Test whether two detections belong to the same target."""
-        return (
-            abs(a.azimuth_m - b.azimuth_m) < self.detector.apart_m[0] / 2
-            and abs(a.range_m - b.range_m) < self.detector.apart_m[1]
         )
 
     def _side_lobe(self, body: Body, other: Body) -> bool:

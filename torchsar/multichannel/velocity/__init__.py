@@ -1,9 +1,8 @@
 """Velocity and position estimation of moving points with several channels along track."""
 
-from torchsar.multichannel.velocity.along_track import along_track_velocity
+from torchsar.multichannel.velocity.along_track import along_track_velocity, interferometry
 from torchsar.multichannel.velocity.aperture import Dwell, ElementBeam
 from torchsar.multichannel.velocity.bank import Search
-from torchsar.multichannel.velocity.interferometry import interferometry
 from torchsar.multichannel.velocity.likelihood import explained_energy, maximum_likelihood
 from torchsar.multichannel.velocity.recommended import moving_point_velocity
 from torchsar.multichannel.velocity.sir import SignalIntensityRatio

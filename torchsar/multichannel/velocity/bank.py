@@ -165,8 +165,9 @@ def _best_tone(
     spectrum = torch.fft.fft(tones, length)[..., bins]
     shift = bins.to(torch.float64) * (rate_hz / length) * scale / motion.along_m_s[..., None]
     # channels with the phases of a point; the slope is in turns per metre of channel position
-    channels = zip(spectrum.unbind(-2), radar.channel_m, strict=True)
-    aligned = sum((x * unit_phasor(shift / scale * dx, x.dtype) for x, dx in channels), spectrum.new_zeros(()))
+    aligned = torch.zeros_like(spectrum[..., 0, :])
+    for x, dx in zip(spectrum.unbind(-2), radar.channel_m, strict=True):
+        aligned = aligned + x * unit_phasor(shift / scale * dx, x.dtype)
     energy = weight.square().sum(-1) * radar.channels if whitening is None else _whitened_energy(model, whitening)
     power = aligned.abs().square().to(torch.float64) / energy.clamp_min(torch.finfo(torch.float32).tiny)[..., None]
     power = torch.where(shift.abs() <= reach_m, power, -torch.inf).flatten(-2)

@@ -278,7 +278,10 @@ def _stepped(
     Returns also in which of these trials it was omitted.
     """
     begin, before = motion, fit.energy
-    step = _bounded(step.reshape(*motion.u_r_m_s.shape, len(unknowns)), motion, unknowns)
+    step = step.reshape(*motion.u_r_m_s.shape, len(unknowns))
+    if "u_a_m_s" in unknowns:  # at most a tenth of the speed along track past the point
+        along = step[..., unknowns.index("u_a_m_s")].abs().clamp_min(TINY)
+        step = step * (0.1 * motion.along_m_s / along).clamp_max(1.0)[..., None]
     for halvings in range(_HALVINGS):
         there = moved(begin, 0.5**halvings * step, unknowns)
         fit_there = fit_at(there)
@@ -294,15 +297,6 @@ def _stepped(
         if not bool(pending.any()):
             break
     return motion, fit, pending
-
-
-def _bounded(step: Tensor, motion: PointMotion, unknowns: tuple[str, ...]) -> Tensor:
-    """Limit steps in u_a to a tenth of the along-track speed of the receiver past the point."""
-    if "u_a_m_s" not in unknowns:
-        return step
-    at = unknowns.index("u_a_m_s")
-    reach = 0.1 * motion.along_m_s / step[..., at].abs().clamp_min(TINY)
-    return step * reach.clamp_max(1.0)[..., None]
 
 
 def fitted_together(
@@ -330,8 +324,8 @@ def fitted_together(
     echoes = fit.amplitude[..., None, None] * weight * point_phasor(radar, motion, time_s, torch.complex128)
     left = data - echoes.sum(-3)
     noise = left.abs().square().mean((-2, -1))
-    count = len(unknowns)
-    covariance = covariance_of(fit.normal, noise).unflatten(-1, (-1, count)).unflatten(-3, (-1, count))
+    pairs = (-1, len(unknowns))
+    covariance = covariance_of(fit.normal, noise).unflatten(-1, pairs).unflatten(-3, pairs)
     own = covariance.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)  # (..., point, unknown, unknown)
     energy = echoes.abs().square().sum((-2, -1))
     first = energy.argmax(-1)

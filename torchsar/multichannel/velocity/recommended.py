@@ -176,7 +176,7 @@ class _Job:
         return job, _chosen_fit(job.fitted(found.motion, whitening), found, uneven)
 
     def or_other(self, other: _Job, first: Tensor) -> _Job:
-        """Take the data and the seen aperture of another job where `first` is False."""
+        """Take the data and the profile of another job where `first` is False."""
         data = torch.where(first[..., None, None], self.data, other.data)
         return replace(self, data=data, profile=torch.where(first[..., None], self.profile, other.profile))
 
@@ -208,7 +208,11 @@ class _Job:
             for _ in range(_PASSES):
                 points, own, others, left = fitted_together(self.data, self.radar, points, self.expected, self.unknowns)
             done = tried & ~sample_whitening(left, self.radar).coloured
-            found, job, tried = _chosen_fit(own, found, done), job.without(others, done), tried & ~done
+            found, job, tried = (
+                _chosen_fit(own, found, done),
+                job.or_other(replace(whole, data=job.data - others), ~done),
+                tried & ~done,
+            )
             hidden = hidden & ~done
         return job, found, hidden
 
@@ -216,11 +220,6 @@ class _Job:
         """Whether the Doppler frequencies of two points differ by few Doppler cells."""
         doppler_hz = [(m.u_r_m_s + m.along_m_s * m.y0_m / m.range_m) / self.radar.wavelength_m for m in (motion, other)]
         return (doppler_hz[0] - doppler_hz[1]).abs() < _OVERLAP / self.coarse.duration_s
-
-    def without(self, echo: Tensor, where: Tensor) -> _Job:
-        """Remove the echo of other points in some trials, which then use the whole aperture."""
-        data = torch.where(where[..., None, None], self.data - echo, self.data)
-        return replace(self, data=data, profile=torch.where(where[..., None], 1.0, self.profile))
 
     def refined(self, found: Found) -> tuple[Found, Whitening]:
         """Repeat the fit up to two times with the covariance of its residual, and return both.

@@ -23,9 +23,9 @@ from torchsar.core import Estimate, Outcome, Signal, Stage, take
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines, refuse_channels
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
+from torchsar.multichannel.velocity.along_track import interfered
 from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.multichannel.velocity.assess import outcome_of_point
-from torchsar.multichannel.velocity.interferometry import interfered
 from torchsar.multichannel.velocity.model import TINY
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar

@@ -12,11 +12,10 @@ from torch import Tensor
 from torchsar.core import Estimate, Outcome, Signal, Stage, take, unit_level
 from torchsar.multichannel.motion import Number, PointMotion, checked_channels
 from torchsar.multichannel.reconstruct import refuse_shifted
-from torchsar.multichannel.velocity.along_track import along_track_velocity
+from torchsar.multichannel.velocity.along_track import along_track_velocity, interferometry
 from torchsar.multichannel.velocity.aperture import Aperture, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.bank import Search
-from torchsar.multichannel.velocity.interferometry import interferometry
 from torchsar.multichannel.velocity.likelihood import PointLikelihood, explained_energy, maximum_likelihood
 from torchsar.multichannel.velocity.model import (
     TINY,
