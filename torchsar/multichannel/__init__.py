@@ -6,7 +6,6 @@ the velocity of the target.
 """
 
 from torchsar.multichannel.azimuth import (
-    AzimuthPlan,
     FocusAzimuth,
     FocusPlan,
     azimuth_filter,
@@ -73,7 +72,6 @@ from torchsar.multichannel.velocity.walk import MigratingLines
 
 __all__ = [
     "AlongTrackAutofocus",
-    "AzimuthPlan",
     "AzimuthScaling",
     "Body",
     "CompressChannels",
