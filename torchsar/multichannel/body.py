@@ -12,6 +12,7 @@ Reference:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,8 +26,6 @@ from torchsar.multichannel.migration import Frame, envelope_phasor
 from torchsar.multichannel.motion import PointMotion, checked_channels
 from torchsar.multichannel.velocity.model import point_phasor
 
-# convention: two overlapping segments of two pulses
-_LEAST_PULSES = 4
 # Largest predicted standard deviation of a reliable body, found by trial: of 200 pairs of ships in
 # one place, 35 were below it, 1.1 deviations off in the rms, one by more than 5. Ships on a sea
 # stay below 0.13. u_r displaces a body by about 20 m per m/s.
@@ -110,8 +109,8 @@ def find_body(
             not finite, or if the data have no range cell of the body, or fewer than 12 beside it.
     """
     data = checked_channels(data, frame.radar, "find_body", "channel, pulse, range")
-    if data.shape[-2] < _LEAST_PULSES:
-        raise ValueError(f"find_body needs at least {_LEAST_PULSES} pulses, got {data.shape[-2]}; give a longer record")
+    if data.shape[-2] < 4:  # convention: two overlapping segments of two pulses
+        raise ValueError(f"find_body needs at least 4 pulses, got {data.shape[-2]}; give a longer record")
     half = frame.radar.ambiguous_velocity_m_s / 2 if u_r_half_m_s is None else u_r_half_m_s
     chip = chip_about(data, frame, PointMotion.imaged_at(frame.radar, data, 0.0, 0.0, image_s, image_m), extraction)
     for number in range(rounds):
@@ -156,31 +155,30 @@ def _body_of(chip: Chip, std: Tensor, half_m_s: float, lost: bool = False) -> Bo
 
 def _closing_speed(chip: Chip, image_s: float, image_m: float, half_m_s: float) -> tuple[Tensor, Tensor]:
     """Return the most likely u_r near that of the chip, and its standard deviation."""
-    middle, step = chip.motion.u_r_m_s, torch.as_tensor(half_m_s / _GRID_HALF, dtype=torch.float64)
-    std = step
+
+    def energy(u_r: Tensor) -> Tensor:
+        u_a = chip.motion.u_a_m_s.expand(u_r.shape)
+        return chip.energy(PointMotion.imaged_at(chip.radar, chip.cells, u_r, u_a, image_s, image_m))
+
+    # all at once take two thirds of the time and nine times the memory
+    return _highest(lambda u_r: torch.cat([energy(part) for part in u_r.split(9)]), chip.motion.u_r_m_s, half_m_s)
+
+
+def _highest(value: Callable[[Tensor], Tensor], middle: Tensor, half_m_s: float) -> tuple[Tensor, Tensor]:
+    """Return the speed of the highest value, by grids about the middle, and its standard deviation.
+
+    A parabola refines the maximum of each grid. The deviation is that of a log-likelihood.
+    """
+    std = step = torch.as_tensor(half_m_s / _GRID_HALF, dtype=torch.float64)
     for _ in range(_GRIDS):
-        u_r = middle + step * torch.arange(-_GRID_HALF, _GRID_HALF + 1, dtype=torch.float64, device=middle.device)
-        energy = torch.cat(
-            [
-                chip.energy(
-                    PointMotion.imaged_at(
-                        chip.radar, chip.cells, part, chip.motion.u_a_m_s.expand(part.shape), image_s, image_m
-                    )
-                )
-                for part in u_r.split(9)  # 81 at once take two thirds of the time and nine times the memory
-            ]
-        )
-        shift, curvature = _peak(energy)
+        grid = torch.arange(-_GRID_HALF, _GRID_HALF + 1, dtype=torch.float64, device=middle.device)
+        values = value(middle + step * grid)
+        inner = values.argmax().clamp(1, len(values) - 2)
+        low, top, high = values[inner + torch.arange(-1, 2, device=values.device)]
+        curvature = (2 * top - low - high).clamp_min(TINY)
+        shift = grid[inner] + (0.5 * (high - low) / curvature).clamp(-1, 1)
         middle, std, step = middle + step * shift, step / torch.sqrt(curvature), step / _GRID_REFINEMENT
     return middle, std
-
-
-def _peak(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the position of the maximum from the middle, in steps, and its curvature."""
-    inner = values.argmax().clamp(1, len(values) - 2)
-    low, top, high = values[inner + torch.arange(-1, 2, device=values.device)]
-    curvature = (2 * top - low - high).clamp_min(TINY)
-    return inner - len(values) // 2 + (0.5 * (high - low) / curvature).clamp(-1, 1), curvature
 
 
 def _along_speed(chip: Chip, half_m_s: float) -> Tensor:
@@ -198,20 +196,15 @@ def _along_speed(chip: Chip, half_m_s: float) -> Tensor:
     # squares of squares must fit into single precision
     echo = unit_level(echo[echo.abs().square().sum(-1).topk(min(8, len(echo))).indices])
     back = point_phasor(radar, motion, time_s, torch.complex128)[0]
-    middle, step = motion.u_a_m_s, half_m_s / _GRID_HALF
-    for _ in range(_GRIDS):
-        u_a = middle + step * torch.arange(-_GRID_HALF, _GRID_HALF + 1, dtype=torch.float64, device=middle.device)
-        there = replace(motion.each(lambda value: value.expand(2 * _GRID_HALF + 1)), u_a_m_s=u_a)
+
+    def sharpness(u_a: Tensor) -> Tensor:
+        there = replace(motion.each(lambda value: value.expand(u_a.shape)), u_a_m_s=u_a)
         turn = point_phasor(radar, there, time_s, torch.complex128)[:, 0].conj() * back
-        picture = (
-            torch.fft.fft((echo * turn[:, None]).to(torch.complex64), smooth_length(2 * echo.shape[-1]))
-            .abs()
-            .square()
-            .to(torch.float64)
-        )
-        shift, _ = _peak(picture.square().sum((-2, -1)) / picture.sum((-2, -1)).square().clamp_min(TINY))
-        middle, step = middle + step * shift, step / _GRID_REFINEMENT
-    return middle
+        turned = (echo * turn[:, None]).to(torch.complex64)
+        picture = torch.fft.fft(turned, smooth_length(2 * echo.shape[-1])).abs().square().to(torch.float64)
+        return picture.square().sum((-2, -1)) / picture.sum((-2, -1)).square().clamp_min(TINY)
+
+    return _highest(sharpness, motion.u_a_m_s, half_m_s)[0]
 
 
 def known_body(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Body:

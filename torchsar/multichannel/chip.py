@@ -278,13 +278,12 @@ class Chip:
         count = (bright.sum() * (self.radar.channels - 1)).clamp_min(1)
         misfit = (self.whitened(left) * bright).sum() / count
         # every pulse lies in two segments, so that the curvature, and the segments, count it twice
-        twice = 2
         step = (pull * left).sum(1).real / curvature
         by_line, share = step.sum((-2, -1)), (pull * slope).sum((1, 2, 3)).real / curvature
-        scatter = by_line.square().sum() + twice * step.sum((0, -1)).square().sum()
+        scatter = by_line.square().sum() + 2 * step.sum((0, -1)).square().sum()
         apart = (by_line.square() / share.clamp_min(TINY)).sum() - step.sum().square()
-        apart = apart - twice * (share > 0).sum() / curvature
-        std = torch.sqrt(twice / curvature) * misfit.clamp_min(1.0)
+        apart = apart - 2 * (share > 0).sum() / curvature
+        std = torch.sqrt(2 / curvature) * misfit.clamp_min(1.0)
         return step.sum(), torch.maximum(std, torch.maximum(scatter, apart).sqrt()), misfit
 
     def echo(self, cells: Tensor) -> Tensor:

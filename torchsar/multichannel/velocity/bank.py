@@ -168,7 +168,12 @@ def _best_tone(
     aligned = torch.zeros_like(spectrum[..., 0, :])
     for x, dx in zip(spectrum.unbind(-2), radar.channel_m, strict=True):
         aligned = aligned + x * unit_phasor(shift / scale * dx, x.dtype)
-    energy = weight.square().sum(-1) * radar.channels if whitening is None else _whitened_energy(model, whitening)
+    energy = weight.square().sum(-1) * radar.channels
+    if whitening is not None:
+        # that of the middle model serves for all, since it hardly depends on the along-track speed
+        middle = model[..., model.shape[-3] // 2, :, :].to(torch.complex128)
+        middle = middle.expand(*whitening.factor.shape[:-3], *middle.shape[-2:])
+        energy = whitening.applied(middle).abs().square().sum((-2, -1))[..., None]
     power = aligned.abs().square().to(torch.float64) / energy.clamp_min(torch.finfo(torch.float32).tiny)[..., None]
     power = torch.where(shift.abs() <= reach_m, power, -torch.inf).flatten(-2)
     at = power.argmax(-1, keepdim=True)
@@ -200,17 +205,3 @@ def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor,
         return tones, prf_hz
     whole = tones.shape[-1] // factor * factor
     return tones[..., :whole].unflatten(-1, (-1, factor)).sum(-1), prf_hz / factor
-
-
-def _whitened_energy(model: Tensor, whitening: Whitening) -> Tensor:
-    """Return the energy of the middle model in the metric of the clutter, shape (..., 1).
-
-    It serves for all hypotheses, since it hardly depends on the along-track speed.
-    """
-    middle = model[..., model.shape[-3] // 2, :, :].to(torch.complex128)
-    return (
-        whitening.applied(middle.expand(*whitening.factor.shape[:-3], *middle.shape[-2:]))
-        .abs()
-        .square()
-        .sum((-2, -1))[..., None]
-    )
