@@ -16,7 +16,7 @@ from torchsar.multichannel import (
     MinimumMeanSquare,
     Reconstruct,
 )
-from torchsar.multichannel.response import Rebuild
+from torchsar.multichannel.reconstruct import Rebuild
 from torchsar.radar import BistaticRadar, LinearFM
 
 F64 = torch.float64

@@ -13,8 +13,7 @@ from torchsar.multichannel.azimuth import (
     known_motion_chain,
 )
 from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
-from torchsar.multichannel.body import Body, body_echo, find_body
-from torchsar.multichannel.chip import Extraction
+from torchsar.multichannel.body import Body, Extraction, body_echo, find_body
 from torchsar.multichannel.migration import (
     CorrectMigration,
     Frame,
@@ -25,18 +24,20 @@ from torchsar.multichannel.migration import (
     correct_migration,
 )
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import Reconstruct, reconstruct, reconstruct_lines
-from torchsar.multichannel.requirements import MultichannelUse, multichannel_limits, multichannel_requirements
-from torchsar.multichannel.response import (
+from torchsar.multichannel.reconstruct import (
     ElementPattern,
     FlatBand,
     LeastSquares,
     MinimumMeanSquare,
+    Reconstruct,
     band_matrix,
     condition_number,
     doppler_offsets,
     noise_gain_db,
+    reconstruct,
+    reconstruct_lines,
 )
+from torchsar.multichannel.requirements import MultichannelUse, multichannel_limits, multichannel_requirements
 from torchsar.multichannel.scene_image import Detection, Detector, ImageMovers, MoversImage, SceneImage, detect
 from torchsar.multichannel.stationary import StationaryImage, stationary_image
 from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation

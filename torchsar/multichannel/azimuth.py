@@ -34,12 +34,16 @@ from torchsar.core import (
 from torchsar.multichannel.migration import CorrectMigration, Migration
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import (
+    LeastSquares,
+    Rebuild,
     Reconstruct,
     check_condition,
     doppler_axis,
+    doppler_centre_hz,
+    doppler_offsets,
     refuse_shifted,
+    shared_response,
 )
-from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_centre_hz, doppler_offsets, shared_response
 from torchsar.multichannel.transmit import CompressChannels, RemoveTransmitRange
 from torchsar.radar import BistaticRadar
 

@@ -35,7 +35,7 @@ from torchsar.multichannel.balance_assess import assessed_balance
 from torchsar.multichannel.clutter_fit import ClutterModel, hann
 from torchsar.multichannel.migration import envelope_phasor
 from torchsar.multichannel.motion import checked_channels
-from torchsar.multichannel.response import ElementPattern, Prior
+from torchsar.multichannel.reconstruct import ElementPattern, Prior
 from torchsar.radar import BistaticRadar
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchsar.core import linear_solve, matrix_inverse, take
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import Prior, band_matrix, doppler_offsets, first_bin, shared_response
+from torchsar.multichannel.reconstruct import Prior, band_matrix, doppler_offsets, first_bin, shared_response
 from torchsar.radar import BistaticRadar
 
 # Found by trial: after 12 Newton steps phases still err by 3e-5 rad with a flat band and by 8e-3

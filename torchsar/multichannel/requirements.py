@@ -24,7 +24,7 @@ from torchsar.core.arguments import names_arguments
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement, phase_error_db
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import (
+from torchsar.multichannel.reconstruct import (
     POOR,
     SINGULAR,
     SINGULAR_SINGLE,

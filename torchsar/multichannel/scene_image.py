@@ -26,11 +26,10 @@ from torch.nn.functional import avg_pool2d
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, fft_lines, linear_phasor, unit_level
 from torchsar.core.arguments import names_arguments
-from torchsar.multichannel.body import Body, body_echo, body_image, find_body, known_body
-from torchsar.multichannel.chip import Extraction
+from torchsar.multichannel.body import Body, Extraction, body_echo, body_image, find_body, known_body
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import LeastSquares, Rebuild, band_matrix, first_bin, shared_response
+from torchsar.multichannel.reconstruct import LeastSquares, Rebuild, band_matrix, first_bin, shared_response
 from torchsar.multichannel.stationary import StationaryImage, stationary_axis
 from torchsar.multichannel.velocity.whitening import line_whitening
 from torchsar.radar import BistaticRadar

@@ -25,8 +25,14 @@ from torchsar.focus import omega_k, omega_k_stolt
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Aperture, phase_error_db
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines, refuse_channels, refuse_shifted
-from torchsar.multichannel.response import LeastSquares, Rebuild
+from torchsar.multichannel.reconstruct import (
+    LeastSquares,
+    Rebuild,
+    check_condition,
+    reconstruct_lines,
+    refuse_channels,
+    refuse_shifted,
+)
 from torchsar.radar import BistaticRadar, StripmapRadar
 
 FORMS: dict[str, Callable[..., Tensor]] = {"bulk": omega_k, "stolt": omega_k_stolt}

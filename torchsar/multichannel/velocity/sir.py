@@ -21,8 +21,14 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, take
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines, refuse_channels
-from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
+from torchsar.multichannel.reconstruct import (
+    LeastSquares,
+    Rebuild,
+    check_condition,
+    doppler_offsets,
+    reconstruct_lines,
+    refuse_channels,
+)
 from torchsar.multichannel.velocity.along_track import interfered
 from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.multichannel.velocity.assess import outcome_of_point

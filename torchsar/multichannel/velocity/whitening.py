@@ -24,7 +24,7 @@ from torch import Tensor
 from torchsar.core import cholesky_factor, matrix_inverse
 from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.motion import PointMotion, checked_channels
-from torchsar.multichannel.response import shared_response
+from torchsar.multichannel.reconstruct import shared_response
 from torchsar.radar import BistaticRadar
 
 # Samples of a covariance: with three channels 60 cost 0.15 dB of SNR on average (Reed, Mallett and
