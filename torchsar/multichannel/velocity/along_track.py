@@ -259,7 +259,18 @@ def interferometry(
 def interfered(
     data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, passes: int = 4
 ) -> tuple[Found, Aperture]:
-    """Return the fit of `interferometry`, and the aperture in which the point is seen."""
+    """Return the fit of `interferometry`, and the aperture in which the point is seen.
+
+    Args:
+        data: Channels, shape (..., channel, pulse), complex128.
+        radar: Radar parameters.
+        start: Starting motion, shape (...,).
+        aperture: Expected amplitude over slow time.
+        passes: Number of passes.
+
+    Returns:
+        The fit and the aperture.
+    """
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     motion = _begun(data, radar, start, time_s)
     aperture, _ = seen_aperture(data, radar, motion, aperture)

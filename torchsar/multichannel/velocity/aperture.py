@@ -83,7 +83,11 @@ class ElementBeam:
 
 @dataclass(frozen=True)
 class Kept:
-    """Expected amplitude that is the same for all motions, float64 (..., pulse)."""
+    """Expected amplitude that is the same for all motions.
+
+    Args:
+        amplitude: Expected amplitude, float64 (..., pulse).
+    """
 
     amplitude: Tensor
 

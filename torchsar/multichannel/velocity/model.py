@@ -303,5 +303,12 @@ def estimate_of(found: Found, outcome: Tensor | None = None, info: Mapping[str, 
 
 
 def quality_of(snr_db: Tensor) -> Tensor:
-    """Map the SNR over all samples to a quality of 0 to 1, one half at the detection threshold."""
+    """Map the SNR over all samples to a quality of 0 to 1, one half at the detection threshold.
+
+    Args:
+        snr_db: SNR in dB, any shape.
+
+    Returns:
+        Quality, same shape.
+    """
     return ((snr_db - DETECTED_DB) / 3).sigmoid()
