@@ -65,7 +65,7 @@ def test_values_are_the_same_without_assessment_which_then_does_no_work(
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("assessed")
 
-    for module in ("sir", "interferometry", "along_track", "gradient", "stages", "recommended"):
+    for module in ("sir", "along_track", "stages", "recommended"):
         monkeypatch.setattr(import_module(f"torchsar.multichannel.velocity.{module}"), "outcome_of_point", refuse)
     bare = STAGES[name](assess=False)(signal, **start)
     assert bare.outcome.tolist() == [Outcome.NOT_ASSESSED] * 3

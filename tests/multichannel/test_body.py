@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from torchsar.multichannel import Extraction, Frame, PointMotion, body_echo, find_body
-from torchsar.multichannel.body import body_image, known_body
-from torchsar.multichannel.chip import Segments, centred_motion, chip_about
+from torchsar.multichannel.body import Segments, body_image, centred_motion, chip_about, known_body
 
 from .helpers import compressed_echo
 from .ocean import EXTRACTION, GATE_S, RADAR, frame_of, ship

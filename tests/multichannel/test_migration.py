@@ -91,17 +91,6 @@ def test_loss_of_the_simpler_forms():
     assert 0.2 < loss[0] < 0.6 and loss[1] > 10 and loss[2] > 8
 
 
-def test_neglected_migration_is_predicted():
-    """The prediction is compared with the strongest cell of a pulse at the edge of the aperture."""
-    move = {"u_r": 12.0, "r0": 5600.0}
-    signal, of = compressed_echo(RADAR, N, 512, [move]), motion(**move)
-    for migration in (NoMigration(), StaticBulk(False), Keystone(False)):
-        data = corrected(signal, motion(), migration).data[1].abs()
-        edges = [data[N // 2 + k].argmax() for k in (-400, 0, 400)]
-        moved = max(abs(int(edges[0] - edges[1])), abs(int(edges[2] - edges[1]))) * RADAR.range_step_m
-        assert moved == pytest.approx(float(migration.neglected_m(800 / 180, of, motion())), abs=RADAR.range_step_m)
-
-
 def test_carrier_phases_are_unchanged():
     signal, of = compressed_echo(RADAR, 600, 128, [{"u_r": 5.0}], gate_s=3.0), motion(5.0)
     out = corrected(signal, motion(), Keystone()).data[:, 100:500, 64]

@@ -9,16 +9,14 @@ import torch
 
 from torchsar.core import Signal
 from torchsar.multichannel import (
-    AzimuthPlan,
     ElementPattern,
     FocusAzimuth,
     FocusPlan,
     LeastSquares,
     MinimumMeanSquare,
-    PointMotion,
     Reconstruct,
 )
-from torchsar.multichannel.response import Rebuild
+from torchsar.multichannel.reconstruct import Rebuild
 from torchsar.radar import BistaticRadar, LinearFM
 
 F64 = torch.float64
@@ -57,24 +55,23 @@ def test_a_plan_is_the_chain_of_two_stages(n: int, rebuild: Rebuild, u_r: float)
 
 def test_the_band_that_is_processed_follows_the_target_to_a_fraction_of_a_bin() -> None:
     radar = receiver()
-    motion = PointMotion.of(radar, torch.zeros(()), 9.97, 3.0)
-    plan = AzimuthPlan(radar, motion, 360, bandwidth_hz=200.0, dtype=torch.complex128)
-    lit = (plan.matrix.abs().sum(1).flatten() > 0).nonzero()[:, 0]
+    plan = FocusPlan(radar, bandwidth_hz=200.0, u_r_m_s=9.97, u_a_m_s=3.0)
+    matrix = plan.matrix(torch.zeros(3, 360, dtype=torch.complex128))
+    lit = (matrix.abs().sum(1).flatten() > 0).nonzero()[:, 0]
     hz = torch.remainder(lit * 0.5 + 180.0, 360.0) - 180.0
     assert len(lit) == pytest.approx(400, abs=1) and float(hz.mean()) == pytest.approx(9.97 / 0.24, abs=0.5)
 
 
 def test_gradients_and_refusals() -> None:
     radar = receiver()
-    motion = PointMotion.of(radar, torch.zeros(()), 5.0)
-    plan = AzimuthPlan(radar, motion, 12, dtype=torch.complex128)
-    assert torch.autograd.gradcheck(plan.image, torch.randn(3, 12, dtype=torch.complex128, requires_grad=True))
-    with pytest.raises(ValueError, match="this plan works on channels and pulses"):
-        plan.image(torch.zeros(3, 12, dtype=torch.complex64))
-    with pytest.raises(ValueError, match="serves one motion"):
-        AzimuthPlan(radar, PointMotion.of(radar, torch.zeros(()), torch.zeros(2, dtype=F64)), 12)
+    plan, axes = FocusPlan(radar, u_r_m_s=5.0), radar.axes(12)
+    data = torch.randn(3, 12, dtype=torch.complex128, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: plan(Signal(x, axes)).data, data)
+    single = data.detach().to(torch.complex64)
+    assert plan(Signal(single, axes)).data.dtype == torch.complex64
+    assert plan(Signal(data[:, :10].detach(), radar.axes(10))).data.shape == (20,)
     with pytest.raises(ValueError, match="cannot be separated"):
-        AzimuthPlan(radar, motion, 12, LeastSquares(4))
+        FocusPlan(radar, LeastSquares(4))(Signal(single, axes))
 
 
 def test_an_image_costs_little_more_than_its_transforms() -> None:
@@ -87,8 +84,9 @@ def test_an_image_costs_little_more_than_its_transforms() -> None:
     torch.set_num_threads(1)
     try:
         data = torch.randn(32, 3, 1080, dtype=torch.complex64)
-        plan = AzimuthPlan(radar, PointMotion.of(radar, torch.zeros(()), 10.0, 5.0), 1080, bandwidth_hz=337.5)
-        whole = plan.image(data)
+        plan = FocusPlan(radar, bandwidth_hz=337.5, u_r_m_s=10.0, u_a_m_s=5.0)
+        signal = Signal(data, radar.axes(1080))
+        whole = plan(signal).data
 
         def bare() -> None:
             torch.fft.fft(data)
@@ -99,7 +97,7 @@ def test_an_image_costs_little_more_than_its_transforms() -> None:
             work()  # type: ignore[operator]
             return time.perf_counter() - began
 
-        turns = [(once(lambda: plan.image(data)), once(bare)) for _ in range(40)]
+        turns = [(once(lambda: plan(signal)), once(bare)) for _ in range(40)]
         assert min(a for a, _ in turns) < 3.5 * min(b for _, b in turns)
     finally:
         torch.set_num_threads(threads)

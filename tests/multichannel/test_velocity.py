@@ -27,8 +27,8 @@ from torchsar.multichannel import (
     maximum_likelihood,
     moving_point_velocity,
 )
+from torchsar.multichannel.velocity.aperture import SeenAperture
 from torchsar.multichannel.velocity.bank import bank_search
-from torchsar.multichannel.velocity.illumination import SeenAperture
 from torchsar.multichannel.velocity.likelihood import PointLikelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, moved, noise_beside, phase_slopes, point_phasor
 from torchsar.scene import KSea, Pattern
@@ -397,7 +397,7 @@ class TestClutter:
         truth = PointMotion.of(self.RADAR, sea, 8.0)
         beam = ElementBeam().weight(self.RADAR, truth, t)
         data = sea + 10**2.5 * beam * point_phasor(self.RADAR, truth, t, C128)
-        whitening = line_whitening(sea, self.RADAR).expanded(trials)
+        whitening = line_whitening(sea, self.RADAR)
         found = maximum_likelihood(data, self.RADAR, truth, ElementBeam(), whitening=whitening)
         assert 0.7 < rms(found.motion.u_r_m_s - 8) / rms(found.covariance[:, 0, 0].sqrt()) < 1.4
         displaced = SeenAperture(ElementBeam(), (1 + 0.02 * t) * torch.ones(trials, 1))

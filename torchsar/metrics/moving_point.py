@@ -18,8 +18,7 @@ from torchsar.metrics.image import error_db
 from torchsar.metrics.replicas import azimuth_response, replica_level, replica_zones
 from torchsar.multichannel.azimuth import FocusAzimuth
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import Reconstruct
-from torchsar.multichannel.response import condition_number, noise_gain_db
+from torchsar.multichannel.reconstruct import Reconstruct, condition_number, noise_gain_db
 from torchsar.radar import BistaticRadar
 
 # symbols of the unknowns, by their names in truth and estimates

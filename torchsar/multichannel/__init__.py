@@ -5,13 +5,15 @@ stationary scene is reconstructed from the channels with zero velocity, that of 
 the velocity of the target.
 """
 
-from torchsar.multichannel.azimuth import FocusAzimuth, azimuth_filter, focus_azimuth
+from torchsar.multichannel.azimuth import (
+    FocusAzimuth,
+    FocusPlan,
+    azimuth_filter,
+    focus_azimuth,
+    known_motion_chain,
+)
 from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
-from torchsar.multichannel.body import Body, body_echo, find_body
-from torchsar.multichannel.chip import Extraction
-from torchsar.multichannel.compress import CompressChannels
-from torchsar.multichannel.detection import Detection, detect
-from torchsar.multichannel.known_motion import known_motion_chain
+from torchsar.multichannel.body import Body, Extraction, body_echo, find_body
 from torchsar.multichannel.migration import (
     CorrectMigration,
     Frame,
@@ -22,23 +24,30 @@ from torchsar.multichannel.migration import (
     correct_migration,
 )
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.plan import AzimuthPlan, FocusPlan
-from torchsar.multichannel.reconstruct import Reconstruct, reconstruct, reconstruct_lines
-from torchsar.multichannel.requirements import MultichannelUse, multichannel_limits, multichannel_requirements
-from torchsar.multichannel.response import (
+from torchsar.multichannel.reconstruct import (
     ElementPattern,
     FlatBand,
     LeastSquares,
     MinimumMeanSquare,
+    Reconstruct,
     band_matrix,
     condition_number,
     doppler_offsets,
     noise_gain_db,
+    reconstruct,
+    reconstruct_lines,
 )
-from torchsar.multichannel.scene_image import Detector, ImageMovers, MoversImage, SceneImage
+from torchsar.multichannel.requirements import MultichannelUse, multichannel_limits, multichannel_requirements
+from torchsar.multichannel.scene_image import Detection, Detector, ImageMovers, MoversImage, SceneImage, detect
 from torchsar.multichannel.stationary import StationaryImage, stationary_image
 from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation
-from torchsar.multichannel.transmit import AzimuthScaling, RemoveTransmitRange, remove_transmit_range, scale_azimuth
+from torchsar.multichannel.transmit import (
+    AzimuthScaling,
+    CompressChannels,
+    RemoveTransmitRange,
+    remove_transmit_range,
+    scale_azimuth,
+)
 from torchsar.multichannel.velocity import (
     AlongTrackAutofocus,
     Dwell,
@@ -60,11 +69,10 @@ from torchsar.multichannel.velocity import (
     moving_point_velocity,
     sample_whitening,
 )
-from torchsar.multichannel.velocity.migrating import MigratingLines
+from torchsar.multichannel.velocity.walk import MigratingLines
 
 __all__ = [
     "AlongTrackAutofocus",
-    "AzimuthPlan",
     "AzimuthScaling",
     "Body",
     "CompressChannels",

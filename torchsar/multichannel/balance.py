@@ -27,19 +27,16 @@ from torchsar.core import (
     Stage,
     checked_samples,
     fft_lines,
-    linear_phasor,
     refuse_non_finite_values,
     unit_level,
     unit_phasor,
 )
-from torchsar.multichannel.balance_assess import BalanceFit, assessed_balance
-from torchsar.multichannel.check import checked_channels
+from torchsar.multichannel.balance_assess import assessed_balance
 from torchsar.multichannel.clutter_fit import ClutterModel, hann
-from torchsar.multichannel.response import ElementPattern, Prior
+from torchsar.multichannel.migration import envelope_phasor
+from torchsar.multichannel.motion import checked_channels
+from torchsar.multichannel.reconstruct import ElementPattern, Prior
 from torchsar.radar import BistaticRadar
-
-# SNR assumed while delays are estimated, found by trial: from 20 dB on they hardly depend on it.
-_COARSE_DB = 20.0
 
 
 def correct_balance(
@@ -82,22 +79,37 @@ def correct_balance(
                 f"shape {tuple(value.shape)}"
             )
     factor = (unit_phasor(-phase_rad / (2 * math.pi), torch.complex128) * 10 ** (-gain_db / 20)).to(data.dtype)
-    if not with_range:
-        if delay_s is not None and bool(delay_s.any()):
-            raise ValueError(
-                "delay_s must be None or zero for data without a range axis, along which delays act; leave delay_s out"
-            )
-        return data * factor[..., None]
-    balanced = data * factor[..., None, None]
-    return balanced if delay_s is None else torch.fft.ifft(torch.fft.fft(balanced) * _advance(delay_s, radar, data))
+    delay_s = None if delay_s is None else delay_s[..., None]
+    return without_errors(data, radar, factor[..., None], delay_s, with_range)
 
 
-def _advance(delay_s: Tensor, radar: BistaticRadar, data: Tensor) -> Tensor:
-    """Return exp(+j 2 pi fr delay), (..., channel, 1, range frequency), FFT order."""
-    n = data.shape[-1]
-    return torch.fft.ifftshift(linear_phasor(delay_s * (radar.sampling_hz / n), -(n // 2), n, data.dtype), dim=-1)[
-        ..., None, :
-    ]
+def without_errors(
+    data: Tensor, radar: BistaticRadar, factor: Tensor, delay_s: Tensor | None, with_range: bool
+) -> Tensor:
+    """Multiply channels by a factor and advance their envelopes in range time.
+
+    Args:
+        data: Channels, shape (..., channel, pulse, range), or (..., channel, pulse), complex.
+        radar: Radar parameters.
+        factor: Factor, which broadcasts to (..., channel, pulse), complex.
+        delay_s: Delay in seconds, as `factor`, or None.
+        with_range: Whether the data have a range axis.
+
+    Returns:
+        Data of the same shape.
+
+    Raises:
+        ValueError: If data without a range axis have a delay.
+    """
+    if with_range:
+        data = data * factor[..., None]
+        phasor = None if delay_s is None else envelope_phasor(delay_s * radar.wave_speed_m_s, radar, data)
+        return data if phasor is None else torch.fft.ifft(torch.fft.fft(data) * phasor)
+    if delay_s is not None and bool(delay_s.any()):
+        raise ValueError(
+            "delay_s must be None or zero for data without a range axis, along which delays act; leave delay_s out"
+        )
+    return data * factor
 
 
 def estimate_balance(
@@ -178,17 +190,18 @@ def estimate_balance(
         lines = lines / torch.where(own > 0, own, 1.0).sqrt()
         bands = bands or math.ceil(2 * radar.speed_m_s / (radar.wavelength_m * radar.prf_hz))
         model = ClutterModel.of(radar, prior or ElementPattern(), data.shape[-2], bands, data.device)
-        reference = _reference(radar)
+        reference = min(range(radar.channels), key=lambda m: abs(radar.channel_m[m]))
         highest = frequency.abs().max()
         position = frequency / highest if delays else None
         middle = None if position is None else position.view(blocks, -1).mean(-1)
         turn = torch.zeros(*data.shape[:-3], radar.channels, dtype=torch.float64, device=data.device)
         products = _products(lines, blocks, no_power)
         if position is not None and middle is not None:
-            by_block = model.weights(products.movedim(-3, 0), _COARSE_DB)[0].movedim(0, -2)
+            coarse_db = 20.0  # by trial: from 20 dB on, delays hardly depend on it
+            by_block = model.weights(products.movedim(-3, 0), coarse_db)[0].movedim(0, -2)
             turn = _slope(by_block, middle, reference)
             products = _products(_turned(lines, turn, position), blocks, no_power)
-            turn = turn + model.fit(products, _COARSE_DB, middle).turn
+            turn = turn + model.fit(products, coarse_db, middle).turn
             products = _products(_turned(lines, turn, position), blocks, no_power)
         mean = products.mean(-3)
         snr_db = model.snr_db(mean)
@@ -212,9 +225,10 @@ def estimate_balance(
         lines = lines * fit.weights[..., None, None]
         if position is not None:
             lines = _turned(lines, turn, position)
-        found = BalanceFit(lines, model, fit, snr_db, position, reference, no_power)
         lead = first[0].lead(mean, weights, first[1]) if 1 < bands < radar.channels else None
-        (phase_std, log_std, turn_std), quality, outcome = assessed_balance(found, lead)
+        (phase_std, log_std, turn_std), quality, outcome = assessed_balance(
+            lines, model, fit, snr_db, position, reference, no_power, lead
+        )
         std = {
             "phase_rad": phase_std,
             "gain_db": log_std * (20 / math.log(10)),
@@ -242,11 +256,6 @@ def _check_data(data: Tensor, radar: BistaticRadar, blocks: int, bands: int | No
             f"blocks must be at least 2 and at most {inside}, the number of range frequencies of {data.shape[-1]} "
             f"range samples within the bandwidth of the pulse, got {blocks}"
         )
-
-
-def _reference(radar: BistaticRadar) -> int:
-    """Return the index of the channel nearest to the reference point of the track."""
-    return min(range(radar.channels), key=lambda m: abs(radar.channel_m[m]))
 
 
 def _band_lines(data: Tensor, radar: BistaticRadar, blocks: int) -> tuple[Tensor, Tensor]:

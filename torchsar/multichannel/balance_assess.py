@@ -13,7 +13,6 @@ Reference:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -27,51 +26,37 @@ _CELL_BLOCKS, _BIN_BLOCKS = 32, 16
 # Curvature below which a combination of unknowns is not determined, per look, and the standard
 # deviation in rad or neper of what is not determined.
 _LEAST_CURVED, _UNKNOWN = 1e-10, 1e3
-# Difference of the powers of balanced channels over that by chance from which the prior is taken to
-# be wrong, by choice.
-_UNLIKELY = 4.0
 # Ratio of deviations by the scatter of Doppler bins and of range cells from which the prior is
 # taken to be wrong, and least number of parts of the swath that hold the power, both by choice. The
 # ratio is at most 1.8 where the prior suits; a point that holds 58 % of the power leaves 3 parts.
 _MISFIT, _LEAST_PARTS = 2.5, 3.0
-# Least logarithm of the likelihood ratio to clutter displaced by whole bands, by choice.
-_LEAST_LEAD = 100.0
 # Convention: a linear phase error of 0.1 rad, three times as much, already makes false targets of
 # about -20 dB when three bands are reconstructed at a PRF of 180 Hz. So do amplitudes. Phases that
 # delays turn over the range band weigh less, since their mean is zero.
 _LARGEST_STD_RAD, _LARGEST_ACROSS_RAD = 0.033, 0.1
-_NOTHING_RAD = 0.25  # standard deviation from which a phase is that of noise, by choice
 _TINY = torch.finfo(torch.float64).tiny
 
 
-@dataclass(frozen=True)
-class BalanceFit:
-    """Fit of the weights of the channels, with what its assessment needs.
+def assessed_balance(
+    lines: Tensor,
+    model: ClutterModel,
+    fit: Fit,
+    snr_db: Tensor,
+    position: Tensor | None,
+    reference: int,
+    no_power: Tensor,
+    lead: Tensor | None,
+) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
+    """Return standard deviations of phases, logarithms of gains and turns, quality and outcome.
 
     Args:
         lines: Balanced spectra, complex128 (..., channel, bin, range frequency).
         model: Model of the clutter.
-        fit: Minimum.
+        fit: Fit of the weights of the channels.
         snr_db: SNR of the model, (...,).
         position: Places of the range frequencies in the band, -1 to 1; None without turns.
         reference: Index of the reference channel.
         no_power: Where a channel has no power, bool (...,).
-    """
-
-    lines: Tensor
-    model: ClutterModel
-    fit: Fit
-    snr_db: Tensor
-    position: Tensor | None
-    reference: int
-    no_power: Tensor
-
-
-def assessed_balance(found: BalanceFit, lead: Tensor | None) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
-    """Return standard deviations of phases, logarithms of gains and turns, quality and outcome.
-
-    Args:
-        found: The fit.
         lead: Lead of the first fit per look, see `ClutterModel.lead`; None where the clutter cannot
             lie in other Doppler bands.
 
@@ -80,8 +65,7 @@ def assessed_balance(found: BalanceFit, lead: Tensor | None) -> tuple[tuple[Tens
         Those of gains contain the difference that remains between the powers of the balanced
         channels, as with a wrong prior.
     """
-    lines, model, fit, reference = found.lines, found.model, found.fit, found.reference
-    inverse = matrix_inverse(model.noisy(found.snr_db))
+    inverse = matrix_inverse(model.noisy(snr_db))
     inner = (inverse @ lines.movedim(-3, -2)).movedim(-2, -3)
     cells, within = (torch.fft.ifft(x, norm="ortho") for x in (lines, inner))
     along = _covariance(_score(cells, within, -2), _CELL_BLOCKS)
@@ -97,31 +81,34 @@ def assessed_balance(found: BalanceFit, lead: Tensor | None) -> tuple[tuple[Tens
     rows[..., :channels, :] -= rows[..., reference, None, :].clone()
     log_std, phase_std = std(along, rows).unflatten(-1, (2, -1)).unbind(-2)
     turn_std = torch.zeros_like(phase_std)
-    if found.position is not None:
-        turning = torch.cat([_score(lines, inner, -2), found.position * (lines.conj() * inner).mean(-2).imag], -2)
+    if position is not None:
+        turning = torch.cat([_score(lines, inner, -2), position * (lines.conj() * inner).mean(-2).imag], -2)
         turn_std = std(_covariance(turning, _CELL_BLOCKS), hessian[..., 2 * channels :, :])
     misfit = std(over_bins, rows).square().sum(-1) / std(along, rows).square().sum(-1).clamp_min(_TINY)
-    power = (cells.abs().square().mean((-3, -2)) - 10 ** (-found.snr_db[..., None] / 10)).clamp_min(0)
+    power = (cells.abs().square().mean((-3, -2)) - 10 ** (-snr_db[..., None] / 10)).clamp_min(0)
     share = _blocks(power, _CELL_BLOCKS)
     share = share / share.sum(-1, keepdim=True).clamp_min(_TINY)
-    # balanced channels have equal power, but with a wrong prior other gains are more likely
+    # balanced channels have equal power, but with a wrong prior other gains are more likely: it is
+    # taken to be wrong where the powers differ by four times as much as by chance, by choice
     looks = lines.shape[-2] * lines.shape[-1] * HANN_LOOKS
     level = lines.abs().square().mean((-2, -1))
     uneven = torch.log((level / level[..., reference, None].clamp_min(1e-300)).clamp_min(1e-3)).abs() / 2
-    chance = model.chance(found.snr_db, reference, looks) / 2
-    log_std = torch.where(uneven > _UNLIKELY * chance, torch.hypot(log_std, uneven), log_std)
+    chance = model.chance(snr_db, reference, looks) / 2
+    log_std = torch.where(uneven > 4.0 * chance, torch.hypot(log_std, uneven), log_std)
     largest = torch.maximum(phase_std, log_std).amax(-1)
     # rms phase over the range band by a delay
     across = turn_std.amax(-1) / math.sqrt(3)
     relative = torch.maximum(largest / _LARGEST_STD_RAD, across / _LARGEST_ACROSS_RAD)
+    # the logarithm of the likelihood ratio to clutter displaced by whole bands must be 100, and the
+    # standard deviation of a phase .25 rad at most, both by choice
     outcome = worst(
         (Outcome.INEXACT, ~(relative < 1)),
         (Outcome.MISFIT, misfit.sqrt() >= _MISFIT),
-        (Outcome.AMBIGUOUS, found.no_power if lead is None else lead * looks <= _LEAST_LEAD),
+        (Outcome.AMBIGUOUS, no_power if lead is None else lead * looks <= 100.0),
         (Outcome.TOO_FEW, share.square().sum(-1) * _LEAST_PARTS >= 1),
-        (Outcome.NOISE, phase_std.amax(-1) > _NOTHING_RAD),
-        (Outcome.EMPTY, found.no_power),
-        (Outcome.SINGULAR, ~determined & ~found.no_power),
+        (Outcome.NOISE, phase_std.amax(-1) > 0.25),
+        (Outcome.EMPTY, no_power),
+        (Outcome.SINGULAR, ~determined & ~no_power),
     )
     return (phase_std, log_std, turn_std), (1 - relative).clamp(0, 1), outcome
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchsar.core import linear_solve, matrix_inverse, take
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import Prior, band_matrix, doppler_offsets, first_bin, shared_response
+from torchsar.multichannel.reconstruct import Prior, band_matrix, doppler_offsets, first_bin, shared_response
 from torchsar.radar import BistaticRadar
 
 # Found by trial: after 12 Newton steps phases still err by 3e-5 rad with a flat band and by 8e-3
@@ -36,10 +36,6 @@ _POINTS, _REACH = 8, 8
 # Rounds in which the power over Doppler is found, by trial, and neighbours of a bin over which it
 # is averaged, by choice: 9 bins of 80 range cells give it to 5 %.
 _POWER_ROUNDS, _NEAR = 30, 4
-# Mean of the phasors of channels from which they count as equal, by choice.
-_SAME = 0.995
-# Least weight of a channel of unit power with which the search starts, by choice.
-_LEAST_WEIGHT = 0.1
 
 
 def hann(radar: BistaticRadar, n_pulse: int, device: torch.device) -> Tensor:
@@ -214,8 +210,8 @@ class ClutterModel:
         moved = weights[..., None, :] * torch.cat([torch.ones_like(others[:1]), others])
         form = (moved.conj() * (moved @ matrix.mT)).sum(-1).real
         lead = form[..., 1:] - form[..., :1]
-        # phases that are nearly equal in all channels displace nothing
-        return torch.where(others.mean(-1).abs() < _SAME, lead, torch.inf).amin(-1)
+        # phases that are nearly equal in all channels displace nothing (.995: by choice)
+        return torch.where(others.mean(-1).abs() < 0.995, lead, torch.inf).amin(-1)
 
     def snr_db(self, products: Tensor) -> Tensor:
         """Estimate the SNR in dB (...,) by maximum likelihood, with the weights."""
@@ -256,7 +252,8 @@ def _start(matrix: Tensor, power: Tensor) -> Tensor:
     """
     level = power.clamp_min(torch.finfo(torch.float64).tiny).rsqrt().to(matrix.dtype)
     least = torch.linalg.eigh(level[..., :, None] * matrix * level[..., None, :])[1][..., 0]
-    return level * torch.polar(least.abs().clamp_min(_LEAST_WEIGHT), least.angle())
+    # no channel starts without weight, by choice
+    return level * torch.polar(least.abs().clamp_min(0.1), least.angle())
 
 
 def _lowest(before: Tensor, here: Tensor, after: Tensor) -> Tensor:

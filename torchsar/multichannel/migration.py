@@ -16,8 +16,7 @@ Reference:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -69,7 +68,7 @@ class Frame:
         Returns:
             Change of range in metres, float64 (..., channel, pulse).
         """
-        return self._history(reference, reference.range_m[..., None, None, None]).path_m[..., 0]
+        return self._moved_m(reference, reference.range_m[..., None, None, None], 0.0)[..., 0]
 
     def residual_m(self, reference: PointMotion, walks: float) -> Tensor:
         """Return the envelope displacement left after removal of the reference range history.
@@ -86,90 +85,23 @@ class Frame:
         Returns:
             Displacement in metres, float64 (..., channel, pulse, range).
         """
-        own, of_reference = (
-            self._history(reference, self.range_m),
-            self._history(reference, reference.range_m[..., None, None, None]),
-        )
-        e = own.path_m - of_reference.path_m
-        return e if not walks else e - walks * self.time_s[:, None] * (own.rate_m_s - of_reference.rate_m_s)
+        whole = self._moved_m(reference, self.range_m, walks)
+        return whole - self._moved_m(reference, reference.range_m[..., None, None, None], walks)
 
-    def _history(self, reference: PointMotion, range_m: Tensor) -> _History:
-        """Return the range history of the reference motion at given closest ranges."""
-        u_r, u_a, y0 = (
-            value[..., None, None, None] for value in (reference.u_r_m_s, reference.u_a_m_s, reference.y0_m)
-        )
-        return _History(
-            self.time_s[:, None],
-            u_r,
-            u_a,
-            y0,
-            range_m,
-            reference.speed_m_s,
-            self.radar.channels_at(self.time_s.device)[:, None, None],
-        )
+    def _moved_m(self, reference: PointMotion, range_m: Tensor, walks: float) -> Tensor:
+        """Return the range history R_m(t) - R0 of the reference motion at given closest ranges.
 
-
-@dataclass(frozen=True)
-class _History:
-    """Range of a point over time; all fields broadcast to (..., channel, pulse, range)."""
-
-    time_s: Tensor
-    u_r_m_s: Tensor
-    u_a_m_s: Tensor
-    y0_m: Tensor
-    range_m: Tensor
-    speed_m_s: float
-    channel_m: Tensor
-
-    @property
-    def path_m(self) -> Tensor:
-        """Change of range R_m(t) - R0 in metres."""
-        return receive_range(
-            self.time_s, self.u_r_m_s, self.u_a_m_s, self.y0_m, self.range_m, self.speed_m_s, self.channel_m
-        )
-
-    @property
-    def rate_m_s(self) -> Tensor:
-        """Derivative of the range with respect to time in m/s."""
-        v = self.speed_m_s - self.u_a_m_s
-        across, along = self.range_m - self.u_r_m_s * self.time_s, v * self.time_s - self.y0_m - self.channel_m
-        return (v * along - self.u_r_m_s * across) / torch.sqrt(across.square() + along.square())
-
-
-class Migration(Protocol):
-    """Method of range migration correction."""
-
-    def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
-        """Correct the range migration.
-
-        Args:
-            data: Range-compressed channels, shape (..., channel, pulse, range), complex.
-            frame: Radar, slow time and ranges of the data.
-            reference: Motion of the reference point, whose range history is removed, shape (...,).
-            ambiguity: PRF ambiguity number of the targets relative to the reference, shape (...,),
-                see `ambiguity_number`.
-
-        Returns:
-            Corrected data, same shape.
+        Its derivative times slow time and `walks` is subtracted. (..., channel, pulse, range)
         """
-        ...
-
-    def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the migration that remains for a point that does not move as the reference point.
-
-        It is the largest displacement of the envelope within the integration time, which is centred
-        on t = 0. Below a quarter of a range cell, c / (4 B) with the bandwidth B, the loss is
-        negligible.
-
-        Args:
-            integration_s: Integration time in seconds.
-            motion: Motion of the point, shape (...,).
-            reference: Motion of the reference point, shape (...,).
-
-        Returns:
-            Remaining migration in metres, shape (...,).
-        """
-        ...
+        time_s, channel_m = self.time_s[:, None], self.radar.channels_at(self.time_s.device)[:, None, None]
+        u_r, u_a, y0 = (x[..., None, None, None] for x in (reference.u_r_m_s, reference.u_a_m_s, reference.y0_m))
+        path = receive_range(time_s, u_r, u_a, y0, range_m, reference.speed_m_s, channel_m)
+        if not walks:
+            return path
+        v = reference.speed_m_s - u_a
+        across, along = range_m - u_r * time_s, v * time_s - y0 - channel_m
+        rate_m_s = (v * along - u_r * across) / torch.sqrt(across.square() + along.square())
+        return path - walks * time_s * rate_m_s
 
 
 @names_arguments
@@ -180,10 +112,6 @@ class NoMigration:
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
         """Return the data unchanged."""
         return data
-
-    def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the largest range change of a point relative to t = 0, in metres, (...,)."""
-        return _moved_m(integration_s, motion).abs().amax(0)
 
 
 @names_arguments
@@ -202,17 +130,9 @@ class StaticBulk:
     whole_swath: bool = False
 
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
-        """Shift pulses by the range history of the reference; arguments as in `Migration.apply`."""
-        spectrum = torch.fft.fft(data) * _envelope_phasor(frame.path_m(reference), frame.radar, data)
+        """Shift pulses by the range history of the reference; arguments as in `Keystone.apply`."""
+        spectrum = torch.fft.fft(data) * envelope_phasor(frame.path_m(reference), frame.radar, data)
         return _profiles(spectrum, frame, reference, 0.0) if self.whole_swath else torch.fft.ifft(spectrum)
-
-    def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the range migration of a point minus that of the reference in metres, (...,)."""
-        return (
-            (_moved_m(integration_s, motion) - _moved_m(integration_s, _followed(motion, reference, self.whole_swath)))
-            .abs()
-            .amax(0)
-        )
 
 
 @names_arguments
@@ -238,33 +158,24 @@ class Keystone:
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
         """Correct range migration by deramp, keystone transform and reramp.
 
-        Arguments as in `Migration.apply`.
+        Args:
+            data: Range-compressed channels, shape (..., channel, pulse, range), complex.
+            frame: Radar, slow time and ranges of the data.
+            reference: Motion of the reference point, whose range history is removed, shape (...,).
+            ambiguity: PRF ambiguity number of the targets relative to the reference, shape (...,),
+                see `ambiguity_number`.
+
+        Returns:
+            Corrected data, same shape.
         """
         path = frame.path_m(reference)
         deramp = unit_phasor(path / frame.radar.wavelength_m, data.dtype)[..., None]
-        spectrum = torch.fft.fft(data * deramp) * _envelope_phasor(path, frame.radar, data)
+        spectrum = torch.fft.fft(data * deramp) * envelope_phasor(path, frame.radar, data)
         spectrum = _rescaled(spectrum, frame.radar, ambiguity) * deramp.conj()
         return _profiles(spectrum, frame, reference, 1.0) if self.whole_swath else torch.fft.ifft(spectrum)
 
-    def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the range curvature of a point minus that of the reference in metres, (...,)."""
-        e = _moved_m(integration_s, motion) - _moved_m(integration_s, _followed(motion, reference, self.whole_swath))
-        return e.mean(0).abs()
 
-
-def _moved_m(integration_s: float, motion: PointMotion) -> Tensor:
-    """Return the range changes R(+-T/2) - R(0) in metres, (2, ...)."""
-
-    def at(time_s: float) -> Tensor:
-        time = torch.tensor(time_s, dtype=torch.float64, device=motion.range_m.device)
-        return receive_range(time, motion.u_r_m_s, motion.u_a_m_s, motion.y0_m, motion.range_m, motion.speed_m_s, 0.0)
-
-    return torch.stack([at(-integration_s / 2) - at(0.0), at(integration_s / 2) - at(0.0)])
-
-
-def _followed(motion: PointMotion, reference: PointMotion, whole_swath: bool) -> PointMotion:
-    """Return the motion whose history is removed at the range of a point."""
-    return replace(reference, range_m=motion.range_m) if whole_swath else reference
+Migration = NoMigration | StaticBulk | Keystone
 
 
 def ambiguity_number(radar: BistaticRadar, motion: PointMotion, reference: PointMotion) -> Tensor:
@@ -287,8 +198,17 @@ def ambiguity_number(radar: BistaticRadar, motion: PointMotion, reference: Point
     return torch.round((tone[0] - tone[1]) / radar.ambiguous_velocity_m_s)
 
 
-def _envelope_phasor(path_m: Tensor, radar: BistaticRadar, data: Tensor) -> Tensor:
-    """Return exp(+j 2 pi fr / c path) over range frequency in FFT order, (..., range frequency)."""
+def envelope_phasor(path_m: Tensor, radar: BistaticRadar, data: Tensor) -> Tensor:
+    """Return exp(+j 2 pi fr / c path), which moves envelopes nearer by a path.
+
+    Args:
+        path_m: Path in metres, float64 (...,).
+        radar: Radar parameters.
+        data: Samples whose number of ranges and dtype are used.
+
+    Returns:
+        Phasor over range frequency in FFT order, (..., range frequency).
+    """
     n = data.shape[-1]
     turns = path_m / (radar.range_step_m * n)
     return torch.fft.ifftshift(linear_phasor(turns, -(n // 2), n, data.dtype), dim=-1)

@@ -1,4 +1,4 @@
-"""Uniform motion of a point in front of an airborne receiver, and derived quantities."""
+"""Uniform motion of a point in front of an airborne receiver, and the check of its channels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import check_value, per_trial
+from torchsar.core import check_value, checked_samples, per_trial
 from torchsar.core.arguments import names_arguments
 from torchsar.radar import BistaticRadar
 
@@ -68,14 +68,11 @@ class PointMotion:
                 or the range is not positive.
         """
         near = radar.reference_range_m if range_m is None else range_m
-        motion = PointMotion(
-            per_trial(u_r_m_s, 0, like),
-            per_trial(u_a_m_s, 0, like),
-            per_trial(y0_m, 0, like),
-            per_trial(near, 0, like),
-            radar.speed_m_s,
-        )
-        _check_motion(motion)
+        values = (per_trial(value, 0, like) for value in (u_r_m_s, u_a_m_s, y0_m, near))
+        motion = PointMotion(*values, speed_m_s=radar.speed_m_s)
+        finite = [torch.isfinite(getattr(motion, name)).all() for name in _VALUES]
+        possible = [(value.detach() > 0).all() for value in (motion.along_m_s, motion.range_m)]
+        check_value(torch.stack(finite + possible).all(), lambda fine: None if fine else _refuse(motion))
         return motion
 
     @staticmethod
@@ -168,8 +165,7 @@ class PointMotion:
         rest, the along-track position y0 at t = 0, the slant-range speed u_r, the along-track speed
         v of the receiver relative to the point, and V^2 = v^2 + u_r^2.
         """
-        cross = self.along_m_s * self.range_m - self.u_r_m_s * self.y0_m
-        return cross / self.square_m2_s2.sqrt()
+        return (self.along_m_s * self.range_m - self.u_r_m_s * self.y0_m) / self.square_m2_s2.sqrt()
 
     def position_m(self, image_s: Tensor) -> Tensor:
         """Return the along-track position y0 at t = 0 of a point that appears at a given slow time.
@@ -190,13 +186,6 @@ class PointMotion:
         return (self.square_m2_s2 * image_s - self.u_r_m_s * self.range_m) / self.along_m_s
 
 
-def _check_motion(motion: PointMotion) -> None:
-    """Raise ValueError for motions that are not finite, overtake the receiver or have no range."""
-    finite = [torch.isfinite(getattr(motion, name)).all() for name in _VALUES]
-    possible = [(value.detach() > 0).all() for value in (motion.along_m_s, motion.range_m)]
-    check_value(torch.stack(finite + possible).all(), lambda fine: None if fine else _refuse(motion))
-
-
 def _refuse(motion: PointMotion) -> None:
     """Raise ValueError with the reason why a motion is impossible."""
     not_finite = [name for name in _VALUES if not bool(torch.isfinite(getattr(motion, name)).all())]
@@ -214,3 +203,34 @@ def _refuse(motion: PointMotion) -> None:
         )
     if not nearest > 0:
         raise ValueError(f"the closest range of a point must be positive, got range_m={nearest:g}")
+
+
+def checked_channels(
+    data: Tensor, radar: BistaticRadar, what: str, dims: str = "channel, pulse", *, finite: bool = True
+) -> Tensor:
+    """Check the samples of several channels, and resolve lazy conjugation and negation.
+
+    Args:
+        data: Samples, shape (..., *dims), complex64 or complex128.
+        radar: Radar parameters.
+        what: Name of the function for the message.
+        dims: Names of the trailing dimensions, of which one is "channel".
+        finite: Whether NaN and Inf are refused.
+
+    Returns:
+        The samples.
+
+    Raises:
+        TypeError: If the data are not a tensor of these dtypes.
+        ValueError: If the data have no samples or too few dimensions, do not have one channel for
+            each position of the radar, or a sample is not finite.
+    """
+    data = checked_samples(data, what, dims, finite=finite)
+    names = dims.split(", ")
+    channels = data.shape[names.index("channel") - len(names)]
+    if channels != radar.channels:
+        raise ValueError(
+            f"{what} works on samples (..., {dims}) with one channel for each of the {radar.channels} positions in "
+            f"the radar's channel_m, got the shape {tuple(data.shape)}"
+        )
+    return data

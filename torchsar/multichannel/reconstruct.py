@@ -1,34 +1,414 @@
 """Azimuth reconstruction: from the aliased spectra of several channels to the full Doppler band.
 
+One channel samples at the pulse rate, so that its spectrum at each alias frequency is a sum over
+Doppler bands one PRF apart. Up to a constant phase, channel m at the along-track position dx_m is
+the reference channel delayed by dx_m / v_e, with the relative sensor velocity v_e of Eq. (25). Its
+response to band b has the factor exp(-j 2 pi b PRF dx_m / v_e), which differs between channels and
+allows the bands to be separated.
+
 Data are demodulated by the Doppler centre of the assumed motion. The reconstructed bands are
 therefore centred on it to a fraction of a bin, and the result is a smooth function of the
 velocities.
 
 Reference:
-    Remote Sens. 2020, 12, 1703, Eqs. (34)-(36).
+    Remote Sens. 2020, 12, 1703, Eqs. (25), (26), (34)-(36). The constant phase is that of Eq. (34);
+    the printed Eq. (27) has wrong signs.
 """
 
 from __future__ import annotations
 
+import math
 import warnings
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, checked_samples, fft_lines, host_largest, host_value, linear_phasor
-from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.response import (
-    POOR,
-    SINGULAR,
-    SINGULAR_SINGLE,
-    LeastSquares,
-    Rebuild,
-    condition_number,
-    doppler_centre_hz,
-    first_bin,
-    shared_response,
+from torchsar.core import (
+    Axis,
+    Signal,
+    Stage,
+    checked_samples,
+    fft_lines,
+    host_largest,
+    host_value,
+    linear_phasor,
+    linear_solve,
+    unit_phasor,
 )
+from torchsar.core.arguments import names_arguments
+from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.radar import BistaticRadar
+
+# Largest condition numbers of an inverse. Convention: an inverse in float64 may lose six of its
+# sixteen digits, one in complex64 four of its seven.
+SINGULAR, SINGULAR_SINGLE = 1e6, 1e4
+# Above this a warning is given: the noise gain of three bands of three channels is then 6.5 dB.
+POOR = 5.0
+
+
+def first_bin(n_pulse: int, bands: int) -> int:
+    """Return the index of the lowest Doppler bin relative to the centre.
+
+    The bands * n_pulse bins rise from this index, PRF / n_pulse apart.
+
+    Args:
+        n_pulse: Number of pulses.
+        bands: Number of Doppler bands.
+
+    Returns:
+        Index, not positive.
+    """
+    return -(bands * n_pulse // 2)
+
+
+def doppler_offsets(n_pulse: int, bands: int, prf_hz: float, device: torch.device | str | None = None) -> Tensor:
+    """Return the Doppler of all bins of a reconstructed spectrum relative to its centre.
+
+    Args:
+        n_pulse: Number of pulses.
+        bands: Number of bands.
+        prf_hz: Pulse repetition frequency in Hz.
+        device: Device of the result.
+
+    Returns:
+        Doppler offsets in Hz, rising, float64 (bands * n_pulse,).
+    """
+    return (torch.arange(bands * n_pulse, dtype=torch.float64, device=device) + first_bin(n_pulse, bands)) * (
+        prf_hz / n_pulse
+    )
+
+
+def band_matrix(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
+    """Return the part of the channel response that differs between Doppler bands.
+
+    It is exp(-j 2 pi b PRF dx_m / v_e) in band b for the channel at the along-track position dx_m,
+    with the relative sensor velocity v_e = V^2 / v. Here v is the along-track speed of the receiver
+    relative to the point, and V^2 = v^2 + u_r^2 with the slant-range speed u_r of the point.
+
+    Args:
+        radar: Radar parameters.
+        motion: Motion of the point, shape (...,).
+        bands: Number of bands; b is counted from the lowest one.
+
+    Returns:
+        The matrix, complex128 (..., channel, band).
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (25), (34).
+    """
+    band = torch.arange(bands, dtype=torch.float64, device=motion.u_r_m_s.device)
+    delay = radar.channels_at(band.device)[:, None] / motion.effective_m_s[..., None, None]
+    return unit_phasor(-radar.prf_hz * band * delay, torch.complex128)
+
+
+def shared_response(
+    radar: BistaticRadar, motion: PointMotion, n_pulse: int, bands: int, dtype: torch.dtype, left_k1_m_s: float = 0.0
+) -> Tensor:
+    """Return the part of the channel response that all Doppler bands share.
+
+    For the channel at the along-track position dx it is exp(-j 2 pi (f dx / v_e + C / (2 R0
+    lambda))) with C = dx^2 - (v dx^2 + 2 R0 u_r dx) / v_e + 2 y0 dx u_r^2 / V^2. Here f is u_r /
+    lambda plus the Doppler of the bin in the lowest band relative to the Doppler centre, v is the
+    along-track speed of the receiver relative to the point, u_r the slant-range speed of the point,
+    V^2 = v^2 + u_r^2, v_e = V^2 / v, y0 the along-track position at t = 0 and R0 the closest range.
+
+    Args:
+        radar: Radar parameters.
+        motion: Motion of the point, shape (...,).
+        n_pulse: Number of pulses.
+        bands: Number of bands.
+        dtype: Complex dtype of the result.
+        left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
+            still in the phase; 0 if it was removed. The response does not depend on it.
+
+    Returns:
+        The response, shape (..., channel, n_pulse), complex.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (7), (34); C is extended by the along-track position y0.
+    """
+    dx = radar.channels_at(motion.u_r_m_s.device)
+    m = motion.each(lambda value: value[..., None])
+    constant = (
+        dx.square()
+        - (m.along_m_s * dx.square() + 2 * m.range_m * m.u_r_m_s * dx) / m.effective_m_s
+        + 2 * m.y0_m * dx * m.u_r_m_s.square() / m.square_m2_s2
+    )
+    delay = dx / m.effective_m_s
+    centre_hz = doppler_centre_hz(radar, m, left_k1_m_s)
+    fixed = -centre_hz * delay - (constant / (2 * m.range_m) + left_k1_m_s * delay) / radar.wavelength_m
+    return unit_phasor(fixed, dtype)[..., None] * linear_phasor(
+        -delay * (radar.prf_hz / n_pulse), first_bin(n_pulse, bands), n_pulse, dtype
+    )
+
+
+def doppler_centre_hz(radar: BistaticRadar, motion: PointMotion, left_k1_m_s: float = 0.0) -> Tensor:
+    """Return the Doppler centre (u_r - k1) / lambda of a point with the slant-range speed u_r.
+
+    It is the Doppler frequency while the point is at broadside.
+
+    Args:
+        radar: Radar parameters.
+        motion: Motion of the point, shape (...,).
+        left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
+            still in the phase; 0 if it was removed.
+
+    Returns:
+        Doppler in Hz, shape (...,).
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eq. (39), for k1 = 0.
+    """
+    return (motion.u_r_m_s - left_k1_m_s) / radar.wavelength_m
+
+
+@names_arguments
+@dataclass(frozen=True)
+class ElementPattern:
+    """Expected power over Doppler by the one-way antenna pattern of a channel.
+
+    The pattern is sinc^2(L sin(look) / lambda) with the length L = `radar.element_m` of the
+    aperture of a channel. The look angle from broadside follows from sin(look) = -lambda offset /
+    v, with the Doppler offset from the centre and the along-track speed v of the receiver relative
+    to the point.
+    """
+
+    def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
+        """Return the expected power relative to its peak: the antenna pattern over Doppler.
+
+        Args:
+            offset_hz: Doppler relative to the Doppler centre in Hz, any shape.
+            radar: Radar parameters.
+            motion: Motion of the point, shape (...,).
+
+        Returns:
+            Power ratio, (...,) followed by the shape of `offset_hz`.
+        """
+        return torch.sinc(radar.element_m * offset_hz / motion.along_m_s[(...,) + (None,) * offset_hz.ndim]).square()
+
+
+@names_arguments
+@dataclass(frozen=True)
+class FlatBand:
+    """Expected power that is equal within a band about the Doppler centre and zero outside.
+
+    Args:
+        bandwidth_hz: Width of the band in Hz.
+
+    Raises:
+        ValueError: If the bandwidth is not positive.
+    """
+
+    bandwidth_hz: float
+
+    def __post_init__(self) -> None:
+        if not self.bandwidth_hz > 0:
+            raise ValueError(f"bandwidth_hz of a flat band must be positive, got {self.bandwidth_hz}")
+
+    def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
+        """Return 1 inside the band and 0 outside, in the shape of `offset_hz`."""
+        return (offset_hz.abs() <= self.bandwidth_hz / 2).to(torch.float64)
+
+
+# Expected power of the echoes over Doppler.
+Prior = ElementPattern | FlatBand
+
+
+def _check_bands(bands: int) -> None:
+    """Raise ValueError unless the number of bands is a whole number of at least one."""
+    if not (isinstance(bands, int) and bands >= 1):
+        raise ValueError(f"a reconstruction needs a whole number of Doppler bands, at least one, got bands={bands}")
+
+
+@names_arguments
+@dataclass(frozen=True)
+class LeastSquares:
+    """Reconstruction of Doppler bands by the pseudo-inverse of the channel responses.
+
+    This is Eq. (36) for any number of channels. The pseudo-inverse is the inverse where there are
+    as many bands as channels. Singular values below 1e-6 of the largest are damped, so that the
+    weights stay finite where two channels sample the same positions. Prefer two bands for three
+    channels: three bands amplify noise strongly near PRFs at which channels sample the same
+    positions.
+
+    Args:
+        bands: Number of Doppler bands, at most the number of channels.
+
+    Raises:
+        ValueError: If `bands` is not a whole number of at least one.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (35), (36).
+    """
+
+    bands: int = 2
+
+    def __post_init__(self) -> None:
+        _check_bands(self.bands)
+
+    def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
+        """Return the weights from channels to Doppler bands, complex128 (..., band, channel).
+
+        They are the same for all Doppler bins of a band.
+        """
+        matrix = band_matrix(radar, motion, self.bands)
+        normal = matrix.mH @ matrix
+        # it acts on singular values below 1 / SINGULAR of the largest
+        floor = SINGULAR**-2 * self.bands * radar.channels
+        return linear_solve(normal + floor * torch.eye(self.bands, dtype=normal.dtype, device=normal.device), matrix.mH)
+
+    def refusal(self, channels: int) -> str | None:
+        """Return why the method cannot work with this number of channels, or None if it can."""
+        few = (
+            f"{self.bands} Doppler bands cannot be separated by {channels} "
+            f"channel{'s' if channels > 1 else ''}; rebuild at most {channels}, or give a prior "
+            "(MinimumMeanSquare)"
+        )
+        return few if self.bands > channels else None
+
+
+@names_arguments
+@dataclass(frozen=True)
+class MinimumMeanSquare:
+    """Reconstruction of Doppler bands with least mean square error, for an expected power.
+
+    The weights are A G^H (G A G^H + I / snr)^-1, with the channel responses G to the bands, the
+    diagonal matrix A of the expected powers of the bands relative to the peak, and the power ratio
+    snr of this peak to the noise. There may be more bands than channels.
+
+    Args:
+        bands: Number of Doppler bands.
+        snr_db: Strongest expected power over the noise of a sample in dB.
+        prior: Expected power over Doppler.
+
+    Raises:
+        ValueError: If `bands` is not a whole number of at least one, or `snr_db` lies outside +-120
+            dB.
+    """
+
+    bands: int = 5
+    snr_db: float = 40.0
+    prior: Prior = ElementPattern()
+
+    def __post_init__(self) -> None:
+        _check_bands(self.bands)
+        if not abs(self.snr_db) <= 120:
+            raise ValueError(
+                f"snr_db of a least-mean-square reconstruction must lie within +-120 dB, got {self.snr_db}"
+            )
+
+    def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
+        """Return the weights from channels to Doppler bands for each Doppler bin of a band.
+
+        The shape is (..., n_pulse, band, channel), complex128.
+        """
+        offset = doppler_offsets(n_pulse, self.bands, radar.prf_hz, motion.u_r_m_s.device).view(self.bands, n_pulse).T
+        matrix = band_matrix(radar, motion, self.bands)[..., None, :, :]
+        weighted = matrix * self.prior.power(offset, radar, motion)[..., None, :].to(matrix.dtype)
+        noise = 10 ** (-self.snr_db / 10) * torch.eye(radar.channels, dtype=matrix.dtype, device=matrix.device)
+        return linear_solve(weighted @ matrix.mH + noise, weighted).mH
+
+    def refusal(self, channels: int) -> str | None:
+        """Return None, since a prior lets any number of channels separate the bands."""
+        return None
+
+
+# Reconstruction method: the number of Doppler bands and the weights that separate them.
+Rebuild = LeastSquares | MinimumMeanSquare
+
+
+def clutter_covariance(
+    radar: BistaticRadar, prior: Prior, n_pulse: int, bands: int, device: torch.device | str | None = None
+) -> Tensor:
+    """Return the covariance across channels of stationary clutter, per Doppler bin.
+
+    Args:
+        radar: Radar parameters.
+        prior: Expected power over Doppler, such as `ElementPattern()`.
+        n_pulse: Number of pulses.
+        bands: Number of Doppler bands that hold the clutter.
+        device: Device of the result.
+
+    Returns:
+        Covariance per bin of the unitary FFT over the pulses, FFT order, complex128 (n_pulse,
+        channel, channel), on the scale of the expected power.
+    """
+    motion = PointMotion.of(radar, torch.zeros((), dtype=torch.float64, device=device))
+    offset = doppler_offsets(n_pulse, bands, radar.prf_hz, device).view(bands, n_pulse).T
+    power = prior.power(offset, radar, motion)[:, None, :].to(torch.complex128)
+    shared = shared_response(radar, motion, n_pulse, bands, torch.complex128).T[..., None]
+    response = shared * band_matrix(radar, motion, bands)
+    return torch.roll((response * power) @ response.mH, first_bin(n_pulse, bands), 0)
+
+
+def noise_and_clutter(radar: BistaticRadar, lit_s: float | None, n_pulse: int, power_db: Tensor | float) -> Tensor:
+    """Return the covariance across channels of white noise of unit variance and stationary clutter.
+
+    Args:
+        radar: Radar parameters.
+        lit_s: Time in seconds for which clutter is lit with constant amplitude; None for the
+            pattern of a channel.
+        n_pulse: Number of pulses.
+        power_db: Power of the clutter over the noise in dB, a number or shape (...,).
+
+    Returns:
+        Covariance per Doppler bin, complex128 (..., n_pulse, channel, channel).
+    """
+    band = None if lit_s is None else radar.speed_m_s**2 * lit_s / (radar.wavelength_m * radar.reference_range_m)
+    prior = ElementPattern() if band is None else FlatBand(band)
+    clutter = clutter_covariance(radar, prior, n_pulse, bands=5)  # which the clutter of a pattern fills
+    level = 10 ** (torch.as_tensor(power_db, dtype=torch.float64) / 10)
+    mean = clutter.diagonal(dim1=-2, dim2=-1).real.mean()
+    return clutter * (level[..., None, None, None] / mean) + torch.eye(radar.channels, dtype=clutter.dtype)
+
+
+def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
+    """Return the condition number of the matrix of channel responses to the Doppler bands.
+
+    It is the ratio of the largest to the least singular value of `band_matrix`, infinite where the
+    matrix is singular or has more bands than channels. Not differentiable.
+
+    Args:
+        radar: Radar parameters.
+        motion: Motion of the point, shape (...,).
+        bands: Number of bands.
+
+    Returns:
+        Condition number, float64 (...,).
+    """
+    values = torch.linalg.svdvals(band_matrix(radar, motion, bands).detach())
+    if bands > radar.channels:
+        return torch.full_like(values[..., 0], math.inf)
+    least = values[..., -1]
+    return torch.where(
+        least > 1e-13 * values[..., 0], values[..., 0] / least.clamp_min(torch.finfo(least.dtype).tiny), math.inf
+    )
+
+
+def noise_gain_db(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, n_pulse: int = 64) -> Tensor:
+    """Return the noise gain of a reconstruction relative to ideal uniform sampling.
+
+    It is the mean noise power of the reconstructed Doppler bins divided by the noise power that
+    uniform sampling with the same number of channels would give: M / N trace(W W^H) for the weights
+    W from M channels to N bands. It is infinite where the matrix of a least-squares reconstruction
+    is singular: the weights are damped and finite there, but do not separate the bands.
+
+    Args:
+        radar: Radar parameters.
+        motion: Motion of the point, shape (...,).
+        rebuild: Reconstruction method.
+        n_pulse: Number of pulses, for weights that differ between bins.
+
+    Returns:
+        Noise gain in dB, shape (...,).
+    """
+    weights = rebuild.weights(radar, motion, n_pulse)
+    power = weights.abs().square().sum((-2, -1)) * (radar.channels / rebuild.bands)
+    gain = 10 * torch.log10(power.mean(-1) if power.ndim > motion.trial_dims else power)
+    if not isinstance(rebuild, LeastSquares):
+        return gain
+    return torch.where(condition_number(radar, motion, rebuild.bands) > SINGULAR, torch.inf, gain)
 
 
 def reconstruct(
@@ -88,38 +468,34 @@ def reconstruct_lines(
             or there are too few channels for the bands.
     """
     data = checked_samples(data, "reconstruct_lines", "channel, pulse, range", finite=False)
-    _check_channels(data, radar, rebuild)
-    n, dtype = data.shape[-2], data.dtype
-    spectrum = fft_lines(_demodulated(data, radar, motion, rebuild.bands, left_k1_m_s))
-    # pulse 0 was sampled n // 2 pulses before slow time zero
-    late = linear_phasor(torch.tensor(n // 2 / n, dtype=torch.float64, device=data.device), 0.0, n, dtype)
-    spectrum = (
-        spectrum * (shared_response(radar, motion, n, rebuild.bands, dtype, left_k1_m_s).conj() * late)[..., None]
-    )
-    return _combined(spectrum, rebuild.weights(radar, motion, n).to(dtype) * rebuild.bands, motion.trial_dims)
-
-
-def _demodulated(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int, left_k1_m_s: float) -> Tensor:
-    """Demodulate data so that their FFT begins with the lowest bin of the lowest band."""
-    n = data.shape[-2]
-    turns = -doppler_centre_hz(radar, motion, left_k1_m_s) / radar.prf_hz - first_bin(n, bands) % n / n
-    return data * linear_phasor(turns, -(n // 2), n, data.dtype)[..., None, :, None]
-
-
-def _combined(spectrum: Tensor, weights: Tensor, trial_dims: int) -> Tensor:
-    """Combine spectra (..., channel, pulse, range) by weights to (..., band * pulse, range)."""
-    if weights.ndim == trial_dims + 2:
-        return (weights @ spectrum.flatten(-2)).unflatten(-1, spectrum.shape[-2:]).flatten(-3, -2)
-    return (weights @ spectrum.transpose(-3, -2)).transpose(-3, -2).flatten(-3, -2)
-
-
-def _check_channels(data: Tensor, radar: BistaticRadar, rebuild: Rebuild) -> None:
-    """Raise ValueError unless the data have the channels of the radar and enough for the bands."""
     if data.shape[-3] != radar.channels:
         raise ValueError(
             f"reconstruction expects {radar.channels} channels as in the radar's channel_m, got data "
             f"with {data.shape[-3]}; select the same channels in radar and data"
         )
+    refuse_channels(radar, rebuild)
+    n, dtype = data.shape[-2], data.dtype
+    # the FFT of the demodulated data begins with the lowest bin of the lowest band
+    turns = -doppler_centre_hz(radar, motion, left_k1_m_s) / radar.prf_hz - first_bin(n, rebuild.bands) % n / n
+    spectrum = fft_lines(data * linear_phasor(turns, -(n // 2), n, dtype)[..., None, :, None])
+    # pulse 0 was sampled n // 2 pulses before slow time zero
+    late = linear_phasor(torch.tensor(n // 2 / n, dtype=torch.float64, device=data.device), 0.0, n, dtype)
+    spectrum = (
+        spectrum * (shared_response(radar, motion, n, rebuild.bands, dtype, left_k1_m_s).conj() * late)[..., None]
+    )
+    weights = rebuild.weights(radar, motion, n).to(dtype) * rebuild.bands
+    if weights.ndim == motion.trial_dims + 2:
+        return (weights @ spectrum.flatten(-2)).unflatten(-1, spectrum.shape[-2:]).flatten(-3, -2)
+    return (weights @ spectrum.transpose(-3, -2)).transpose(-3, -2).flatten(-3, -2)
+
+
+def refuse_channels(radar: BistaticRadar, rebuild: Rebuild) -> None:
+    """Raise ValueError if the radar has too few channels for a reconstruction.
+
+    Args:
+        radar: Radar parameters.
+        rebuild: Reconstruction method.
+    """
     why = rebuild.refusal(radar.channels)
     if why is not None:
         raise ValueError(why)
@@ -150,9 +526,7 @@ class Reconstruct(Stage):
         if rebuild is not None and not hasattr(rebuild, "refusal"):
             raise TypeError(f"rebuild must be LeastSquares(bands) or MinimumMeanSquare(...), got {rebuild!r}")
         self.radar, self.rebuild, self.range_m = radar, rebuild or LeastSquares(), range_m
-        why = self.rebuild.refusal(radar.channels)
-        if why is not None:
-            raise ValueError(why)
+        refuse_channels(radar, self.rebuild)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Signal:
         """Reconstruct the full Doppler band with the velocities of each trial.
@@ -179,13 +553,9 @@ class Reconstruct(Stage):
         motion = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         check_condition(self.radar, motion, self.rebuild, signal.data.dtype)
         refuse_shifted(self.radar, signal.axis("pulse"))
-        n = signal.axis("pulse").n
-        doppler = doppler_axis(self.radar, n, self.rebuild.bands)
-        if "range" in signal.names:
-            return Signal(
-                reconstruct_lines(signal.data, self.radar, motion, self.rebuild), (doppler, signal.axis("range"))
-            )
-        return Signal(reconstruct(signal.data, self.radar, motion, self.rebuild), (doppler,))
+        doppler = doppler_axis(self.radar, signal.axis("pulse").n, self.rebuild.bands)
+        made = reconstruct_lines if "range" in signal.names else reconstruct
+        return Signal(made(signal.data, self.radar, motion, self.rebuild), (doppler, *signal.axes[2:]))
 
 
 def refuse_shifted(radar: BistaticRadar, pulse: Axis) -> None:
@@ -251,29 +621,18 @@ def check_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild,
         return
     found = condition_number(radar, motion, rebuild.bands)
     limit = SINGULAR if dtype == torch.complex128 else SINGULAR_SINGLE
-    if host_value((found > limit).all(), False):
-        then = (
-            f"so that {rebuild.bands} bands cannot be separated; rebuild fewer bands, use "
-            "MinimumMeanSquare, or change the pulse rate"
-        )
-        raise ValueError(_condition_message(radar, motion, rebuild.bands, float(found.min()), then))
-    worst = host_largest(found, 0.0)
-    if worst > POOR:
-        warnings.warn(
-            _condition_message(
-                radar,
-                motion,
-                rebuild.bands,
-                worst,
-                "so that noise and errors of the velocity grow; rebuild fewer bands, or use MinimumMeanSquare",
-            ),
-            stacklevel=3,
-        )
-
-
-def _condition_message(radar: BistaticRadar, motion: PointMotion, bands: int, worst: float, then: str) -> str:
-    """Return the message about an ill-conditioned reconstruction."""
-    found = condition_number(radar, motion, bands)
+    singular, worst = host_value((found > limit).all(), False), host_largest(found, 0.0)
+    if not singular and not worst > POOR:
+        return
     speed = motion.effective_m_s.detach().expand(found.shape).flatten()[int(found.flatten().argmax())]
-    where = f"at a pulse rate of {radar.prf_hz:g} Hz and a speed past the target of {float(speed):.4g} m/s"
-    return f"{where} the channels sample nearly the same positions (condition number {worst:.3g}), {then}"
+    seen = (
+        f"at a pulse rate of {radar.prf_hz:g} Hz and a speed past the target of {float(speed):.4g} m/s the channels "
+        f"sample nearly the same positions (condition number {float(found.min()) if singular else worst:.3g}), so that"
+    )
+    if singular:
+        raise ValueError(
+            f"{seen} {rebuild.bands} bands cannot be separated; rebuild fewer bands, use MinimumMeanSquare, or change "
+            "the pulse rate"
+        )
+    then = "noise and errors of the velocity grow; rebuild fewer bands, or use MinimumMeanSquare"
+    warnings.warn(f"{seen} {then}", stacklevel=3)

@@ -24,7 +24,7 @@ from torchsar.core.arguments import names_arguments
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement, phase_error_db
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import (
+from torchsar.multichannel.reconstruct import (
     POOR,
     SINGULAR,
     SINGULAR_SINGLE,
@@ -36,20 +36,15 @@ from torchsar.multichannel.response import (
 )
 from torchsar.radar import BistaticRadar, receive_range
 
-# Convention: fraction of the largest unambiguous speed beyond which a warning is given.
-NEAR_AMBIGUOUS = 0.95
-# Threshold of interferometry and maximum likelihood over all channels and pulses: -15 dB per sample
-# with three channels and 810 pulses. Below it the strongest tone is often one of noise.
-GATHERED_SNR_DB = 19.0
-# Upper end of the threshold of the intensity ratio, which lies at 0 to +7 dB per sample.
-SIR_SNR_DB = 7.0
+# Threshold of interferometry and maximum likelihood over all channels and pulses, -15 dB per sample
+# with three channels and 810 pulses, below which the strongest tone is often one of noise; and
+# upper end of the threshold of the intensity ratio, which lies at 0 to +7 dB per sample.
+GATHERED_SNR_DB, SIR_SNR_DB = 19.0, 7.0
 # Convention: well below the pi / 4 at which a quadratic phase broadens the impulse response.
 FAINT_RAD = 0.3
 # Samples over the aperture, the Doppler band and half the search interval: maxima of smooth curves
 # are found closely enough for a limit.
 _POINTS = 65
-_GEO_RANGE_M = 3.9e7  # slant range of a geosynchronous transmitter
-_SAME_TURNS = 1e-6  # cycles between phases that are taken as equal: rounding only
 
 Estimator = Literal["sir", "ati", "ml", "whitened"]
 
@@ -113,11 +108,8 @@ class MultichannelUse:
                 "a record needs n_pulse of 1 or more and a positive integration_s, got "
                 f"n_pulse={self.n_pulse} and integration_s={self.integration_s}"
             )
-        least = {
-            name: getattr(self, name)
-            for name in ("y0_m", "acceleration_m_s2", "swath_m", "u_r_error_m_s", "u_a_error_m_s", "channel_error_rad")
-        }
-        wrong = {name: value for name, value in least.items() if not (math.isfinite(value) and value >= 0)}
+        names = ("y0_m", "acceleration_m_s2", "swath_m", "u_r_error_m_s", "u_a_error_m_s", "channel_error_rad")
+        wrong = {name: getattr(self, name) for name in names if not 0 <= getattr(self, name) < math.inf}
         if wrong:
             raise ValueError(
                 f"{', '.join(wrong)} must be finite and not negative, got "
@@ -232,14 +224,13 @@ def _band_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
         "rebuild more bands, or integrate less",
     )
     if "sir" in use.estimators:
-        nothing = "the intensity ratio has no band outside the signal"
         yield Limit(
             "Doppler band inside the intensity ratio",
             _bandwidth_hz(radar, use),
             rebuilt,
             "Hz",
             "refuse",
-            nothing,
+            "the intensity ratio has no band outside the signal",
             "rebuild more bands, or integrate less",
         )
 
@@ -257,10 +248,13 @@ def _channel_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limi
     )
     other = "rebuild fewer bands, use MinimumMeanSquare, or change the pulse rate"
     yield Limit("condition number at rest", rest, least, "", "refuse", same, other)
-    worst, speed = _worst_condition(radar, use)
+    u_a = torch.linspace(*use.u_a_m_s, 2 * _POINTS - 1, dtype=torch.float64)
+    u_r = torch.tensor([*use.u_r_m_s], dtype=torch.float64)[:, None]
+    within = condition_number(radar, PointMotion.of(radar, u_a, u_r, u_a), bands).amax(0)
+    speed = float(u_a[int(within.argmax())])
     yield Limit(
         "condition number within the velocities",
-        worst,
+        float(within.max()),
         POOR,
         "",
         "warn",
@@ -280,14 +274,6 @@ def _channel_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limi
     )
 
 
-def _worst_condition(radar: BistaticRadar, use: MultichannelUse) -> tuple[float, float]:
-    """Return the largest condition number within the velocities, and the u_a at which it occurs."""
-    u_a = torch.linspace(*use.u_a_m_s, 2 * _POINTS - 1, dtype=torch.float64)
-    u_r = torch.tensor([*use.u_r_m_s], dtype=torch.float64)[:, None]
-    found = condition_number(radar, PointMotion.of(radar, u_a, u_r, u_a), use.rebuild.bands)
-    return float(found.max()), float(u_a[int(found.amax(0).argmax())])
-
-
 def singular_speeds_m_s(radar: BistaticRadar, bands: int, u_a_m_s: tuple[float, float]) -> list[float]:
     """Return along-track speeds at which the reconstruction is singular.
 
@@ -303,43 +289,34 @@ def singular_speeds_m_s(radar: BistaticRadar, bands: int, u_a_m_s: tuple[float, 
     Returns:
         Along-track speeds of the target within the bounds in m/s, rising.
     """
-    positions = radar.channel_m
-    pairs = {round(abs(a - b), 9) for i, a in enumerate(positions) for b in positions[:i]}
-    fastest, slowest = radar.speed_m_s - u_a_m_s[0], radar.speed_m_s - u_a_m_s[1]
+    positions, prf = radar.channel_m, radar.prf_hz
+    turns_per_s = {round(abs(a - b), 9) * prf for i, a in enumerate(positions) for b in positions[:i]}
+    least, most = (1 / (radar.speed_m_s - u_a) for u_a in u_a_m_s)
     speeds = {
-        spacing * radar.prf_hz / q
-        for spacing in pairs
-        for q in _whole_between(spacing * radar.prf_hz / fastest, spacing * radar.prf_hz / slowest)
+        rate / q
+        for rate in turns_per_s
+        for q in range(max(1, math.ceil(rate * least - 1e-9)), math.floor(rate * most + 1e-9) + 1)
     }
-    return sorted(radar.speed_m_s - v for v in speeds if _count_different(positions, radar.prf_hz / v) < bands)
-
-
-def _whole_between(low: float, high: float) -> range:
-    """Return the positive whole numbers between two bounds, including them."""
-    return range(max(1, math.ceil(low - 1e-9)), math.floor(high + 1e-9) + 1)
+    return sorted(radar.speed_m_s - v for v in speeds if _count_different(positions, prf / v) < bands)
 
 
 def _count_different(positions: tuple[float, ...], turns_per_m: float) -> int:
     """Return the number of channel positions whose phases differ by other than whole cycles."""
-    seen: list[float] = []
-    for position in positions:
-        turns = position * turns_per_m
-        if all(abs((turns - other + 0.5) % 1 - 0.5) > _SAME_TURNS for other in seen):
-            seen.append(turns)
-    return len(seen)
+    turns = [position * turns_per_m for position in positions]
+    off = [[abs((x - before + 0.5) % 1 - 0.5) for before in turns[:i]] for i, x in enumerate(turns)]
+    return sum(all(cycles > 1e-6 for cycles in row) for row in off)  # more than rounding
 
 
 def _tone_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
     """Yield the limits of the Doppler ambiguity."""
     half, centre = radar.ambiguous_velocity_m_s / 2, use.fastest_m_s
-    unknown = "velocities are measured modulo lambda PRF, and appear at the other end of the interval"
     yield Limit(
         "slant-range speed",
         centre,
-        NEAR_AMBIGUOUS * half,
+        0.95 * half,  # convention
         "m/s",
         "warn",
-        unknown,
+        "velocities are measured modulo lambda PRF, and appear at the other end of the interval",
         "resolve the ambiguity by range walk, or raise the pulse rate",
     )
     tone = centre + (radar.speed_m_s - use.u_a_m_s[0]) * use.y0_m / radar.reference_range_m
@@ -353,14 +330,13 @@ def _tone_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
         "give the ambiguity number",
     )
     if not use.deramped:
-        smeared = "the keystone transform defocuses data that are aliased in slow time"
         yield Limit(
             "Doppler band for the keystone transform",
             _bandwidth_hz(radar, use),
             radar.prf_hz,
             "Hz",
             "warn",
-            smeared,
+            "the keystone transform defocuses data that are aliased in slow time",
             "deramp before it",
         )
 
@@ -477,7 +453,18 @@ def _path_rows(radar: BistaticRadar, use: MultichannelUse, tolerance_rad: float)
         radar.reference_range_m,
         use.fastest_m_s,
     )
-    v, parabola = radar.speed_m_s - use.u_a_m_s[0], _parabola_left_m(radar, use)
+    v, time = radar.speed_m_s - use.u_a_m_s[0], _aperture_times(use)
+    # a broadside point at the corners of the velocities searched, including u_r = 0: (corner, time)
+    speeds = [torch.tensor(u, dtype=torch.float64) for u in ((*use.u_r_m_s, 0.0), use.u_a_m_s)]
+    across, along = (u.reshape(-1, 1) for u in torch.meshgrid(*speeds, indexing="ij"))
+    exact = receive_range(time, across, along, 0.0, r0, radar.speed_m_s, 0.0)
+    parabola = exact + across * time - (radar.speed_m_s - along).square() * time.square() / (2 * r0)
+    # Eqs. (6), (7), (corner, channel, time)
+    across, along, dx = across[:, None], along[:, None], radar.channels_at()[:, None]
+    past = radar.speed_m_s - along
+    delayed = time - dx * past / (past.square() + across.square())
+    left_m = receive_range(time, across, along, 0.0, r0, radar.speed_m_s, dx)
+    left_m = left_m - receive_range(delayed, across, along, 0.0, r0, radar.speed_m_s, 0.0)
     yield Requirement(
         "parabolic receive range",
         "third and higher orders of the hyperbola",
@@ -490,35 +477,32 @@ def _path_rows(radar: BistaticRadar, use: MultichannelUse, tolerance_rad: float)
     yield Requirement(
         "channels as delays of one another",
         "second and higher orders of the path between channels",
-        wave * _delay_left_m(radar, use),
+        wave * float((left_m - left_m.mean(-1, keepdim=True)).abs().max()),
         math.nan,
         tolerance_rad,
         "shorten the row of channels",
     )
-    shift = wave * u_r * use.y0_m * v * half**2 / (2 * r0**2)
     yield Requirement(
         "y0 left out of the azimuth filter",
         "change of the closest range, u_r y0 / v",
-        shift,
+        wave * u_r * use.y0_m * v * half**2 / (2 * r0**2),
         math.nan,
         FAINT_RAD,
         "give y0 to the filter",
     )
     ground = u_r * r0 / math.sqrt(r0**2 - radar.height_m**2)
-    rise = wave * (ground * radar.height_m * half) ** 2 / (2 * r0**3)
     yield Requirement(
         "motion in the slant plane",
         "curvature of motion on the ground, absorbed by u_a",
-        rise,
+        wave * (ground * radar.height_m * half) ** 2 / (2 * r0**3),
         math.nan,
         tolerance_rad,
         "refit u_a per target, and do not interpret it as a speed",
     )
-    acceleration_rad = wave * use.acceleration_m_s2 * half**2 / 2
     yield Requirement(
         "no radial acceleration",
         "its quadratic phase, absorbed by u_a",
-        acceleration_rad,
+        wave * use.acceleration_m_s2 * half**2 / 2,
         math.nan,
         tolerance_rad,
         "refit u_a per target, and do not interpret it as a speed",
@@ -528,34 +512,6 @@ def _path_rows(radar: BistaticRadar, use: MultichannelUse, tolerance_rad: float)
 def _aperture_times(use: MultichannelUse) -> Tensor:
     """Return slow times over the integration time in seconds."""
     return use.integration_s * torch.linspace(-0.5, 0.5, _POINTS, dtype=torch.float64)
-
-
-def _corner_speeds(use: MultichannelUse) -> tuple[Tensor, Tensor]:
-    """Return the corners (corner, 1) of the velocities searched, including u_r = 0."""
-    u_r, u_a = torch.meshgrid(
-        torch.tensor([*use.u_r_m_s, 0.0], dtype=torch.float64),
-        torch.tensor([*use.u_a_m_s], dtype=torch.float64),
-        indexing="ij",
-    )
-    return u_r.reshape(-1, 1), u_a.reshape(-1, 1)
-
-
-def _parabola_left_m(radar: BistaticRadar, use: MultichannelUse) -> Tensor:
-    """Return the error (corner, time) in m of a parabolic receive range, for a broadside point."""
-    time, (u_r, u_a) = _aperture_times(use), _corner_speeds(use)
-    exact = receive_range(time, u_r, u_a, 0.0, radar.reference_range_m, radar.speed_m_s, 0.0)
-    parabola = -u_r * time + (radar.speed_m_s - u_a).square() * time.square() / (2 * radar.reference_range_m)
-    return exact - parabola
-
-
-def _delay_left_m(radar: BistaticRadar, use: MultichannelUse) -> float:
-    """Return the largest time-varying error in metres of the delay model, Eqs. (6), (7)."""
-    time, r0 = _aperture_times(use), radar.reference_range_m
-    u_r, u_a = (u[:, None] for u in _corner_speeds(use))
-    dx, v = radar.channels_at()[:, None], radar.speed_m_s - u_a
-    delayed = receive_range(time - dx * v / (v.square() + u_r.square()), u_r, u_a, 0.0, r0, radar.speed_m_s, 0.0)
-    left = receive_range(time, u_r, u_a, 0.0, r0, radar.speed_m_s, dx) - delayed
-    return float((left - left.mean(-1, keepdim=True)).abs().max())
 
 
 def _migration_rows(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Requirement]:
@@ -634,40 +590,34 @@ def _replica_share(radar: BistaticRadar, use: MultichannelUse, phase_rad: Tensor
 
     The largest and least u_a searched and u_a = 0 are considered.
     """
-    shares = []
+    shares = [0.0]
+    bands, prf = use.rebuild.bands, radar.prf_hz
     for u_a in (0.0, *use.u_a_m_s):
         motion = PointMotion.of(radar, torch.zeros(()), 0.0, u_a)
-        half = min(_bandwidth_hz(radar, use, 0.0, u_a), use.rebuild.bands * radar.prf_hz) / 2
-        shares.append(_leak(radar, use.rebuild, motion, half, phase_rad))
-    return max(shares)
-
-
-def _leak(radar: BistaticRadar, rebuild: Rebuild, motion: PointMotion, half_hz: float, phase_rad: Tensor) -> float:
-    """Return the largest mean leakage between bands for phase errors (Doppler, channel)."""
-    bands, prf = rebuild.bands, radar.prf_hz
-    doppler = half_hz * torch.linspace(-1, 1, phase_rad.shape[0], dtype=torch.float64) * (1 - 1e-9)
-    band_position = (doppler + bands * prf / 2) / prf
-    band = band_position.floor().long()
-    weights = rebuild.weights(radar, motion, _POINTS)
-    weights = (
-        weights[((band_position - band) * _POINTS).long().clamp_max(_POINTS - 1)] if weights.ndim == 3 else weights
-    )
-    seen = band_matrix(radar, motion, bands).mT[band]
-    leaked = (weights @ ((cis(phase_rad) - 1) * seen)[..., None])[..., 0]
-    shares = [0.0]
-    for order in range(-bands + 1, bands):
-        inside = (doppler + order * prf).abs() <= half_hz
-        if order and bool(inside.any()):
-            shares.append(
-                float((leaked.gather(-1, (band + order).clamp(0, bands - 1)[:, None])[:, 0] * inside).abs().mean())
-            )
+        half_hz = min(_bandwidth_hz(radar, use, 0.0, u_a), bands * prf) / 2
+        doppler = half_hz * torch.linspace(-1, 1, phase_rad.shape[0], dtype=torch.float64) * (1 - 1e-9)
+        band_position = (doppler + bands * prf / 2) / prf
+        band = band_position.floor().long()
+        weights = use.rebuild.weights(radar, motion, _POINTS)
+        weights = (
+            weights[((band_position - band) * _POINTS).long().clamp_max(_POINTS - 1)] if weights.ndim == 3 else weights
+        )
+        seen = band_matrix(radar, motion, bands).mT[band]
+        leaked = (weights @ ((cis(phase_rad) - 1) * seen)[..., None])[..., 0]
+        for order in range(-bands + 1, bands):
+            inside = (doppler + order * prf).abs() <= half_hz
+            if order and bool(inside.any()):
+                shares.append(
+                    float((leaked.gather(-1, (band + order).clamp(0, bands - 1)[:, None])[:, 0] * inside).abs().mean())
+                )
     return max(shares)
 
 
 def _precision_rows(radar: BistaticRadar, tolerance_rad: float) -> Iterable[Requirement]:
     """Yield the rows of ranges in single precision."""
     wave = 2 * math.pi / radar.wavelength_m
-    for name, range_m in (("transmit", _GEO_RANGE_M), ("receive", radar.reference_range_m)):
+    # the slant range of a geosynchronous transmitter, and that of the receiver
+    for name, range_m in (("transmit", 3.9e7), ("receive", radar.reference_range_m)):
         single = wave * range_m * 2.0**-24
         yield Requirement(
             f"{name} range in float32",

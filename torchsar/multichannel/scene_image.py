@@ -4,7 +4,8 @@ The conventional image is formed and targets are detected in it. Then for each t
 first, the range lines around it are extracted, its velocity is estimated, its echo is removed from
 the data, and it is imaged with its own velocity at its true position. Removal of the echo also
 removes the false targets that it causes, so that these are not detected as targets. Weaker targets
-are then sought in an image in which the sea is suppressed.
+are then sought in an image in which the sea is suppressed. Targets are detected by the mean
+intensity of small rectangles of pixels.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Fig. 13 and section 4.3.
@@ -15,37 +16,34 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, fft_lines, linear_phasor
+from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, fft_lines, linear_phasor, unit_level
 from torchsar.core.arguments import names_arguments
-from torchsar.multichannel.body import Body, body_echo, body_image, find_body, known_body
-from torchsar.multichannel.chip import Extraction
-from torchsar.multichannel.detection import Detection, detect
+from torchsar.multichannel.body import Body, Extraction, body_echo, body_image, find_body, known_body
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import LeastSquares, Rebuild, band_matrix, first_bin, shared_response
-from torchsar.multichannel.stationary import StationaryImage
+from torchsar.multichannel.reconstruct import LeastSquares, Rebuild, band_matrix, first_bin, shared_response
+from torchsar.multichannel.stationary import StationaryImage, stationary_axis
 from torchsar.multichannel.velocity.whitening import line_whitening
 from torchsar.radar import BistaticRadar
 
 Removal = Literal["subtract", "zero"]
 # Found by trial: velocities within this difference count as equal. A larger value rejects targets
 # beside a ship, a smaller one accepts side lobes of the ship as targets.
-_SAME_VELOCITY_M_S = 5.0
 # Level of range side lobes relative to those of one point of the mean level, found by trial: a body
 # has many points, and its brightest ones exceed the mean.
-_SIDE_LOBES = 20.0
+_SAME_VELOCITY_M_S, _SIDE_LOBES = 5.0, 20.0
 # Range lines to either side of a body that are processed with it: 6 guard cells, and 28 lines for
 # the covariance of the sea. Found by trial: 20 to 80 give the same velocities, 80 take 1.4 times
 # the time; the lines must also hold the range migration of the body.
 _LINES_BESIDE = 34
-_BINS_AVERAGED = 4  # neighbouring Doppler bins over which the covariance of all lines is averaged
-_HALF_QUALITY_LEVEL = 100.0  # level (20 dB) at which the quality of a target is one half: convention
 
 
 @names_arguments
@@ -104,9 +102,9 @@ class SceneImage:
     conventional: Signal
     rest: Signal
     fused: Signal
-    bodies: list[Body] = field(default_factory=list)
-    estimate: Estimate | None = None
-    data: Signal | None = None
+    bodies: list[Body]
+    estimate: Estimate
+    data: Signal
 
 
 class ImageMovers(Stage):
@@ -183,37 +181,34 @@ class ImageMovers(Stage):
                 "exceeds the swath; give more lines, or a smaller extraction",
                 stacklevel=3,
             )
-        remaining, bodies = signal, []
         if known is not None:
-            remaining, bodies = self._extract_known(remaining, known)
+            remaining, bodies = self._extract_known(signal, known)
         else:
-            for image in self._detection_images(signal):
-                remaining, bodies = self._extract_detected(remaining, image, bodies)
-        rest = self.image(remaining)
-        fused = rest
-        for body in bodies:
-            if self._moves(body):
-                fused = placed(fused, body, self.extraction)
+            remaining, bodies = self._extract_detected(signal, self.image, [])
+            if self.detector.suppressed_m_s:
+                speeds_m_s = self.detector.suppressed_m_s
+                shown = partial(suppressed_image, radar=self.radar, image=self.image, speeds_m_s=speeds_m_s)
+                remaining, bodies = self._extract_detected(remaining, shown, bodies)
+        rest = fused = self.image(remaining)
+        for body in filter(self._moves, bodies):
+            fused = placed(fused, body, self.extraction)
         return SceneImage(conventional, rest, fused, bodies, self._estimate(bodies, signal.data), remaining)
-
-    def _detection_images(self, signal: Signal):
-        """Yield imaging functions: the conventional image, then images with suppressed sea."""
-        yield self.image
-        if self.detector.suppressed_m_s:
-            yield lambda data: suppressed_image(data, self.radar, self.image, self.detector.suppressed_m_s)
 
     def _extract_detected(self, remaining: Signal, image_of, bodies: list[Body]) -> tuple[Signal, list[Body]]:
         """Detect targets and remove those that move, strongest first, until none is new."""
         bodies, visited = list(bodies), [self._apparent_position(body) for body in bodies]
-        candidates = self.detector.found(image_of(remaining))
+        candidates, apart_m = self.detector.found(image_of(remaining)), self.detector.apart_m
         while candidates and len(bodies) < self.detector.most:
             candidate = candidates.pop(0)
-            if not self._inside_frame(candidate, remaining) or any(
-                self._same_target(candidate, other) for other in visited
-            ):
+            away = [(abs(candidate.azimuth_m - x.azimuth_m), abs(candidate.range_m - x.range_m)) for x in visited]
+            known = any(along < apart_m[0] / 2 and across < apart_m[1] for along, across in away)
+            if known or not self._inside_frame(candidate, remaining):
                 continue
             visited.append(candidate)
-            body = self._body(remaining, candidate)
+            lines, frame = self._lines(remaining, candidate.range_m)
+            image_s, image_m = candidate.azimuth_m / self.radar.speed_m_s, candidate.range_m
+            data = remaining.data[..., lines]
+            body = find_body(data, frame, image_s, image_m, self.extraction, u_a_half_m_s=self.u_a_half_m_s)
             if not bool(body.ok) or any(self._side_lobe(body, other) for other in bodies):
                 continue
             bodies.append(body)
@@ -250,13 +245,6 @@ class ImageMovers(Stage):
         return (
             axis.start + walk <= detection.range_m <= axis.stop - walk - curvature
             and pulse.start < abeam_s < pulse.stop
-        )
-
-    def _same_target(self, a: Detection, b: Detection) -> bool:
-        """Test whether two detections belong to the same target."""
-        return (
-            abs(a.azimuth_m - b.azimuth_m) < self.detector.apart_m[0] / 2
-            and abs(a.range_m - b.range_m) < self.detector.apart_m[1]
         )
 
     def _side_lobe(self, body: Body, other: Body) -> bool:
@@ -303,18 +291,6 @@ class ImageMovers(Stage):
         frame = Frame.of(self.radar, signal)
         return lines, replace(frame, range_m=frame.range_m[lines])
 
-    def _body(self, signal: Signal, detection: Detection) -> Body:
-        """Find the body of a detection."""
-        lines, frame = self._lines(signal, detection.range_m)
-        return find_body(
-            signal.data[..., lines],
-            frame,
-            detection.azimuth_m / self.radar.speed_m_s,
-            detection.range_m,
-            self.extraction,
-            u_a_half_m_s=self.u_a_half_m_s,
-        )
-
     def _removed(self, signal: Signal, body: Body) -> Signal:
         """Return the data without the echo of a body."""
         lines, frame = self._lines(signal, float(body.motion.range_m))
@@ -342,7 +318,7 @@ class ImageMovers(Stage):
         return Estimate(
             value,
             {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])},
-            level / (_HALF_QUALITY_LEVEL + level),
+            level / (100.0 + level),  # convention: one half at 20 dB
             outcome,
             info={"level": level},
         )
@@ -410,26 +386,21 @@ class MoversImage(Stage):
         Raises:
             ValueError: If some of the four values are missing, or as in `ImageMovers`.
         """
-        values = [u_r_m_s, u_a_m_s, y0_m, range_m]
-        known = [None if x is None else x.to(torch.float64).expand(*signal.trials, x.shape[-1]) for x in values]
-        if any(x is None for x in known) != all(x is None for x in known):
+        values = [x for x in (u_r_m_s, u_a_m_s, y0_m, range_m) if x is not None]
+        if len(values) not in (0, 4):
             raise ValueError(
                 "known targets need all of u_r_m_s, u_a_m_s, y0_m and range_m, got only some of them; "
                 "connect all four, or none to detect the targets"
             )
         frames = signal.data.reshape(-1, *signal.data.shape[-3:])
-        rows = [None if x is None else x.reshape(len(frames), -1) for x in known]
-        made = [
-            self.flow(Signal(frame, signal.axes), self._motions(frame, [None if x is None else x[i] for x in rows]))
-            for i, frame in enumerate(frames)
-        ]
-
-        def stacked(images: list[Signal]) -> Tensor:
-            return torch.stack([image.data for image in images]).unflatten(0, signal.trials or (1,))
-
+        known = [x.to(torch.float64).expand(*signal.trials, x.shape[-1]).reshape(len(frames), -1) for x in values]
+        made = []
+        for frame, *of_frame in zip(frames, *known, strict=True):
+            pairs = zip(*of_frame, strict=True)
+            motions = [PointMotion.of(self.flow.radar, frame.real, *pair) for pair in pairs] if known else None
+            made.append(self.flow(Signal(frame, signal.axes), motions))
         parts = []
         for one in made:
-            assert one.estimate is not None
             info = {**one.estimate.info, "rest": one.rest.data, "conventional": one.conventional.data}
             tables = (one.estimate.value, one.estimate.std, info)
             value, std, info = ({name: x[None] for name, x in table.items()} for table in tables)
@@ -437,15 +408,8 @@ class MoversImage(Stage):
             if not self.assess:
                 outcome = torch.where(info["level"] > 0, Outcome.NOT_ASSESSED, outcome)
             parts.append(Estimate(value, std, one.estimate.quality[None], outcome, info))
-        fused = stacked([one.fused for one in made])
-        image = Signal(fused if signal.trials else fused[0], made[0].fused.axes)
-        return image, Estimate.joined(parts, signal.trials)
-
-    def _motions(self, frame: Tensor, values: list[Tensor | None]) -> list[PointMotion] | None:
-        """Motions of all targets of one frame, None where they are not known."""
-        numbers = [x for x in values if x is not None]
-        pairs = zip(*numbers, strict=True)
-        return [PointMotion.of(self.flow.radar, frame.real, *of_one) for of_one in pairs] if numbers else None
+        fused = torch.stack([one.fused.data for one in made]).view(*signal.trials, *made[0].fused.data.shape)
+        return Signal(fused, made[0].fused.axes), Estimate.joined(parts, signal.trials)
 
 
 def suppressed_image(
@@ -473,18 +437,17 @@ def suppressed_image(
         Remote Sens. 2020, 12, 1703, section 4.3 (clutter suppression via Doppler filtering).
     """
     data = signal.data.movedim(-1, -3)
-    whitening = line_whitening(data, radar, samples=_BINS_AVERAGED * data.shape[-3])
-    backed = whitening.expanded(data.shape[-3]).backed(data.to(torch.complex128)).movedim(-3, -1).to(signal.data.dtype)
-    best, shown = None, None
+    # averaged over all lines and four neighbouring Doppler bins
+    whitening = line_whitening(data, radar, samples=4 * data.shape[-3])
+    backed = whitening.backed(data.to(torch.complex128)).movedim(-3, -1).to(signal.data.dtype)
+    best = signal.data.real.new_zeros(())
     for speed in speeds_m_s:
-        matched = image.focused(
-            _matched(backed, radar, PointMotion.of(radar, signal.data.real, speed), image.rebuild.bands), signal
-        )
-        level = matched.data.abs().square()
-        level = level / level.median().clamp_min(torch.finfo(level.dtype).tiny)
-        best, shown = level if best is None else torch.maximum(best, level), matched
-    assert best is not None and shown is not None
-    return shown.with_data(best.sqrt().to(signal.data.dtype))
+        motion = PointMotion.of(radar, signal.data.real, speed)
+        shown = image.focused(_matched(backed, radar, motion, image.rebuild.bands), signal)
+        level = shown.data.abs().square()
+        best = torch.maximum(best, level / level.median().clamp_min(torch.finfo(level.dtype).tiny))
+    axes = (stationary_axis(radar, signal.axis("pulse"), image.rebuild.bands), signal.axis("range"))
+    return Signal(best.sqrt().to(signal.data.dtype), axes)
 
 
 def _matched(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
@@ -531,3 +494,103 @@ def placed(image: Signal, body: Body, extraction: Extraction) -> Signal:
     data = image.data.clone()
     data[rows[:, None], columns] += (scale * body_image(body, position[rows], extraction)).to(data.dtype)
     return image.with_data(data)
+
+
+@names_arguments
+@dataclass(frozen=True)
+class Detection:
+    """Position of one detection in an image.
+
+    Args:
+        azimuth_m: Azimuth x = V_R t of the intensity centre in metres, with the speed V_R of the
+            receiver.
+        range_m: Range of the intensity centre in metres.
+        contrast_db: Mean intensity of the brightest neighbourhood, a small rectangle of pixels,
+            relative to the median over all neighbourhoods of the image in dB.
+    """
+
+    azimuth_m: float
+    range_m: float
+    contrast_db: float
+
+
+def contrast(image: Signal, extent_m: tuple[float, float] = (60.0, 10.0)) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Compute the mean intensity of small rectangles of pixels relative to the median of all.
+
+    The rectangles (neighbourhoods) overlap by half along both axes.
+
+    Args:
+        image: Image (azimuth, range), complex.
+        extent_m: Extent of a neighbourhood in azimuth and range in metres.
+
+    Returns:
+        The contrast (intensity ratio), float64 (..., row, column), and the azimuths (row,) and
+        ranges (column,) of the middles of the neighbourhoods in metres.
+    """
+    azimuth, range_ = image.axes
+    size = tuple(
+        min(axis.n, max(2, 2 * round(extent / axis.step / 2)))
+        for axis, extent in zip((azimuth, range_), extent_m, strict=True)
+    )
+    intensity = unit_level(image.data.detach()).abs().square().to(torch.float64)
+    mean = avg_pool2d(
+        intensity.flatten(0, -3)[:, None] if intensity.ndim > 2 else intensity[None, None],
+        size,
+        stride=(max(1, size[0] // 2), max(1, size[1] // 2)),
+    )
+    mean = mean[:, 0].unflatten(0, image.trials) if image.trials else mean[0, 0]
+    typical = mean.flatten(-2).median(-1).values.clamp_min(torch.finfo(torch.float64).tiny)
+    middles = [
+        axis.start
+        + axis.step * ((n - 1) / 2 + max(1, n // 2) * torch.arange(count, dtype=torch.float64, device=mean.device))
+        for axis, n, count in zip((azimuth, range_), size, mean.shape[-2:], strict=True)
+    ]
+    return mean / typical[..., None, None], (middles[0], middles[1])
+
+
+def detect(
+    image: Signal,
+    threshold_db: float = 10.0,
+    extent_m: tuple[float, float] = (60.0, 10.0),
+    apart_m: tuple[float, float] = (200.0, 40.0),
+    most: int = 16,
+) -> list[Detection]:
+    """Detect bright targets in one image, strongest first.
+
+    The image is divided into rectangles of pixels (neighbourhoods) that overlap by half. Their
+    contrast is the mean intensity relative to the median over all of them. Any two detections are
+    at least `apart_m` apart along one of the axes. The position of a detection is the
+    contrast-weighted mean position of all neighbourhoods that lie within `apart_m` of the brightest
+    one and have more than a quarter of its contrast.
+
+    Args:
+        image: Image (azimuth, range) without trials, complex.
+        threshold_db: Least contrast of a detection in dB.
+        extent_m: Extent of a neighbourhood in azimuth and range in metres.
+        apart_m: Least separation in azimuth and range in metres.
+        most: Largest number of detections.
+
+    Returns:
+        The detections, strongest first.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If the image has trials or no samples, or a sample is not finite.
+    """
+    if image.trials:
+        raise ValueError(
+            "detect works on one image at a time, got images with the trial dimensions "
+            f"{tuple(image.trials)}; call it for each image separately"
+        )
+    image = image.with_data(checked_samples(image.data, "detect", ", ".join(image.names)))
+    level, (rows, columns) = contrast(image, extent_m)
+    left, found = level.clone(), []
+    while len(found) < most and float(left.max()) >= 10 ** (threshold_db / 10):
+        peak = float(left.max())
+        row, column = divmod(int(left.argmax()), left.shape[1])
+        near = ((rows - rows[row]).abs() < apart_m[0])[:, None] & ((columns - columns[column]).abs() < apart_m[1])
+        bright = torch.where(near & (level > peak / 4), level, 0.0)
+        azimuth, range_ = ((bright.sum(dim) * middle).sum() / bright.sum() for dim, middle in ((1, rows), (0, columns)))
+        found.append(Detection(float(azimuth), float(range_), 10 * float(torch.log10(torch.tensor(peak)))))
+        left = torch.where(near, 0.0, left)
+    return found

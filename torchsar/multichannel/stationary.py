@@ -25,8 +25,14 @@ from torchsar.focus import omega_k, omega_k_stolt
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Aperture, phase_error_db
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines, refuse_shifted
-from torchsar.multichannel.response import LeastSquares, Rebuild
+from torchsar.multichannel.reconstruct import (
+    LeastSquares,
+    Rebuild,
+    check_condition,
+    reconstruct_lines,
+    refuse_channels,
+    refuse_shifted,
+)
 from torchsar.radar import BistaticRadar, StripmapRadar
 
 FORMS: dict[str, Callable[..., Tensor]] = {"bulk": omega_k, "stolt": omega_k_stolt}
@@ -159,9 +165,7 @@ class StationaryImage(Stage):
     ) -> None:
         super().__init__()
         self.radar, self.rebuild, self.form, self.band_hz = radar, rebuild or LeastSquares(), form, band_hz
-        why = self.rebuild.refusal(radar.channels)
-        if why is not None:
-            raise ValueError(why)
+        refuse_channels(radar, self.rebuild)
 
     def forward(self, signal: Signal) -> Signal:
         """Image the stationary scene from channels with the axes (channel, pulse, range).
@@ -174,11 +178,9 @@ class StationaryImage(Stage):
                 reconstruction singular, or `form` is unknown.
         """
         refuse_shifted(self.radar, signal.axis("pulse"))
-        check_condition(self.radar, PointMotion.of(self.radar, signal.data.real), self.rebuild, signal.data.dtype)
-        return self.focused(
-            reconstruct_lines(signal.data, self.radar, PointMotion.of(self.radar, signal.data.real), self.rebuild),
-            signal,
-        )
+        still = PointMotion.of(self.radar, signal.data.real)
+        check_condition(self.radar, still, self.rebuild, signal.data.dtype)
+        return self.focused(reconstruct_lines(signal.data, self.radar, still, self.rebuild), signal)
 
     def focused(self, spectrum: Tensor, signal: Signal) -> Signal:
         """Focus a Doppler spectrum that was reconstructed from `signal` by any method.

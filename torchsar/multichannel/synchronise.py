@@ -17,14 +17,13 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, linear_phasor, unit_phasor, worst
+from torchsar.core import Estimate, Outcome, Signal, Stage, unit_phasor, worst
+from torchsar.multichannel.balance import without_errors
 from torchsar.radar import BistaticRadar
 
-# The maximum of samples interpolated four times lies within an eighth of a sample of the peak.
-_OVERSAMPLING = 4
-# Four Newton steps from there err by 1e-5 of a sample at 12 dB, by less at a higher SNR.
-_NEWTON = 4
-_LEAST_SNR = 10.0  # 10 dB after compression: below, the strongest sample is often one of noise
+# The maximum of samples interpolated four times lies within an eighth of a sample of the peak. Four
+# Newton steps from there err by 1e-5 of a sample at 12 dB, by less at a higher SNR.
+_OVERSAMPLING, _NEWTON = 4, 4
 
 
 def estimate_synchronisation(direct: Tensor, radar: BistaticRadar, *, assess: bool = True) -> Estimate:
@@ -54,11 +53,17 @@ def estimate_synchronisation(direct: Tensor, radar: BistaticRadar, *, assess: bo
             "estimate_synchronisation works on a complex direct path (..., pulse, sample) of 8 "
             f"samples or more, got {direct.dtype} of shape {tuple(direct.shape)}"
         )
-    band, frequency = _direct_band(direct, radar)
+    spectrum = torch.fft.fft(torch.fft.ifftshift(direct.to(torch.complex128), dim=-1))
+    frequency = radar.range_frequency_hz(direct.shape[-1], direct.device)
+    inside = frequency.abs() <= radar.pulse.bandwidth_hz / 2
+    band, frequency = spectrum[..., inside], frequency[inside]
     delay = _refined_delay(band, frequency, _coarse_delay(direct, radar))
     peak = (band * unit_phasor(delay[..., None] * frequency, band.dtype)).sum(-1)
-    snr = _snr(band, peak)
-    detected = snr >= _LEAST_SNR
+    # energy of the fitted echo over the noise of one frequency
+    fitted = peak.abs().square() / len(frequency)
+    noise = (band.abs().square().sum(-1) - fitted) / max(len(frequency) - 2, 1)
+    snr = fitted / torch.maximum(noise, 1e-14 * fitted).clamp_min(torch.finfo(torch.float64).tiny)
+    detected = snr >= 10.0  # 10 dB: below, the strongest sample is often one of noise
     phase_std = (2 * snr).clamp_min(0.05).rsqrt()
     std = {"phase_rad": phase_std, "delay_s": phase_std / (2 * math.pi * frequency.square().mean().sqrt())}
     value = {"phase_rad": torch.where(detected, torch.angle(peak), 0.0), "delay_s": torch.where(detected, delay, 0.0)}
@@ -68,15 +73,6 @@ def estimate_synchronisation(direct: Tensor, radar: BistaticRadar, *, assess: bo
     quality = (1 - phase_std.square().mean(-1).sqrt()).clamp(0, 1)
     outcome = worst((Outcome.INEXACT, ~detected.all(-1)), (Outcome.NOISE, ~detected.any(-1)))
     return Estimate(value, std, quality, outcome, info)
-
-
-def _direct_band(direct: Tensor, radar: BistaticRadar) -> tuple[Tensor, Tensor]:
-    """Return the spectrum (..., pulse, frequency) in the band of the pulse, and frequencies."""
-    n = direct.shape[-1]
-    spectrum = torch.fft.fft(torch.fft.ifftshift(direct.to(torch.complex128), dim=-1))
-    frequency = radar.range_frequency_hz(n, direct.device)
-    inside = frequency.abs() <= radar.pulse.bandwidth_hz / 2
-    return spectrum[..., inside], frequency[inside]
 
 
 def _coarse_delay(direct: Tensor, radar: BistaticRadar) -> Tensor:
@@ -99,14 +95,6 @@ def _refined_delay(band: Tensor, frequency: Tensor, delay: Tensor) -> Tensor:
         step = torch.where(second < 0, -first / torch.where(second < 0, second, -1.0), 0.0)
         delay = start + (delay + step - start).clamp(-reach, reach)
     return delay
-
-
-def _snr(band: Tensor, peak: Tensor) -> Tensor:
-    """Return the energy of the fitted echo over the noise of one frequency, (..., pulse)."""
-    n = band.shape[-1]
-    fitted = peak.abs().square() / n
-    noise = (band.abs().square().sum(-1) - fitted) / max(n - 2, 1)
-    return fitted / torch.maximum(noise, 1e-14 * fitted).clamp_min(torch.finfo(torch.float64).tiny)
 
 
 def remove_synchronisation(
@@ -139,19 +127,7 @@ def remove_synchronisation(
                 f"{tuple(value.shape)}"
             )
     turn = unit_phasor(-phase_rad.to(torch.float64) / (2 * math.pi), data.dtype)[..., None, :]
-    if not with_range:
-        if delay_s is not None and bool((delay_s != 0).any()):
-            raise ValueError(
-                "delay_s must be None or zero for data without a range axis, along which delays act; leave delay_s out"
-            )
-        return data * turn
-    if delay_s is None:
-        return data * turn[..., None]
-    n = data.shape[-1]
-    advance = torch.fft.ifftshift(linear_phasor(delay_s * (radar.sampling_hz / n), -(n // 2), n, data.dtype), dim=-1)[
-        ..., None, :, :
-    ]
-    return torch.fft.ifft(torch.fft.fft(data * turn[..., None]) * advance)
+    return without_errors(data, radar, turn, None if delay_s is None else delay_s[..., None, :], with_range)
 
 
 class EstimateSynchronisation(Stage):

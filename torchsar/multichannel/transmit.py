@@ -1,4 +1,4 @@
-"""Removal of the transmit range from the phase of every pulse.
+"""Range compression, and removal of the transmit range from the phase of every pulse.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Eqs. (8)-(14), (31). The transmit range is the same for all
@@ -16,27 +16,10 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Signal, Stage, checked_samples, per_trial, unit_phasor
-from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.focus import range_compress
+from torchsar.focus.reference import REFERENCES
+from torchsar.multichannel.motion import Number, PointMotion, checked_channels
 from torchsar.radar import BistaticRadar, polynomial_range
-
-
-def transmit_phasor(
-    coefficients: Sequence[float | Tensor], time_s: Tensor, wavelength_m: float, dtype: torch.dtype
-) -> Tensor:
-    """Return the phasor exp(+j 2 pi / lambda (k1 t + k2 t^2 + ...)) that removes a transmit range.
-
-    Args:
-        coefficients: Coefficients k1, k2, ... of the transmit range over slow time t in m/s, m/s^2,
-            ...
-        time_s: Slow time in seconds, float64.
-        wavelength_m: Carrier wavelength in metres.
-        dtype: Complex dtype of the result.
-
-    Returns:
-        The phasor, complex, shape of `time_s`.
-    """
-    return unit_phasor(polynomial_range(coefficients, time_s) / wavelength_m, dtype)
 
 
 def remove_transmit_range(
@@ -72,8 +55,9 @@ def remove_transmit_range(
             f"remove_transmit_range needs time_s with one value for each of the {pulses} pulses, but its "
             f"shape is {tuple(time_s.shape)}; check with_range={with_range}, which determines the pulse axis"
         )
-    phasor = transmit_phasor([per_trial(k, 1, data) for k in coefficients], time_s, wavelength_m, data.dtype)
-    return data * _over_range(phasor[..., None, :], with_range)
+    path_m = polynomial_range([per_trial(k, 1, data) for k in coefficients], time_s)
+    phasor = unit_phasor(path_m / wavelength_m, data.dtype)[..., None, :]
+    return data * (phasor[..., None] if with_range else phasor)
 
 
 def scale_azimuth(
@@ -113,10 +97,9 @@ def scale_azimuth(
     dims = "channel, pulse, range" if with_range else "channel, pulse"
     data = checked_channels(data, radar, "scale_azimuth", dims, finite=False)
     delay = radar.channels_at(data.device) / motion.effective_m_s[..., None]
-    higher_orders = (0.0, *radar.transmit_range[1:order])
-    return data * _over_range(
-        transmit_phasor(higher_orders, time_s - delay[..., None], radar.wavelength_m, data.dtype), with_range
-    )
+    path_m = polynomial_range((0.0, *radar.transmit_range[1:order]), time_s - delay[..., None])
+    phasor = unit_phasor(path_m / radar.wavelength_m, data.dtype)
+    return data * (phasor[..., None] if with_range else phasor)
 
 
 def neglected_transmit_phase_rad(radar: BistaticRadar, order: int, integration_s: float) -> float:
@@ -139,11 +122,6 @@ def neglected_transmit_phase_rad(radar: BistaticRadar, order: int, integration_s
         / radar.wavelength_m
         * sum(abs(k) * half**power for power, k in enumerate(radar.transmit_range, 1) if power > order)
     )
-
-
-def _over_range(phasor: Tensor, with_range: bool) -> Tensor:
-    """Add a range dimension to a phasor where the data have one."""
-    return phasor[..., None] if with_range else phasor
 
 
 class RemoveTransmitRange(Stage):
@@ -183,12 +161,11 @@ class RemoveTransmitRange(Stage):
                 f"the ends of the data; raise the order to {len(self.radar.transmit_range)}",
                 stacklevel=3,
             )
-        coefficients = self.radar.transmit_range[: self.order]
         return signal.with_data(
             remove_transmit_range(
                 signal.data,
                 pulse.values(signal.data.device),
-                coefficients,
+                self.radar.transmit_range[: self.order],
                 self.radar.wavelength_m,
                 "range" in signal.names,
             )
@@ -241,3 +218,36 @@ class AzimuthScaling(Stage):
         return signal.with_data(
             scale_azimuth(signal.data, self.radar, time, motion, self.order, "range" in signal.names)
         )
+
+
+class CompressChannels(Stage):
+    """Range compression with the transmitted pulse; a unit echo has a unit peak at its range.
+
+    An echo whose pulse is cut by an end of the range line is compressed with the samples that
+    remain.
+
+    Args:
+        radar: Radar parameters.
+        reference: Reference spectrum "matched", "flat" or "phase", see `focus.RangeCompress`.
+            "flat" gives an exactly rectangular band and thus the response of data that are
+            simulated directly in range-compressed form.
+
+    Raises:
+        ValueError: If `reference` is unknown.
+    """
+
+    works_on = ("channel", "pulse", "range")
+
+    def __init__(self, radar: BistaticRadar, reference: str = "matched") -> None:
+        super().__init__()
+        if reference not in REFERENCES:
+            raise ValueError(f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}")
+        self.radar, self.reference = radar, reference
+
+    def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor:
+        """Return the reference spectrum of compression for lines of n samples, complex128 (n,)."""
+        return REFERENCES[self.reference](self.radar.pulse, n, self.radar.sampling_hz, device)
+
+    def forward(self, signal: Signal) -> Signal:
+        """Compress full chirps (channel, pulse, range) in range; the axes stay the same."""
+        return signal.with_data(range_compress(signal.data, self.spectrum(signal.data.shape[-1], signal.data.device)))

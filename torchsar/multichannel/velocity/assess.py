@@ -17,8 +17,7 @@ from torch import Tensor
 from torchsar.core import Outcome, unit_level, unit_phasor, worst
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.velocity.aperture import Aperture, Kept
-from torchsar.multichannel.velocity.illumination import lit_as_expected
+from torchsar.multichannel.velocity.aperture import Aperture, Kept, lit_as_expected
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
 from torchsar.multichannel.velocity.model import DETECTED_DB, Found, point_phasor
 from torchsar.multichannel.velocity.whitening import Whitening
@@ -30,7 +29,6 @@ _RESOLVED = 10.0
 _U_A_HALF_M_S, _U_A_STEP_M_S = 22.0, 0.5
 _FASTEST = 0.9  # largest u_a tried, relative to the speed of the receiver
 _STEPS = 6  # Gauss-Newton steps of a hypothesis, found by trial: more add less than the noise of a sample
-_LARGE_DB = 250.0  # ratios of zeros are returned as -300 dB
 
 
 @torch.no_grad()
@@ -66,7 +64,8 @@ def outcome_of_point(
         `inside`, also `pulse_rates` of shape (...,): the number of PRFs to add to the Doppler,
         -1, 0 or 1, and 0 where nothing is found.
     """
-    empty, weak = found.snr_db < -_LARGE_DB, found.snr_db < DETECTED_DB
+    # the ratio of zeros is -300 dB
+    empty, weak = found.snr_db < -250.0, found.snr_db < DETECTED_DB
     codes = [
         (Outcome.EMPTY, empty),
         (Outcome.MISFIT, weak | ~lit_as_expected(data, radar, found.motion, aperture, whitening)),
@@ -79,7 +78,14 @@ def outcome_of_point(
     off, ambiguous, snr_db = _compared(unit_level(data), radar, found, aperture, inside, assumed, whitening)
     noise = weak & (snr_db < DETECTED_DB)
     off, before = torch.where(noise, 0, off), worst((Outcome.NOISE, noise), *codes)
-    _warn(radar, (off != 0) & (before == Outcome.OK))
+    wrong = (off != 0) & (before == Outcome.OK)
+    if bool(wrong.any()):
+        warnings.warn(
+            f"in {int(wrong.sum())} of {wrong.numel()} trials the slant-range velocity is off by whole pulse rates "
+            f"(multiples of {radar.ambiguous_velocity_m_s:.4g} m/s), which this estimator cannot resolve; use a wider "
+            "search (MovingPointVelocity), or the range walk (WalkAmbiguity)",
+            stacklevel=3,
+        )
     return torch.maximum(before, worst((Outcome.AMBIGUOUS, ambiguous))), {"pulse_rates": off}
 
 
@@ -148,14 +154,3 @@ def _sharpest(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture:
         u_a_m_s=(motion.u_a_m_s + error[at // length] * middle / rate).clamp_max(_FASTEST * motion.speed_m_s),
         y0_m=motion.y0_m + frequency[at % length] / rate,
     )
-
-
-def _warn(radar: BistaticRadar, wrong: Tensor) -> None:
-    """Warn of trials whose velocity is off by pulse rates."""
-    if bool(wrong.any()):
-        warnings.warn(
-            f"in {int(wrong.sum())} of {wrong.numel()} trials the slant-range velocity is off by whole pulse rates "
-            f"(multiples of {radar.ambiguous_velocity_m_s:.4g} m/s), which this estimator cannot resolve; use a wider "
-            "search (MovingPointVelocity), or the range walk (WalkAmbiguity)",
-            stacklevel=4,
-        )

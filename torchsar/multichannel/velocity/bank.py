@@ -8,7 +8,6 @@ PRF, but the cubic phase of the range history resolves this ambiguity.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -24,7 +23,6 @@ from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
 _BLOCK_BYTES = 64 << 20  # limits the memory of a block of hypotheses
-_TINY = torch.finfo(torch.float32).tiny  # keeps divisions by zero finite
 
 
 @names_arguments
@@ -103,9 +101,9 @@ def bank_search(
     best = PointMotion.of(radar, data, 0.0, u_a_m_s, 0.0, range_m)
     best = best.each(lambda value: value.expand(data.shape[:-2]))
     energy = torch.zeros(data.shape[:-2], dtype=torch.float64, device=data.device)
-    hypotheses = []
+    hypotheses, size = [], max(1, _BLOCK_BYTES // (32 * data.numel()))
     for u_r in _steps(search.u_r_m_s, search.u_r_step_m_s, data.device):
-        for offsets in _blocks(_steps(search.u_a_m_s, search.u_a_step_m_s, data.device), data):
+        for offsets in _steps(search.u_a_m_s, search.u_a_step_m_s, data.device).split(size):
             u_a = per_trial(u_a_m_s, 1, data) + offsets
             there = PointMotion.of(radar, data, u_r, u_a, 0.0, None if range_m is None else per_trial(range_m, 1, data))
             if image_s is not None:
@@ -118,7 +116,10 @@ def bank_search(
         if few
         else [slice(None)] * len(hypotheses)
     )
-    for there, pulses, fastest in zip(hypotheses, parts, _tone_rates(radar, hypotheses), strict=True):
+    # largest change of the residual tone with position, infinite inside vmap, which reads no values
+    rates = [(each.along_m_s / (radar.wavelength_m * each.range_m)).max() for each in hypotheses]
+    fastest_hz_m = host_values(torch.stack(rates), math.inf)
+    for there, pulses, fastest in zip(hypotheses, parts, fastest_hz_m, strict=True):
         found, position, along = _best_tone(
             prepared[..., pulses], radar, there, aperture, time_s[pulses], search.y0_m, fastest, whitening
         )
@@ -139,12 +140,6 @@ def _steps(half: float, step: float, device: torch.device) -> Tensor:
     )
 
 
-def _blocks(offsets: Tensor, data: Tensor) -> Iterator[Tensor]:
-    """Split offsets into blocks that fit the memory limit for all trials."""
-    size = max(1, _BLOCK_BYTES // (32 * data.numel()))
-    yield from offsets.split(size)
-
-
 def _best_tone(
     prepared: Tensor,
     radar: BistaticRadar,
@@ -157,7 +152,7 @@ def _best_tone(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the greatest normalised correlation per trial, its position y0 and its u_a.
 
-    fastest_hz_m: Result of `_tone_rates` for this motion.
+    fastest_hz_m: Largest change of the residual tone with position.
     """
     weight = aperture.weight(radar, motion, time_s)
     model = weight[..., None, :].to(prepared.dtype) * point_phasor(radar, motion, time_s, prepared.dtype)
@@ -165,12 +160,21 @@ def _best_tone(
     fastest = fastest_hz_m * reach_m
     tones, rate_hz = _decimated(model.conj() * prepared[..., None, :, :], radar.prf_hz, fastest)
     length = smooth_length(2 * tones.shape[-1])
-    bins = _bins_within(fastest * length / rate_hz, length, prepared.device)
+    half = int(min(length // 2, fastest * length / rate_hz + 1))
+    bins = torch.arange(-half, min(half + 1, length - half), device=prepared.device)
     spectrum = torch.fft.fft(tones, length)[..., bins]
     shift = bins.to(torch.float64) * (rate_hz / length) * scale / motion.along_m_s[..., None]
-    aligned = _aligned(spectrum, radar, shift / scale)
-    energy = weight.square().sum(-1) * radar.channels if whitening is None else _whitened_energy(model, whitening)
-    power = aligned.abs().square().to(torch.float64) / energy.clamp_min(_TINY)[..., None]
+    # channels with the phases of a point; the slope is in turns per metre of channel position
+    aligned = torch.zeros_like(spectrum[..., 0, :])
+    for x, dx in zip(spectrum.unbind(-2), radar.channel_m, strict=True):
+        aligned = aligned + x * unit_phasor(shift / scale * dx, x.dtype)
+    energy = weight.square().sum(-1) * radar.channels
+    if whitening is not None:
+        # that of the middle model serves for all, since it hardly depends on the along-track speed
+        middle = model[..., model.shape[-3] // 2, :, :].to(torch.complex128)
+        middle = middle.expand(*whitening.factor.shape[:-3], *middle.shape[-2:])
+        energy = whitening.applied(middle).abs().square().sum((-2, -1))[..., None]
+    power = aligned.abs().square().to(torch.float64) / energy.clamp_min(torch.finfo(torch.float32).tiny)[..., None]
     power = torch.where(shift.abs() <= reach_m, power, -torch.inf).flatten(-2)
     at = power.argmax(-1, keepdim=True)
     wide = torch.broadcast_to(motion.y0_m[..., None] + shift, aligned.shape).flatten(-2)
@@ -180,14 +184,6 @@ def _best_tone(
         wide.expand(power.shape).gather(-1, at)[..., 0],
         along.expand(power.shape).gather(-1, at)[..., 0],
     )
-
-
-def _tone_rates(radar: BistaticRadar, motions: list[PointMotion]) -> list[float]:
-    """Return the largest change of the residual tone with position for each block, in Hz/m;
-    infinite inside vmap, where values cannot be read.
-    """
-    rates = [(each.along_m_s / (radar.wavelength_m * each.range_m)).max() for each in motions]
-    return host_values(torch.stack(rates), math.inf)
 
 
 def _illuminated(weights: list[Tensor]) -> list[slice]:
@@ -209,33 +205,3 @@ def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor,
         return tones, prf_hz
     whole = tones.shape[-1] // factor * factor
     return tones[..., :whole].unflatten(-1, (-1, factor)).sum(-1), prf_hz / factor
-
-
-def _bins_within(reach: float, length: int, device: torch.device) -> Tensor:
-    """Return the bins of an FFT, negative ones first, that lie within `reach` bins of zero."""
-    half = int(min(length // 2, reach + 1))
-    return torch.arange(-half, min(half + 1, length - half), device=device)
-
-
-def _aligned(spectrum: Tensor, radar: BistaticRadar, slope: Tensor) -> Tensor:
-    """Add channels (..., channel, bin) with the phases of a point; slope (..., bin) is its position
-    over wavelength and range, in turns per metre of channel position.
-    """
-    total = torch.zeros_like(spectrum[..., 0, :])
-    for i, dx in enumerate(radar.channel_m):
-        total = total + spectrum[..., i, :] * unit_phasor(slope * dx, spectrum.dtype)
-    return total
-
-
-def _whitened_energy(model: Tensor, whitening: Whitening) -> Tensor:
-    """Return the energy of the middle model in the metric of the clutter, shape (..., 1).
-
-    It serves for all hypotheses, since it hardly depends on the along-track speed.
-    """
-    middle = model[..., model.shape[-3] // 2, :, :].to(torch.complex128)
-    return (
-        whitening.applied(middle.expand(*whitening.factor.shape[:-3], *middle.shape[-2:]))
-        .abs()
-        .square()
-        .sum((-2, -1))[..., None]
-    )

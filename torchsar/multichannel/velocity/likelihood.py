@@ -2,21 +2,23 @@
 
 The complex amplitude is fitted for each motion in closed form. The noise is white, or clutter of
 known covariance. In white noise the estimate reaches the Cramer-Rao bound of
-`metrics.bistatic_bounds`.
+`metrics.bistatic_bounds`. Several points in one range line can be fitted together.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.motion import PointMotion
+from torchsar.core import take
+from torchsar.multichannel.motion import PointMotion, checked_channels
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.model import (
+    TINY,
     UNKNOWNS,
     Found,
     centred_slopes,
@@ -32,7 +34,6 @@ from torchsar.multichannel.velocity.model import (
 from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
-_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _HALVINGS = 4  # trials of a step: whole, half, quarter, eighth; then it is omitted
 # Predicted gain of energy below which no step is taken, relative to the noise of a sample (a step
 # of 3e-4 standard deviations) and to the energy that is explained already (rounding).
@@ -58,19 +59,6 @@ class PointFit:
     energy: Tensor
     gradient: Tensor
     normal: Tensor
-
-
-class Likelihood(Protocol):
-    """Likelihood of the motion of one or several points."""
-
-    @property
-    def data(self) -> Tensor:
-        """Channels, shape (..., channel, pulse), complex128."""
-        ...
-
-    def fit(self, motion: PointMotion) -> PointFit:
-        """Return the least-squares amplitudes for a motion, with derivatives by the unknowns."""
-        ...
 
 
 def maximum_likelihood(
@@ -117,8 +105,7 @@ def maximum_likelihood(
     data = checked_channels(data, radar, "maximum_likelihood")
     problem = PointLikelihood.of(data, radar, start, aperture, unknowns, whitening)
     motion = start.each(lambda value: value.expand(data.shape[:-2]))
-    fit = problem.fit(motion)
-    motion, fit = climbed(problem, motion, fit, unknowns, steps)
+    motion, fit = _climbed(problem.data, problem.fit, motion, unknowns, steps)
     return Found(motion, fit.amplitude, problem.noise_power(fit), problem.covariance(motion, fit), fit.energy, unknowns)
 
 
@@ -168,7 +155,7 @@ class PointLikelihood:
         if self.whitening is None:
             return _white(self.data * phasor.conj(), self.weight, slopes)
         model = self.weight * phasor
-        tilted = self.time_s / self.time_s.abs().amax().clamp_min(_TINY) * model
+        tilted = self.time_s / self.time_s.abs().amax().clamp_min(TINY) * model
         applied = self.whitening.applied
         return _coloured(self.data, applied(model), applied(tilted), applied(1j * slopes * model[..., None, :, :]))
 
@@ -216,7 +203,7 @@ class PointLikelihood:
 
 def _white(deramped: Tensor, weight: Tensor, slopes: Tensor) -> PointFit:
     """Fit in white noise on deramped data, which are constant where the motion is right."""
-    total = weight.square().expand(deramped.shape).sum((-2, -1)).clamp_min(_TINY)
+    total = weight.square().expand(deramped.shape).sum((-2, -1)).clamp_min(TINY)
     amplitude = (weight * deramped).sum((-2, -1)) / total
     centred = centred_slopes(slopes, weight)
     gradient = (centred * (amplitude.conj()[..., None, None] * deramped).imag[..., None, :, :]).sum((-2, -1))
@@ -236,50 +223,50 @@ def _coloured(data: Tensor, model: Tensor, tilted: Tensor, columns: Tensor) -> P
     linearly over slow time, by a real factor.
     """
     x, s, q, d = data.flatten(-2), model.flatten(-2), tilted.flatten(-2), columns.flatten(-2)
-    total = s.abs().square().sum(-1).clamp_min(_TINY)
+    total = s.abs().square().sum(-1).clamp_min(TINY)
     amplitude = (s.conj() * x).sum(-1) / total
     q = q - ((q * s.conj()).sum(-1) / total)[..., None] * s
     d = d - ((d * s.conj()[..., None, :]).sum(-1) / total[..., None])[..., None] * s[..., None, :]
-    tilt = q.abs().square().sum(-1).clamp_min(_TINY)
+    tilt = q.abs().square().sum(-1).clamp_min(TINY)
     d = d - ((d * q.conj()[..., None, :]).sum(-1).real / tilt[..., None])[..., None] * q[..., None, :]
     gradient = (amplitude.conj()[..., None] * (d.conj() * x[..., None, :]).sum(-1)).real
     normal = (d.conj()[..., :, None, :] * d[..., None, :, :]).sum(-1).real
     power = amplitude.abs().square()
-    changed = (amplitude.conj() * (q.conj() * x).sum(-1)).real.square() / (power * tilt).clamp_min(_TINY)
+    changed = (amplitude.conj() * (q.conj() * x).sum(-1)).real.square() / (power * tilt).clamp_min(TINY)
     return PointFit(amplitude, power * total + changed, gradient, power[..., None, None] * normal)
 
 
-def climbed(
-    problem: Likelihood, motion: PointMotion, fit: PointFit, unknowns: tuple[str, ...], steps: int
+def _climbed(
+    data: Tensor, fit_at: Callable[[PointMotion], PointFit], motion: PointMotion, unknowns: tuple[str, ...], steps: int
 ) -> tuple[PointMotion, PointFit]:
     """Take Gauss-Newton steps until none of the trials gains by a step.
 
     Args:
-        problem: Likelihood of one point, or of several that are fitted together.
+        data: Data to which one point, or several together, are fitted, (..., channel, pulse).
+        fit_at: Fit for a motion, with the unknowns of all points in its gradient.
         motion: Starting motion, shape (...,), or (..., point) for several points.
-        fit: Fit for this motion, with the unknowns of all points in its gradient.
         unknowns: Names of the parameters to estimate.
         steps: Largest number of steps.
 
     Returns:
         Motion after the steps, and the fit for it.
     """
-    channels, samples = problem.data.shape[-2:]
-    total = problem.data.abs().square().sum((-2, -1))
+    fit = fit_at(motion)
+    total = data.abs().square().sum((-2, -1))
     stuck = torch.zeros_like(fit.energy, dtype=torch.bool)  # no part of the step gained anything
     for _ in range(steps):
         step = solved(fit.normal, fit.gradient[..., None])[..., 0]
-        noise = (total - fit.energy).clamp_min(0) / (channels * samples)
+        noise = (total - fit.energy).clamp_min(0) / data.shape[-2:].numel()
         pending = ~stuck & ((step * fit.gradient).sum(-1) > _LEAST_GAIN * noise + _LEAST_SHARE * fit.energy)
         if not bool(pending.any()):
             break
-        motion, fit, failed = _stepped(problem, motion, fit, unknowns, step, pending)
+        motion, fit, failed = _stepped(fit_at, motion, fit, unknowns, step, pending)
         stuck = stuck | failed
     return motion, fit
 
 
 def _stepped(
-    problem: Likelihood,
+    fit_at: Callable[[PointMotion], PointFit],
     motion: PointMotion,
     fit: PointFit,
     unknowns: tuple[str, ...],
@@ -291,10 +278,13 @@ def _stepped(
     Returns also in which of these trials it was omitted.
     """
     begin, before = motion, fit.energy
-    step = _bounded(step.reshape(*motion.u_r_m_s.shape, len(unknowns)), motion, unknowns)
+    step = step.reshape(*motion.u_r_m_s.shape, len(unknowns))
+    if "u_a_m_s" in unknowns:  # at most a tenth of the speed along track past the point
+        along = step[..., unknowns.index("u_a_m_s")].abs().clamp_min(TINY)
+        step = step * (0.1 * motion.along_m_s / along).clamp_max(1.0)[..., None]
     for halvings in range(_HALVINGS):
         there = moved(begin, 0.5**halvings * step, unknowns)
-        fit_there = problem.fit(there)
+        fit_there = fit_at(there)
         better = pending & (fit_there.energy > before)
 
         def improved(new: Tensor, old: Tensor, better: Tensor = better) -> Tensor:
@@ -309,10 +299,91 @@ def _stepped(
     return motion, fit, pending
 
 
-def _bounded(step: Tensor, motion: PointMotion, unknowns: tuple[str, ...]) -> Tensor:
-    """Limit steps in u_a to a tenth of the along-track speed of the receiver past the point."""
-    if "u_a_m_s" not in unknowns:
-        return step
-    at = unknowns.index("u_a_m_s")
-    reach = 0.1 * motion.along_m_s / step[..., at].abs().clamp_min(_TINY)
-    return step * reach.clamp_max(1.0)[..., None]
+def fitted_together(
+    data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, unknowns: tuple[str, ...]
+) -> tuple[PointMotion, Found, Tensor, Tensor]:
+    """Find the motions of several points of highest likelihood in white noise, near a start.
+
+    Args:
+        data: Channels with the transmit range removed and slow time zero at pulse n // 2, shape
+            (..., channel, pulse), complex128.
+        radar: Radar parameters.
+        start: Starting motions, shape (..., point).
+        aperture: Expected amplitude over slow time.
+        unknowns: Names of the parameters to estimate; the others keep the values of the start.
+
+    Returns:
+        Motions, shape (..., point). Fit of the strongest point, with the noise power and the
+        covariance in the noise of all samples, which contains the effect of the others. Echo of the
+        others, and data without any point, shape (..., channel, pulse).
+    """
+    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
+    weight = aperture.weight(radar, start, time_s)[..., None, :]
+    fit_at = partial(_fit_of_points, data, radar, weight, time_s, unknowns)
+    motion, fit = _climbed(data, fit_at, start, unknowns, 8)  # by trial: points 10 dB apart converge
+    echoes = fit.amplitude[..., None, None] * weight * point_phasor(radar, motion, time_s, torch.complex128)
+    left = data - echoes.sum(-3)
+    noise = left.abs().square().mean((-2, -1))
+    pairs = (-1, len(unknowns))
+    covariance = covariance_of(fit.normal, noise).unflatten(-1, pairs).unflatten(-3, pairs)
+    own = covariance.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)  # (..., point, unknown, unknown)
+    energy = echoes.abs().square().sum((-2, -1))
+    first = energy.argmax(-1)
+    found = Found(
+        motion.each(lambda value: take(value, first)),
+        take(fit.amplitude, first),
+        noise,
+        take(own, first, -3),
+        take(energy, first),
+        unknowns,
+    )
+    return motion, found, echoes.sum(-3) - take(echoes, first, -3), left
+
+
+def _fit_of_points(
+    data: Tensor, radar: BistaticRadar, weight: Tensor, time_s: Tensor, unknowns: tuple[str, ...], motion: PointMotion
+) -> PointFit:
+    """Fit the amplitudes of points with motions (..., point) and weights (..., point, 1, pulse)."""
+    echo = weight * point_phasor(radar, motion, time_s, torch.complex128)
+    x, s = data.flatten(-2), echo.flatten(-2)
+    gram = s.conj() @ s.mT
+    amplitude = solved(gram, s.conj() @ x[..., None])[..., 0]
+    left = x - (amplitude[..., None, :] @ s)[..., 0, :]
+    slopes = phase_slopes(radar, motion, time_s, unknowns)
+    columns = (amplitude[..., None, None, None] * 1j * slopes * echo[..., None, :, :]).flatten(-2).flatten(-3, -2)
+    # without the parts that other amplitudes would take up
+    columns = columns - solved(gram, s.conj() @ columns.mT).mT @ s
+    return PointFit(
+        amplitude,
+        x.abs().square().sum(-1) - left.abs().square().sum(-1),
+        (columns.conj() @ left[..., None])[..., 0].real,
+        (columns.conj() @ columns.mT).real,
+    )
+
+
+def explained_energy(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor) -> Tensor:
+    """Return the energy of the data that a point explains with its best complex amplitude.
+
+    Up to constants this is the log-likelihood. Differentiable in data and motion.
+
+    Args:
+        data: Channels, shape (..., channel, pulse), complex.
+        radar: Radar parameters.
+        motion: Motion of the point, shape (...,).
+        weight: Expected amplitude, shape (..., pulse). In a search, compute it once for the
+            starting motion with `aperture.weight(...)` and keep it. Otherwise the search fits the
+            position to the ends of the aperture.
+
+    Returns:
+        Energy, shape (...,).
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, or the channels are not those of the radar.
+    """
+    data = checked_channels(data, radar, "explained_energy", finite=False)
+    time_s, weight = radar.pulse_axis(data.shape[-1]).values(data.device), weight[..., None, :]
+    total = weight.square().expand(data.shape).sum((-2, -1)).clamp_min(TINY)
+    return (weight * data.to(torch.complex128) * point_phasor(radar, motion, time_s, torch.complex128).conj()).sum(
+        (-2, -1)
+    ).abs().square() / total

@@ -17,7 +17,7 @@ UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")
 # Detection threshold over all samples, -15 dB per sample with three channels and 810 pulses: below
 # it the strongest tone is often one of noise.
 DETECTED_DB = 19.0
-_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
+TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _ROUNDING = 1e-13  # added to the unit diagonal of normal matrices
 # chosen: Doppler cells on either side in which the noise of a point is measured; standard
 # deviations then scatter by 12 %
@@ -84,7 +84,7 @@ def centred_slopes(slopes: Tensor, weight: Tensor) -> Tensor:
         Weighted derivatives, same shape as `slopes`.
     """
     power = weight.square()[..., None, :, :]
-    total = slopes.shape[-2] * power.sum((-2, -1), keepdim=True).clamp_min(_TINY)
+    total = slopes.shape[-2] * power.sum((-2, -1), keepdim=True).clamp_min(TINY)
     return weight[..., None, :, :] * (slopes - (power * slopes).sum((-2, -1), keepdim=True) / total)
 
 
@@ -118,23 +118,9 @@ class Found:
 
     @property
     def snr_db(self) -> Tensor:
-        """SNR of the point over all its samples in dB, limited to +-300 dB."""
-        return energy_ratio_db(self.energy, self.noise_power)
-
-
-def energy_ratio_db(energy: Tensor, noise_power: Tensor) -> Tensor:
-    """Return the ratio of an energy to a noise power in dB.
-
-    The ratio is limited to +-300 dB, and is -300 dB where energy and noise power are zero.
-
-    Args:
-        energy: Energies, any shape, float64.
-        noise_power: Noise powers in the same unit, a shape that broadcasts.
-
-    Returns:
-        Ratios in dB, the broadcast shape.
-    """
-    return 10 * torch.log10((energy / noise_power.clamp_min(torch.finfo(torch.float64).tiny)).clamp(1e-30, 1e30))
+        """SNR of the point over all its samples in dB, -300 dB for zeros, limited to +-300 dB."""
+        ratio = self.energy / self.noise_power.clamp_min(TINY)
+        return 10 * torch.log10(ratio.clamp(1e-30, 1e30))
 
 
 def covariance_of(normal: Tensor, noise_power: Tensor) -> Tensor:
@@ -173,7 +159,7 @@ def noise_beside(left: Tensor, weight: Tensor, amplitude: Tensor, fitted: int) -
     """
     n = left.shape[-1]
     energy = weight.square().sum((-2, -1))
-    cells = energy.square() / weight.square().square().sum((-2, -1)).clamp_min(_TINY) / n  # per bin
+    cells = energy.square() / weight.square().square().sum((-2, -1)).clamp_min(TINY) / n  # per bin
     inside = torch.fft.fftfreq(n, 1 / n, dtype=torch.float64, device=left.device).abs() * cells[..., None] <= _BESIDE
     turned = (left * torch.polar(torch.ones_like(amplitude.abs()), -amplitude.angle())).imag
     spectrum = torch.fft.fft(weight * turned) * inside[..., None, :]
@@ -317,5 +303,12 @@ def estimate_of(found: Found, outcome: Tensor | None = None, info: Mapping[str, 
 
 
 def quality_of(snr_db: Tensor) -> Tensor:
-    """Map the SNR over all samples to a quality of 0 to 1, one half at the detection threshold."""
+    """Map the SNR over all samples to a quality of 0 to 1, one half at the detection threshold.
+
+    Args:
+        snr_db: SNR in dB, any shape.
+
+    Returns:
+        Quality, same shape.
+    """
     return ((snr_db - DETECTED_DB) / 3).sigmoid()

@@ -12,33 +12,26 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome
-from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.velocity.aperture import Aperture, Dwell
+from torchsar.multichannel.motion import Number, PointMotion, checked_channels
+from torchsar.multichannel.velocity.aperture import Aperture, Dwell, SeenAperture, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.bank import Search, bank_search
-from torchsar.multichannel.velocity.illumination import SeenAperture, seen_aperture
-from torchsar.multichannel.velocity.likelihood import maximum_likelihood
-from torchsar.multichannel.velocity.model import UNKNOWNS, Found, estimate_of, point_phasor
-from torchsar.multichannel.velocity.several import fitted_together, joined
+from torchsar.multichannel.velocity.likelihood import fitted_together, maximum_likelihood
+from torchsar.multichannel.velocity.model import TINY, UNKNOWNS, Found, estimate_of, point_phasor
 from torchsar.multichannel.velocity.whitening import Whitening, sample_whitening
 from torchsar.radar import BistaticRadar
 
 # Aperture of the first search: integration time of Remote Sens. 2020, 12, 1703, Table 1.
 _COARSE_S = 4.5
-_ROUNDS = 2  # refinements of the residual covariance
 # Least share of the energy of a further point in what is left: clutter that fills 800 Doppler cells
-# gives 0.01 to its strongest tone; a point just detected in noise gives 0.03.
-_POINT_SHARE = 0.02
-# Share from which it is a point rather than clutter, and Doppler cells within which it then bends
-# the fit unless it is separated, by choice.
-_CLEAR_SHARE, _OVERLAP = 0.05, 8.0
-# Least energy of such a point over that of the first: the model of the echo of a wide chirp leaves
-# 0.001 of the energy of the point itself.
-_LEAST_HIDDEN = 0.002
-_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
-_PASSES = 2  # of their fit: the second has the expected amplitudes at the positions found
-_OTHERS = 3  # points fitted besides the strongest, by choice: each takes a search of its own
+# gives 0.01 to its strongest tone; a point just detected in noise gives 0.03. Share from which it
+# is a point rather than clutter, and Doppler cells within which it then bends the fit unless it is
+# separated, by choice. Least energy of such a point over that of the first: the model of the echo
+# of a wide chirp leaves 0.001 of the energy of the point itself.
+_POINT_SHARE, _CLEAR_SHARE, _OVERLAP, _LEAST_HIDDEN = 0.02, 0.05, 8.0, 0.002
+# Refinements of the residual covariance; points fitted besides the strongest, by choice: each takes
+# a search of its own; passes of their fit: the second has the amplitudes at the positions found.
+_ROUNDS, _OTHERS, _PASSES = 2, 3, 2
 
 
 def moving_point_velocity(
@@ -112,50 +105,53 @@ def moving_point_velocity(
     if u_a_m_s is not None:
         search = replace(search, u_a_m_s=0.0)
     coarse, u_a = aperture if isinstance(aperture, Dwell) else Dwell(_COARSE_S), 0.0 if u_a_m_s is None else u_a_m_s
-    job = _Job(data.to(torch.complex128), radar, aperture, coarse, search, u_a, range_m, unknowns)
+    data = data.to(torch.complex128)
+    job = _Job(data, radar, aperture, torch.ones_like(data[..., 0, :].real), coarse, search, u_a, range_m, unknowns)
     if whitening is not None:
         job, found = job.as_seen(job.found(whitening), whitening)
         coloured = torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device)
         return job.estimate(found, coloured, torch.zeros_like(coloured), assess, whitening)
     seen, plain = job.as_seen(job.found(None), None)
-    white, plain, hidden = seen.separated(plain, aperture)
-    plain = white.refined(plain)
-    if not bool(plain.coloured.any()):
-        return white.estimate(plain.found, plain.coloured, hidden, assess)
+    white, plain, hidden = seen.separated(plain)
+    plain, rest = white.refined(plain)
+    if not bool(rest.coloured.any()):
+        return white.estimate(plain, rest.coloured, hidden, assess)
     # what the fit in white noise shows of the aperture and of other points may be clutter
     clutter = sample_whitening(job.data, radar)
     job, found = job.as_seen(job.found(clutter), clutter)
-    other = job.refined(found)
-    first = ~plain.coloured | (plain.log_det <= other.log_det)  # independent of the other trials
+    other, rest_of_other = job.refined(found)
+    # the smaller log determinant is likelier
+    first = ~rest.coloured | (rest.log_det <= rest_of_other.log_det)  # independent of the other trials
     return white.or_other(job, first).estimate(
-        _chosen_fit(plain.found, other.found, first),
-        torch.where(first, plain.coloured, other.coloured),
-        hidden & (first | job._overlap(plain.found.motion, other.found.motion)),
+        _chosen_fit(plain, other, first),
+        torch.where(first, rest.coloured, rest_of_other.coloured),
+        hidden & (first | job._overlap(plain.motion, other.motion)),
         assess,
     )
 
 
 @dataclass(frozen=True)
-class _Refined:
-    """Fit in the covariance of its residual, log determinant (smaller is likelier), and colour."""
-
-    found: Found
-    log_det: Tensor
-    coloured: Tensor
-
-
-@dataclass(frozen=True)
 class _Job:
-    """Data and settings of one estimate; `coarse` is the aperture of the search."""
+    """Data and settings of one estimate.
+
+    The aperture is the expected one times `profile` (..., pulse), which the data have shown;
+    `coarse` is the aperture of the search.
+    """
 
     data: Tensor
     radar: BistaticRadar
-    aperture: Aperture
+    expected: Aperture
+    profile: Tensor
     coarse: Dwell
     search: Search
     u_a_m_s: Tensor | float
     range_m: Number | None
     unknowns: tuple[str, ...]
+
+    @property
+    def aperture(self) -> SeenAperture:
+        """Expected amplitude over slow time, as the data have shown it."""
+        return SeenAperture(self.expected, self.profile)
 
     def found(self, whitening: Whitening | None) -> Found:
         """Find the point by a grid search over velocities, followed by maximum likelihood.
@@ -173,32 +169,25 @@ class _Job:
 
     def as_seen(self, found: Found, whitening: Whitening | None) -> tuple[_Job, Found]:
         """Refit points that are lit in a part of the aperture only, and keep that part."""
-        aperture, uneven = seen_aperture(self.data, self.radar, found.motion, self.aperture, whitening)
-        if not bool(uneven.any()):
+        aperture, uneven = seen_aperture(self.data, self.radar, found.motion, self.expected, whitening)
+        if not isinstance(aperture, SeenAperture):
             return self, found
-        job = replace(self, aperture=aperture)
+        job = replace(self, profile=aperture.profile)
         return job, _chosen_fit(job.fitted(found.motion, whitening), found, uneven)
 
     def or_other(self, other: _Job, first: Tensor) -> _Job:
-        """Take the data and the seen aperture of another job where `first` is False."""
+        """Take the data and the profile of another job where `first` is False."""
         data = torch.where(first[..., None, None], self.data, other.data)
-        if not any(isinstance(job.aperture, SeenAperture) for job in (self, other)):
-            return replace(self, data=data)
-        one = data.real.new_ones(())
-        (expected, mine), (_, others) = (
-            (x.aperture, x.profile) if isinstance(x, SeenAperture) else (x, one)
-            for x in (self.aperture, other.aperture)
-        )
-        return replace(self, data=data, aperture=SeenAperture(expected, torch.where(first[..., None], mine, others)))
+        return replace(self, data=data, profile=torch.where(first[..., None], self.profile, other.profile))
 
-    def separated(self, found: Found, aperture: Aperture) -> tuple[_Job, Found, Tensor]:
+    def separated(self, found: Found) -> tuple[_Job, Found, Tensor]:
         """Fit up to three further points together with the first, where these leave white noise.
 
         Their echo is then removed from the data. A point of the same Doppler frequency is otherwise
         taken for clutter, whose covariance over several Doppler bins does not describe it. Returns
         also where there is such a point that cannot be separated.
         """
-        job, whole = self, replace(self, aperture=aperture)
+        job, whole = self, replace(self, profile=torch.ones_like(self.profile))
         tried = sample_whitening(self.left(found), self.radar).coloured
         hidden = torch.zeros_like(tried)
         if not bool(tried.any()):
@@ -209,18 +198,21 @@ class _Job:
         points, left = found.motion.each(lambda value: value.expand(tried.shape)[..., None]), whole.left(found)
         for _ in range(_OTHERS):
             further = replace(whole, data=left).found(None)
-            share = further.energy / left.abs().square().sum((-2, -1)).clamp_min(_TINY)
+            share = further.energy / left.abs().square().sum((-2, -1)).clamp_min(TINY)
             tried = tried & (share > _POINT_SHARE)
             if not bool(tried.any()):
                 break
             clear = (share > _CLEAR_SHARE) & (further.energy > _LEAST_HIDDEN * found.energy)
             hidden = hidden | (tried & clear & self._overlap(found.motion, further.motion))
-            points = joined(points, further.motion)
+            points = points.each(lambda these, one: torch.cat([these, one[..., None]], -1), further.motion)
             for _ in range(_PASSES):
-                fit = fitted_together(self.data, self.radar, points, aperture, self.unknowns)
-                points, left = fit.motion, fit.left
+                points, own, others, left = fitted_together(self.data, self.radar, points, self.expected, self.unknowns)
             done = tried & ~sample_whitening(left, self.radar).coloured
-            found, job, tried = _chosen_fit(fit.found, found, done), job.without(fit.others, done), tried & ~done
+            found, job, tried = (
+                _chosen_fit(own, found, done),
+                job.or_other(replace(whole, data=job.data - others), ~done),
+                tried & ~done,
+            )
             hidden = hidden & ~done
         return job, found, hidden
 
@@ -229,16 +221,8 @@ class _Job:
         doppler_hz = [(m.u_r_m_s + m.along_m_s * m.y0_m / m.range_m) / self.radar.wavelength_m for m in (motion, other)]
         return (doppler_hz[0] - doppler_hz[1]).abs() < _OVERLAP / self.coarse.duration_s
 
-    def without(self, echo: Tensor, where: Tensor) -> _Job:
-        """Remove the echo of other points in some trials, which then use the whole aperture."""
-        aperture = self.aperture
-        if isinstance(aperture, SeenAperture):
-            aperture = replace(aperture, profile=torch.where(where[..., None], 1.0, aperture.profile))
-        data = torch.where(where[..., None, None], self.data - echo, self.data)
-        return replace(self, data=data, aperture=aperture)
-
-    def refined(self, found: Found) -> _Refined:
-        """Repeat the fit up to two times with the covariance of its residual.
+    def refined(self, found: Found) -> tuple[Found, Whitening]:
+        """Repeat the fit up to two times with the covariance of its residual, and return both.
 
         Trials whose residual is white noise keep their fit.
         """
@@ -248,7 +232,7 @@ class _Job:
                 break
             found = _chosen_fit(self.fitted(found.motion, whitening), found, whitening.coloured)
             whitening = sample_whitening(self.left(found), self.radar)
-        return _Refined(found, whitening.log_det, whitening.coloured)
+        return found, whitening
 
     def left(self, found: Found) -> Tensor:
         """Return the data without the fitted point."""
@@ -281,12 +265,8 @@ class _Job:
 
     def at(self, trials: Tensor) -> _Job:
         """Return the job of some trials, which a bool tensor (...,) selects."""
-        aperture, u_a = self.aperture, self.u_a_m_s
-        if isinstance(aperture, SeenAperture):
-            aperture = replace(aperture, profile=aperture.profile.expand(*trials.shape, -1)[trials])
-        if isinstance(u_a, Tensor):
-            u_a = u_a.expand(trials.shape)[trials]
-        return replace(self, data=self.data[trials], aperture=aperture, u_a_m_s=u_a)
+        u_a = self.u_a_m_s.expand(trials.shape)[trials] if isinstance(self.u_a_m_s, Tensor) else self.u_a_m_s
+        return replace(self, data=self.data[trials], profile=self.profile[trials], u_a_m_s=u_a)
 
     def fitted(self, start: PointMotion, whitening: Whitening | None, steps: int = 12) -> Found:
         """Return the fit of highest likelihood near a start."""

@@ -21,11 +21,18 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, take
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines
-from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
+from torchsar.multichannel.reconstruct import (
+    LeastSquares,
+    Rebuild,
+    check_condition,
+    doppler_offsets,
+    reconstruct_lines,
+    refuse_channels,
+)
+from torchsar.multichannel.velocity.along_track import interfered
 from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.multichannel.velocity.assess import outcome_of_point
-from torchsar.multichannel.velocity.interferometry import interfered
+from torchsar.multichannel.velocity.model import TINY
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
 
@@ -34,15 +41,6 @@ _TOLERANCE_M_S = 1e-4  # of the maximum, well below the 0.06 m/s of error withou
 # Found by trial: with a fixed half step of 0.5 m/s, errors are 0.6, 0.75 and 1.0 of the prediction
 # at 10, 13 and 17 dB per sample; with 1 m/s they are 1.0, 1.2 and 1.8.
 _FIRST_M_S, _CURVE_M_S = 0.75, (0.4, 1.5)
-# The second half step is that at which the maximum has fallen by this many standard deviations of
-# the noise of ln Gamma. Found by trial: predictions then hold within 10 % from 10 to 25 dB.
-_FALL = 1.8
-# Systematic error without noise, from echoes beyond the reconstructed bands, relative to lambda
-# PRF: 0.035 m/s rms over velocities and positions, up to 0.06 m/s, of 43 m/s.
-_REST = 8e-4
-# Predicted deviations by which the interferometric speed of the strongest point may differ by
-# chance, by convention.
-_UNLIKELY = 2.0
 _GROUPS = 16  # of the jackknife: 8 and 32 groups give the same standard deviation within 6 %
 
 
@@ -51,47 +49,26 @@ class Intensity:
     """Energies and summed amplitudes of a spectrum inside and outside the processed band.
 
     Args:
-        energy_in: Energy inside the band, shape (...,).
-        energy_out: Energy outside the band, shape (...,).
-        amplitude_in: Sum of the amplitudes inside the band, shape (...,).
-        amplitude_out: Sum of the amplitudes outside the band, shape (...,).
-        bins_in: Number of samples inside the band.
-        bins_out: Number of samples outside the band.
+        energy: Energies inside and outside the band, shape (2, ...).
+        amplitude: Sums of the amplitudes inside and outside the band, shape (2, ...).
+        bins: Numbers of samples inside and outside the band.
     """
 
-    energy_in: Tensor
-    energy_out: Tensor
-    amplitude_in: Tensor
-    amplitude_out: Tensor
-    bins_in: int
-    bins_out: int
-
-    @property
-    def total(self) -> Intensity:
-        """Energies and amplitudes summed over their last dimension."""
-        return self._each(lambda x: x.sum(-1))
+    energy: Tensor
+    amplitude: Tensor
+    bins: tuple[int, int]
 
     def summed(self, weight: Tensor) -> Intensity:
         """Return weighted sums over the last dimension, with weights (last, group).
 
-        The energies and amplitudes of the result have the shape (..., group).
+        The energies and amplitudes of the result have the shape (2, ..., group).
         """
-        return self._each(lambda x: x @ weight)
-
-    def _each(self, change: Callable[[Tensor], Tensor]) -> Intensity:
-        return Intensity(
-            change(self.energy_in),
-            change(self.energy_out),
-            change(self.amplitude_in),
-            change(self.amplitude_out),
-            self.bins_in,
-            self.bins_out,
-        )
+        return Intensity(self.energy @ weight, self.amplitude @ weight, self.bins)
 
     @property
     def power_ratio(self) -> Tensor:
         """Ratio Gamma 1 of the energies inside and outside the band, Eq. (37); 0 for zero data."""
-        return self.energy_in / self.energy_out.clamp_min(torch.finfo(self.energy_out.dtype).tiny)
+        return self.energy[0] / self.energy[1].clamp_min(TINY)
 
     @property
     def amplitude_ratio(self) -> Tensor:
@@ -99,8 +76,7 @@ class Intensity:
 
         It is 0 for zero data.
         """
-        outside = self.amplitude_out.clamp_min(torch.finfo(self.amplitude_out.dtype).tiny)
-        return self.bins_out / self.bins_in * self.amplitude_in / outside
+        return self.bins[1] / self.bins[0] * self.amplitude[0] / self.amplitude[1].clamp_min(TINY)
 
     @property
     def ratio(self) -> Tensor:
@@ -125,28 +101,30 @@ def signal_intensity(
         bandwidth_hz: Processed Doppler bandwidth in Hz.
 
     Returns:
-        Energies and summed amplitudes of shape (...,).
+        Energies and summed amplitudes of shape (2, ...).
 
     Raises:
         ValueError: If the reconstructed band does not exceed `bandwidth_hz`, or there are fewer
             channels than the reconstruction needs.
     """
-    return _intensity_of_bins(data, radar, motion, rebuild, bandwidth_hz).total
+    bins = _intensity_of_bins(data, radar, motion, rebuild, bandwidth_hz)
+    return Intensity(bins.energy.sum(-1), bins.amplitude.sum(-1), bins.bins)
 
 
 def _intensity_of_bins(
     data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float
 ) -> Intensity:
-    """Return the intensities of each alias frequency, (..., pulse); see `signal_intensity`."""
+    """Return the intensities of each alias frequency, (2, ..., pulse); see `signal_intensity`."""
     refuse_full_band(radar, rebuild, bandwidth_hz)
     n = data.shape[-2]
     spectrum = reconstruct_lines(data, radar, motion, rebuild)
     inside = doppler_offsets(n, rebuild.bands, radar.prf_hz, data.device).abs() <= bandwidth_hz / 2
     amplitude = spectrum.abs().to(torch.float64)
     lines = [line.sum(-1).unflatten(-1, (rebuild.bands, n)) for line in (amplitude.square(), amplitude)]
-    within, without = ([(line * mask.view(rebuild.bands, n)).sum(-2) for line in lines] for mask in (inside, ~inside))
+    masks = [mask.view(rebuild.bands, n) for mask in (inside, ~inside)]
+    energy, total = (torch.stack([(line * mask).sum(-2) for mask in masks]) for line in lines)
     samples = int(inside.sum()) * data.shape[-1]
-    return Intensity(within[0], without[0], within[1], without[1], samples, inside.numel() * data.shape[-1] - samples)
+    return Intensity(energy, total, (samples, inside.numel() * data.shape[-1] - samples))
 
 
 def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float) -> None:
@@ -235,9 +213,7 @@ class SignalIntensityRatio(Stage):
                 "search_m_s must be (least, largest) velocity with at least two steps of step_m_s between them, got "
                 f"search_m_s={self.search_m_s} and step_m_s={step_m_s}"
             )
-        why = self.rebuild.refusal(radar.channels)
-        if why is not None:
-            raise ValueError(why)
+        refuse_channels(radar, self.rebuild)
         refuse_full_band(radar, self.rebuild, bandwidth_hz)
 
     def forward(self, signal: Signal, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
@@ -270,13 +246,12 @@ class SignalIntensityRatio(Stage):
         start = torch.full(signal.trials, middle, dtype=torch.float64, device=lines.device)
         check_condition(self.radar, self._motion(lines, start, u_a_m_s, y0_m), self.rebuild, lines.dtype)
 
-        def intensity(u_r_m_s: Tensor) -> Intensity:
-            return _intensity_of_bins(
-                lines, self.radar, self._motion(lines, u_r_m_s, u_a_m_s, y0_m), self.rebuild, self.bandwidth_hz
-            )
+        def intensity(u_r_m_s: Tensor, of_bins=_intensity_of_bins) -> Intensity:
+            motion = self._motion(lines, u_r_m_s, u_a_m_s, y0_m)
+            return of_bins(lines, self.radar, motion, self.rebuild, self.bandwidth_hz)
 
         def cost(u_r_m_s: Tensor) -> Tensor:
-            return -torch.log(intensity(u_r_m_s).total.ratio.clamp_min(torch.finfo(torch.float64).tiny))
+            return -torch.log(intensity(u_r_m_s, signal_intensity).ratio.clamp_min(TINY))
 
         reach = (self.search_m_s[1] - self.search_m_s[0]) / 2
         coarse, costs = grid_minimum(cost, start, reach, 2 * round(reach / self.step_m_s) + 1)
@@ -286,7 +261,9 @@ class SignalIntensityRatio(Stage):
         value = torch.where(has_data, fine.clamp(low, high), middle)
         if not self.assess:
             return Estimate({"u_r_m_s": value}, info={"log_ratio": -costs})
-        std = _standard_deviation(intensity, fine, _REST * self.radar.ambiguous_velocity_m_s)
+        # Systematic error without noise, from echoes beyond the reconstructed bands: 0.035 m/s rms
+        # over velocities and positions, up to 0.06 m/s, of lambda PRF = 43 m/s.
+        std = _standard_deviation(intensity, fine, 8e-4 * self.radar.ambiguous_velocity_m_s)
         quality = torch.where(has_data, 1 - torch.exp(costs.amin(-1) - costs.median(-1).values), 0.0).clamp(0, 1)
         ended = (coarse - low).abs().minimum((coarse - high).abs()) <= self.step_m_s / 2
         reasons = [(Outcome.NOISE, ~(quality >= self.least_quality)), (Outcome.OUTSIDE_SEARCH, ended)]
@@ -307,7 +284,8 @@ class SignalIntensityRatio(Stage):
         apart = (motion.u_r_m_s - tone.motion.u_r_m_s).abs()
         within = torch.full_like(apart > 0, not self.bounded)
         outcome, info = outcome_of_point(line, radar, tone, aperture, reasons, lambda _: within, assumed=True)
-        return torch.where(apart > _UNLIKELY * std, apart, std), outcome, info
+        # by chance they differ by up to two predicted deviations, by convention
+        return torch.where(apart > 2.0 * std, apart, std), outcome, info
 
     def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
         """Return the motion with a candidate of u_r."""
@@ -324,7 +302,9 @@ def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor,
     step = torch.full_like(value, _FIRST_M_S)
     spread, bend = _slope_and_bend(intensity, value, step)
     noise = math.sqrt(2) * step * spread  # of log Gamma at one speed
-    step = torch.where(bend > 0, (2 * _FALL * noise / torch.where(bend > 0, bend, 1)).sqrt(), math.inf)
+    # The second half step is that at which the maximum has fallen by 1.8 standard deviations of the
+    # noise of ln Gamma. Found by trial: predictions then hold within 10 % from 10 to 25 dB.
+    step = torch.where(bend > 0, (2 * 1.8 * noise / torch.where(bend > 0, bend, 1)).sqrt(), math.inf)
     spread, bend = _slope_and_bend(intensity, value, step.clamp(*_CURVE_M_S))
     std = torch.where(bend > 0, spread / torch.where(bend > 0, bend, 1), math.inf)
     return torch.hypot(std, torch.full_like(std, rest_m_s))
@@ -344,7 +324,7 @@ def _slope_and_bend(intensity: Callable[[Tensor], Intensity], value: Tensor, ste
 
 def _left_out(bins: Intensity) -> Tensor:
     """Return log Gamma (..., group) of all alias frequencies but those of one group."""
-    n = bins.energy_in.shape[-1]
-    group = torch.arange(n, device=bins.energy_in.device) % _GROUPS
+    n = bins.energy.shape[-1]
+    group = torch.arange(n, device=bins.energy.device) % _GROUPS
     kept = (group[:, None] != torch.arange(_GROUPS, device=group.device)).to(torch.float64)
-    return torch.log(bins.summed(kept).ratio.clamp_min(torch.finfo(torch.float64).tiny))
+    return torch.log(bins.summed(kept).ratio.clamp_min(TINY))

@@ -1,7 +1,7 @@
 """Velocity estimators of a moving point as stages.
 
 They work on signals with the axes (channel, pulse). If there is also a range axis, they work on the
-strongest range line of each trial.
+strongest range line of each trial. The maximum of the likelihood by gradients is found here.
 """
 
 from __future__ import annotations
@@ -10,18 +10,24 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, take, unit_level
-from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.motion import Number, PointMotion, checked_channels
 from torchsar.multichannel.reconstruct import refuse_shifted
-from torchsar.multichannel.velocity.along_track import along_track_velocity, motion_from
-from torchsar.multichannel.velocity.aperture import Aperture
+from torchsar.multichannel.velocity.along_track import along_track_velocity, interferometry
+from torchsar.multichannel.velocity.aperture import Aperture, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.bank import Search
-from torchsar.multichannel.velocity.gradient import gradient_likelihood
-from torchsar.multichannel.velocity.illumination import seen_aperture
-from torchsar.multichannel.velocity.interferometry import interferometry
-from torchsar.multichannel.velocity.likelihood import maximum_likelihood
-from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of, refuse_unknowns
+from torchsar.multichannel.velocity.likelihood import PointLikelihood, explained_energy, maximum_likelihood
+from torchsar.multichannel.velocity.model import (
+    TINY,
+    UNKNOWNS,
+    estimate_of,
+    moved,
+    point_phasor,
+    refuse_unknowns,
+    round_units,
+)
 from torchsar.multichannel.velocity.recommended import moving_point_velocity
+from torchsar.optim import lbfgs
 from torchsar.radar import BistaticRadar
 
 _LEAST_PULSES = 4  # convention: three pulses define a tone and its curvature, a fourth shows noise
@@ -38,6 +44,78 @@ def strongest_line(data: Tensor) -> tuple[Tensor, Tensor]:
     """
     index = unit_level(data.detach(), 3).abs().square().sum((-3, -2)).argmax(-1)
     return take(data.movedim(-1, -3), index, -3), index
+
+
+def gradient_likelihood(
+    data: Tensor,
+    radar: BistaticRadar,
+    start: PointMotion,
+    aperture: Aperture,
+    unknowns: tuple[str, ...] = UNKNOWNS,
+    steps: int = 60,
+    *,
+    assess: bool = True,
+) -> Estimate:
+    """Estimate the motion of highest likelihood by limited-memory BFGS with autograd gradients.
+
+    >>> import torch
+    >>> from torchsar.multichannel import Dwell, PointMotion, gradient_likelihood
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> data = torch.zeros(3, 90, dtype=torch.complex64)
+    >>> gradient_likelihood(data, radar, PointMotion.of(radar, data.real), Dwell(0.5)).failed
+    tensor(True)
+
+    The function serves as a check of `maximum_likelihood`, which is faster, and as an example for
+    other objectives.
+
+    Args:
+        data: Channels with the transmit range removed, shape (..., channel, pulse), complex.
+        radar: Radar parameters.
+        start: Starting motion, shape (...,). Its residual Doppler must lie within half a Doppler
+            cell, as for `maximum_likelihood`.
+        aperture: Expected amplitude over slow time.
+        unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`.
+        steps: Largest number of steps.
+        assess: Whether the outcome is assessed.
+
+    Returns:
+        `u_r_m_s`, `u_a_m_s`, `y0_m` of shape (...,) with standard deviations of the unknowns.
+        `info` holds `snr_db` (over all samples), `noise_power` (per sample) and `converged`. Where
+        the point is lit in a part of the aperture only, this part is used, see `seen_aperture`.
+        Outcomes: those of `outcome_of_point`, and `NOT_CONVERGED` where the search failed.
+
+    Raises:
+        TypeError: If the samples are not complex64 or complex128.
+        ValueError: If there are no samples, the channels are not those of the radar, or a sample is
+            not finite, or if `unknowns` holds other names or a name twice.
+    """
+    data = checked_channels(data, radar, "gradient_likelihood")
+    aperture, _ = seen_aperture(data, radar, start, aperture)
+    energy = data.abs().to(torch.float64).square().sum((-2, -1)).clamp_min(TINY)
+    at_start = maximum_likelihood(data, radar, start, aperture, unknowns, steps=0)
+    # the phases of the unknowns are nearly alike: in whitened units the objective is isotropic
+    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
+    weight = aperture.weight(radar, at_start.motion, time_s)
+    echo = weight[..., None, :] * point_phasor(radar, at_start.motion, time_s, torch.complex128)
+    units = round_units(
+        PointLikelihood.of(echo, radar, at_start.motion, aperture, unknowns, None).fit(at_start.motion).normal
+    )
+
+    def there(x: Tensor) -> PointMotion:
+        return moved(at_start.motion, (units @ x[..., None])[..., 0], unknowns)
+
+    def cost(x: Tensor) -> Tensor:
+        return -explained_energy(data, radar, there(x), weight) / energy
+
+    found = lbfgs(
+        cost, torch.zeros(*data.shape[:-2], len(unknowns), dtype=torch.float64, device=data.device), steps=steps
+    )
+    fit = maximum_likelihood(data, radar, there(found.x), aperture, unknowns, steps=0)
+    outcome = None
+    if assess:
+        outcome, _ = outcome_of_point(data, radar, fit, aperture, [(Outcome.NOT_CONVERGED, ~found.ok)])
+    return estimate_of(fit, outcome, {"converged": found.converged})
 
 
 class _Velocity(Stage):
@@ -80,7 +158,8 @@ class _Velocity(Stage):
     ) -> tuple[Tensor, BistaticRadar, PointMotion, Aperture]:
         """Return data, radar, starting motion and aperture for an estimator that needs a start."""
         data, range_m = self.line(signal)
-        return data, self.radar, motion_from(self.radar, data, u_r_m_s, u_a_m_s, y0_m, range_m), self.aperture
+        motion = PointMotion.of(self.radar, data, u_r_m_s, u_a_m_s, y0_m, range_m)
+        return data, self.radar, motion.each(lambda value: value.expand(data.shape[:-2])), self.aperture
 
 
 class Interferometry(_Velocity):
@@ -260,8 +339,7 @@ class GradientVelocity(LikelihoodVelocity):
             ValueError: If the data have other channels than the radar or fewer than 4 pulses, or
                 slow time is not zero at pulse n // 2.
         """
-        begun = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
-        return gradient_likelihood(*begun, self.unknowns, assess=self.assess)
+        return gradient_likelihood(*self.begin(signal, u_r_m_s, u_a_m_s, y0_m), self.unknowns, assess=self.assess)
 
 
 class MovingPointVelocity(_Velocity):

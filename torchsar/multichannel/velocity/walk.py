@@ -1,4 +1,4 @@
-"""PRF ambiguity number of a moving point from its range walk.
+"""PRF ambiguity number of a moving point from its range walk, and velocities in migrating lines.
 
 The channels measure the slant-range velocity only modulo lambda PRF; the ambiguity number counts
 these intervals. Each adds a range walk of lambda PRF T in T seconds of illumination, far more than
@@ -7,15 +7,18 @@ a range cell. Migration correction with the right number concentrates the point 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, best_of
-from torchsar.multichannel.migration import Frame, Keystone, Migration, correct_migration
+from torchsar.multichannel.migration import CorrectMigration, Frame, Keystone, Migration, correct_migration
 from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.velocity.model import TINY
+from torchsar.multichannel.velocity.stages import strongest_line
 from torchsar.radar import BistaticRadar
 
-_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _CONTRAST = 5.0  # least contrast of a line that is not one of noise, by choice
 
 
@@ -41,30 +44,20 @@ def walk_ambiguity(
         deviations of the energy of a line of noise. Third, the index of the strongest line.
     """
     numbers = torch.arange(-most, most + 1, dtype=torch.float64, device=data.device)
+    migration = migration or Keystone(whole_swath=False)
     energies = torch.stack(
         [
-            _line_energy(correct_migration(data, frame, reference, migration or Keystone(whole_swath=False), number))
+            correct_migration(data, frame, reference, migration, number).abs().to(torch.float64).square().sum((-3, -2))
             for number in numbers
         ]
     )
     strongest, line = energies.max(-1)
     best, margin = best_of(-strongest, numbers[(...,) + (None,) * (strongest.ndim - 1)].expand(strongest.shape))
-    noise_std = _noise_std(energies[most])
+    # the energies of lines with noise alone, by their median absolute deviation
+    middle = energies[most].median(-1, keepdim=True).values
+    spread = 1.4826 * (energies[most] - middle).abs().median(-1).values
+    noise_std = spread.clamp_min(1e-12 * middle[..., 0]).clamp_min(TINY)
     return best, margin / noise_std, line.gather(0, (best + most).long()[None])[0]
-
-
-def _line_energy(data: Tensor) -> Tensor:
-    """Return the energy of each range line, (..., range)."""
-    return data.abs().to(torch.float64).square().sum((-3, -2))
-
-
-def _noise_std(energy: Tensor) -> Tensor:
-    """Return the standard deviation of the energies of lines (..., range) with noise alone.
-
-    It is estimated from their median absolute deviation.
-    """
-    middle = energy.median(-1, keepdim=True).values
-    return (1.4826 * (energy - middle).abs().median(-1).values).clamp_min(1e-12 * middle[..., 0]).clamp_min(_TINY)
 
 
 class WalkAmbiguity(Stage):
@@ -118,3 +111,59 @@ class WalkAmbiguity(Stage):
             return Estimate({"ambiguity": number}, info=info)
         outcome = Outcome.of(contrast > _CONTRAST, Outcome.NOISE)
         return Estimate({"ambiguity": number}, {}, contrast / (_CONTRAST + contrast), outcome, info)
+
+
+class MigratingLines(Stage):
+    """Stage that estimates a velocity from range lines whose migration has not been corrected.
+
+    The estimator gets a copy of the data in which the migration of a point at rest and the range
+    walk of the strongest point are corrected. An along-track speed leaves a curved migration, which
+    weakens the ends of the range line and bends its phase. The estimator therefore runs again, on
+    data in which the migration of the motion found is corrected. The signal itself is not changed,
+    so that a later `CorrectMigration` can use the estimated velocity. Data without a range axis do
+    not migrate and go to the estimator directly.
+
+    Args:
+        radar: Radar parameters.
+        estimator: Estimator of the velocity, a stage on (channel, pulse, range) or, with
+            `one_line`, on (channel, pulse).
+        one_line: Whether the estimator gets only the strongest range line.
+        assess: Whether the range walk is assessed; `estimator` has a switch of its own.
+    """
+
+    works_on = ("channel", "pulse", "range")
+    also_on = (("channel", "pulse"),)
+
+    def __init__(self, radar: BistaticRadar, estimator: Stage, one_line: bool = False, *, assess: bool = True) -> None:
+        super().__init__()
+        self.estimator, self.one_line = estimator, one_line
+        self.walk = WalkAmbiguity(radar, assess=assess)
+        self.correct = CorrectMigration(radar, Keystone(whole_swath=False))
+        self.provides, self.neutral = estimator.provides, estimator.neutral
+
+    def forward(self, signal: Signal) -> Estimate:
+        """Estimate the velocity from channels with the axes (channel, pulse[, range]).
+
+        Returns:
+            Values of the estimator. If there is a range axis, `info` holds the ambiguity number of
+            the range walk as `ambiguity`. Outcomes: those of the estimator, and `IN_DOUBT` where
+            this number is not reliable.
+        """
+        if "range" not in signal.names:
+            return self.estimator(signal)
+        walk = self.walk(signal)
+        first = self._estimate(self.correct(signal, ambiguity=walk["ambiguity"]))
+        # values that are not ok count as well: the migration that they correct may be why
+        found = self._estimate(self.correct(signal, **{name: first[name] for name in self.provides}))
+        return replace(
+            found,
+            outcome=torch.maximum(found.outcome, Outcome.of(walk.ok, Outcome.IN_DOUBT)),
+            quality=found.quality.minimum(walk.quality),
+            info={**found.info, "ambiguity": walk["ambiguity"]},
+        )
+
+    def _estimate(self, corrected: Signal) -> Estimate:
+        """Run the estimator on corrected data."""
+        if self.one_line:
+            corrected = Signal(strongest_line(corrected.data)[0], corrected.axes[:2])
+        return self.estimator(corrected)

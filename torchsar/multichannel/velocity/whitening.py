@@ -23,20 +23,13 @@ from torch import Tensor
 
 from torchsar.core import cholesky_factor, matrix_inverse
 from torchsar.core.arguments import names_arguments
-from torchsar.multichannel.check import checked_channels
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import shared_response
+from torchsar.multichannel.motion import PointMotion, checked_channels
+from torchsar.multichannel.reconstruct import shared_response
 from torchsar.radar import BistaticRadar
 
 # Samples of a covariance: with three channels 60 cost 0.15 dB of SNR on average (Reed, Mallett and
 # Brennan 1974); more would average over a wider Doppler interval.
 _SAMPLES = 60
-_LOADING = 1e-6  # relative to the mean power: keeps the covariance of noise-free data invertible
-# Log-likelihood over its expectation by chance from which clutter is assumed. Found by trial: white
-# noise of 384 pulses is taken for clutter in 0 of 200 trials, with 1.5 in 2 %.
-_EVIDENCE = 2.0
-
-
 # Pulses of the taper at either end, at most an eighth of the record. Found by trial with 900 pulses
 # and clutter of 30 dB: errors of 0.25 m/s become 0.17 m/s with 9 pulses, 0.16 m/s with 27 to 108.
 _TAPER = 16
@@ -64,11 +57,6 @@ class Whitening:
         """Return the whitening of some trials, which a bool tensor (...,) selects."""
         return Whitening(self.factor[trials], self.log_det[trials], self.coloured[trials])
 
-    def expanded(self, count: int) -> Whitening:
-        """Return this whitening repeated `count` times along a new first dimension."""
-        factor, log_det, coloured = (x.expand(count, *x.shape) for x in (self.factor, self.log_det, self.coloured))
-        return Whitening(factor, log_det, coloured)
-
     def applied(self, data: Tensor) -> Tensor:
         """Return the whitened Doppler spectra of the channels.
 
@@ -79,8 +67,7 @@ class Whitening:
         Returns:
             Whitened spectra, same shape with Doppler bins in place of pulses.
         """
-        spectrum = _spectrum(data)
-        return _mixed(self.factor if data.ndim == self.factor.ndim - 1 else self.factor[..., None, :, :, :], spectrum)
+        return _mixed(self.factor, _spectrum(data))
 
     def backed(self, data: Tensor) -> Tensor:
         """Return channels weighted by their inverse covariance in each Doppler bin.
@@ -88,7 +75,7 @@ class Whitening:
         The correlation of the result with the model of an echo is the matched filter in clutter.
 
         Args:
-            data: Channels, shape (..., channel, pulse), complex.
+            data: As in `applied`.
 
         Returns:
             Data of the same shape.
@@ -111,11 +98,11 @@ def _spectrum(data: Tensor) -> Tensor:
 
 
 def _mixed(factor: Tensor, spectrum: Tensor) -> Tensor:
-    """Multiply spectra (..., channel, bin) by matrices (..., bin, channel, channel).
+    """Multiply spectra (..., [any,] channel, bin) by matrices (..., bin, channel, channel).
 
     Sums of products are many times faster than as many small matrix products.
     """
-    rows = factor.movedim(-3, -1)
+    rows = (factor if spectrum.ndim == factor.ndim - 1 else factor[..., None, :, :, :]).movedim(-3, -1)
     return sum(
         (rows[..., :, i, :] * spectrum[..., i, None, :] for i in range(1, spectrum.shape[-2])),
         rows[..., :, 0, :] * spectrum[..., 0, None, :],
@@ -180,25 +167,19 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES)
     total = products.new_zeros(*products.shape[:-1], (n - 1) * groups // n + 1).index_add(-1, group, products).sum(-4)
     size = total.real.new_zeros(total.shape[-1]).index_add(0, group, total.real.new_ones(n)) * count
     covariance = (total / size).movedim(-1, -3)
-    covariance, log_det, coloured = _or_white(covariance, size)
-    inverse = matrix_inverse(cholesky_factor(covariance))
-    return Whitening(inverse[..., group, :, :] * ramp.conj().mT[..., None, :], log_det, coloured)
-
-
-def _or_white(covariance: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return loaded or white covariances, the log determinant, and which trials are coloured."""
-    channels = covariance.shape[-1]
     eye = torch.eye(channels, dtype=covariance.dtype, device=covariance.device)
     level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1)
     power = (level * size).sum(-1) / size.sum()
     power = torch.where(power > 0, power, 1.0)
-    loaded = covariance + _LOADING * power[..., None, None, None] * eye
+    # the diagonal keeps the covariance of noise-free data invertible
+    loaded = covariance + 1e-6 * power[..., None, None, None] * eye
     log_det = (torch.linalg.slogdet(loaded)[1] * size).sum(-1)
     white = channels * torch.log(power) * size.sum()
-    chance = _EVIDENCE * channels**2 * len(size) / 2
+    # Clutter is assumed from twice the log-likelihood expected by chance. Found by trial: white
+    # noise of 384 pulses is taken for clutter in 0 of 200 trials, with 1.5 times in 2 %.
+    chance = 2.0 * channels**2 * len(size) / 2
     plain = (white - log_det < chance) | ~(level.amax(-1) > 0)
-    return (
-        torch.where(plain[..., None, None, None], power[..., None, None, None] * eye, loaded),
-        torch.where(plain, white, log_det),
-        ~plain,
-    )
+    covariance = torch.where(plain[..., None, None, None], power[..., None, None, None] * eye, loaded)
+    inverse = matrix_inverse(cholesky_factor(covariance))
+    factor = inverse[..., group, :, :] * ramp.conj().mT[..., None, :]
+    return Whitening(factor, torch.where(plain, white, log_det), ~plain)

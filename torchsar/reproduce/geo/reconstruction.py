@@ -28,7 +28,7 @@ from torchsar.multichannel import (
     PointMotion,
     Reconstruct,
 )
-from torchsar.multichannel.response import Rebuild
+from torchsar.multichannel.reconstruct import Rebuild
 from torchsar.multichannel.velocity.sir import Intensity, signal_intensity
 from torchsar.reproduce.geo.sensor import BANDWIDTH_HZ, INTEGRATION_S, RADAR
 from torchsar.reproduce.item import Check, Item, falling, number, statement

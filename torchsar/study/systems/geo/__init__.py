@@ -21,7 +21,7 @@ from torchsar.metrics.moving_point import (
     ideal_responses,
     point_responses,
 )
-from torchsar.multichannel.response import noise_and_clutter
+from torchsar.multichannel.reconstruct import noise_and_clutter
 from torchsar.radar import BistaticRadar
 from torchsar.study.names.registry import MULTICHANNEL_IMPAIRMENTS
 from torchsar.study.output.pictures import Drawn

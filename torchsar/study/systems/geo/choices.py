@@ -45,7 +45,7 @@ from torchsar.multichannel.velocity import (
     MovingPointVelocity,
     SignalIntensityRatio,
 )
-from torchsar.multichannel.velocity.migrating import MigratingLines
+from torchsar.multichannel.velocity.walk import MigratingLines
 from torchsar.scene import BandLimited, ExactRange, LitPoints, MovingPoints, TaylorRange
 from torchsar.study.systems.geo.world import TRUTHS, Level, Points
 from torchsar.study.trials.batch import Trials

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchsar.core import Chain, Draws, Outcome, Signal, Trace
 from torchsar.metrics.ship_scene import FoundTarget, MadeScene, made_scenes, matched, ship_metrics
 from torchsar.multichannel import Extraction, PointMotion, StationaryImage
-from torchsar.multichannel.response import LeastSquares, condition_number, noise_gain_db
+from torchsar.multichannel.reconstruct import LeastSquares, condition_number, noise_gain_db
 from torchsar.multichannel.scene_image import MoversImage
 from torchsar.radar import BistaticRadar
 from torchsar.study.output.pictures import Drawn

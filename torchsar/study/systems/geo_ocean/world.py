@@ -13,7 +13,7 @@ from torchsar.core import Draws, Signal
 from torchsar.echo import bistatic_echo, simulate_bistatic
 from torchsar.metrics.ship_scene import Ship, ShownShip
 from torchsar.multichannel import Extraction, PointMotion, RemoveTransmitRange, StationaryImage
-from torchsar.multichannel.response import Rebuild
+from torchsar.multichannel.reconstruct import Rebuild
 from torchsar.radar import BistaticRadar
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, Gate, KSea, Movers, Sea
 from torchsar.scene import Ship as ShipOfPoints
