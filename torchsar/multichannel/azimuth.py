@@ -331,6 +331,10 @@ class FocusPlan(Stage):
         data, pulse = signal.data, signal.axis("pulse")
         refuse_shifted(self.radar, pulse)
         axis, matrix = image_axis(self.radar, doppler_axis(self.radar, pulse.n, self.rebuild.bands)), self.matrix(data)
+        if data.shape[-2] != matrix.shape[1]:
+            raise ValueError(
+                f"FocusPlan: the radar has {matrix.shape[1]} channels, got data of {data.shape[-2]}; give all channels"
+            )
         tangent = forward_ad.unpack_dual(data).tangent
         if tangent is not None or (torch.is_grad_enabled() and data.requires_grad):
             bands = torch.einsum("bmp,...mp->...bp", matrix, torch.fft.fft(data))

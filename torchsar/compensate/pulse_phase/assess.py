@@ -162,14 +162,8 @@ def _seen(
     noise, zero = sharpness_of_noise(count.clamp_min(1)), torch.zeros_like(sharp)
     if through is not None:
         halves = halves_of_image(through, rows, phase)
-        return (
-            sharp,
-            noise,
-            half_difference(halves, present, phase, partial(_from, again, which)),
-            zero,
-            zero + 2,
-            *(zero,) * 3,
-        )
+        std = half_difference(halves, present, phase, partial(_from, again, which))
+        return sharp, noise, std, *[zero] * 5
     spectrum = fft_lines(rows)
     band = occupied_band(spectrum)
     apart = half_difference(halves_of_rows(rows), present, phase, partial(_disturbed, again, which, present))
@@ -208,7 +202,7 @@ def gain_of_parts(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
         energy = power_of(block).sum(-1)
         strongest = energy.topk(min(_JUDGED, block.shape[-2]), -1).indices
         block = block.gather(-2, strongest[..., None].expand(-1, -1, rows.shape[-1]))
-        own = fixed_point(block, pair_phase(block, present), Run(LogAbove(2.5), AlongPulses(), _ITERATIONS, 1.8, 0.01))[
+        own = fixed_point(block, pair_phase(block, present), Run(LogAbove(2.5), AlongPulses(), _ITERATIONS, 1.8, 0.0))[
             0
         ]
         images = (torch.fft.fft(rotate(block, at), norm="ortho") for at in (own, phase))

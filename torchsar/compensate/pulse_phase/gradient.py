@@ -277,7 +277,8 @@ def sca(data: Tensor, *, assess: bool = True) -> Estimate:
     tensor([0., 1., 3., 2.])
 
     The phase between two adjacent pulses is that of the product of one with the conjugate of the
-    other, summed over range, :math:`\mathrm{arg} \sum_n s_{k,n} s_{k-1,n}^*`; these phases are added up.
+    other, summed over range, :math:`\mathrm{arg} \sum_n s_{k,n} s_{k-1,n}^*`; these phases are
+    added up.
     The compensated data are data * exp(-j phase_rad)[..., None]. If a phase a[k] is added to pulse
     k of the data, the estimate grows by exactly a[k], up to a constant, so that the size of the
     phase errors has no effect. Noise and the scene limit the accuracy; a scene of many scatterers

@@ -38,7 +38,7 @@ def pair_products(rows: Tensor, present: Tensor) -> Tensor:
     Returns:
         The products, shape (trial, pulse - 1), complex; zero for a pulse without samples.
     """
-    if bool(present.all()):
+    if present.device.type == "cpu" and bool(present.all()):
         return (rows[..., 1:] * rows[..., :-1].conj()).sum(-2)
     # the last earlier pulse that holds samples; 0 where there is none
     index = torch.arange(present.shape[-1], device=present.device)

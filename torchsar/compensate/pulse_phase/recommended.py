@@ -185,9 +185,13 @@ def autofocus(
         if not polish:
             return fixed_point(rows, at, Run(LogAbove(_FLOOR), AlongPulses(), 4, _RELAXATION, 0.0))[0]
         reached = fixed_point(rows, at, polishing(along, few_iterations))[0]
-        gaps = have_gaps(pulses.present[which]) & (through is None)
+        if not with_gaps:
+            return reached
+        gaps = have_gaps(pulses.present[which])
         return _filled(rows, reached, at, gaps, _FILLING * few_iterations, tolerance_rad / 10)
 
+    judged = assess and through is None and polish > 0 and pulses.n >= 3 and len(pulses.rows) > 0
+    with_gaps = judged and bool(host_value(have_gaps(pulses.present).any(), True))
     begin = starting_phase(start, pulses, "autofocus")
     phase, taken = find_phases(pulses, find, begin, whole=through is not None)
     sharpest = conclude(pulses, phase, taken, assess, again, through)

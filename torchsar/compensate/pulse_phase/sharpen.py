@@ -85,7 +85,7 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run, done: int = 0) -> tuple[T
         phase = torch.where(active[:, None], phase + factors[(number - 1) % len(factors)] * step, phase)
         taken = taken + active
         active = active & ((min(factors) * step).detach().square().mean(-1) > run.tolerance_rad**2)
-        if number % every or run.iterations - number < every:
+        if number % every or run.iterations - number < every or not run.tolerance_rad:
             continue
         going = host_value(active.sum(), len(active))
         if not going:

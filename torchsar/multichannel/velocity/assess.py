@@ -136,7 +136,8 @@ def _sharpest(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture:
     rate = motion.along_m_s / (radar.wavelength_m * motion.range_m)
     middle = radar.speed_m_s / (radar.wavelength_m * radar.reference_range_m)
     # neighbouring pulses are added as far as the frequencies of the tried chirps allow
-    factor = max(1, int(radar.prf_hz**2 / (2 * _U_A_HALF_M_S * middle * data.shape[-1])))
+    factor = int(radar.prf_hz**2 / (2 * _U_A_HALF_M_S * middle * data.shape[-1]))
+    factor = min(max(1, factor), data.shape[-1])
     echo = data * point_phasor(radar, motion, time_s, data.dtype).conj()
     line = (echo.sum(-2) * aperture.weight(radar, motion, time_s)).to(torch.complex64)
     whole = line.shape[-1] // factor * factor

@@ -35,6 +35,7 @@ from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
 _HALVINGS = 4  # trials of a step: whole, half, quarter, eighth; then it is omitted
+_LOOK = 4  # steps on an accelerator between two decisions whether to stop, by choice
 # Predicted gain of energy below which no step is taken, relative to the noise of a sample (a step
 # of 3e-4 standard deviations) and to the energy that is explained already (rounding).
 _LEAST_GAIN, _LEAST_SHARE = 1e-7, 1e-13
@@ -254,11 +255,12 @@ def _climbed(
     fit = fit_at(motion)
     total = data.abs().square().sum((-2, -1))
     stuck = torch.zeros_like(fit.energy, dtype=torch.bool)  # no part of the step gained anything
-    for _ in range(steps):
+    every = 1 if data.device.type == "cpu" else _LOOK
+    for number in range(steps):
         step = solved(fit.normal, fit.gradient[..., None])[..., 0]
         noise = (total - fit.energy).clamp_min(0) / data.shape[-2:].numel()
         pending = ~stuck & ((step * fit.gradient).sum(-1) > _LEAST_GAIN * noise + _LEAST_SHARE * fit.energy)
-        if not bool(pending.any()):
+        if number % every == 0 and not bool(pending.any()):
             break
         motion, fit, failed = _stepped(fit_at, motion, fit, unknowns, step, pending)
         stuck = stuck | failed
@@ -294,7 +296,7 @@ def _stepped(
         motion = replace(motion, **values)
         fit = PointFit(*map(improved, vars(fit_there).values(), vars(fit).values()))
         pending = pending & ~better
-        if not bool(pending.any()):
+        if pending.device.type == "cpu" and not bool(pending.any()):
             break
     return motion, fit, pending
 
