@@ -5,10 +5,14 @@ modules have a comment with their source or reason.
 from __future__ import annotations
 
 import ast
+import doctest
+import importlib
 import inspect
 import re
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 import torchsar
 
@@ -78,6 +82,17 @@ def test_public_names_describe_parameters_and_results() -> None:
         for what in missing(node)
     ]
     assert not found, "docstrings lack\n" + "\n".join(found)
+
+
+WITH_EXAMPLES = [path for path in LIBRARY if ">>>" in path.read_text(encoding="utf-8")]
+
+
+@pytest.mark.parametrize("path", WITH_EXAMPLES, ids=label)
+def test_examples_run(path: Path) -> None:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    module = importlib.import_module(".".join(parts if parts[-1] != "__init__" else parts[:-1]))
+    found = doctest.testmod(module)
+    assert found.attempted and not found.failed
 
 
 def constant(node: ast.stmt) -> ast.expr | None:

@@ -67,8 +67,9 @@ def sharpest_phase(
 
     >>> import torch
     >>> from torchsar.compensate import sharpest_phase
-    >>> points = torch.eye(8, dtype=torch.complex64).repeat(4, 1)  # of 32 pulses, 8 range cells
-    >>> sharpest_phase(points, objective="contrast", assess=False)["phase_rad"].shape
+    >>> point = torch.zeros(32, 8, dtype=torch.complex64)  # pulses, range cells
+    >>> point[:, 3] = torch.exp(2j * torch.rand(32))
+    >>> sharpest_phase(point, objective="contrast", assess=False)["phase_rad"].shape
     torch.Size([32])
 
     Each trial descends separately into a minimum near its start.

@@ -170,8 +170,9 @@ def pga(
 
     >>> import torch
     >>> from torchsar.compensate import pga
-    >>> points = torch.eye(8, dtype=torch.complex64).repeat(4, 1)  # of 32 pulses, 8 range cells
-    >>> pga(points, kernel="ml", assess=False)["phase_rad"].shape
+    >>> point = torch.zeros(32, 8, dtype=torch.complex64)  # pulses, range cells
+    >>> point[:, 3] = torch.exp(2j * torch.rand(32))
+    >>> pga(point, kernel="ml", assess=False)["phase_rad"].shape
     torch.Size([32])
 
     Every iteration works on the original data with the present phase removed. It shifts the

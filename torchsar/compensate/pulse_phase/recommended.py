@@ -212,8 +212,9 @@ def entropy_fixed_point(
 
     >>> import torch
     >>> from torchsar.compensate import entropy_fixed_point
-    >>> points = torch.eye(8, dtype=torch.complex64).repeat(4, 1)  # of 32 pulses, 8 range cells
-    >>> entropy_fixed_point(points, assess=False)["phase_rad"].shape
+    >>> point = torch.zeros(32, 8, dtype=torch.complex64)  # pulses, range cells
+    >>> point[:, 3] = torch.exp(2j * torch.rand(32))
+    >>> entropy_fixed_point(point, assess=False)["phase_rad"].shape
     torch.Size([32])
 
     Each iteration forms the image and weights its cells with ln(max(p, floor) / floor), where p is
