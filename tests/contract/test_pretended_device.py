@@ -42,7 +42,7 @@ CHAIN_WAITS = {
     "sal_snr": (5, []),
     "isal_snr": (15, []),
     "geo_velocity_scnr": (26, ["world.pulses=512"]),
-    "isal_rotation_snr": (9, ["world.pulses=1000"]),
+    "isal_rotation_snr": (10, ["world.pulses=1000"]),  # the last step of a fit shows that it has converged
 }
 
 SMALL = {
@@ -63,8 +63,9 @@ CHAINS = {
 _ONCE = ("estimate_balance", "link_phases", "signal_intensity", "geo_ocean")
 # Absolute differences of figures, in metres, m/s and dB: the iterations that find velocities of
 # ships end at a thousandth of what noise leaves, and rounding sets where. Sums that round in
-# another way change positions, which are 0.3 m off, by up to 1.4 mm.
-LEEWAY = {"geo_ocean": 5e-3}
+# another way change positions, which are 0.3 m off, by up to 1.4 mm. Fits of a rotation end up to a
+# round later on an accelerator, which looks less often: a thousandth of a deviation, in percent.
+LEEWAY = {"geo_ocean": 5e-3, "isal_rotation": 2e-4}
 
 
 def waits(counts: Counts) -> Counter[str]:

@@ -187,7 +187,7 @@ def fit_scatterers(
             used = each(lambda x, width=near.shape[1]: x[:, :width], found)
             fit = replace(fit, scatterers=used, noise=noise)
         # no trial settles before the search is over; an accelerator should not wait in every round
-        looks = iteration > _SEARCHED and (device.type == "cpu" or iteration % 4 == 0)
+        looks = iteration > _SEARCHED and (device.type == "cpu" or iteration % 2 == 0)
         if iteration == rounds or (looks and bool(fit.settled.all())):
             break
         residual, step = Step.of(data, sampling, fit, near, count)
