@@ -341,8 +341,8 @@ def test_report_shows_the_numbers_of_the_summary(page: str, summary: dict[str, A
     rows = [row for row in read(page).rows if row and row[0] in summary["algorithms"]]
     count = len(summary["points"])
     assert len(rows) == count + count // 2
-    told = [point for point in summary["points"] if point["metric"] == "doppler_error_hz"]
-    for row, point in zip(rows[count:], told, strict=True):
+    points = [point for point in summary["points"] if point["metric"] == "doppler_error_hz"]
+    for row, point in zip(rows[count:], points, strict=True):
         assert row[4:6] == [f"{point['trials']}", with_interval(point["ok_share"], point["ok_interval"])]
         assert row[6] == ", ".join(f"{Outcome[name].label}: {n}" for name, n in point["outcomes"].items())
     rows = rows[:count]

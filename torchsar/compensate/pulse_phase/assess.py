@@ -158,7 +158,7 @@ def _seen(
     rows, present, phase = rows[part], present[part], phase[part]
     focused = rotate(rows, phase)
     image = torch.fft.fft(focused, norm="ortho") if through is None else through.image(focused).mT
-    sharp, count, telling = sharpness_beyond_speckle(image)
+    sharp, count, sharp_rows = sharpness_beyond_speckle(image)
     noise, zero = sharpness_of_noise(count.clamp_min(1)), torch.zeros_like(sharp)
     if through is not None:
         halves = halves_of_image(through, rows, phase)
@@ -169,7 +169,7 @@ def _seen(
     apart = half_difference(halves_of_rows(rows), present, phase, partial(_disturbed, again, which, present))
     moved = displacement(spectrum, present)
     scatter, rest = scatter_of_point(focused, present)
-    single = ((telling < _ONE_ROW) & (sharp > noise)) | (different_rows(rows, power_of(rows).sum(-1)) < _ONE_RANGE)
+    single = ((sharp_rows < _ONE_ROW) & (sharp > noise)) | (different_rows(rows, power_of(rows).sum(-1)) < _ONE_RANGE)
     steady = (scatter < _STEADY) & (present.sum(-1) >= _LEAST_PULSES) & (rows.shape[-2] > 1)
     return (
         sharp,

@@ -112,10 +112,10 @@ def moving_point_velocity(
         coloured = torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device)
         return job.estimate(found, coloured, torch.zeros_like(coloured), assess, whitening)
     seen, plain = job.as_seen(job.found(None), None)
-    white, plain, hidden = seen.separated(plain)
+    white, plain, disturbed = seen.separated(plain)
     plain, rest = white.refined(plain)
     if not bool(rest.coloured.any()):
-        return white.estimate(plain, rest.coloured, hidden, assess)
+        return white.estimate(plain, rest.coloured, disturbed, assess)
     # what the fit in white noise shows of the aperture and of other points may be clutter
     clutter = sample_whitening(job.data, radar)
     job, found = job.as_seen(job.found(clutter), clutter)
@@ -125,7 +125,7 @@ def moving_point_velocity(
     return white.or_other(job, first).estimate(
         _chosen_fit(plain, other, first),
         torch.where(first, rest.coloured, rest_of_other.coloured),
-        hidden & (first | job._overlap(plain.motion, other.motion)),
+        disturbed & (first | job._overlap(plain.motion, other.motion)),
         assess,
     )
 
@@ -189,9 +189,9 @@ class _Job:
         """
         job, whole = self, replace(self, profile=torch.ones_like(self.profile))
         tried = sample_whitening(self.left(found), self.radar).coloured
-        hidden = torch.zeros_like(tried)
+        disturbed = torch.zeros_like(tried)
         if not bool(tried.any()):
-            return job, found, hidden
+            return job, found, disturbed
         # with a slant-range speed that is wrong by lambda PRF, one point leaves others over
         found = _chosen_fit(self.resolved(found, None), found, tried)
         tried = tried & sample_whitening(self.left(found), self.radar).coloured
@@ -203,7 +203,7 @@ class _Job:
             if not bool(tried.any()):
                 break
             clear = (share > _CLEAR_SHARE) & (further.energy > _LEAST_HIDDEN * found.energy)
-            hidden = hidden | (tried & clear & self._overlap(found.motion, further.motion))
+            disturbed = disturbed | (tried & clear & self._overlap(found.motion, further.motion))
             points = points.each(lambda these, one: torch.cat([these, one[..., None]], -1), further.motion)
             for _ in range(_PASSES):
                 points, own, others, left = fitted_together(self.data, self.radar, points, self.expected, self.unknowns)
@@ -213,8 +213,8 @@ class _Job:
                 job.or_other(replace(whole, data=job.data - others), ~done),
                 tried & ~done,
             )
-            hidden = hidden & ~done
-        return job, found, hidden
+            disturbed = disturbed & ~done
+        return job, found, disturbed
 
     def _overlap(self, motion: PointMotion, other: PointMotion) -> Tensor:
         """Whether the Doppler frequencies of two points differ by few Doppler cells."""
@@ -281,9 +281,9 @@ class _Job:
         return inside
 
     def estimate(
-        self, found: Found, coloured: Tensor, hidden: Tensor, assess: bool, whitening: Whitening | None = None
+        self, found: Found, coloured: Tensor, disturbed: Tensor, assess: bool, whitening: Whitening | None = None
     ) -> Estimate:
-        """Form the estimate, and assess it; `hidden` tells where another point bends it."""
+        """Form the estimate, and assess it; `disturbed` says where another point changes it."""
         found = self.resolved(found, whitening)
         if not assess:
             return estimate_of(found, None, {"coloured": coloured})
@@ -292,7 +292,7 @@ class _Job:
         reasons = [
             (Outcome.OUTSIDE_SEARCH, ~self.inside(found.motion)),
             (Outcome.SINGULAR, ~(found.covariance[..., 0, 0].sqrt() <= half)),
-            (Outcome.PARTS_DISAGREE, hidden),
+            (Outcome.PARTS_DISAGREE, disturbed),
         ]
         fit = self.data, self.radar, found, self.aperture, reasons
         outcome, info = outcome_of_point(*fit, self.inside, whitening=whitening)

@@ -124,11 +124,11 @@ def _case(bench: Bench, name: str) -> Result:
     whole = {method: joined_metrics(parts) for method, parts in metrics.items()}
     of_targets = {method: {t: joined_metrics(parts) for t, parts in of.items()} for method, of in targets.items()}
     found = {method: joined_found(parts) for method, parts in estimates.items()}
-    told = {
+    joined_marks = {
         method: {k: joined_metrics([part.get(k, {}) for part in parts]) for k in ("outcomes", "neutral", "doubtful")}
         for method, parts in marks.items()
     }
-    result = Result(bench, first, whole, of_targets, found, joined_metrics(truth), told)
+    result = Result(bench, first, whole, of_targets, found, joined_metrics(truth), joined_marks)
     _warn_if_unreliable(name, result)
     log.info("%s: %.1f s", bench.loaded.name if name == ALL else name, time.perf_counter() - began)
     return result
