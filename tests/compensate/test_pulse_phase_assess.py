@@ -82,7 +82,7 @@ def test_a_second_motion_among_points_is_seen() -> None:
     assert (found.outcome[wrong] == Outcome.PARTS_DISAGREE).double().mean() > 0.8
 
 
-def test_reasons_are_told_apart() -> None:
+def test_each_cause_has_its_own_reason() -> None:
     source = torch.Generator().manual_seed(3)
     points, _ = spread_points(1, 20, 15.0, seed=2)
     noise = torch.randn(points.shape, generator=source, dtype=torch.complex128)
