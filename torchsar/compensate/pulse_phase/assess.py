@@ -49,7 +49,7 @@ _DISTURBED_RAD, _RETURNED_RAD, _ROUNDS = 0.4, 0.04, 2
 # distributed phases is half of their error
 _APART_RAD = 2.0
 # A single scatterer: the sharpness is that of so many rows, or the rows are side lobes of one
-# range. Its own motion cannot be separated from a phase error, and phases can be found that make one
+# range. Its own motion cannot be separated from a phase error, and some phases exist that make one
 # point of several. But no phase changes its modulus: noise and weaker scatterers change it as much
 # as the phase. It is steady if it scatters by less than this, far below the 0.52 of noise, over at
 # least so many pulses.
