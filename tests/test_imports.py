@@ -64,9 +64,12 @@ FLOORS = ("settings", "names", "output", "montecarlo", "trials", "systems", "com
 SHARED = {"isal_rotation": {"isal"}, "geo_ocean": {"geo"}, "path": {"isal"}}
 # statements that the system `path` adds at most; those of all of `study`, and of its systems alone
 PATH_STATEMENTS = 300
+# what judges the images and estimates of single systems
+JUDGE_STATEMENTS = 648
 MOST_STATEMENTS = {
-    "torchsar.study": 6620 + PATH_STATEMENTS,  # with the sizes of batches and the measurement of memory
-    "torchsar.study.systems": 3500,
+    # with the sizes of batches, the measurement of memory, cuts and directly summed images
+    "torchsar.study": 6620 + JUDGE_STATEMENTS + 168 + PATH_STATEMENTS,
+    "torchsar.study.systems": 3500 + JUDGE_STATEMENTS,
     "torchsar.study.systems.path": PATH_STATEMENTS,
 }
 

@@ -19,12 +19,12 @@ from tests.study.scenes import (
     world,
 )
 from torchsar.core import Draws
-from torchsar.metrics.moving_point import ideal_responses
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import ElementPattern, FlatBand, clutter_covariance, condition_number
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo import sweep
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.systems.geo.judge import ideal_responses
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 

@@ -9,9 +9,9 @@ import torch
 
 from tests.study.scenes import GEO_OCEAN, SHIP, bench_of, world
 from torchsar.core import Axis, Draws, Signal
-from torchsar.metrics.ship_scene import ImagePosition
 from torchsar.multichannel.motion import PointMotion
 from torchsar.study.commands.requires import refuse_beyond_limits
+from torchsar.study.systems.geo_ocean.judge import ImagePosition
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 

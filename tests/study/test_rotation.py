@@ -14,10 +14,10 @@ import torch
 from tests.study.scenes import FOUND_ROTATION, ISAL_ROTATION, bench_of, loaded_as, world
 from torchsar.core import Axis, Draws, Signal
 from torchsar.focus.rotation_requirements import least_order, rotation_limits, rotation_requirements
-from torchsar.metrics.rotation import cross_range_cut
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.montecarlo import sweep
+from torchsar.study.systems.isal_rotation.judge import cross_range_cut
 
 BOX = {"low": [0.018, 9.0, 900.0], "high": [0.022, 11.0, 1100.0]}
 

@@ -24,7 +24,6 @@ from tests.study.scenes import (
 from torchsar.cli import main
 from torchsar.core import Axis, Draws, Signal
 from torchsar.metrics import impulse_response
-from torchsar.metrics.radial_motion import course_of, finer_in_range
 from torchsar.study.commands import run as command
 from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.montecarlo import sweep
@@ -35,6 +34,7 @@ from torchsar.study.names.registry import (
     SWEEP_ERRORS,
     SWEEP_FIDELITIES,
 )
+from torchsar.study.systems.sal.judge import course_of, finer_in_range
 from torchsar.study.table import load, systems
 from torchsar.study.trials.bench import Bench
 

@@ -31,7 +31,6 @@ from torchsar.core import Chain, Draws, Recording, Signal, Stage, Trace, Truth, 
 from torchsar.echo import simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import contrast, entropy, impulse_response
-from torchsar.metrics.radial_motion import Course, course_of, finer_in_range
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.repair import BlankTurningPoints, CircularShift, SplitSweeps
 from torchsar.reproduce.item import Check, Item, falling, number, parameters, statement
@@ -46,6 +45,7 @@ from torchsar.scene import (
     RetroAndBrokenLine,
     Sinusoid,
 )
+from torchsar.study.systems.sal.judge import Course, course_of, finer_in_range
 
 # of Table 4; the sampling is that of the text, the speed follows from azimuth cells of 0.1 mm
 RADAR = TriangularLadar(

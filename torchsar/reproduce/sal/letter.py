@@ -24,10 +24,10 @@ from torchsar.core import Axis, Chain, Draws, Signal, Trace, use
 from torchsar.echo import simulate_ladar
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import contrast, entropy
-from torchsar.metrics.radial_motion import course_of, finer_in_range
 from torchsar.reproduce.item import Check, Item, falling, number
 from torchsar.reproduce.sal.points import BEAM_RAD, MOTION, RADAR
 from torchsar.scene import LadarWorld, LetterE, QuadraticInSweep
+from torchsar.study.systems.sal.judge import course_of, finer_in_range
 
 # relative ranges of the letter (m), and SNR (dB) per sample before compression of one point
 SCENE_M, SNR_DB = (-1.5, 1.5), 20.0

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from torchsar.metrics.direct_images import DirectlySummed
+from torchsar.study.trials.direct_images import DirectlySummed
 
 
 @dataclass(frozen=True)

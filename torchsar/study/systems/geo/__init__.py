@@ -13,14 +13,6 @@ from torch import Tensor
 
 from torchsar.core import Chain, Draws, Signal, Trace, per_trial
 from torchsar.metrics import bistatic_bounds
-from torchsar.metrics.moving_point import (
-    UNKNOWNS,
-    FocusedPoint,
-    FoundMotion,
-    error_name,
-    ideal_responses,
-    point_responses,
-)
 from torchsar.multichannel.reconstruct import noise_and_clutter
 from torchsar.radar import BistaticRadar
 from torchsar.study.names.registry import MULTICHANNEL_IMPAIRMENTS
@@ -28,6 +20,14 @@ from torchsar.study.output.pictures import Drawn
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.geo import choices, figures
+from torchsar.study.systems.geo.judge import (
+    UNKNOWNS,
+    FocusedPoint,
+    FoundMotion,
+    error_name,
+    ideal_responses,
+    point_responses,
+)
 from torchsar.study.systems.geo.radar import bistatic_radar
 from torchsar.study.systems.geo.world import TRUTHS, Points, compression_gain_db
 from torchsar.study.trials.batch import OK, Batch, Found, Judged, Processed, Result, Trials

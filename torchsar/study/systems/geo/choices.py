@@ -16,8 +16,6 @@ from torchsar.echo import bistatic_echo
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_db
-from torchsar.metrics.direct_images import DirectlySummed, points_at_rest
-from torchsar.metrics.moving_point import FocusedPoint, PeakCuts, point_responses, worst_image_error_db
 from torchsar.metrics.replicas import azimuth_response
 from torchsar.multichannel import (
     CorrectMigration,
@@ -47,10 +45,12 @@ from torchsar.multichannel.velocity import (
 )
 from torchsar.multichannel.velocity.walk import MigratingLines
 from torchsar.scene import BandLimited, ExactRange, LitPoints, MovingPoints, TaylorRange
+from torchsar.study.systems.geo.judge import FocusedPoint, PeakCuts, point_responses, worst_image_error_db
 from torchsar.study.systems.geo.world import TRUTHS, Level, Points
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
+from torchsar.study.trials.direct_images import DirectlySummed, points_at_rest
 
 _ESTIMATORS: dict[type, Estimator] = {
     SignalIntensityRatio: "sir",

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Signal
-from torchsar.metrics.cuts import about_peak, finer
-from torchsar.metrics.moving_point import PeakCuts
 from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.cases import key_of, titled, word_of
+from torchsar.study.systems.geo.judge import PeakCuts
 from torchsar.study.trials.batch import Result
+from torchsar.study.trials.cuts import about_peak, finer
 
 # half extent of main lobes (m), and lowest levels of profiles and of spectra
 _NEAR_M, _LOW_DB, _SPECTRUM_DB = 12.0, -90.0, -70.0

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Chain, Draws, Outcome, Signal, Trace
-from torchsar.metrics.ship_scene import FoundTarget, MadeScene, made_scenes, matched, ship_metrics
 from torchsar.multichannel import Extraction, PointMotion, StationaryImage
 from torchsar.multichannel.reconstruct import LeastSquares, condition_number, noise_gain_db
 from torchsar.multichannel.scene_image import MoversImage
@@ -22,6 +21,7 @@ from torchsar.study.output.pictures import Drawn
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.geo.radar import bistatic_radar
 from torchsar.study.systems.geo_ocean import choices, figures
+from torchsar.study.systems.geo_ocean.judge import FoundTarget, MadeScene, made_scenes, matched, ship_metrics
 from torchsar.study.systems.geo_ocean.world import TRUTHS, Ocean
 from torchsar.study.trials.batch import OK, Found, Judged, Processed, Result, Trials, verdict
 from torchsar.study.trials.bench import Bench

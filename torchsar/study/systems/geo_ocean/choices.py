@@ -15,7 +15,6 @@ from torchsar.echo import bistatic_echo
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_db
-from torchsar.metrics.ship_scene import FoundTarget, MadeScene, matched, ship_metrics
 from torchsar.multichannel import (
     ImageMovers,
     MultichannelUse,
@@ -29,6 +28,7 @@ from torchsar.multichannel.scene_image import MoversImage
 from torchsar.multichannel.stationary import bulk_error_db, swath_limit
 from torchsar.scene import BandLimited, MovingPoints
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.systems.geo_ocean.judge import FoundTarget, MadeScene, matched, ship_metrics
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 

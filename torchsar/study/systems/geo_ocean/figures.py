@@ -11,10 +11,10 @@ import torch
 
 from torchsar import plot
 from torchsar.core import Signal
-from torchsar.metrics.ship_scene import ImagePosition, MadeScene, ShownShip
 from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.cases import titled, word_of
 from torchsar.study.systems.geo.figures import by_target
+from torchsar.study.systems.geo_ocean.judge import ImagePosition, MadeScene, ShownShip
 from torchsar.study.trials.batch import Result
 
 # half extents in azimuth and range (m) of pictures of ships, and of the boxes about them

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from torchsar.core import Draws, Signal
 from torchsar.echo import bistatic_echo, simulate_bistatic
-from torchsar.metrics.ship_scene import Ship, ShownShip
 from torchsar.multichannel import Extraction, PointMotion, RemoveTransmitRange, StationaryImage
 from torchsar.multichannel.reconstruct import Rebuild
 from torchsar.radar import BistaticRadar
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, Gate, KSea, Movers, Sea
 from torchsar.scene import Ship as ShipOfPoints
 from torchsar.study.names.registry import GATES, SEAS
+from torchsar.study.systems.geo_ocean.judge import Ship, ShownShip
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.system import World
 

@@ -18,7 +18,6 @@ from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.io import read_inverse
 from torchsar.metrics import phase_rmse
-from torchsar.metrics.direct_images import DirectlySummed, turning_target
 from torchsar.radar import InverseRadar, geometry_of
 from torchsar.scene import PhaseOnly, Sinusoid, displacement_m
 from torchsar.study.names.factories import with_wavelength
@@ -31,6 +30,7 @@ from torchsar.study.systems.isal.world import Target, echo_choices
 from torchsar.study.trials.batch import Judged, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
+from torchsar.study.trials.direct_images import DirectlySummed, turning_target
 from torchsar.study.trials.system import Column, System
 
 _GEOMETRY = ("frequency_hz", "angle_rad", "position_m", "reference_m")

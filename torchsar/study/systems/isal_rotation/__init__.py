@@ -15,12 +15,12 @@ from torchsar.core import Draws, Trace
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.matched_fourier import MatchedFourier
 from torchsar.metrics import contrast, entropy, rotation_bounds
-from torchsar.metrics.rotation import CrossRangeCut, FoundRotation, cross_range_cut, k_scales, true_k
 from torchsar.radar import InverseRadar
 from torchsar.study.names.factories import with_wavelength
 from torchsar.study.names.registry import TARGET_IMPAIRMENTS
 from torchsar.study.output.pictures import Drawn
 from torchsar.study.systems.isal_rotation import choices, figures
+from torchsar.study.systems.isal_rotation.judge import CrossRangeCut, FoundRotation, cross_range_cut, k_scales, true_k
 from torchsar.study.systems.isal_rotation.world import Rotating
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench

@@ -25,13 +25,13 @@ from torchsar.focus.rotation_requirements import (
     rotation_requirements,
 )
 from torchsar.metrics import error_db, rotation_bounds
-from torchsar.metrics.direct_images import DirectlySummed, turning_target
 from torchsar.scene import PhaseOnly, Points
 from torchsar.study.systems.isal.world import echo_choices
 from torchsar.study.systems.isal_rotation.world import Rotating, first_values, k_of
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
+from torchsar.study.trials.direct_images import DirectlySummed, turning_target
 from torchsar.study.trials.system import Noise
 
 # products of pulses, lines and range cells up to which the sum itself is the yardstick

@@ -19,7 +19,6 @@ from torchsar.focus.path_image import last_image
 from torchsar.focus.tiles.plan import possible_tiles
 from torchsar.io import read_history
 from torchsar.metrics import error_db, registered_error_db
-from torchsar.metrics.direct_images import some_pixels, white_noise
 from torchsar.radar import AntennaPath, InverseRadar
 from torchsar.study.names.registry import PATH_IMPAIRMENTS
 from torchsar.study.output.pictures import Drawn, comparisons
@@ -29,6 +28,7 @@ from torchsar.study.systems.path.world import Flown, path_radar
 from torchsar.study.trials.batch import Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.direct_images import some_pixels, white_noise
 from torchsar.study.trials.system import Column, System
 
 # errors of tiles that are compared, in dB

@@ -24,7 +24,6 @@ from torchsar.metrics import (
     velocity_known_offset_bound_m_s,
     velocity_segmented_bound_m_s,
 )
-from torchsar.metrics.radial_motion import Course, course_of, target_responses
 from torchsar.radar import TriangularLadar
 from torchsar.scene import Points
 from torchsar.study.names.factories import with_wavelength
@@ -32,6 +31,7 @@ from torchsar.study.names.registry import group_of
 from torchsar.study.output.pictures import Drawn
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.systems.sal import figures, limits
+from torchsar.study.systems.sal.judge import Course, course_of, target_responses
 from torchsar.study.systems.sal.world import Ground
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Result, Trials
 from torchsar.study.trials.bench import Bench

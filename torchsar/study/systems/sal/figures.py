@@ -12,11 +12,11 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Axis, Signal
-from torchsar.metrics.cuts import impulse_cuts
-from torchsar.metrics.radial_motion import Course, finer_in_range
 from torchsar.study.output.pictures import Drawn, comparisons, first_named
 from torchsar.study.settings.cases import titled, word_of
+from torchsar.study.systems.sal.judge import Course, finer_in_range
 from torchsar.study.trials.batch import Result, image_of
+from torchsar.study.trials.cuts import impulse_cuts
 
 # margins about the scatterers: samples in azimuth, cells in range, and a part of the extent of the
 # scene

@@ -19,14 +19,14 @@ from torchsar.focus import AzimuthMatchedFilter
 from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_after_gain_db
-from torchsar.metrics.direct_images import DirectlySummed, ladar_strip
-from torchsar.metrics.radial_motion import lit_periods
 from torchsar.scene import drawn_motion
 from torchsar.scene.moved_scene import Moved
 from torchsar.study.names.registry import SWEEP_FIDELITIES
+from torchsar.study.systems.sal.judge import lit_periods
 from torchsar.study.systems.sal.world import Ground
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
+from torchsar.study.trials.direct_images import DirectlySummed, ladar_strip
 from torchsar.study.trials.system import Noise
 
 # limits that stop only methods with such a stage, whose key has that value

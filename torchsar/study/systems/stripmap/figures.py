@@ -14,14 +14,14 @@ import torch
 from torchsar import plot
 from torchsar.compensate.velocity import EffectiveVelocity
 from torchsar.core import Signal
-from torchsar.metrics.cuts import impulse_cuts
-from torchsar.metrics.spectra import azimuth_spectrum, phase_increments, range_spectrum
-from torchsar.metrics.strip_image import focus_name, window
 from torchsar.repair.response import band_grid
 from torchsar.study.names.registry import group_of
 from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.cases import titled, word_of
+from torchsar.study.systems.stripmap.image import focus_name, window
+from torchsar.study.systems.stripmap.spectra import azimuth_spectrum, phase_increments, range_spectrum
 from torchsar.study.trials.batch import IMAGE, Result, image_of
+from torchsar.study.trials.cuts import impulse_cuts
 
 # the part of the velocity curve that is drawn finely: half its extent in steps of the grid, and its
 # number of points, of which the middle one is the estimate

@@ -13,7 +13,7 @@ from torchsar.core import Chain, Signal, Trace, wrapped
 from torchsar.focus import ClosestRange
 from torchsar.focus.skew import common_lines
 from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
-from torchsar.metrics.strip_image import Margin, Used, window
+from torchsar.study.systems.stripmap.image import Margin, Used, window
 from torchsar.study.trials.batch import IMAGE, Judged, Processed, Trials
 from torchsar.study.trials.bench import Bench
 
