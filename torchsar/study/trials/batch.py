@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Recording, Signal, Trace
+from torchsar.core import Draws, Estimate, Outcome, Recording, Signal, Trace, Truth
 
 OK, OUTCOME = "ok", "outcome"
 IMAGE = ("azimuth", "range")
@@ -35,6 +35,16 @@ class Trials:
     truth: Mapping[str, Tensor]
     count: int = 1
     own: Any = None
+
+    @classmethod
+    def of(cls, recording: Recording, truth: Truth, draws: Draws, own: Any) -> Trials:
+        """Return the trials of a simulation; see `torchsar.echo`."""
+        assert truth.clean is not None
+        return cls(recording, truth.clean, truth.values, len(draws.trials or (0,)), own)
+
+    def first(self, *names: str) -> list[Tensor]:
+        """Return true values of the first trial by name, one per scatterer or pulse."""
+        return [self.truth[name].reshape(-1, self.truth[name].shape[-1])[0].cpu() for name in names]
 
 
 @dataclass(frozen=True)

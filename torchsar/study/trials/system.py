@@ -16,6 +16,7 @@ from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
 from torchsar.study.names.registry import stages
 from torchsar.study.output.pictures import Drawn, comparisons
+from torchsar.study.settings.cases import titled, word_of
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Processed, Result, Trials
@@ -80,6 +81,9 @@ class Column:
     drawn: str = ""
 
 
+Draw = Callable[[Result], Drawn]
+
+
 class System(ABC):
     """Base class of the systems. A system is a kind of experiment, such as stripmap SAR.
 
@@ -100,6 +104,9 @@ class System(ABC):
         exact: For each key that may be `auto` (see `Choice.at`), the keys and values that select
             the exact alternative.
         images: Axes of signals that are images.
+        settings: Settings of the metrics that metrics.json defines, by their names there.
+        draw_first: Functions of the result of the first case that draw its scene.
+        draw_case: Functions of a result that draw the pictures of a case.
         address: Case of the random draws of runs (see `Draws`).
         peak: Size of the largest tensor of a trial relative to that of its raw data, as measured.
     """
@@ -119,6 +126,9 @@ class System(ABC):
     tolerance: ClassVar[Mapping[str, float]] = {}
     exact: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     images: ClassVar[Sequence[tuple[str, ...]]] = (IMAGE,)
+    settings: ClassVar[Mapping[str, str]] = {}
+    draw_first: ClassVar[Sequence[Draw]] = ()
+    draw_case: ClassVar[Sequence[Draw]] = ()
     address: ClassVar[str | int] = "run"
     peak: ClassVar[float] = 8.0
 
@@ -136,17 +146,17 @@ class System(ABC):
 
     # physics of every system
 
-    @abstractmethod
     def simulate(self, bench: Bench, world: Any, draws: Draws) -> Trials:
         """Simulate the trials in `draws`; numbers of the world may differ between trials."""
+        return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
 
     @abstractmethod
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
         """Compute the metrics of a method; with `detail` those of single targets as well."""
 
-    @abstractmethod
     def samples(self, world: Any, radar: Any) -> int:
         """Return the number of samples of the raw data of one trial."""
+        return world.pulses * world.samples
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
         """Return whether a number of the world, by dotted key, may differ between trials.
@@ -213,7 +223,14 @@ class System(ABC):
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         """Yield functions that draw the pictures of a run, in order, from the results by case."""
+        yield from (partial(draw, next(iter(results.values()))) for draw in self.draw_first)
         yield partial(comparisons, results, self.columns)
+        yield from self.case_pictures(results)
+
+    def case_pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
+        """Yield functions that draw the pictures of every case, with its name in their titles."""
+        for case, result in results.items():
+            yield from (partial(_of_case, draw, case, result) for draw in self.draw_case)
 
     def pictured(self, result: Result) -> dict[str, Signal]:
         """Return the images of the first trial of a case that are stored, by path."""
@@ -229,10 +246,15 @@ class System(ABC):
 
     def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
         """Return definitions that depend on the config."""
-        return {}
+        return {shown: getattr(bench.judging, name) for shown, name in self.settings.items()}
 
 
 def per_trial_first(x: Tensor, count: int) -> Tensor:
     """Return a tensor with trials as the first dim; a value without this dim is repeated."""
     x = x.detach()
     return x if x.ndim and x.shape[0] == count else x[None].expand(count, *x.shape)
+
+
+def _of_case(draw: Draw, case: str, result: Result) -> Drawn:
+    for name, title, caption, figure in draw(result):
+        yield f"{name}_{word_of(case)}", titled(title, case), caption, figure

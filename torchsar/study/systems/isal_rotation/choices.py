@@ -26,7 +26,7 @@ from torchsar.focus.rotation_requirements import (
 )
 from torchsar.metrics import error_db, rotation_bounds
 from torchsar.scene import PhaseOnly, Points
-from torchsar.study.systems.isal.world import echo_choices
+from torchsar.study.systems.isal import echo_choices
 from torchsar.study.systems.isal_rotation.world import Rotating, first_values, k_of
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench

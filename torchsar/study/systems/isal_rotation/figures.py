@@ -13,7 +13,7 @@ from torchsar import plot
 from torchsar.core import Axis, Signal
 from torchsar.study.output.pictures import Drawn, comparisons, first_named
 from torchsar.study.settings.cases import titled, word_of
-from torchsar.study.systems.isal.figures import target
+from torchsar.study.systems.isal import target
 from torchsar.study.systems.isal_rotation.judge import CrossRangeCut
 from torchsar.study.systems.isal_rotation.world import first_values
 from torchsar.study.trials.batch import Result

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsar.core import Draws
 from torchsar.radar import InverseRadar
 from torchsar.scene import Points, PolynomialRotation, Scatterers, Scene, Together, TurntableWorld
-from torchsar.study.systems.isal.world import Target
+from torchsar.study.systems.isal import Target
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,472 @@
+"""Antennas on any path: aircraft and drones that do not fly straight, bistatic pairs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsar import plot
+from torchsar.compensate.pulse_phase.data import without_line
+from torchsar.core import Chain, Draws, Recording, Signal, Trace, per_trial
+from torchsar.echo import Impairment, simulate_path
+from torchsar.echo.path import nominal_geometry
+from torchsar.focus import MotionCompensation, OmegaKImage, PathImage, TilePlan, backproject
+from torchsar.focus.ladar_requirements import Limit
+from torchsar.focus.motion_compensation import possible_compensations
+from torchsar.focus.path_image import last_image, seen_in
+from torchsar.focus.tiles.plan import possible_tiles
+from torchsar.io import read_history
+from torchsar.metrics import (
+    contrast,
+    entropy,
+    error_db,
+    impulse_response,
+    line_of_sight_bound_m,
+    registered_error_db,
+    residual_phase,
+)
+from torchsar.radar import AntennaPath, InverseRadar
+from torchsar.scene import (
+    Flight,
+    Navigation,
+    NominalPath,
+    PathWorld,
+    PlaneGround,
+    Points,
+    Scene,
+    SideBeam,
+    Sway,
+    Together,
+)
+from torchsar.scene.path_world import Ground
+from torchsar.study.names.registry import GROUNDS, NOMINAL_PATHS, PATH_IMPAIRMENTS, SCENES, AntennaMotions
+from torchsar.study.output.pictures import Drawn, first_named
+from torchsar.study.systems.isal import estimated_phase, received
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Metrics, Processed, Result, Trials
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.direct_images import some_pixels, white_noise
+from torchsar.study.trials.system import Column, Noise, System, World
+
+
+def path_radar(carrier_hz: float, bandwidth_hz: float, prf_hz: float) -> InverseRadar:
+    """Band and pulse rate of a radar whose pulses are compressed or dechirped.
+
+    Args:
+        carrier_hz: Middle of the band in Hz.
+        bandwidth_hz: Bandwidth in Hz; a range cell is c / (2 bandwidth).
+        prf_hz: Pulse repetition frequency in Hz.
+    """
+    return InverseRadar(carrier_hz, bandwidth_hz, prf_hz)
+
+
+@dataclass(frozen=True)
+class Track:
+    """True path of an antenna.
+
+    Args:
+        nominal: Nominal path.
+        x: Motions along axis x by name, which add up.
+        y: Motions along axis y.
+        z: Motions along axis z, which points up.
+    """
+
+    nominal: Annotated[NominalPath, NOMINAL_PATHS]
+    x: AntennaMotions = ()
+    y: AntennaMotions = ()
+    z: AntennaMotions = ()
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What navigation records of a path.
+
+    Args:
+        x: Errors along axis x by name, which add up.
+        y: Errors along axis y.
+        z: Errors along axis z.
+        latency_s: Age of a recorded position in seconds.
+        step_m: Step in metres to which positions are rounded; 0 for none.
+        rate_hz: Rate of the records in hertz, between which splines interpolate; null for a record
+            at every pulse.
+    """
+
+    x: AntennaMotions = ()
+    y: AntennaMotions = ()
+    z: AntennaMotions = ()
+    latency_s: Tensor | float = 0.0
+    step_m: Tensor | float = 0.0
+    rate_hz: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flown(World):
+    """Section `world`: the scene and the true paths.
+
+    Args:
+        pulses: Number of pulses of the record.
+        samples: Number of range cells of each pulse.
+        scene: Parts of the scene by name; range is axis x, azimuth axis y.
+        transmitter: True path of the transmitter.
+        receiver: True path of the receiver; null if both share an antenna.
+        navigation: What is recorded of the path of the transmitter; null for the true path.
+        receiver_navigation: What is recorded of the path of the receiver; null for the true path.
+        ground: Height of the ground.
+        beam: Beam of the receiver, and of the transmitter if they share an antenna; null if the
+            scene is always lit.
+        window_range_m: Constant range of the middle of the range window in metres; null to follow
+            the middle of the scene.
+        noise: Receiver noise; the SNR is the mean over the samples of lit pulses.
+        impairments: Impairments of the recording by name, in the order of their effect.
+    """
+
+    pulses: int
+    samples: int
+    scene: Mapping[str, Annotated[Scene, SCENES]]
+    transmitter: Track
+    receiver: Track | None = None
+    navigation: Recorded | None = None
+    receiver_navigation: Recorded | None = None
+    ground: Annotated[Ground, GROUNDS] = field(default_factory=PlaneGround)
+    beam: SideBeam | None = None
+    window_range_m: float | None = None
+    noise: Noise = field(default_factory=Noise)
+    impairments: Mapping[str, Annotated[Impairment, PATH_IMPAIRMENTS]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.pulses < 2 or self.samples < 2 or not self.scene:
+            raise ValueError(
+                "world needs at least one scene, two pulses and two samples, got "
+                f"{len(self.scene)} scenes, {self.pulses} pulses and {self.samples} samples"
+            )
+
+    def of(self) -> PathWorld:
+        """The parameters of the echo simulation."""
+        tracks = (self.transmitter, self.receiver)
+        flown = [None if one is None else Flight(one.nominal, Sway(one.x, one.y, one.z)) for one in tracks]
+        records = (one or Recorded() for one in (self.navigation, self.receiver_navigation))
+        known = [Navigation(Sway(one.x, one.y, one.z), one.latency_s, one.step_m, one.rate_hz) for one in records]
+        effects = (self.ground, self.beam, self.window_range_m, self.noise.snr_db)
+        return PathWorld(Together(self.scene), *flown, *known, *effects)  # pyright: ignore[reportArgumentType]
+
+    def trials_of(self, radar: InverseRadar, draws: Draws, dtype: torch.dtype, device: str) -> Trials:
+        """Simulate recordings, and recordings without impairments whose positions are true."""
+        world, size = self.of(), (self.pulses, self.samples)
+        return Trials.of(*simulate_path(radar, world, *size, draws, self.impairments, dtype, device), draws, world)
+
+    @property
+    def named_points(self) -> dict[str, tuple[Tensor | float, Tensor | float]]:
+        """Azimuth and range in metres of the points of the scene, by names such as `corners.0`."""
+        return {
+            f"{part}.{i}": place
+            for part, scene in self.scene.items()
+            if isinstance(scene, Points)
+            for i, place in enumerate(zip(scene.azimuth_m, scene.range_m, strict=True))
+        }
+
+
+def residual_m(chain: Chain, trace: Trace, trials: Trials, wavelength_m: float, clean: bool) -> Tensor:
+    """Return the error of the line of sight (m) that a chain leaves, (trial, pulse).
+
+    It has no constant and linear terms, which shift the image, and rotate and stretch it slightly.
+    Where the chain estimates it or phases of pulses it is known modulo half a wavelength. It is NaN
+    for pulses outside of the strip, if the image is that of a strip.
+    """
+    strip = seen_in(chain.stages.values(), AntennaPath.recorded(trials.recording.aux))
+    pulses = (trials.count, len(strip))
+    parts = [x for key, x in trials.truth.items() if key.rpartition(".")[2] == "line_of_sight_m" and not clean]
+    true = sum((x.expand(pulses) for x in parts), torch.zeros(pulses, dtype=torch.float64, device=strip.device))
+    phases = [x for key, x in trials.truth.items() if key.endswith(".phase_rad") and not clean]
+    radians = 4 * math.pi / wavelength_m
+    of_path = [e.value["line_of_sight_m"] for e in trace.estimates.values() if "line_of_sight_m" in e.value]
+    if phases or of_path or any("phase_rad" in uses for uses in chain.uses.values()):
+        # a recorded range that is too long leaves a positive phase
+        whole = radians * true + sum((x.reshape(pulses) for x in phases), torch.zeros_like(true))
+        found = sum((radians * x.reshape(pulses) for x in of_path), estimated_phase(chain, trace, whole))
+        present = received(trials)
+        left = residual_phase(found, whole, strip.expand(pulses) if present is None else present & strip) / radians
+    else:
+        left = -without_line(true, strip)
+    return left.masked_fill(~strip, math.nan)
+
+
+def _positions(off: Tensor, at: Tensor) -> dict[str, Tensor]:
+    """The common shift of points in m, (trial,), and the rms distance that is left of them in m.
+
+    Of more than three points a linear displacement is removed besides: rotation and stretch of the
+    image. off: displacements (trial, point, 2); at: places (trial, point, 2).
+    """
+    basis = torch.cat([torch.ones_like(at[..., :1]), at[..., : 2 * (at.shape[1] > 3)]], -1)
+    left = (off - basis @ (torch.linalg.pinv(basis) @ off)).square().sum(-1).mean(-1).sqrt()
+    return {"image_shift_m": off.mean(1).square().sum(-1).sqrt(), "position_error_rms_m": left}
+
+
+def _points(
+    bench: Bench, chain: Chain, image: Signal, trials: Trials, reach_m: float = 10.0
+) -> tuple[dict[str, Metrics], list[str], dict[str, Tensor]]:
+    """Metrics of the named points in the image, the names of those outside it, and what their
+    displacements have in common. A point is sought within `reach_m`, or less if another is near.
+    """
+    stage = last_image(chain.stages.values())
+    if stage is None:
+        return {}, [], {}
+    (_, cos, _), (_, sin, _) = stage.grid.axes.tolist()  # azimuth and range axes of the image
+    places, outside = {}, []
+    image = image.with_data(image.data.expand(trials.count, *image.data.shape[-2:]))
+    for name, place in bench.world().named_points.items():
+        y, x = (per_trial(v, 0, image.data).expand(trials.count) for v in place)
+        at = torch.stack([cos * y - sin * x, cos * x + sin * y], -1)
+        edges = [(axis.index_of(at[:, i]), axis.n - 1) for i, axis in enumerate(image.axes)]
+        if all(bool(((i >= 0) & (i <= last)).all()) for i, last in edges):
+            places[name] = at
+        else:
+            outside.append(name)
+    if not places:
+        return {}, outside, {}
+    at = torch.stack([*places.values()], 1)  # (trial, point, 2)
+    apart = torch.cdist(at, at) + 2 * reach_m * torch.eye(len(places), dtype=torch.float64, device=at.device)
+    search_m = max(image.axes[0].step, min(reach_m, float(apart.min()) / 2))
+    found = impulse_response(image, (at[..., 0], at[..., 1]), search_m=search_m)
+    off = torch.stack([found[f"position_{axis}_m"] for axis in IMAGE], -1) - at
+    found |= {f"displacement_{axis}_m": off[..., i] for i, axis in enumerate(IMAGE)}
+    shown = AnyPath.target_columns
+    targets: dict[str, Metrics] = {name: {key: found[key][:, i] for key in shown} for i, name in enumerate(places)}
+    return targets, outside, _positions(off, at)
+
+
+def _images(result: Result) -> Drawn:
+    """Draw the images of all methods, the ideal one first."""
+    shown = first_named(result.images)
+    caption = (
+        f"The first trial, in dB: 0.1 % of the samples of '{next(iter(shown))}' exceed 0 dB, the same level for all "
+        "methods."
+    )
+    yield "images", "Images by every method", caption, plot.images(shown, 45.0)
+
+
+def _paths(result: Result) -> Drawn:
+    """Draw how the true path deviates from a straight line, and what is left of its errors."""
+    trials = result.first.trials
+    if not trials.truth:  # a recording to which no errors were added
+        return
+    time = plot.array(trials.recording.signal.axes[-2].offsets())
+    shown: dict[tuple[str, str], dict[str, np.ndarray]] = {}
+    for name in ("transmitter", "receiver"):
+        if f"true_{name}_m" in trials.truth:
+            place = plot.array(trials.truth[f"true_{name}_m"].reshape(-1, len(time), 3)[0])
+            line = np.stack([time, np.ones_like(time)], -1)
+            bent = place - line @ np.linalg.lstsq(line, place, rcond=None)[0]
+            shown[f"true path of the {name} minus a straight line", "distance (m)"] = dict(zip("xyz", bent.T))
+    shown["error of the line of sight that is left", "error (mm)"] = {
+        name: 1e3 * plot.array(outcome.judged.view[0])
+        for name, outcome in result.first.outcomes.items()
+        if name != "ideal" and not outcome.failed
+    }
+    parts = [
+        {
+            "series": {name: (time, y) for name, y in of.items()},
+            "xlabel": "time (s)",
+            "ylabel": label,
+            "title": title,
+        }
+        for (title, label), of in shown.items()
+    ]
+    caption = (
+        "The first trial. The error of the line of sight is that of half the path over the middle of the scene, "
+        "recorded and corrected minus true, without constant and linear terms, which hardly change the focus."
+    )
+    yield "paths", "Paths", caption, plot.panels(parts)
+
+
+class AnyPath(System):
+    """Antennas on any path."""
+
+    name = "path"
+    about = "one antenna or two on any path, simulated or recorded range profiles with positions"
+    Radar = staticmethod(path_radar)
+    World = Flown
+    impairments = PATH_IMPAIRMENTS
+    reads = "phase history with positions"
+    ending = "tile_image, spotlight_image, omega_k_image or direct_image"
+    tolerance = {"image_error_db": -40.0}
+    exact = {"stage": {"stage": "direct_image"}}
+    definitions = {
+        "snr": "mean power of the samples of lit pulses over noise variance, dB",
+        "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
+        "contrast": "standard deviation over mean of the intensity |I|^2",
+        "image_error_db": "10 lg of |g I - I0|^2 / |I0|^2 in dB, I0 from the reference method, after the shift, "
+        "rotation and stretch, the linear and small quadratic phase over the image and the complex gain g that fit "
+        "best, which autofocus cannot observe; in `trade`: of the image of white noise, without registration, "
+        "relative to the direct sum over the same pulses",
+        "path_residual_rms_m": "rms over the pulses of half the path over the middle of the scene, recorded and "
+        "corrected minus true, without constant and linear terms; modulo half a wavelength where the path or phases of "
+        "pulses are corrected; for a strip over the middle of the strip abeam, and over the pulses that see the image",
+        "image_shift_m": "mean displacement of the named points, which autofocus cannot observe, m",
+        "position_error_rms_m": "rms over the named points of the distance of the peak from the true position, without "
+        "the common shift of all points, and of more than three without a common rotation and stretch, m",
+        "entropy_above_ideal_nats": "entropy minus that of the reference method",
+    }
+    columns = {
+        "image_error_db": Column("image error against the reference", "dB", drawn="mean"),
+        "path_residual_rms_m": Column("error of the line of sight, rms", "m", drawn="rms"),
+        "position_error_rms_m": Column("position error of points, rms", "m"),
+        "image_shift_m": Column("common shift of the points", "m"),
+        "entropy_nats": Column("entropy", "nats", drawn="mean"),
+        "entropy_above_ideal_nats": Column("entropy above the reference", "nats"),
+        "contrast": Column("contrast of the intensity"),
+        "ok": Column("share of trials called reliable"),
+        "seconds": Column("time of a trial", "s"),
+    }
+    target_columns = {
+        "displacement_azimuth_m": Column("displacement in azimuth", "m"),
+        "displacement_range_m": Column("displacement in range", "m"),
+        "irw_azimuth_m": Column("width in azimuth", "m"),
+        "irw_range_m": Column("width in range", "m"),
+        "pslr_azimuth_db": Column("PSLR in azimuth", "dB"),
+        "pslr_range_db": Column("PSLR in range", "dB"),
+    }
+
+    draw_case = (_images, _paths)
+    read = staticmethod(read_history)  # pyright: ignore[reportAssignmentType]
+
+    def context(self, recording: Recording) -> dict[str, Any]:
+        return {"side_data": recording.aux}
+
+    def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+        """Return the metrics of the image and of the path by one method.
+
+        The field `view` of the result is the error of the line of sight in metres that is left,
+        (trial, pulse).
+        """
+        chain, clean = bench.chains[name], bench.config.processor[name].input == "clean"
+        left = residual_m(chain, trace, trials, bench.radar.wavelength_m, clean)
+        metrics = {"path_residual_rms_m": left.square().nanmean(-1).sqrt()}
+        targets: dict[str, Metrics] = {}
+        outside: list[str] = []
+        if trace.signal.names == IMAGE:
+            metrics |= {"entropy_nats": entropy(trace.signal), "contrast": contrast(trace.signal)}
+            if bench.recording is None:
+                targets, outside, positions = _points(bench, chain, trace.signal, trials)
+                metrics |= positions
+        metrics = {key: value.double().expand(trials.count) for key, value in metrics.items()}
+        return Judged(metrics, targets if detail else {}, outside if detail else (), view=left)
+
+    def compare(self, bench: Bench, outcome: Processed, ideal: Processed | None) -> Judged:
+        judged = super().compare(bench, outcome, ideal)
+        signals = [one.signal for one in (outcome, ideal) if one is not None and one.signal is not None]
+        if ideal is outcome or len({signal.axes for signal in signals}) != 1 or len(signals) != 2:
+            return judged
+        count = len(judged.metrics["path_residual_rms_m"])
+        error = registered_error_db(*(signal.data for signal in signals)).expand(count)
+        return replace(judged, metrics={**judged.metrics, "image_error_db": error})
+
+    def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
+        """Return the Cramer-Rao bound of the line of sight, (trial,); nothing for large or recorded
+        scenes and for data without noise.
+        """
+        truth, count = batch.trials.truth, batch.trials.count
+        std = truth.get("noise_std")
+        if bench.recording is not None or std is None or not bool((std > 0).all()):
+            return {}
+        points = torch.stack(
+            torch.broadcast_tensors(*(truth[f"{axis}_m"] for axis in ("range", "azimuth", "height"))), -1
+        )
+        # a bound of more pulses * samples * scatterers would take more than some seconds
+        aux = batch.trials.clean.aux
+        antennas = AntennaPath.recorded(aux)
+        if antennas.pulses * len(aux["frequency_hz"]) * points.shape[-2] > 10_000_000 or bench.world().beam is not None:
+            return {}
+        bound = line_of_sight_bound_m(aux["frequency_hz"], antennas, points, truth["amplitude"], std)
+        return {"path_residual_rms_m": {"Cramer-Rao": bound.expand(count)}}
+
+    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
+        """Return the limits of the sample spacing of the images, by the nominal path."""
+        geometry = (
+            nominal_geometry(bench.radar, (world := bench.world()).of(), world.pulses, world.samples)
+            if bench.recording is None
+            else (AntennaPath.recorded(bench.recording.aux), bench.recording.aux["frequency_hz"])
+        )
+        images = {name: last_image(chain.stages.values()) for name, chain in bench.chains.items()}
+        found = [(limit, name) for name, one in images.items() if one for limit in one.sampling_limits(*geometry)]
+        return {limit: [name for other, name in found if other == limit] for limit, _ in found}
+
+    def choices(self, bench: Bench) -> Sequence[Choice]:
+        stage = last_image(bench.chains["recommended"].stages.values())
+        if stage is None:
+            return []
+        clean = (
+            replace(bench.world(), impairments={}).trials_of(bench.radar, bench.draws(), bench.dtype, "cpu").clean
+            if bench.recording is None
+            else bench.recording
+        )
+        antennas, grid = AntennaPath.recorded(clean.aux), stage.grid
+        geometry = (clean.aux["frequency_hz"], antennas.transmitter_m, antennas.receiver_m, antennas.reference_m)
+        # tiles sum the pulses of the recommended method
+        errors_db = (-20.0, -40.0, -60.0, -80.0)
+        tiles = possible_tiles(errors_db, *geometry, grid, lit=stage.lit(antennas), weight=stage.weight(antennas))
+        alternatives = [
+            Alternative(
+                f"tiles at {error:g} dB",
+                {"stage": "tile_image", "error_db": error},
+                {"image_error_db": plan.choice.error_db},
+                "higher terms of the path within tiles",
+            )
+            for error, plan in tiles.items()
+        ]
+        # by the beam of the method that uses omega-K, if there is one
+        lit = None if bench.recording is not None else bench.world().beam
+        images = (s for c in bench.chains.values() for s in c.stages.values() if isinstance(s, OmegaKImage))
+        beams = [image.beam for image in images if image.beam is not None]
+        straight = {} if not beams else possible_compensations(geometry[0], antennas, grid, beams[0])
+        compensated = [
+            Alternative(
+                f"omega-K after motion compensation of order {order}",
+                {"stage": "omega_k_image", "order": order, "beam_deg": one.beam.width_deg},
+                {"image_error_db": one.predicted_db(None if lit is None else lit.mean_power)},
+                "change of motion errors with the angle" + (" and with the range" if order == 1 else ""),
+            )
+            for order, one in straight.items()
+        ]
+        every = [*compensated, *alternatives, Alternative("direct sum", {"stage": "direct_image"}, {})]
+        measured = partial(_measured, bench, geometry, {**straight, **tiles}, stage)
+        return [Choice("image", "stage", every, measured)]
+
+
+def _measured(
+    bench: Bench,
+    geometry: tuple[Tensor, Tensor, Tensor | None, Tensor],
+    plans: Mapping[float, MotionCompensation | TilePlan],
+    stage: PathImage,
+) -> Measured:
+    """Images of white noise, at random pixels beside the direct sum."""
+    draws, every = bench.draws(), stage.grid.pixels_m().reshape(-1, 3)
+    noise = white_noise(draws, geometry[1].shape[-2], len(geometry[0]))
+    some = some_pixels(draws, len(every))
+    pixels = every[some]
+    whole = backproject(noise, *geometry, pixels)
+    history = noise.to(bench.dtype)
+
+    def plan(one: Alternative) -> MotionCompensation | TilePlan | None:
+        return plans.get(one.keys.get("order", one.keys.get("error_db", 0)))
+
+    def run(one: Alternative) -> Tensor:
+        return backproject(history, *geometry, pixels, eps=1e-6) if (of := plan(one)) is None else of.image(history)
+
+    def loss(one: Alternative, image: Tensor) -> dict[str, float]:
+        exact = whole if (of := plan(one)) is None else of.exact(noise, pixels)
+        made = image if one.keys["stage"] == "direct_image" else image.flatten(-2)[..., some]
+        return {"image_error_db": float(error_db(made[..., None, :].to(exact.dtype), exact[..., None, :]).max())}
+
+    part = len(some) / len(every)
+    return Measured(run, loss, lambda one: part if one.keys["stage"] == "direct_image" else 1.0)
+
+
+SYSTEM = AnyPath
