@@ -42,7 +42,8 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Trace, keep_freed_memory
+from torchsar import keep_freed_memory
+from torchsar.core import Draws, Trace
 from torchsar.core.draws import Source
 from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.text import find_config

@@ -26,7 +26,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchsar.core import Chain, Draws, Recording, keep_freed_memory
+from torchsar import keep_freed_memory
+from torchsar.core import Chain, Draws, Recording
 from torchsar.study.settings.cases import cases_of
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench

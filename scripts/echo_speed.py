@@ -14,7 +14,8 @@ import time
 
 import torch
 
-from torchsar.core import Draws, keep_freed_memory
+from torchsar import keep_freed_memory
+from torchsar.core import Draws
 from torchsar.echo import simulate
 from torchsar.metrics import error_db
 from torchsar.radar import LinearFM, StripmapRadar

@@ -24,7 +24,8 @@ from pathlib import Path
 
 import torch
 
-from torchsar.core import Axis, Draws, Signal, keep_freed_memory
+from torchsar import keep_freed_memory
+from torchsar.core import Axis, Draws, Signal
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK, OmegaKStolt, RangeDoppler, StoredOmegaK
 from torchsar.metrics import error_db, impulse_response

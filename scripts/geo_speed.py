@@ -21,8 +21,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchsar import plot
-from torchsar.core import Draws, Signal, Stage, keep_freed_memory
+from torchsar import keep_freed_memory, plot
+from torchsar.core import Draws, Signal, Stage
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import bistatic_bounds
 from torchsar.multichannel import (

@@ -33,7 +33,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, keep_freed_memory
+from torchsar import keep_freed_memory
+from torchsar.core import Axis
 from torchsar.focus import ImageGrid, PolarOperator, TilePlan, backproject, image_tiles
 from torchsar.radar import LIGHT_M_S, Spotlight, range_profiles
 

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from torchsar.core import keep_freed_memory
+from torchsar import keep_freed_memory
 from torchsar.study.commands.trade import trade
 from torchsar.study.table import load
 

@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar import plot
-from torchsar.core import Draws, Signal, keep_freed_memory
+from torchsar import keep_freed_memory, plot
+from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_turntable
 from torchsar.focus import CompiledNufft, DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
 from torchsar.focus.transforms import Transform

@@ -25,7 +25,8 @@ from typing import Any
 
 import torch
 
-from torchsar.core import device_fault, keep_freed_memory
+from torchsar import keep_freed_memory
+from torchsar.core import device_fault
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo.engines import Engine, Task, engine
 from torchsar.study.montecarlo.grid import Grid

@@ -19,7 +19,7 @@ from dataclasses import replace
 
 import torch
 
-from torchsar.core import keep_freed_memory
+from torchsar import keep_freed_memory
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo.batches import rows_by_bytes
 from torchsar.study.montecarlo.engines import Engine, InProcess, engine

@@ -59,7 +59,7 @@ def _imports(path: Path) -> set[str]:
 
 
 # study/ from the ground up: a floor imports itself and what stands below it
-FLOORS = ("settings", "names", "output", "montecarlo", "trials", "systems", "commands", "table")
+FLOORS = ("memory", "settings", "names", "output", "montecarlo", "trials", "systems", "commands", "table")
 # a system that builds on another one, by name
 SHARED = {"isal_rotation": {"isal"}, "geo_ocean": {"geo"}, "path": {"isal"}}
 # statements that the system `path` adds at most; those of all of `study`, and of its systems alone
@@ -67,8 +67,8 @@ PATH_STATEMENTS = 300
 # what judges the images and estimates of single systems
 JUDGE_STATEMENTS = 648
 MOST_STATEMENTS = {
-    # with the sizes of batches, the measurement of memory, cuts and directly summed images
-    "torchsar.study": 6620 + JUDGE_STATEMENTS + 168 + PATH_STATEMENTS,
+    # with sizes of batches, memory, fingerprints, own files, cuts and directly summed images
+    "torchsar.study": 7020 + JUDGE_STATEMENTS + 168 + PATH_STATEMENTS,
     "torchsar.study.systems": 3500 + JUDGE_STATEMENTS,
     "torchsar.study.systems.path": PATH_STATEMENTS,
 }
@@ -201,7 +201,7 @@ def test_only_the_table_names_the_systems(study: _Study) -> None:
 def test_the_monte_carlo_loop_knows_no_physics(study: _Study) -> None:
     for name, imports in study.imports.items():
         if _floor(name) == "montecarlo":
-            general = ("torchsar.study", "torchsar.core", "torchsar.plot", "torchsar.metrics.intervals")
+            general = ("torchsar.study", "torchsar.core", "torchsar.io", "torchsar.plot", "torchsar.metrics.intervals")
             outside = {one for one in imports if not one.startswith(general)}
             assert not outside and "torchsar.study.names" not in {one.rpartition(".")[0] for one in imports}, name
 

@@ -18,9 +18,10 @@ import yaml
 from tests.study.tiny import TINY
 from torchsar.cli import main
 from torchsar.compensate import EnergyCentre
-from torchsar.core import Outcome, PeakMemory
+from torchsar.core import Outcome
 from torchsar.focus import Detect, FocusStrip, QuickLook
 from torchsar.io import StripImage, read_images, read_stripmap
+from torchsar.study.memory import PeakMemory
 from torchsar.study.table import load
 from torchsar.study.trials.bench import Bench
 

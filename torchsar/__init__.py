@@ -27,10 +27,10 @@ if TYPE_CHECKING:
         Stage,
         Trace,
         Truth,
-        keep_freed_memory,
         use,
         validate,
     )
+    from torchsar.study.memory import keep_freed_memory
 
 __version__ = "0.1.0"
 # subpackages that are no part of the public face: what they need is not always installed
@@ -65,6 +65,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in __all__ or name in _ON_REQUEST:
+        if name == "keep_freed_memory":
+            return importlib.import_module("torchsar.study.memory").keep_freed_memory
         core = importlib.import_module("torchsar.core")
         return getattr(core, name) if name in core.__all__ else importlib.import_module(f"torchsar.{name}")
     raise AttributeError(f"module 'torchsar' has no attribute {name!r}")

@@ -216,7 +216,8 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
     find_config(options.config)  # an unknown name, before the import of torch
     import torch
 
-    from torchsar.core import device_fault, keep_freed_memory
+    from torchsar.core import device_fault
+    from torchsar.study.memory import keep_freed_memory
     from torchsar.study.table import load
 
     if options.command != "focus":  # whose blocks are so large that kept ones would not fit
@@ -321,8 +322,8 @@ def _export(options: argparse.Namespace) -> int:
 def _reproduce(options: argparse.Namespace) -> int:
     import torch
 
-    from torchsar.core import keep_freed_memory
     from torchsar.reproduce import reproduce
+    from torchsar.study.memory import keep_freed_memory
 
     keep_freed_memory()
     if options.threads is not None:

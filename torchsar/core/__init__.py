@@ -26,7 +26,6 @@ from torchsar.core.fft import (
     to_frequency,
     transform_in_blocks,
 )
-from torchsar.core.fingerprint import fingerprint, own_code
 from torchsar.core.host import (
     Validation,
     check_value,
@@ -35,20 +34,13 @@ from torchsar.core.host import (
     host_largest,
     host_value,
     host_values,
+    is_out_of_memory,
     is_traced,
     untraced,
     validate,
     validation,
 )
-from torchsar.core.libraries import library
 from torchsar.core.linear import cholesky_factor, linear_solve, matrix_inverse
-from torchsar.core.memory import (
-    PeakMemory,
-    is_out_of_memory,
-    keep_freed_memory,
-    machine_memory_bytes,
-    wait_for_devices,
-)
 from torchsar.core.outcome import Outcome, counts, worst
 from torchsar.core.phase import (
     cis,
@@ -61,18 +53,14 @@ from torchsar.core.phase import (
     wrapped,
 )
 from torchsar.core.polynomials import legendre
-from torchsar.core.replace import OwnFiles, remove_empty
-from torchsar.core.seal import SEAL, address, canonical, checksum, is_sealed, sealed
 from torchsar.core.select import best_of, numbers_on, per_trial, take, true_positions
 from torchsar.core.signal import Recording, Signal, Truth
 from torchsar.core.spline import UniformSpline
 from torchsar.core.stage import Stage
 from torchsar.core.stored import ArrayFile, StoredArray
-from torchsar.core.stores import array_metadata, document, fault_of_name, group_attributes
 from torchsar.core.uneven_spline import UnevenSpline
 
 __all__ = [
-    "SEAL",
     "Alternate",
     "ArrayFile",
     "Axis",
@@ -80,8 +68,6 @@ __all__ = [
     "Draws",
     "Estimate",
     "Outcome",
-    "OwnFiles",
-    "PeakMemory",
     "Recording",
     "Signal",
     "Source",
@@ -94,46 +80,33 @@ __all__ = [
     "UniformSpline",
     "Use",
     "Validation",
-    "address",
-    "array_metadata",
     "best_of",
     "block_bytes_of",
-    "canonical",
     "centred_fft",
     "centred_ifft",
     "check_value",
     "checked_samples",
-    "checksum",
     "cholesky_factor",
     "cis",
     "counts",
     "device_fault",
-    "document",
-    "fault_of_name",
     "fft_lines",
-    "fingerprint",
     "from_frequency",
     "gathered_checks",
-    "group_attributes",
     "host_largest",
     "host_value",
     "host_values",
     "is_out_of_memory",
     "is_plain",
-    "is_sealed",
     "is_traced",
-    "keep_freed_memory",
     "legendre",
     "level_of",
-    "library",
     "linear_phasor",
     "linear_solve",
-    "machine_memory_bytes",
     "matrix_inverse",
     "numbers_on",
     "outer_phasor",
     "over_blocks",
-    "own_code",
     "per_trial",
     "phasor_tables",
     "power_of",
@@ -141,8 +114,6 @@ __all__ = [
     "reduced_turns",
     "refuse_non_finite",
     "refuse_non_finite_values",
-    "remove_empty",
-    "sealed",
     "settle",
     "spectrum_in_blocks",
     "take",
@@ -155,7 +126,6 @@ __all__ = [
     "use",
     "validate",
     "validation",
-    "wait_for_devices",
     "worst",
     "wrapped",
 ]

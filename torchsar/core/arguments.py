@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from torch import Tensor
 
-from torchsar.core.memory import is_out_of_memory
+from torchsar.core.host import is_out_of_memory
 
 _Class = TypeVar("_Class")
 # types that annotations name, and what they are called

@@ -15,8 +15,6 @@ from torch._guards import active_fake_mode
 from torch._subclasses.fake_tensor import is_fake
 from torch.utils._python_dispatch import _disable_current_modes
 
-from torchsar.core.memory import is_out_of_memory
-
 Number = TypeVar("Number", bool, int, float)
 # raises an error if the values are not acceptable
 Check = Callable[..., None]
@@ -183,6 +181,20 @@ def device_fault(device: torch.device | str) -> str:
     except (RuntimeError, AssertionError, TypeError, ImportError) as error:
         return str(error).splitlines()[0].rstrip(".")
     return ""
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Decide whether an error says that memory is short.
+
+    Args:
+        error: An error. CUDA raises a class of its own, the CPU allocator of torch only a text.
+
+    Returns:
+        Whether a smaller batch may succeed.
+    """
+    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (
+        isinstance(error, RuntimeError) and "allocate memory" in str(error)
+    )
 
 
 def is_traced(x: Tensor) -> bool:

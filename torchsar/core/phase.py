@@ -8,8 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchsar.core.host import check_value, flat_index, is_traced, validation
-from torchsar.core.memory import is_out_of_memory
+from torchsar.core.host import check_value, flat_index, is_out_of_memory, is_traced, validation
 
 # the distance of float64 numbers of this size is 6e-5 turn
 MAX_TURNS = 4e11

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import warnings
 from collections.abc import Mapping
@@ -13,7 +14,6 @@ from torch import Tensor
 
 from torchsar.core.axis import Axis
 from torchsar.core.check import refuse_non_finite
-from torchsar.core.libraries import library
 from torchsar.core.show import Rows, Shown, Summary, content, in_bytes, kind_of
 
 # Limit of plausibility, for errors in files: 200 dB is a factor of 1e10 in amplitude.
@@ -175,7 +175,13 @@ class Signal(Shown):
         Raises:
             ModuleNotFoundError: If the extra `xarray` is not installed.
         """
-        xarray, count = library("xarray", "xarray", "Signal.to_xarray"), len(self.trials)
+        try:
+            xarray = importlib.import_module("xarray")
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(
+                'Signal.to_xarray needs the package xarray: pip install "torchsar-lab[xarray]"'
+            ) from error
+        count = len(self.trials)
         trials = ("trial",) if count == 1 else tuple(f"trial_{i}" for i in range(count))
         coordinates = {a.name: (a.name, a.values().numpy(), {"units": a.unit}) for a in self.axes}
         data = torch.resolve_neg(self.data.detach().cpu().resolve_conj()).numpy()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import struct
 import textwrap
 import zipfile
@@ -15,11 +16,21 @@ from typing import IO
 
 import numpy as np
 
-from torchsar.core.memory import machine_memory_bytes
-
 # start of a file that holds a single array, and largest number of bytes before its numbers
 _MAGIC, _LONGEST_HEADER = b"\x93NUMPY", 1 << 16
 _AGAIN = "copy or save the file again"
+
+
+def machine_memory_bytes() -> int | None:
+    """Return the size of the main memory of this machine.
+
+    Returns:
+        The size in bytes, or None on systems that do not report it.
+    """
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return None
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, library
-from torchsar.io.extras import reading
+from torchsar.core import Axis, Signal
+from torchsar.io.extras import library, reading
 
 
 def write_arrays(

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from torchsar.core import ArrayFile, library
-from torchsar.io.extras import reading
+from torchsar.core import ArrayFile
+from torchsar.io.extras import library, reading
 from torchsar.io.fields import complex_type, joined
 from torchsar.io.matlab import MatlabFile
 from torchsar.spelling import did_you_mean

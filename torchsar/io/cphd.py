@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Recording, library, refuse_non_finite, unit_phasor
+from torchsar.core import Recording, refuse_non_finite, unit_phasor
 from torchsar.focus.chirp_z import chirp_z
-from torchsar.io.extras import reading
+from torchsar.io.extras import library, reading
 from torchsar.radar import LIGHT_M_S, AntennaPath, InverseRadar, LocalFrame, geocentric, range_profiles
 from torchsar.radar.spotlight import frequency_step_hz
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchsar.core import Signal, library
+from torchsar.core import Signal
 from torchsar.focus.detection import to_db
 from torchsar.focus.path_image import PathImage
-from torchsar.io.extras import write_whole
+from torchsar.io.extras import library, write_whole
 from torchsar.io.geometry import image_samples
 from torchsar.io.strip import StripImage
 from torchsar.radar import LocalFrame

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import torch
 
-from torchsar.core import Signal, library
-from torchsar.io.extras import write_whole
+from torchsar.core import Signal
+from torchsar.io.extras import library, write_whole
 
 
 def write_netcdf(signal: Signal, path: str | Path, title: str = "") -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchsar.core import Axis, Signal, library, refuse_non_finite
-from torchsar.io.extras import reading
+from torchsar.core import Axis, Signal, refuse_non_finite
+from torchsar.io.extras import library, reading
 
 
 def read_sicd(path: str | Path, dtype: torch.dtype = torch.complex64) -> Signal:

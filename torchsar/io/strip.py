@@ -10,12 +10,13 @@ from typing import Any
 
 import torch
 
-from torchsar.core import Axis, Recording, Signal, canonical, group_attributes, library, sealed
+from torchsar.core import Axis, Recording, Signal
 from torchsar.focus.detection import QuickLook
 from torchsar.io.arrays import put
-from torchsar.io.extras import reading
+from torchsar.io.extras import library, reading
 from torchsar.io.fields import archive, joined, naming
 from torchsar.io.recorded import describe_stripmap
+from torchsar.io.seal import canonical, group_attributes, sealed
 
 # number of the layout of the store; another one is refused
 _FORMAT = 1

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Recording, library, unit_phasor
-from torchsar.io.extras import quiet, write_whole
+from torchsar.core import Recording, unit_phasor
+from torchsar.io.extras import library, quiet, write_whole
 from torchsar.io.geometry import antennas_of, frame_of, pulse_time_s, single
 from torchsar.radar import LIGHT_M_S, AntennaPath, LocalFrame, frequency_samples
 from torchsar.radar.spotlight import frequency_step_hz

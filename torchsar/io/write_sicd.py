@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import Recording, Signal, library, unit_phasor
+from torchsar.core import Recording, Signal, unit_phasor
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.path_image import PathImage, spatial_band
 from torchsar.focus.spotlight import window_weights
-from torchsar.io.extras import quiet, write_whole
+from torchsar.io.extras import library, quiet, write_whole
 from torchsar.io.geometry import antennas_of, frame_of, image_samples, pulse_time_s, single
 from torchsar.io.write_cphd import UNKNOWN_START
 from torchsar.radar import LIGHT_M_S, LocalFrame

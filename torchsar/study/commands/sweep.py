@@ -12,8 +12,9 @@ from typing import Any
 
 from torch import Tensor
 
-from torchsar.core import Chain, Draws, own_code
+from torchsar.core import Chain, Draws
 from torchsar.study.montecarlo.engines import engine
+from torchsar.study.montecarlo.fingerprint import own_code
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.loop import (
     SWEEP_FILES,

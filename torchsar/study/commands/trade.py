@@ -18,8 +18,8 @@ from typing import Any
 import torch
 
 from torchsar import plot
-from torchsar.core import PeakMemory, wait_for_devices
 from torchsar.study.commands.requires import aligned
+from torchsar.study.memory import PeakMemory, wait_for_devices
 from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
 from torchsar.study.output.numbers import MISSING, number

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from torchsar.core import PeakMemory
+from torchsar.study.memory import PeakMemory
 
 # Larger batches take more time per trial for want of cache, but batches of fewer than four trials
 # 10 to 25 % more for the calls, as measured with sweeps of four systems.

@@ -14,7 +14,8 @@ from typing import Any
 
 import torch
 
-from torchsar.core import keep_freed_memory, library
+from torchsar.io.extras import library
+from torchsar.study.memory import keep_freed_memory
 from torchsar.study.montecarlo.work import Chunk, Computed, Work
 from torchsar.study.settings.errors import ConfigError, one_line
 

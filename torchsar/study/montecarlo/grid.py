@@ -12,8 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from torchsar.core import address, canonical, fault_of_name
+from torchsar.io.seal import address, canonical
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.text import fault_of_name
 
 # names of dims and parts of results
 RESERVED = ("algorithm", "trial", "method", "ok", "outcome", "done", "saved")

@@ -15,9 +15,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
-from torchsar.core import Draws, Source, device_fault, fingerprint
+from torchsar.core import Draws, Source, device_fault
 from torchsar.metrics.intervals import half_width_ratio
 from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
+from torchsar.study.montecarlo.fingerprint import fingerprint
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.record import OK, OUTCOME, Record
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
@@ -205,8 +206,8 @@ def sweep(
             unchanged.
         version: Version of `trial`. A sweep is resumed only by the same version. Without a version,
             it is resumed only if the code of `trial`, what it closes over and the global names that
-            it uses are unchanged; see `torchsar.core.fingerprint`. Give a version if these change
-            without an effect on the results, or if results depend on more than these.
+            it uses are unchanged; see `fingerprint`. Give a version if these change without an
+            effect on the results, or if results depend on more than these.
         random: Source of the random numbers: "numpy" draws them on the CPU, "torch" other ones on
             the device where they are used; see `torchsar.Draws`.
 

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from torchsar.core import Outcome, checksum, library
+from torchsar.core import Outcome
 from torchsar.core.show import Shown, Summary, some_of
+from torchsar.io.extras import library
+from torchsar.io.seal import checksum
 from torchsar.study.montecarlo.grid import RESERVED, check_name
 from torchsar.study.settings.errors import ConfigError
 

@@ -24,17 +24,8 @@ import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec
 
-from torchsar.core import (
-    SEAL,
-    address,
-    array_metadata,
-    canonical,
-    checksum,
-    document,
-    group_attributes,
-    machine_memory_bytes,
-    sealed,
-)
+from torchsar.core.stored import machine_memory_bytes
+from torchsar.io.seal import SEAL, address, array_metadata, canonical, checksum, document, group_attributes, sealed
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.record import OUTCOME, Labels, Record, blank
 from torchsar.study.settings.errors import ConfigError, one_line

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchsar.core import OwnFiles, remove_empty
+from torchsar.study.output.own_files import OwnFiles, remove_empty
 from torchsar.study.settings.errors import ConfigError
 
 try:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from torchsar.core import fault_of_name
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import LONGEST_NAME, RESERVED, Loaded
+from torchsar.study.settings.text import fault_of_name
 
 # name of the only case of a config that lists none
 ALL = "all"

@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from torchsar.core import Source, fault_of_name
+from torchsar.core import Source
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.settings.plausible import refuse_implausible
 from torchsar.study.settings.sentences import Strict, sentence
-from torchsar.study.settings.text import dump
+from torchsar.study.settings.text import dump, fault_of_name
 
 # prefix of the true values in configs of earlier versions
 _OLD_TRUTH = "aux.true_"

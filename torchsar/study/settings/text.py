@@ -216,3 +216,21 @@ def _assigned(tree: Any, path: list[str], value: Any, key: str) -> dict[str, Any
         )
     head, rest = path[0], path[1:]
     return {**tree, head: _assigned(tree.get(head), rest, value, key) if rest else value}
+
+
+def fault_of_name(name: Any, longest: int) -> str:
+    """Decide whether a store can have an entry of some name, for which it makes a folder.
+
+    Args:
+        name: The name.
+        longest: Largest number of bytes; file systems allow 255, and names of files are longer.
+
+    Returns:
+        The reason why it cannot be used, as the end of a sentence; empty if it can.
+    """
+    if not isinstance(name, str) or name.strip() in ("", ".", "..", "zarr.json") or re.search("^__|/", name):
+        return "since names are words without '/' that do not begin with '__'"
+    if not name.isprintable():
+        return "since names have only printable characters"
+    size = len(name.encode())
+    return f"since it has {size} bytes; use {longest} at most" if size > longest else ""

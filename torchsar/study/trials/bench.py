@@ -15,17 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.core import (
-    Chain,
-    Draws,
-    Estimate,
-    Outcome,
-    Recording,
-    Trace,
-    gathered_checks,
-    is_out_of_memory,
-    machine_memory_bytes,
-)
+from torchsar.core import Chain, Draws, Estimate, Outcome, Recording, Trace, gathered_checks, is_out_of_memory
+from torchsar.core.stored import machine_memory_bytes
 from torchsar.echo import apply_impairments
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded, Method

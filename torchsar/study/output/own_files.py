@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchsar.core.seal import is_sealed, sealed
+from torchsar.io.seal import is_sealed, sealed
 
 # larger files are compared by their size alone: reading gigabytes would take as long as a run
 _HASHED_BYTES = 1 << 22

@@ -10,7 +10,7 @@ import torch
 
 import torchsar
 from tests.program import Program
-from torchsar.core import PeakMemory
+from torchsar.study.memory import PeakMemory
 
 
 def count_faults(keeps: bool) -> None:

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchsar.core import Chain, Stage, fingerprint, own_code
+from torchsar.core import Chain, Stage
+from torchsar.study.montecarlo.fingerprint import fingerprint, own_code
 
 PROGRAM = """
 import argparse, math, torch
@@ -91,9 +92,8 @@ def test_values_are_shown_by_name() -> None:
 
 
 def test_another_process_gives_the_same() -> None:
-    words = (
-        f"import json\nfrom torchsar.core import fingerprint\nscope = {{'__name__': 'mine'}}\nexec({PROGRAM!r}, scope)"
-    )
+    words = "import json\nfrom torchsar.study.montecarlo.fingerprint import fingerprint\n"
+    words += f"scope = {{'__name__': 'mine'}}\nexec({PROGRAM!r}, scope)"
     words += "\nprint(json.dumps([fingerprint(scope[n]) for n in ('function', 'object')]))"
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == [of(), of(name="object")]

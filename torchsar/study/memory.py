@@ -1,4 +1,4 @@
-"""Memory of the machine, peak memory of a block of code, and reuse of freed memory."""
+"""Peak memory of a block of code, and reuse of freed memory."""
 
 from __future__ import annotations
 
@@ -39,18 +39,6 @@ def keep_freed_memory() -> bool:
         and set_option(_TRIM_THRESHOLD, _KEPT_BYTES) == 1
         and set_option(_ARENA_MAX, 1) == 1  # arenas of other threads would return their memory
     )
-
-
-def machine_memory_bytes() -> int | None:
-    """Return the size of the main memory of this machine.
-
-    Returns:
-        The size in bytes, or None on systems that do not report it.
-    """
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return None
 
 
 def _of_c_library(name: str) -> Callable[..., int] | None:
@@ -115,17 +103,3 @@ def wait_for_devices() -> None:
     """Wait until CUDA has computed what was asked of it, if it is in use."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.synchronize()
-
-
-def is_out_of_memory(error: Exception) -> bool:
-    """Decide whether an error says that memory is short.
-
-    Args:
-        error: An error. CUDA raises a class of its own, the CPU allocator of torch only a text.
-
-    Returns:
-        Whether a smaller batch may succeed.
-    """
-    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (
-        isinstance(error, RuntimeError) and "allocate memory" in str(error)
-    )
