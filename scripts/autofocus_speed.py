@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchsar import Draws, keep_freed_memory
-from torchsar.compensate import autofocus, entropy_fixed_point, minimum_entropy, pga, pga_sca, sca
+from torchsar.compensate import autofocus, entropy_fixed_point, pga, pga_sca, sca, sharpest_phase
 from torchsar.core import Estimate
 from torchsar.echo import simulate_turntable
 from torchsar.metrics import phase_rmse
@@ -32,7 +32,7 @@ METHODS: dict[str, Callable[[Tensor], Estimate]] = {
     "pga_sca": pga_sca,
     "pga_sca, synchronised": lambda x: pga_sca(x, kernel="synchronised"),
     "entropy_fixed_point": entropy_fixed_point,
-    "minimum_entropy": minimum_entropy,
+    "sharpest_phase": sharpest_phase,
     "autofocus": autofocus,
     "autofocus, polish 0": lambda x: autofocus(x, polish=0),
 }
@@ -94,7 +94,7 @@ def main() -> None:
     for name, estimate in found.items():
         count = float(estimate.info["iterations"].double().mean())
         bare = bare_ms(name, count, plain, padded) / options.trials
-        ratio = "" if name in ("sca", "minimum_entropy") else f"{best[name] / options.trials / bare:.1f}"
+        ratio = "" if name in ("sca", "sharpest_phase") else f"{best[name] / options.trials / bare:.1f}"
         error = float(phase_rmse(estimate["phase_rad"], truth).median())
         print(
             f"{name:<24}{best[name] / options.trials:>11.1f}{count:>12.1f}{bare:>14.1f} "

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate import CorrectPulsePhase, Listed, Sca, autofocus, pga_sca, sca
+from torchsar.compensate import CorrectPulsePhase, Sca, autofocus, pga_sca, sca
 from torchsar.core import Chain, Draws, Signal, legendre, use
 from torchsar.echo import simulate_turntable
 from torchsar.focus import AzimuthTransform
@@ -108,7 +108,7 @@ def learnt_windows(n_pulse: int, trials: int, candidates: int) -> tuple[list[int
 
     # the experiment: what is tuned, how it is drawn, how it is judged
     def judged(cells: Tensor) -> Tensor:
-        found = pga_sca(data, windows=Listed(tuple(cells.tolist())), iterations=len(cells))
+        found = pga_sca(data, windows=cells.tolist(), iterations=len(cells))
         return phase_rmse(found["phase_rad"], truth).mean()
 
     drawn = (
@@ -123,7 +123,7 @@ def learnt_windows(n_pulse: int, trials: int, candidates: int) -> tuple[list[int
     data, truth = pairs(Draws(4, trials=range(len(SNR_DB) * trials)), n_pulse, snr_of(trials))
     found = {
         "pga_sca, 3 iterations": pga_sca(data, iterations=3),
-        "pga_sca, 3 learnt windows": pga_sca(data, windows=Listed(tuple(best)), iterations=3),
+        "pga_sca, 3 learnt windows": pga_sca(data, windows=best, iterations=3),
         "pga_sca, 20 iterations": pga_sca(data),
         "autofocus, a free phase": autofocus(data),
     }

@@ -23,10 +23,9 @@ from torchsar.compensate import (
     PhasePolish,
     Sca,
     SharpestPhase,
-    TargetAutofocus,
     align_envelopes,
-    maximum_contrast,
     pulse_gain,
+    sharpest_phase,
 )
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_turntable
@@ -274,9 +273,8 @@ def entries() -> list[Entry]:
         "EntropyFixedPoint": EntropyFixedPoint(),
         "LinkPhases": LinkPhases(),
         "SharpestPhase": SharpestPhase(steps=60),
-        "maximum_contrast": lambda x: maximum_contrast(x.data, steps=60),
+        "SharpestPhase:contrast": lambda x: sharpest_phase(x.data, objective="contrast", steps=60),
         "Autofocus": Autofocus(),
-        "TargetAutofocus": TargetAutofocus(LADAR),
         "PhasePolish": PhasePolish(),
     }
     shifts = [Quantity("shift_cells", 0.5, shift_error, 0.02)]
@@ -293,6 +291,7 @@ def entries() -> list[Entry]:
         Entry(
             "compensate.pulse_gain",
             pulse_gain,
+            sharpest_phase,
             (*nothing((PULSES, CELLS)), *(World("direct", gains(snr), snr) for snr in SNR_DB)),
             [Quantity("gain", math.log(10) / 20, gain_error, 0.02)],  # 1 dB
         ),

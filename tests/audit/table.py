@@ -16,7 +16,6 @@ SAME = {
     "compensate.entropy_fixed_point": "compensate.EntropyFixedPoint",
     "compensate.link_phases": "compensate.LinkPhases",
     "compensate.sharpest_phase": "compensate.SharpestPhase",
-    "compensate.minimum_entropy": "compensate.SharpestPhase",
     "compensate.autofocus": "compensate.Autofocus",
     "compensate.path_autofocus": "compensate.PathAutofocus",
     "compensate.path_phase": "compensate.PathPhase",
@@ -80,11 +79,11 @@ _CHANGES = {  # SNR of the worlds whose scatterers change, by a short name
 _ALWAYS = ("8 points", "40 points", "walk")
 _MANY = ("many scintillate", "many scintillate, 0 dB")
 _CHANGING = {
-    **dict.fromkeys(("Autofocus", "TargetAutofocus"), tuple(_CHANGES)),
+    "Autofocus": tuple(_CHANGES),
     "EntropyFixedPoint": (*_ALWAYS, "few scintillate", *_MANY),
     "SharpestPhase": (*_ALWAYS, *_MANY),
     "PgaSca:synchronised": (*_ALWAYS, "many scintillate"),
-    **dict.fromkeys(("Sca", "PgaSca", "maximum_contrast"), _ALWAYS),
+    **dict.fromkeys(("Sca", "PgaSca", "SharpestPhase:contrast"), _ALWAYS),
 }
 LIMITS: dict[str, list[tuple[str, str, float | None]]] = {
     "scatterers that change from pulse to pulse, or another scene from some pulse on: halves of the range cells hold "

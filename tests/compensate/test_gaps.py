@@ -10,8 +10,9 @@ from torch import Tensor
 
 from tests.compensate.scenes import spread_points
 from torchsar.compensate import autofocus
-from torchsar.compensate.pulse_phase.data import noise_power
-from torchsar.compensate.pulse_phase.gaps import have_gaps, longest_gap, side_lobes
+from torchsar.compensate.pulse_phase.assess import longest_gap
+from torchsar.compensate.pulse_phase.fixed_point import have_gaps, side_lobes
+from torchsar.compensate.pulse_phase.points import noise_power
 from torchsar.core import Outcome
 from torchsar.metrics import phase_rmse
 

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from tests.audit.pulses import scintillating
 from torchsar.compensate import LinkPhases, autofocus, entropy_fixed_point, link_phases, pga, sca
-from torchsar.compensate.pulse_phase.homogeneous import describe, sparse_gain_nats
+from torchsar.compensate.pulse_phase.homogeneous import describe, smoothed_spectrum, sparse_gain_nats
 from torchsar.compensate.pulse_phase.likelihood import Speckle
 from torchsar.compensate.pulse_phase.linking import _grown
-from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
 from torchsar.core import Axis, Outcome, Signal
 from torchsar.metrics.phase import phase_rmse
 from torchsar.study.montecarlo.batches import LargestTensor

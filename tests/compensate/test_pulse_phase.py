@@ -27,12 +27,9 @@ from torchsar.compensate import (
     Autofocus,
     CorrectPulsePhase,
     EntropyFixedPoint,
-    Listed,
-    Measured,
     Pga,
     PgaSca,
     Sca,
-    Shrinking,
     autofocus,
     correct_pulse_phase,
     entropy_fixed_point,
@@ -41,11 +38,10 @@ from torchsar.compensate import (
     sca,
     sharpest_phase,
 )
-from torchsar.compensate.pulse_phase.data import without_line
-from torchsar.compensate.pulse_phase.gradient import _centred, _Rows, _solver, _view, _windowed
+from torchsar.compensate.pulse_phase.data import pair_products, without_line
+from torchsar.compensate.pulse_phase.fixed_point import WIENER_FACTORS, LogAbove, Run, Wiener, fixed_point
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
-from torchsar.compensate.pulse_phase.pairs import pair_products
-from torchsar.compensate.pulse_phase.sharpen import WIENER_FACTORS, LogAbove, Run, Wiener, fixed_point
+from torchsar.compensate.pulse_phase.pga import _KERNELS, View, window_width
 from torchsar.core import Chain, Estimate, Signal, use
 from torchsar.metrics import entropy, phase_rmse, residual_phase
 from torchsar.radar import InverseRadar
@@ -218,11 +214,11 @@ def test_coherent_kernels_find_the_first_eigenvector(kernel):
     a = smooth(64)
     x = noisy(turned(still(1, 64, 32, per_row=1), a[None]), 30.0)
     assert float(phase_rmse(pga(x, kernel=kernel)["phase_rad"][0], a)) < 0.03
-    view, everywhere = _view(x.mT.contiguous(), a[None]), torch.ones(1, 64, dtype=torch.bool)
-    windowed = _Rows(_windowed(view, torch.tensor([4])), 128, everywhere)
-    rows = _centred(windowed, view)[0]
+    view = View.of(x.mT.contiguous(), torch.ones(1, 64, dtype=torch.bool), a[None])
+    cells = view.windowed(torch.tensor([4]))
+    rows = view.centred(cells)[0]
     first = torch.from_numpy(np.linalg.eigh((rows.mT @ rows.conj()).numpy())[1][:, -1])
-    assert constant_apart(_solver(kernel)(windowed, view)[0], torch.angle(first)) < 0.01
+    assert constant_apart(_KERNELS[kernel](view, cells)[0], torch.angle(first)) < 0.01
 
 
 @pytest.mark.parametrize("n", [64, 81])
@@ -230,22 +226,23 @@ def test_coherent_kernels_find_the_first_eigenvector(kernel):
 def test_sums_over_range_are_exact_with_any_window(n, half, monkeypatch):
     """A narrow window is transformed with fewer cells, a wide one or a missing pulse with all."""
     x = torch.randn(2, 40, n, dtype=torch.complex128, generator=torch.Generator().manual_seed(n + half))
-    view, present = _view(x, torch.zeros(2, n)), torch.ones(2, n, dtype=torch.bool)
-    windowed = _Rows(_windowed(view, torch.tensor([half, max(1, half // 2)])), 2 * n, present)
-    g = windowed.pulses()
+    present = torch.ones(2, n, dtype=torch.bool)
+    view = View.of(x, present, torch.zeros(2, n))
+    cells = view.windowed(torch.tensor([half, max(1, half // 2)]))
+    g = view.pulses(cells)
     sizes, ifft = [], torch.fft.ifft
     monkeypatch.setattr(torch.fft, "ifft", lambda x, **options: (sizes.append(x.numel()), ifft(x, **options))[1])
-    products, before = windowed.adjacent()
+    products, before = view.adjacent(cells)
     assert half > 7 or sum(sizes) <= 1.5 * x.numel(), "a padded transform has 2 samples for each of x"
     torch.testing.assert_close(products, pair_products(g, present))
     torch.testing.assert_close(before, g[..., :-1].abs().square().sum(-2))
     present[0, 3] = False
-    holes = _Rows(windowed.cells, 2 * n, present).adjacent()[0]
+    holes = View.of(x, present, torch.zeros(2, n)).adjacent(cells)[0]
     torch.testing.assert_close(holes, pair_products(g, present))
 
 
 @pytest.mark.parametrize("kernel", ["lumv", "ml", "synchronised", "eigenvector"])
-@pytest.mark.parametrize("windows", [Shrinking(), Measured(), Listed((96.0, 64.0, 32.0, 16.0, 8.0))])
+@pytest.mark.parametrize("windows", ["shrinking", "measured", (96.0, 64.0, 32.0, 16.0, 8.0)])
 def test_every_kernel_and_window_removes_a_smooth_error(kernel, windows):
     a = 2 * smooth(128)
     found = pga(turned(noisy(still(1), 20.0), a[None]), kernel=kernel, windows=windows)
@@ -253,11 +250,12 @@ def test_every_kernel_and_window_removes_a_smooth_error(kernel, windows):
 
 
 def test_windows():
-    flat = torch.zeros(2, 64)
-    flat[:, 0], flat[0, 1], flat[0, -3], flat[1, 40] = 1.0, 0.5, 0.2, 0.05
-    assert Measured().width(0, 64, lambda: flat).tolist() == [1.5 * 7, 5.0]
-    assert [float(Shrinking().width(i, 100, lambda: flat)) for i in (0, 1, 30)] == [50.0, 40.0, 5.0]
-    assert [float(Listed((9.0, 4.0)).width(i, 100, lambda: flat)) for i in (0, 1, 2)] == [9.0, 4.0, 4.0]
+    power = torch.zeros(2, 1, 128)  # every other cell is padded
+    power[:, 0, 0], power[0, 0, 2], power[0, 0, -6], power[1, 0, 80] = 1.0, 0.5, 0.2, 0.05
+    view = View(power, power, torch.zeros(2, 1, dtype=torch.int64), torch.ones(2, 64, dtype=torch.bool))
+    assert window_width("measured", 0, view).tolist() == [1.5 * 7, 5.0]
+    assert [float(window_width("shrinking", i, view)) for i in (0, 1, 30)] == pytest.approx([32.0, 25.6, 5.0])
+    assert [float(window_width((9.0, 4.0), i, view)) for i in (0, 1, 2)] == [9.0, 4.0, 4.0]
 
 
 def test_constant_and_line_are_fitted_to_present_pulses():
@@ -564,8 +562,9 @@ def test_a_start_connects_to_pga():
         (lambda x: pga(x, kernel="mean"), "kernel 'mean' is not known"),  # pyright: ignore[reportArgumentType]
         (lambda x: pga(x, iterations=0), "iterations must be a whole number of 1 or more"),
         (lambda x: pga_sca(x, patience=0), "patience must be a whole number of 1 or more"),
-        (lambda x: Shrinking(factor=1.2), "first and factor must be above 0 and at most 1"),
-        (lambda x: Listed(()), "widths of 1 Doppler cell or more"),
+        (lambda x: pga(x, windows="narrow"), "windows must be 'shrinking', 'measured' or a list"),  # pyright: ignore
+        (lambda x: pga_sca(x, windows=(9.0, 0.5)), "widths of 1 Doppler cell or more"),
+        (lambda x: Pga(windows=[]), "widths of 1 Doppler cell or more"),
         (lambda x: entropy_fixed_point(x, floors=((0.0, 3),)), "pairs of a floor above 0"),
         (lambda x: entropy_fixed_point(x, relaxation=2.0), "relaxation must lie between 0 and 2"),
         (lambda x: EntropyFixedPoint(floors=[5.0], iterations=[3, 4]), "a number of iterations for each floor"),

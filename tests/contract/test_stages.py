@@ -67,7 +67,6 @@ from torchsar.compensate import (
     ShiftRange,
     SpectrumCorrelation,
     StripAutofocus,
-    TargetAutofocus,
     UnevenRotation,
 )
 from torchsar.core import Alternate, Estimate, Signal, Stage, Turn, real_dtype
@@ -756,7 +755,6 @@ MORE = {
     "PulseGain": PulseGain,
     "SharpestPhase": SharpestPhase,
     "SplitSweeps": lambda: SplitSweeps(LADAR, "search"),
-    "TargetAutofocus": lambda: TargetAutofocus(TURNTABLE),
 }
 
 

@@ -324,8 +324,6 @@ FUNCTIONS = [
     _entry("compensate.pga_sca", "raw", compensate.pga_sca),
     _entry("compensate.entropy_fixed_point", "raw", compensate.entropy_fixed_point),
     _entry("compensate.link_phases", "raw", compensate.link_phases),
-    _entry("compensate.maximum_contrast", "raw", lambda x: compensate.maximum_contrast(x, steps=10)),
-    _entry("compensate.minimum_entropy", "raw", lambda x: compensate.minimum_entropy(x, steps=10)),
     _entry("compensate.sharpest_phase", "raw", lambda x: compensate.sharpest_phase(x, steps=10)),
     _entry("compensate.phase_polish", "raw", compensate.phase_polish),
     _entry(
@@ -633,7 +631,6 @@ MORE_STAGES = [
     _on_signal("AlignEnvelopes", "turntable", compensate.AlignEnvelopes),
     _on_signal("PulseGain", "turntable", compensate.PulseGain),
     _on_signal("SharpestPhase", "turntable", lambda: compensate.SharpestPhase(steps=5)),
-    _on_signal("TargetAutofocus", "turntable", lambda: compensate.TargetAutofocus(TURNTABLE)),
     Entry(
         "EqualisePulses",
         "turntable",

@@ -198,12 +198,12 @@ NOT_SHIFTED = {
 # gains, envelopes and clocks
 RANGE_FREE = (
     *("Sca:sca", "Pga:pga", "PgaSca:pga_sca", "EntropyFixedPoint:entropy_fixed_point", "LinkPhases:link_phases"),
-    *("Autofocus:autofocus", "PhasePolish:phase_polish", "SharpestPhase", "TargetAutofocus", "AlignEnvelopes"),
+    *("Autofocus:autofocus", "PhasePolish:phase_polish", "SharpestPhase", "AlignEnvelopes"),
     *("PulseGain", "EstimateImbalance:estimate_imbalance", "PilotJitter:pilot_jitter", "BlindJitter:blind_jitter"),
     *("EstimateBalance:estimate_balance", "WalkAmbiguity:walk_ambiguity", "compensate.align_envelopes"),
     "compensate.pulse_gain",
     *("compensate.autofocus", "compensate.sca", "compensate.pga", "compensate.pga_sca", "compensate.link_phases"),
-    *("compensate.entropy_fixed_point", "compensate.maximum_contrast", "compensate.minimum_entropy"),
+    "compensate.entropy_fixed_point",
     *("compensate.sharpest_phase", "compensate.phase_polish", "metrics.entropy"),
     *("metrics.contrast", "metrics.correlation", "metrics.error_db"),
 )

@@ -13,7 +13,7 @@ import yaml
 
 from tests.study.scenes import CORRECT, IMAGE, ISAL, bench_of, loaded_as, run, world, write
 from torchsar.cli import main
-from torchsar.compensate import Sca, TargetAutofocus
+from torchsar.compensate import Autofocus, Sca
 from torchsar.core import Draws, Outcome
 from torchsar.focus import TargetImage
 from torchsar.io import read_inverse
@@ -163,9 +163,9 @@ def test_a_run_tells_the_reasons_and_where_doubtful_and_neutral_values_were_used
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The first trial is doubtful, and the second one failed."""
-    found = TargetAutofocus.forward
+    found = Autofocus.forward
     codes = torch.tensor([Outcome.MISFIT, Outcome.NOISE])
-    monkeypatch.setattr(TargetAutofocus, "forward", lambda self, *x, **y: replace(found(self, *x, **y), outcome=codes))
+    monkeypatch.setattr(Autofocus, "forward", lambda self, *x, **y: replace(found(self, *x, **y), outcome=codes))
     careful = {"phase": {"stage": "autofocus"}, "correct": {**CORRECT, "in_doubt": "neutral"}, "image": IMAGE}
     config = write(tmp_path, "isal", processor={**ISAL["processor"], "careful": {"stages": careful}})
     tree = run(config, tmp_path / "out", "world.trials=2")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
-from torchsar.compensate.pulse_phase.sharpen import Wiener
+from torchsar.compensate.pulse_phase.fixed_point import Wiener
 from torchsar.focus import TileOperator
 
 # most iterations of conjugate gradients, and share of the energy of the noise by which the last one

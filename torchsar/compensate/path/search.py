@@ -12,9 +12,9 @@ from torchsar.compensate.path.axes import Found, three_axes
 from torchsar.compensate.path.envelopes import drift_m, matched_m, moved
 from torchsar.compensate.path.fringes import rough_near, roughness, smooth_near, smoothest
 from torchsar.compensate.path.ground import FINE_STEP, line_free, placed
+from torchsar.compensate.pulse_phase.data import pair_phase
+from torchsar.compensate.pulse_phase.fixed_point import Run, Weights, Wiener, fixed_point, weighted
 from torchsar.compensate.pulse_phase.imaging import Through
-from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import Run, Weights, Wiener, fixed_point, weighted
 from torchsar.compensate.pulse_phase.sharpness import sharpness_beyond_speckle, sharpness_of_noise
 from torchsar.core import cis, real_dtype
 from torchsar.focus import TileOperator

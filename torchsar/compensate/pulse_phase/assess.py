@@ -19,12 +19,18 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.alignment import LARGEST_JITTER, LARGEST_MIGRATION, displacement
-from torchsar.compensate.pulse_phase.data import Pulses, by_blocks, on_the_circle, or_one, rotate, without_line
-from torchsar.compensate.pulse_phase.gaps import longest_gap
+from torchsar.compensate.pulse_phase.data import (
+    Pulses,
+    by_blocks,
+    on_the_circle,
+    or_one,
+    pair_phase,
+    rotate,
+    without_line,
+)
+from torchsar.compensate.pulse_phase.fixed_point import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.homogeneous import describe, different_rows, occupied_band
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Through
-from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.sharpness import scatter_of_point, sharpness_beyond_speckle, sharpness_of_noise
 from torchsar.core import Estimate, Outcome, fft_lines, host_value, power_of, worst
 from torchsar.metrics.phase import phase_rmse, residual_phase
@@ -181,6 +187,24 @@ def _seen(
         moved.jitter,
         moved.migration,
     )
+
+
+def longest_gap(present: Tensor) -> Tensor:
+    """Compute the length of the longest gap between the first and the last pulse.
+
+    Args:
+        present: False where a pulse is missing, shape (trial, pulse).
+
+    Returns:
+        The share of the pulses from the first to the last that the gap takes, shape (trial,),
+        float64; 0 without pulses.
+    """
+    number = torch.arange(1, present.shape[-1] + 1, device=present.device)
+    last = torch.where(present, number, 0).cummax(-1).values
+    first = torch.where(present, number, number[-1] + 1).amin(-1, keepdim=True)
+    steps = torch.where(present[:, 1:] & (number[1:] > first), number[1:] - last[:, :-1], 1).amax(-1)
+    span = (last[:, -1:] - first + 1)[:, 0]
+    return torch.where(present.any(-1), (steps - 1).double() / or_one(span.double()), 0)
 
 
 def gain_of_parts(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:

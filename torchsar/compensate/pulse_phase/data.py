@@ -1,4 +1,8 @@
-"""Input of the autofocus functions: pulses are checked, scaled and brought to one layout."""
+"""Pulses in the layout of the autofocus functions, and the phases between adjacent ones.
+
+The phase between two pulses is that of the product of one with the conjugate of the other, summed
+over range.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,10 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import block_bytes_of, checked_samples, cis, is_plain, over_blocks, power_of, unit_level
+from torchsar.core import block_bytes_of, checked_samples, cis, over_blocks, unit_level
 
 
 @dataclass(frozen=True)
@@ -292,43 +295,54 @@ def or_one(x: Tensor) -> Tensor:
     return torch.where(x > 0, x, 1)
 
 
-def without_lobes(image: Tensor) -> Tensor:
-    """Weight the pulses of an image with a Hann window, so that side lobes do not count as noise.
-
-    Args:
-        image: Image or its transform over range, shape (..., Doppler), complex, by a Fourier
-            transform of pulses.
-
-    Returns:
-        The image with the same mean power of noise, same shape.
-    """
-    return (image - (image.roll(1, -1) + image.roll(-1, -1)) / 2) / math.sqrt(1.5)
-
-
-def noise_power(rows: Tensor, present: Tensor, phase_rad: Tensor) -> Tensor:
-    """Estimate the variance of the noise of pulses whose scatterers fill less than half the image.
+def pair_phase(rows: Tensor, present: Tensor) -> Tensor:
+    """Estimate the phase of each pulse by adding up the phases between successive pulses.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.
-        present: False where a pulse holds only zeros, shape (trial, pulse).
-        phase_rad: Phases that focus them in rad, shape (trial, pulse).
+        present: False for pulses without samples, shape (trial, pulse), bool.
 
     Returns:
-        The variance of a sample, shape (trial,), float64, without derivatives: the median power of
-        the cells of the image over ln 2, which is that of the median of noise. Range cells that
-        hold only zeros do not count, and the power of absent pulses is made up for.
+        The phases in rad, shape (trial, pulse); that of the first pulse is 0.
     """
-    rows = rows.detach()
-    image = without_lobes(torch.fft.fft(rotate(rows, phase_rad.detach()), norm="ortho"))
-    power = power_of(image)
-    filled = (rows != 0).any(-1)
-    power = torch.where(filled[..., None], power, torch.inf).flatten(1)
-    if power.device.type == "cpu" and is_plain(power):  # numpy sorts many times as fast as torch
-        power = torch.from_numpy(np.sort(power.numpy(), axis=-1))
-    else:
-        power = power.sort(-1).values
-    middle = (filled.sum(-1, keepdim=True) * rows.shape[-1] - 1).clamp_min(0) // 2
-    median = torch.where(filled.any(-1), power.gather(-1, middle)[:, 0].to(torch.float64), 0)
-    # the window that the pulses had in the image
-    window = torch.fft.ifft(without_lobes(torch.fft.fft(present.to(torch.complex128))))
-    return median / (math.log(2) * or_one(window.real.square().mean(-1)))
+    return running_sum(pair_products(rows, present))
+
+
+def pair_products(rows: Tensor, present: Tensor) -> Tensor:
+    """Sum over range the product of each pulse and the conjugate of the pulse before it.
+
+    Pulses without samples are skipped: the next pulse that holds samples is paired with the last
+    one that does.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        present: False for pulses without samples, shape (trial, pulse), bool.
+
+    Returns:
+        The products, shape (trial, pulse - 1), complex; zero for a pulse without samples.
+    """
+    if present.device.type == "cpu" and bool(present.all()):
+        return (rows[..., 1:] * rows[..., :-1].conj()).sum(-2)
+    # the last earlier pulse that holds samples; 0 where there is none
+    index = torch.arange(present.shape[-1], device=present.device)
+    before = torch.where(present, index, 0).cummax(-1).values[:, :-1]
+    return torch.where(
+        present[:, 1:],
+        (rows[..., 1:] * rows.gather(-1, before[:, None, :].expand(-1, rows.shape[-2], -1)).conj()).sum(-2),
+        0,
+    )
+
+
+def running_sum(products: Tensor) -> Tensor:
+    """Add up the phases of products of successive pulses, in float64.
+
+    Args:
+        products: Product of each pulse but the first with the conjugate of the pulse before it,
+            shape (trial, pulse - 1), complex.
+
+    Returns:
+        The phase of every pulse in rad, shape (trial, pulse); that of the first pulse is 0.
+    """
+    steps = safe_angle(products)
+    total = steps.to(torch.float64).cumsum(-1).to(steps.dtype)
+    return torch.cat([torch.zeros_like(total[..., :1]), total], -1)

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import or_one
-from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, occupied_band, power_groups
-from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum
+from torchsar.compensate.pulse_phase.homogeneous import SPECTRAL_FLOOR, occupied_band, power_groups, smoothed_spectrum
 from torchsar.core import cholesky_factor, cis, fft_lines, linear_solve, matrix_inverse, power_of
 
 PRIOR = 3 / math.pi**2  # information in 1/rad^2 of a phase that is uniform over a turn
@@ -384,3 +383,18 @@ def without_line_matrix(n: int, device: torch.device) -> Tensor:
     pulse = torch.linspace(-1, 1, n, dtype=torch.float64, device=device)
     line = torch.linalg.qr(torch.stack([torch.ones_like(pulse), pulse], -1)).Q
     return torch.eye(n, dtype=torch.float64, device=device) - line @ line.mT
+
+
+def windowed_spectrum(power: Tensor, looks: Tensor) -> Tensor:
+    """Smooth a mean periodogram by a Hann window of 9 bins, for phases that are still far off.
+
+    Args:
+        power: Mean power, shape (trial, bin); the first and the last bin are neighbours.
+        looks: Not used, see `smoothed_spectrum`.
+
+    Returns:
+        The smoothed power, same shape.
+    """
+    window = torch.hann_window(11, periodic=False, dtype=power.dtype, device=power.device)[1:-1]
+    padded = torch.nn.functional.pad(power[:, None], (4, 4), mode="circular")
+    return torch.nn.functional.conv1d(padded, (window / window.sum())[None, None])[:, 0]

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare, starting_phase
+from torchsar.compensate.pulse_phase.homogeneous import smoothed_spectrum
 from torchsar.compensate.pulse_phase.likelihood import (
     Fit,
     Speckle,
@@ -21,9 +22,10 @@ from torchsar.compensate.pulse_phase.likelihood import (
     newton,
     newton_step,
     rms_of_pulses,
+    windowed_spectrum,
 )
 from torchsar.compensate.pulse_phase.linking_assess import Judged, judged, outcome_of
-from torchsar.compensate.pulse_phase.spectrum import smoothed_spectrum, windowed_spectrum
+from torchsar.compensate.pulse_phase.stages import PhaseEstimatorFromStart
 from torchsar.core import Estimate, Outcome, cis, over_blocks
 
 # Longest block whose phases are found by themselves, in pulses; bands of their first guesses as
@@ -86,6 +88,17 @@ def link_phases(data: Tensor, *, start: Tensor | None = None, assess: bool = Tru
     """
     pulses = prepare(data, "link_phases")
     return linked(pulses, starting_phase(start, pulses, "link_phases"), assess=assess)
+
+
+class LinkPhases(PhaseEstimatorFromStart):
+    """Phase per pulse of a homogeneous scene by maximum likelihood; see `link_phases`.
+
+    Args:
+        assess: Whether to add the standard deviation and the outcome.
+    """
+
+    def __init__(self, assess: bool = True) -> None:
+        super().__init__(link_phases, assess=assess)
 
 
 def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False, assess: bool = True) -> Estimate:

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.alignment import LARGEST_JITTER, LARGEST_MIGRATION, coherent_jitter, displacement
 from torchsar.compensate.pulse_phase.assess import LEAST_STREHL
-from torchsar.compensate.pulse_phase.data import Pulses, or_one
+from torchsar.compensate.pulse_phase.data import Pulses, or_one, pair_phase
+from torchsar.compensate.pulse_phase.fixed_point import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.homogeneous import LEAST_LOOKS, describe, occupied_band
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.likelihood import (
@@ -27,8 +28,6 @@ from torchsar.compensate.pulse_phase.likelihood import (
     rms_of_pulses,
     without_line_matrix,
 )
-from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.core import Outcome, fft_lines, power_of, worst
 
 # Gain of the log likelihood per pulse by which the phases fit circular noise: 1.1 to 2.3 nats were

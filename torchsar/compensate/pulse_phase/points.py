@@ -14,26 +14,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import noise_power, or_one, rotate, safe_angle
+from torchsar.compensate.pulse_phase.data import or_one, rotate, safe_angle
 from torchsar.core import cis, host_value, power_of, true_positions
-
-# Largest number of lines, of lines per pulse, and of the strongest range cells that count.
-_MOST_LINES, _OF_PULSES, _CELLS = 16, 1 / 8, 32
-# The phases stay where they start until lines explain all but this share of the energy without
-# noise: phases that make a line of one point out of ten hide the others.
-_HELD = 0.25
-# Rounds of amplitudes and Dopplers for each number of lines: those with held phases, and all if the
-# phases become free. They end earlier where a round moves the phases by less than `_SETTLED_RAD`
-# rms. The bend is adapted every third round.
-_HELD_ROUNDS, _ROUNDS, _SETTLED_RAD, _BEND_EVERY = 3, 20, 1e-3, 3
-# Largest bend in rad per range cell. The bend is pi / 8 times a wavelength over a cell, if cells
-# are squares. With cells of 100 wavelengths, the points of a target of 80 cells migrate by a
-# fifth of a cell, and are no lines any more.
-_LARGEST_BEND = 0.004
-# Samples of the spectrum per Doppler cell, in which the strongest line is found; change of a
-# Doppler in one round in cells; share of the energy of a line with which equal lines have an
-# inverse.
-_FINER, _LARGEST_TURN, _RIDGE = 4, 0.25, 1e-6
 
 
 def phases_of_points(rows: Tensor, present: Tensor, phase_rad: Tensor) -> tuple[Tensor, Tensor]:
@@ -73,7 +55,7 @@ def phases_of_points(rows: Tensor, present: Tensor, phase_rad: Tensor) -> tuple[
     noise = torch.maximum(noise, 1e-8 * energy[at].mean(-1).double() / rows.shape[-1])
     fit = _Fit.begin(rows[at], present[at], phase[at], noise)
     open_ = open_.index_copy(0, at, fit.cells > 0)
-    for lines in range(1, _MOST_LINES + 1):
+    for lines in range(1, 17):
         fit = fit.with_another_line()
         # the level of the noise errs by a few percent
         found = (fit.rest() < 1.15) & fit.free & open_[at]
@@ -82,7 +64,7 @@ def phases_of_points(rows: Tensor, present: Tensor, phase_rad: Tensor) -> tuple[
         good = found & (fit.of_second_range() < 0.25)
         phase = phase.index_copy(0, at, torch.where(good[:, None], phase_rad[at] + fit.change, phase[at]))
         explained = explained.index_copy(0, at, explained[at] | good)
-        open_ = open_.index_copy(0, at, open_[at] & ~found & (lines < (_OF_PULSES * present[at].sum(-1)).floor()))
+        open_ = open_.index_copy(0, at, open_[at] & ~found & (lines < present[at].sum(-1) // 8))
         some = true_positions(open_[at], host_value(open_[at].sum(), len(at)))
         if not len(some):
             break
@@ -130,7 +112,7 @@ class _Fit:
         """Return the fit without a line."""
         pulses = present.sum(-1)
         power, strongest = power_of(rows).sum(-1).detach().sort(-1, descending=True)
-        power, strongest = power[:, :_CELLS], strongest[:, :_CELLS]
+        power, strongest = power[:, :32], strongest[:, :32]
         # a range cell counts if its energy exceeds that of noise by five deviations
         seen = power > (noise * (pulses + 5.0 * pulses.sqrt()))[:, None]
         cells = seen.sum(-1)
@@ -154,7 +136,7 @@ class _Fit:
     def with_another_line(self) -> _Fit:
         """Add a line where the spectrum of the rest is largest, and fit all lines and phases."""
         change, bend, free, model = self.change, self.bend, self.free, self.model
-        n = _FINER * self.rows.shape[-1]
+        n = 4 * self.rows.shape[-1]  # samples of the spectrum, four per Doppler cell
         power = power_of(torch.fft.fft(self.left, n)).sum(-2)
         top = power.argmax(-1, keepdim=True)
         below, peak, above = (power.gather(-1, (top + k) % n)[:, 0] for k in (-1, 0, 1))
@@ -164,10 +146,11 @@ class _Fit:
         lines = torch.cat([self.lines, strongest[:, None]], -1)
         pulses = self.present.sum(-1)
         pulse = _numbers(self.present, change.dtype)
-        ridge = _RIDGE * pulses[:, None, None] * torch.eye(lines.shape[-1], dtype=change.dtype, device=change.device)
+        # equal lines have an inverse by a share of the energy of a line
+        ridge = 1e-6 * pulses[:, None, None] * torch.eye(lines.shape[-1], dtype=change.dtype, device=change.device)
         amplitudes = self.rows.new_zeros(*lines.shape, self.rows.shape[-2])
         active = torch.ones_like(free)
-        for number in range(1, _ROUNDS + 1):
+        for number in range(1, 21):
             rows = rotate(self._straight(bend), change)
             waves = cis(lines[..., None] * pulse[:, None]) * self.present[:, None]
             matrix = waves.conj() @ waves.mT + ridge
@@ -175,22 +158,28 @@ class _Fit:
             solved = torch.linalg.solve_ex(matrix, waves.conj() @ rows.mT)[0]
             amplitudes = torch.where(active[:, None, None], solved, amplitudes)
             model = torch.where(active[:, None, None], (waves.mT @ amplitudes).mT, model)
-            if number == _HELD_ROUNDS:
+            # The phases stay where they start for three rounds, and until lines explain all but a
+            # quarter of the energy without noise: phases that make a line of one point out of ten
+            # hide the others.
+            if number == 3:
                 unknown = power_of(rows - model).sum((-2, -1)) - self.noise * self._degrees(lines.shape[-1])
                 energy = power_of(self.rows).sum((-2, -1)) - self.cells * pulses * self.noise
-                free = free | (unknown < _HELD * energy.detach())
+                free = free | (unknown < 0.25 * energy.detach())
                 active = active & free
             step = safe_angle((model.conj() * rows).sum(-2)) * (active & free)[:, None]
             left = rotate(rows, step) - model
             lines = lines + active[:, None] * _turns(waves, 1j * pulse[:, None] * waves, matrix, amplitudes, left)
             change = change + step
-            if number % _BEND_EVERY == 0:
+            if number % 3 == 0:
                 bent = self.curve * model
                 more = (bent.conj() * left).imag.sum((-2, -1)) / or_one(power_of(bent).sum((-2, -1)))
-                bend = (bend + active * more).clamp(-_LARGEST_BEND, _LARGEST_BEND)
-            if number > _HELD_ROUNDS:
-                active = active & (step.detach().square().sum(-1) > _SETTLED_RAD**2 * pulses)
-            if number >= _HELD_ROUNDS and not host_value(active.sum(), 1):
+                # The bend is pi / 8 times a wavelength over a cell, if cells are squares. With
+                # cells of 100 wavelengths, 0.004, the points of a target of 80 cells migrate by a
+                # fifth of a cell, and are no lines any more.
+                bend = (bend + active * more).clamp(-0.004, 0.004)
+            if number > 3:  # a round that moves the phases by less than 1e-3 rad rms is the last
+                active = active & (step.detach().square().sum(-1) > 1e-3**2 * pulses)
+            if number >= 3 and not host_value(active.sum(), 1):
                 break
         left = rotate(self._straight(bend), change) - model
         return replace(
@@ -237,8 +226,37 @@ def _turns(waves: Tensor, slopes: Tensor, matrix: Tensor, amplitudes: Tensor, le
     free = slopes.conj() @ slopes.mT - mixed.mH @ torch.linalg.solve_ex(matrix, mixed)[0]
     curvature = (free * (amplitudes @ amplitudes.mH).conj()).real
     size = or_one(curvature.diagonal(dim1=-2, dim2=-1).sum(-1))[:, None, None]
-    ridge = _RIDGE * size * torch.eye(curvature.shape[-1], dtype=size.dtype, device=size.device)
+    ridge = 1e-6 * size * torch.eye(curvature.shape[-1], dtype=size.dtype, device=size.device)
     right = (amplitudes.conj() * (slopes.conj() @ left.mT)).real.sum(-1, keepdim=True)
     turns = torch.linalg.solve_ex(curvature + ridge, right)[0][..., 0]
-    largest = _LARGEST_TURN * 2 * math.pi / waves.shape[-1]
+    largest = 0.25 * 2 * math.pi / waves.shape[-1]  # a quarter of a cell
     return turns.clamp(-largest, largest)
+
+
+def noise_power(rows: Tensor, present: Tensor, phase_rad: Tensor) -> Tensor:
+    """Estimate the variance of the noise of pulses whose scatterers fill less than half the image.
+
+    A Hann window over the pulses keeps side lobes from counting as noise.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        present: False where a pulse holds only zeros, shape (trial, pulse).
+        phase_rad: Phases that focus them in rad, shape (trial, pulse).
+
+    Returns:
+        The variance of a sample, shape (trial,), float64, without derivatives: the median power of
+        the cells of the image over ln 2, which is that of the median of noise. Range cells that
+        hold only zeros do not count, and the power of absent pulses is made up for.
+    """
+    rows = rows.detach()
+    image = _windowed(torch.fft.fft(rotate(rows, phase_rad.detach()), norm="ortho"))
+    power = torch.where((rows != 0).any(-1, keepdim=True), power_of(image), torch.nan)
+    median = power.flatten(1).nanmedian(-1).values.nan_to_num(0.0).double()
+    # the window that the pulses had in the image
+    window = torch.fft.ifft(_windowed(torch.fft.fft(present.to(torch.complex128))))
+    return median / (math.log(2) * or_one(window.real.square().mean(-1)))
+
+
+def _windowed(image: Tensor) -> Tensor:
+    """Image (..., Doppler) with the Hann window over its pulses and the same power of noise."""
+    return (image - (image.roll(1, -1) + image.roll(-1, -1)) / 2) / math.sqrt(1.5)

@@ -7,45 +7,47 @@ from collections.abc import Sequence
 from typing import Literal, get_args
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchsar.compensate.pulse_phase.assess import conclude
 from torchsar.compensate.pulse_phase.data import (
     Pulses,
     find_phases,
+    pair_phase,
     prepare,
     refuse_odd_counts,
     rotate,
     starting_phase,
 )
-from torchsar.compensate.pulse_phase.gaps import across_gaps, have_gaps
-from torchsar.compensate.pulse_phase.homogeneous import describe, occupied_band
-from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
-from torchsar.compensate.pulse_phase.linking import link_phases, linked
-from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.points import phases_of_points
-from torchsar.compensate.pulse_phase.sharpen import (
+from torchsar.compensate.pulse_phase.fixed_point import (
     LEAST_PULSES_OF_FACTORS,
     WIENER_FACTORS,
     LogAbove,
     Run,
     Wiener,
+    across_gaps,
     fixed_point,
+    have_gaps,
     in_turn,
 )
-from torchsar.core import Estimate, fft_lines, host_value, power_of, true_positions
+from torchsar.compensate.pulse_phase.homogeneous import describe, occupied_band
+from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
+from torchsar.compensate.pulse_phase.linking import link_phases, linked
+from torchsar.compensate.pulse_phase.points import phases_of_points
+from torchsar.compensate.pulse_phase.stages import PhaseEstimatorFromStart
+from torchsar.core import Estimate, Signal, fft_lines, host_value, power_of, true_positions
+from torchsar.focus import TargetImage
 from torchsar.metrics import entropy
 
 Scene = Literal["sparse", "points", "clutter", "auto"]
 
-# floor of the entropy fixed point in mean powers, found by trial: a lower floor includes noise, a
-# higher one excludes weak scatterers
+# floor of the entropy fixed point in mean powers: a lower floor includes noise, a higher one
+# excludes weak scatterers
 _FLOOR = 2.5
 # on scenes at 30 dB, 3 of 32 trials of the entropy fixed point ended in a local minimum without
 # over-relaxation and none with this one
 _RELAXATION = 1.8
-# Iterations across gaps for each of the third step: filled pulses grow slowly. A quarter of a
-# record of 40 points takes 60 to 100.
+# iterations across gaps for each of the third step: filled pulses grow slowly
 _FILLING = 5
 
 
@@ -266,6 +268,95 @@ def entropy_fixed_point(
     tuned = (relaxation, *(floor for floor, _ in floors))
     found = find_phases(pulses, find, begin, tuned, through is not None)
     return conclude(pulses, *found, assess, through=through)
+
+
+class Autofocus(PhaseEstimatorFromStart):
+    """Phase per pulse by the recommended autofocus; see `autofocus`.
+
+    Args:
+        search: Largest number of iterations of the entropy fixed point, approximately.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
+        imaging: Image formation whose image is sharpened; by default a Fourier transform along
+            pulses. A `TargetImage` gives the polar-format image of a target in known geometry.
+        scene: Kind of the scene: "sparse", "points", "clutter" or "auto", see `autofocus`; with an
+            image formation it is taken to be sparse.
+        assess: Whether to add the standard deviation and the outcome.
+    """
+
+    def __init__(
+        self,
+        search: int = 120,
+        polish: int = 20,
+        imaging: Imaging | TargetImage | None = None,
+        scene: Scene = "sparse",
+        assess: bool = True,
+    ) -> None:
+        super().__init__(autofocus, search=search, polish=polish, scene=scene, assess=assess)
+        self.imaging = imaging
+
+    def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            start: Phase to start from in rad, shape (..., pulse); by default that of the
+                spatial correlation algorithm (function `sca`).
+
+        Returns:
+            `Estimate` by the function `autofocus` with `phase_rad` of shape (..., pulse), to be
+            removed.
+        """
+        imaging = self.imaging.operator(signal.data) if isinstance(self.imaging, TargetImage) else self.imaging
+        return self.find(signal.data, start=start, imaging=imaging, **self.options)
+
+
+class EntropyFixedPoint(PhaseEstimatorFromStart):
+    """Phase per pulse by the entropy fixed point; see `entropy_fixed_point`.
+
+    Args:
+        floors: Power floors as multiples of the mean power of the image, used one after another;
+            cells below the floor get no weight. An nn.Parameter, shape (floor,), stays tunable.
+        iterations: Largest number of iterations for each floor.
+        relaxation: Factor applied to the phase step. An nn.Parameter stays tunable.
+        imaging: Image formation whose image is sharpened; by default a Fourier transform along
+            pulses.
+        assess: Whether to add the standard deviation and the outcome.
+
+    Raises:
+        ValueError: If `floors` and `iterations` differ in length.
+    """
+
+    def __init__(
+        self,
+        floors: list[float] | tuple[float, ...] | nn.Parameter = (5.0, 2.0),
+        iterations: list[int] | tuple[int, ...] = (12, 12),
+        relaxation: float | nn.Parameter = 1.8,
+        imaging: Imaging | None = None,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(entropy_fixed_point, imaging=imaging, assess=assess)
+        if len(floors) != len(iterations):
+            raise ValueError(
+                "EntropyFixedPoint: iterations must hold a number of iterations for each floor, got floors "
+                f"{list(floors)} and iterations {list(iterations)}"
+            )
+        self.floors, self.iterations, self.relaxation = floors, iterations, relaxation
+
+    def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            start: Phase to start from in rad, shape (..., pulse); by default that of the
+                spatial correlation algorithm (function `sca`).
+
+        Returns:
+            `Estimate` by the function `entropy_fixed_point` with `phase_rad` of shape (...,
+            pulse), to be removed.
+        """
+        floors = tuple(zip(self.floors, self.iterations))
+        return self.find(signal.data, start=start, floors=floors, relaxation=self.relaxation, **self.options)
 
 
 def _filled(rows: Tensor, phase: Tensor, start: Tensor, gaps: Tensor, iterations: int, tolerance_rad: float) -> Tensor:

@@ -8,10 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import prepare
+from torchsar.compensate.pulse_phase.data import pair_phase, prepare
+from torchsar.compensate.pulse_phase.fixed_point import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
-from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
 from torchsar.compensate.radial.bands import filled
 from torchsar.compensate.radial.dense import SAME_RAD, Walk
 from torchsar.compensate.radial.measured import LEAST_SQUARED, TINY, Intercept, Levels, Measured, mean_of

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.assess import conclude
 from torchsar.compensate.pulse_phase.data import find_phases, prepare, refuse_odd_counts, starting_phase
+from torchsar.compensate.pulse_phase.fixed_point import Run, Wiener, bright, in_turn
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
-from torchsar.compensate.pulse_phase.sharpen import Run, Wiener, bright, in_turn
 from torchsar.core import Estimate, power_of
 
 # over-relaxation, found by trial: larger values converge faster, at 2 or more need not converge

@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase import Listed, pga
+from torchsar.compensate.pulse_phase import pga
 from torchsar.compensate.pulse_phase.data import prepare, rotate, starting_phase
 from torchsar.compensate.radial.assess import LEAST_PERIODS, assessed_motion, assessed_velocity
 from torchsar.compensate.radial.bands import Bands, Spectra, filled, refuse_other_sweeps
@@ -37,7 +37,7 @@ _FAR_RAD, _FEW_PERIODS = 0.4, 32
 # scenes of more effective image cells are dense
 _DENSE_CELLS = 20.0
 # windows of PGA in Doppler cells, found by trial: a random walk blurs by few cells
-_WINDOWS = Listed((31.0, 21.0, 15.0, 9.0, 9.0, 9.0))
+_WINDOWS = (31.0, 21.0, 15.0, 9.0, 9.0, 9.0)
 
 
 def radial_motion(
@@ -185,7 +185,7 @@ def _start(cells: Tensor, coarse: Estimate, enough: Tensor, radar: TriangularLad
     far = enough & (4 * math.pi / radar.wavelength_m * walk_m > _FAR_RAD)
     if pulse.n < _FEW_PERIODS or not bool(far.any()):
         return None
-    found = pga(cells.detach(), windows=_WINDOWS, iterations=len(_WINDOWS.cells), assess=False)
+    found = pga(cells.detach(), windows=_WINDOWS, iterations=len(_WINDOWS), assess=False)
     return torch.where(far[..., None], found["phase_rad"], 0)
 
 

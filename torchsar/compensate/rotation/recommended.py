@@ -16,10 +16,9 @@ from torch.nn.functional import pad
 
 from torchsar.compensate.pulse_phase import autofocus
 from torchsar.compensate.pulse_phase.assess import conclude
-from torchsar.compensate.pulse_phase.data import find_phases, prepare, refuse_odd_counts, starting_phase
+from torchsar.compensate.pulse_phase.data import find_phases, pair_phase, prepare, refuse_odd_counts, starting_phase
+from torchsar.compensate.pulse_phase.fixed_point import LogAbove, Run, Wiener, fixed_point, in_turn
 from torchsar.compensate.pulse_phase.imaging import Through
-from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
 from torchsar.compensate.rotation.assess import judged_fit, judged_motion
 from torchsar.compensate.rotation.coarse import coarse_warp
 from torchsar.compensate.rotation.histories import HALF_CELLS, refined_by_histories

@@ -12,13 +12,13 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from torchsar.compensate import EffectiveVelocity, RotationAutofocus, UnevenRotation
+from torchsar.compensate import Autofocus, EffectiveVelocity, RotationAutofocus, UnevenRotation
 from torchsar.compensate.pulse_phase import CorrectPulsePhase
 from torchsar.core import Alternate, Turn
 from torchsar.echo import PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift
-from torchsar.focus import OmegaK, PaddedLines
+from torchsar.focus import OmegaK, PaddedLines, TargetImage
 from torchsar.optim.scalar import gradient_minimum, parabola_minimum
-from torchsar.radar import LIGHT_M_S, InverseRadar, StripmapRadar
+from torchsar.radar import LIGHT_M_S, FarField, InverseRadar, Spotlight, StripmapRadar
 from torchsar.repair import BandLimited, CorrectJitter, Lagrange
 from torchsar.scene import Dechirped, ImageReflectivity, KSea, Polynomial
 
@@ -64,6 +64,32 @@ def omega_k_padded(
         lines: Number of empty lines; None for one aperture.
     """
     return PaddedLines(OmegaK(radar, reference, velocity_m_s, doppler_hz), lines)
+
+
+def autofocus(
+    radar: InverseRadar,
+    geometry: FarField | Spotlight | None = None,
+    search: int = 120,
+    polish: int = 20,
+    scene: Literal["sparse", "points", "clutter", "auto"] = "sparse",
+    assess: bool = True,
+) -> Autofocus:
+    """Phase per pulse that sharpens the image of a target; see `torchsar.compensate.autofocus`.
+
+    The image is the polar-format image of `TargetImage` if `geometry` is given, and the Fourier
+    transform along pulses otherwise.
+
+    Args:
+        geometry: Geometry of the recording; None if it is not known.
+        search: Largest number of iterations of the entropy fixed point, approximately.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
+        scene: Kind of the scene: "sparse", "points", "clutter" or "auto"; with a geometry it is
+            taken to be sparse.
+        assess: Whether to add the standard deviation and the outcome.
+    """
+    imaging = None if geometry is None else TargetImage(radar, geometry)
+    return Autofocus(search, polish, imaging, scene, assess)
 
 
 def rotation_and_phase(

@@ -196,7 +196,7 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "entropy_fixed_point": compensate.EntropyFixedPoint,
     "sharpest_phase": compensate.SharpestPhase,
     "link_phases": compensate.LinkPhases,
-    "autofocus": compensate.TargetAutofocus,
+    "autofocus": factories.autofocus,
     "path_autofocus": compensate.PathAutofocus,
     "path_phase": compensate.PathPhase,
     "strip_autofocus": compensate.StripAutofocus,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import or_one, safe_angle
+from torchsar.compensate.pulse_phase.data import or_one, rotate, safe_angle
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging
 from torchsar.core import block_bytes_of, cis, host_value, power_of, true_positions
 
@@ -76,7 +76,7 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run, done: int = 0) -> tuple[T
     """
     active = torch.ones_like(phase[:, 0], dtype=torch.bool)
     taken = torch.zeros_like(active, dtype=torch.int64)
-    step_of = _Step.of(rows, run)
+    step_of = _step_of(rows, run)
     # on an accelerator waiting for the decision costs as much as iterations that change nothing
     every = 1 if rows.device.type == "cpu" else 4
     factors = run.relaxation if isinstance(run.relaxation, tuple) else (run.relaxation,)
@@ -98,43 +98,30 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run, done: int = 0) -> tuple[T
     return phase, taken
 
 
-@dataclass(frozen=True)
-class _Step:
-    """The phase step arg sum_n x conj(A^H (w A x)) of `fixed_point`.
+def _step_of(rows: Tensor, run: Run) -> Callable[[Tensor], Tensor]:
+    """The function that maps phases to the step arg sum_n x conj(A^H (w A x)) of `fixed_point`.
 
     If the weight of a cell depends on no other cell, and the image formation acts on each row
     alone, the rows are processed in slabs that stay in the cache: a third of the time. The mean
     power of the image is then that of the rows (Parseval).
-
-    Args:
-        slabs: Rows and their conjugates, shape (trial, range of the slab, pulse) each.
-        run: Settings of the iterations.
-        mean: Mean power of the image, shape (trial, 1, 1); None to take it from the image.
     """
+    size, mean = rows.shape[-2], None
+    if isinstance(run.imaging, AlongPulses) and isinstance(run.weights, LogAbove) and len(rows):
+        mean = power_of(rows).mean((-2, -1), keepdim=True) / run.imaging.oversampling
+        if not rows.requires_grad:
+            of_row = len(rows) * rows.shape[-1] * rows.element_size() * run.imaging.oversampling
+            size = max(1, block_bytes_of(rows.device) // (2 * of_row))
+    slabs = [(slab, slab.conj().resolve_conj()) for slab in rows.split(size, -2)]
 
-    slabs: Sequence[tuple[Tensor, Tensor]]
-    run: Run
-    mean: Tensor | None
-
-    @staticmethod
-    def of(rows: Tensor, run: Run) -> _Step:
-        size, mean = rows.shape[-2], None
-        if isinstance(run.imaging, AlongPulses) and isinstance(run.weights, LogAbove) and len(rows):
-            mean = power_of(rows).mean((-2, -1), keepdim=True) / run.imaging.oversampling
-            if not rows.requires_grad:
-                of_row = len(rows) * rows.shape[-1] * rows.element_size() * run.imaging.oversampling
-                size = max(1, block_bytes_of(rows.device) // (2 * of_row))
-        return _Step([(slab, slab.conj().resolve_conj()) for slab in rows.split(size, -2)], run, mean)
-
-    def __call__(self, phase: Tensor) -> Tensor:
-        turn, total = cis(-phase), None
-        for slab, mirrored in self.slabs:
-            image = self.run.imaging.image(slab * turn[..., None, :])
-            model = self.run.imaging.adjoint(weighted(image, self.run.weights, self.mean))
-            products = mirrored * model if model.requires_grad else model.mul_(mirrored)
-            total = products.sum(-2) if total is None else total + products.sum(-2)
-        assert total is not None
+    def step(phase: Tensor) -> Tensor:
+        turn, total = cis(-phase), torch.zeros_like(rows[:, 0])
+        for slab, mirrored in slabs:
+            image = run.imaging.image(slab * turn[..., None, :])
+            model = run.imaging.adjoint(weighted(image, run.weights, mean))
+            total = total + (mirrored * model if model.requires_grad else model.mul_(mirrored)).sum(-2)
         return -safe_angle(total * turn.conj())
+
+    return step
 
 
 def weighted(image: Tensor, weights: Weights, mean: Tensor | None = None) -> Tensor:
@@ -259,3 +246,79 @@ def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, T
         phase, taken = fixed_point(rows, phase, run)
         total = total + taken
     return phase, total
+
+
+def side_lobes(present: Tensor) -> Tensor:
+    """Compute the largest side lobe that missing pulses make.
+
+    Args:
+        present: False where a pulse is missing, shape (trial, pulse).
+
+    Returns:
+        The side lobe relative to the main lobe at the Dopplers of an image without padding, shape
+        (trial,), float64; 0 without missing pulses and where lobes repeat the whole scene.
+    """
+    response = torch.fft.rfft(present.to(torch.float64)).abs()
+    lobes = response[:, 1:] / or_one(response[:, :1])
+    # lobes as high as the main lobe are images of the whole scene, as of every other pulse: they do
+    # not change the sharpness
+    return torch.where(lobes < 0.98, lobes, 0).amax(-1)
+
+
+def have_gaps(present: Tensor) -> Tensor:
+    """Say where missing pulses change the phases that sharpen an image, see `across_gaps`.
+
+    Args:
+        present: False where a pulse is missing, shape (trial, pulse).
+
+    Returns:
+        True where they do, shape (trial,).
+    """
+    # with 0.07, a gap of a sixteenth of the record, errors of 40 points were a sixth larger
+    return side_lobes(present) > 0.06
+
+
+def across_gaps(rows: Tensor, phase_rad: Tensor, iterations: int, tolerance_rad: float) -> Tensor:
+    """Compare pulses with a Wiener estimate of the scene from all pulses and fill missing ones in.
+
+    The image of a point has side lobes where pulses are missing. Phases that shift the parts of the
+    record against each other in Doppler lower them, so that sharpness and a scene that contains
+    them find wrong phases: with a quarter of the record missing, by 0.5 rad in nearly every scene,
+    and both halves of the rows agree. With the missing pulses taken from the estimated scene there
+    are no such lobes.
+
+    The weights, the steps and their factors are those of `autofocus`. The missing pulses are those
+    of the last estimate.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex; missing ones are all zeros.
+        phase_rad: Phase to start from in rad, shape (trial, pulse).
+        iterations: Largest number of iterations.
+        tolerance_rad: Phase step in rad, rms over the pulses and with the smallest factor, below
+            which the iterations of a trial end.
+
+    Returns:
+        The phase in rad, shape (trial, pulse).
+    """
+    present, along, scene = (rows != 0).any(-2), AlongPulses(2), Wiener()
+    factors = WIENER_FACTORS if rows.shape[-1] >= LEAST_PULSES_OF_FACTORS else (1.0,)
+    filled, phase = torch.zeros_like(rows), phase_rad
+    active = torch.ones_like(phase[:, 0], dtype=torch.bool)
+    for number in range(-6, iterations):  # the first six fill without changing phases
+        pulses = torch.where(present[:, None], rotate(rows, phase), filled)
+        image = along.image(pulses)
+        power = power_of(image)
+        mean = or_one(power.mean((-2, -1), keepdim=True))
+        weight = scene.of_scene(power, mean)
+        filled = along.adjoint(image * weight)
+        if number < 0:
+            continue
+        others = filled - weight.mean(-1, keepdim=True) * pulses
+        step = torch.where(present & active[:, None], safe_angle((others.conj() * pulses).sum(-2)), 0)
+        phase = phase + factors[number % len(factors)] * step
+        size = (min(factors) * step.detach()).square().sum(-1) / or_one(present.sum(-1))
+        active = active & (size > tolerance_rad**2)
+        # on an accelerator waiting for the decision costs as much as iterations that change nothing
+        if phase.device.type == "cpu" and not host_value(active.sum(), 1):
+            break
+    return phase

@@ -7,53 +7,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.assess import conclude
-from torchsar.compensate.pulse_phase.data import Pulses, find_phases, on_the_circle, prepare, rotate, starting_phase
+from torchsar.compensate.pulse_phase.data import (
+    Pulses,
+    find_phases,
+    on_the_circle,
+    pair_phase,
+    prepare,
+    rotate,
+    starting_phase,
+)
+from torchsar.compensate.pulse_phase.fixed_point import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
-from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, fixed_point
+from torchsar.compensate.pulse_phase.stages import PhaseEstimatorFromStart
 from torchsar.core import Estimate, centred_ifft, cis
 from torchsar.metrics.image import contrast, entropy
-from torchsar.optim import Descent, adam, lbfgs
+from torchsar.optim import adam, lbfgs
 
 Cost = Callable[[Tensor], Tensor]
-Objective = Literal["power_entropy", "amplitude_entropy", "contrast"] | Cost
+Named = Literal["power_entropy", "amplitude_entropy", "contrast"]
 Method = Literal["lbfgs", "adam"]
 # phase (trial, pulse) -> cost (trial,), gradient (trial, pulse)
 _PhaseCost = Callable[[Tensor], tuple[Tensor, Tensor]]
-
-# rms length of the first step, found by trial: shorter steps cost iterations, longer ones leave the
-# minimum near the start
-_STEP_RAD = 0.05
-# Iterations that continue a descent on half of the range cells, with the weights that follow from
-# the objective. The floor of those of the entropy was found by trial: with a higher one they leave
-# the minimum, with a lower one they hardly move in noise.
-_OF_ENTROPY = Run(LogAbove(1.0), AlongPulses(), 8, 1.8, 0.0)
-_OF_CONTRAST = Run(lambda power, mean: power / mean, AlongPulses(), 8, 1.8, 0.0)
-# objectives by name, to be minimised
-_COSTS: dict[str, Callable[..., Tensor]] = {
-    "power_entropy": entropy,
-    "amplitude_entropy": partial(entropy, of="amplitude"),
-    "contrast": lambda image, mask: -contrast(image, mask=mask),
-}
-# descents by name, with their default options; value_tolerance is a relative change of the cost
-_METHODS: dict[str, tuple[Callable[..., Descent], dict[str, Any]]] = {
-    "lbfgs": (lbfgs, {"steps": 100, "value_tolerance": 1e-7}),
-    "adam": (adam, {"steps": 500, "rate": _STEP_RAD}),
-}
 
 
 def sharpest_phase(
     data: Tensor,
     *,
-    objective: Objective = "power_entropy",
+    objective: Named | Cost = "power_entropy",
     mask: Tensor | None = None,
     start: Tensor | None = None,
     basis: Tensor | None = None,
@@ -116,71 +103,86 @@ def sharpest_phase(
             shape, the functions of the basis depend on each other, or the objective or method is
             unknown.
     """
-    name = "sharpest_phase"
-    pulses = prepare(data, name)
-    begin = starting_phase(start, pulses, name)
-    continued = _OF_CONTRAST if objective == "contrast" else _OF_ENTROPY
+    pulses = prepare(data, "sharpest_phase")
+    begin = starting_phase(start, pulses, "sharpest_phase")
     cost, functions = _cost_of(objective, mask, imaging, pulses), _functions_of(basis, pulses)
-    descend = _descent_of(method, steps, tolerance)
+    most = {"lbfgs": 100, "adam": 500}
+    if method not in most:
+        raise ValueError(f"sharpest_phase: method {method!r} is not known; choose one of {', '.join(most)}")
+    count = most[method] if steps is None else steps
+
+    def descend(cost_of_x: _PhaseCost, first: Tensor) -> tuple[Tensor, Tensor]:
+        # the first step is 0.05 rad rms long: shorter ones cost iterations, longer ones leave the
+        # minimum near the start
+        if method == "adam":
+            found = adam(cost_of_x, first, steps=count, rate=0.05, gradient_tolerance=tolerance, with_gradient=True)
+        else:
+            found = lbfgs(
+                cost_of_x,
+                first,
+                steps=count,
+                first_step=0.05 * math.sqrt(first.shape[-1]),
+                gradient_tolerance=tolerance,
+                value_tolerance=1e-7,
+                with_gradient=True,
+            )
+        return found.x, found.steps
 
     def find(rows: Tensor, present: Tensor, which: Tensor | None) -> tuple[Tensor, Tensor]:
         assert which is not None
         rows, own = rows.detach(), _of_trials(functions, which)
         first, cost_of = pair_phase(rows, present) if begin is None else begin[which], cost(rows, which)
         if own is None:
-            found = descend(cost_of, first)
-            return torch.where(present, found.x, first), found.steps
+            phase, taken = descend(cost_of, first)
+            return torch.where(present, phase, first), taken
 
         def of_weights(x: Tensor) -> tuple[Tensor, Tensor]:
             value, gradient = cost_of(_summed(own, x))
             return value, _projected(own, gradient)
 
-        found = descend(of_weights, _projected(own, first) / pulses.n)
-        return _summed(own, found.x), found.steps
+        weights, taken = descend(of_weights, _projected(own, first) / pulses.n)
+        return _summed(own, weights), taken
 
     # the start passed to `find` is the indices of the trials of a block, because masks, starts and
     # basis functions may differ between trials
     phase, taken = find_phases(pulses, find, torch.arange(len(pulses.rows), device=pulses.rows.device))
 
     def again(rows: Tensor, which: Tensor | slice, at: Tensor) -> Tensor:
-        """Continue without what the basis does not hold."""
+        """Continue without what the basis does not hold, with weights that follow from the cost.
+
+        With a higher floor of the entropy the iterations leave the minimum, with a lower one they
+        hardly move in noise.
+        """
+        weights = (lambda power, mean: power / mean) if objective == "contrast" else LogAbove(1.0)
         own, from_ = _of_trials(functions, which), phase[which]
 
         def held(change: Tensor) -> Tensor:
             return change if own is None else _summed(own, _projected(own, change) / pulses.n)
 
         at = from_ + held(at - from_)
-        return at + held(on_the_circle(fixed_point(rows, at, continued)[0] - at))
+        return at + held(on_the_circle(fixed_point(rows, at, Run(weights, AlongPulses(), 8, 1.8, 0.0))[0] - at))
 
     return conclude(pulses, phase, taken, assess, again)
 
 
-def minimum_entropy(data: Tensor, **options: Any) -> Estimate:
-    """Find the phases of the pulses with which the entropy of the image power is least.
+class SharpestPhase(PhaseEstimatorFromStart):
+    """Phase per pulse of least image entropy or most contrast, by descent; see `sharpest_phase`.
 
     Args:
-        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
-        options: Further options of `sharpest_phase`.
-
-    Returns:
-        `Estimate` by the function `sharpest_phase` with `phase_rad` of shape (..., pulse), to be
-        removed.
+        objective: "power_entropy" or "amplitude_entropy" (minimised), or "contrast" (maximised).
+        method: Gradient descent: "lbfgs", or "adam" for rough objectives.
+        steps: Largest number of steps.
+        assess: Whether to add the standard deviation and the outcome.
     """
-    return sharpest_phase(data, objective="power_entropy", **options)
 
-
-def maximum_contrast(data: Tensor, **options: Any) -> Estimate:
-    """Find the phases of the pulses with which the contrast of the image intensity is greatest.
-
-    Args:
-        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
-        options: Further options of `sharpest_phase`.
-
-    Returns:
-        `Estimate` by the function `sharpest_phase` with `phase_rad` of shape (..., pulse), to be
-        removed.
-    """
-    return sharpest_phase(data, objective="contrast", **options)
+    def __init__(
+        self,
+        objective: Named = "power_entropy",
+        method: Method = "lbfgs",
+        steps: int = 100,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(sharpest_phase, objective=objective, method=method, steps=steps, assess=assess)
 
 
 def _summed(functions: Tensor, x: Tensor) -> Tensor:
@@ -205,17 +207,13 @@ def _functions_of(basis: Tensor | None, pulses: Pulses) -> Tensor | None:
     """
     if basis is None:
         return None
-    if (
-        _check_tensor(basis, "basis").is_complex()
-        or basis.ndim < 2
-        or basis.shape[-1] != pulses.n
-        or not 1 <= basis.shape[-2] <= pulses.n
-    ):
+    wide = _by_trial(basis, pulses, "basis")
+    if wide.is_complex() or wide.ndim < 2 or wide.shape[-1] != pulses.n or not 1 <= wide.shape[-2] <= pulses.n:
         raise ValueError(
             f"sharpest_phase: basis must hold 1..{pulses.n} real functions over {pulses.n} pulses, shape "
             f"(coefficient, pulse), got {basis.dtype} of shape {tuple(basis.shape)}"
         )
-    wide = _by_trial(basis.to(device=pulses.rows.device, dtype=torch.float64), pulses, "basis")
+    wide = wide.to(torch.float64)
     if not torch.isfinite(wide).all() or bool((torch.linalg.matrix_rank(wide) < wide.shape[-2]).any()):
         raise ValueError(
             f"sharpest_phase: the {wide.shape[-2]} functions of basis must be finite and linearly "
@@ -224,69 +222,52 @@ def _functions_of(basis: Tensor | None, pulses: Pulses) -> Tensor | None:
     return (torch.linalg.qr(wide.mT).Q.mT * math.sqrt(pulses.n)).to(pulses.rows.real.dtype).contiguous()
 
 
-def _check_tensor(x: Tensor, what: str) -> Tensor:
-    """x, or TypeError if it is not a tensor."""
+def _by_trial(x: Tensor, pulses: Pulses, what: str) -> Tensor:
+    """x (..., a, b) as (trial, a, b); of the same shape if it has two dimensions or fewer."""
     if not isinstance(x, Tensor):
         raise TypeError(f"sharpest_phase: {what} must be a tensor, got {type(x).__name__}; torch.as_tensor makes one")
-    return x
-
-
-def _by_trial(x: Tensor, pulses: Pulses, what: str) -> Tensor:
-    """x (..., a, b) as (trial, a, b); unchanged if it has two dimensions or fewer."""
-    if x.ndim < 3:
-        return x
     try:
-        return x.expand(*pulses.trials, *x.shape[-2:]).reshape(-1, *x.shape[-2:])
+        wide = x if x.ndim < 3 else x.expand(*pulses.trials, *x.shape[-2:]).reshape(-1, *x.shape[-2:])
     except RuntimeError:
         raise ValueError(
             f"sharpest_phase: {what} of shape {tuple(x.shape)} does not fit "
             f"the trials of shape {tuple(pulses.trials)}; give two dimensions, for all trials alike, or put "
             "the dimensions of the trials in front"
         ) from None
+    return wide.to(pulses.rows.device)
 
 
 def _cost_of(
-    objective: Objective, mask: Tensor | None, imaging: Imaging | None, pulses: Pulses
+    objective: Named | Cost, mask: Tensor | None, imaging: Imaging | None, pulses: Pulses
 ) -> Callable[[Tensor, Tensor], _PhaseCost]:
     """Function of (rows, which trials) that returns the cost of their phases.
 
     Raises ValueError if the objective is unknown or does not use the mask.
     """
-    if isinstance(objective, str) and objective not in _COSTS:
+    if isinstance(objective, str) and objective not in get_args(Named):
         raise ValueError(
             f"sharpest_phase: objective {objective!r} is not known; choose one of "
-            f"{', '.join(_COSTS)}, or give a function of images"
+            f"{', '.join(get_args(Named))}, or give a function of images"
         )
     if mask is not None and not isinstance(objective, str):
         raise ValueError(
             "sharpest_phase: mask must be None if objective is a function; apply the mask inside that function"
         )
     if objective == "power_entropy" and mask is None and imaging is None:
-        return lambda rows, _: _PowerEntropy(rows, rows.conj().resolve_conj())
+        return lambda rows, _: partial(power_entropy, rows, rows.conj().resolve_conj())
     image = _centred_image if imaging is None else Through(imaging).image
-    if not isinstance(objective, str):
-        return lambda rows, _: _Derived(rows, image, objective)
-    weights = None if mask is None else _by_trial(_check_tensor(mask, "mask").to(pulses.rows.device), pulses, "mask")
-    cost = _COSTS[objective]
-    return lambda rows, which: _Derived(rows, image, partial(cost, mask=_of_trials(weights, which)))
+    weights = None if mask is None else _by_trial(mask, pulses, "mask")
 
+    def of_trials(rows: Tensor, which: Tensor) -> _PhaseCost:
+        own = _of_trials(weights, which)
+        named: dict[str, Cost] = {
+            "power_entropy": partial(entropy, mask=own),
+            "amplitude_entropy": partial(entropy, of="amplitude", mask=own),
+            "contrast": lambda x: -contrast(x, mask=own),
+        }
+        return partial(_derived, rows, image, named[objective] if isinstance(objective, str) else objective)
 
-def _descent_of(method: Method, steps: int | None, tolerance: float) -> Callable[[_PhaseCost, Tensor], Descent]:
-    """Descent by name with its options; raises ValueError if the method is unknown."""
-    if method not in _METHODS:
-        raise ValueError(f"sharpest_phase: method {method!r} is not known; choose one of {', '.join(_METHODS)}")
-    run, options = _METHODS[method]
-    if steps is not None:
-        options = {**options, "steps": steps}
-    first = _STEP_RAD if method == "lbfgs" else None
-    return lambda cost_of_x, start: run(
-        cost_of_x,
-        start,
-        with_gradient=True,
-        gradient_tolerance=tolerance,
-        **options,
-        **({} if first is None else {"first_step": first * math.sqrt(start.shape[-1])}),
-    )
+    return of_trials
 
 
 def _centred_image(rows: Tensor) -> Tensor:
@@ -294,51 +275,46 @@ def _centred_image(rows: Tensor) -> Tensor:
     return (centred_ifft(rows) * math.sqrt(rows.shape[-1])).mT
 
 
-@dataclass(frozen=True)
-class _Derived:
+def _derived(
+    rows: Tensor, image: Callable[[Tensor], Tensor], of_image: Cost, phase_rad: Tensor
+) -> tuple[Tensor, Tensor]:
     """Any cost of the image, with its gradient by automatic differentiation."""
-
-    rows: Tensor
-    image: Callable[[Tensor], Tensor]
-    cost: Cost
-
-    def __call__(self, phase_rad: Tensor) -> tuple[Tensor, Tensor]:
-        with torch.enable_grad():
-            phase = phase_rad.detach().requires_grad_()
-            cost = self.cost(self.image(rotate(self.rows, phase)))
-            if not isinstance(cost, Tensor) or cost.shape != phase.shape[:-1] or not cost.requires_grad:
-                got = (
-                    f"{'' if cost.requires_grad else 'detached '}{cost.dtype} of shape {tuple(cost.shape)}"
-                    if isinstance(cost, Tensor)
-                    else type(cost).__name__
-                )
-                raise ValueError(
-                    f"sharpest_phase: the objective returned {got} for {len(phase)} images; it must return one real "
-                    "cost per image that is differentiable in the samples of the image"
-                )
-            return cost.detach(), torch.autograd.grad(cost.sum(), phase)[0]
+    with torch.enable_grad():
+        phase = phase_rad.detach().requires_grad_()
+        cost = of_image(image(rotate(rows, phase)))
+        if not isinstance(cost, Tensor) or cost.shape != phase.shape[:-1] or not cost.requires_grad:
+            got = type(cost).__name__
+            if isinstance(cost, Tensor):
+                got = f"{'' if cost.requires_grad else 'detached '}{cost.dtype} of shape {tuple(cost.shape)}"
+            raise ValueError(
+                f"sharpest_phase: the objective returned {got} for {len(phase)} images; it must return one real "
+                "cost per image that is differentiable in the samples of the image"
+            )
+        return cost.detach(), torch.autograd.grad(cost.sum(), phase)[0]
 
 
-@dataclass(frozen=True)
-class _PowerEntropy:
-    """Entropy of the image and its gradient.
+def power_entropy(rows: Tensor, mirrored: Tensor, phase_rad: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the entropy of the image and its gradient by the phases.
 
     dE/dpsi_k = -(2 / F) Im sum_n x conj(IFFT((1 + ln p) f)), where F is the energy. Any constant
-    may be omitted from (1 + ln p). mirrored: the conjugate of rows.
+    may be omitted from (1 + ln p).
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        mirrored: Their conjugate.
+        phase_rad: Phases in rad, shape (trial, pulse).
+
+    Returns:
+        The entropy in nats, shape (trial,), and its gradient, shape (trial, pulse).
     """
-
-    rows: Tensor
-    mirrored: Tensor
-
-    def __call__(self, phase_rad: Tensor) -> tuple[Tensor, Tensor]:
-        image = torch.fft.fft(rotate(self.rows, phase_rad), norm="ortho")
-        real, imag = image.real.contiguous(), image.imag.contiguous()
-        power = real * real + imag * imag
-        mean = power.mean((-2, -1), keepdim=True)
-        unit = power * torch.where(mean > 0, mean, 1).reciprocal()
-        log = torch.log(unit.clamp_min(torch.finfo(unit.dtype).tiny))
-        cells = unit.shape[-2] * unit.shape[-1]
-        cost = math.log(cells) - (unit * log).sum((-2, -1), dtype=torch.float64) / cells
-        model = torch.fft.ifft(torch.complex(real.mul_(log), imag.mul_(log)), norm="ortho")
-        turned = ((self.mirrored * model).sum(-2) * cis(phase_rad)).imag
-        return cost, 2 / cells * turned / torch.where(mean > 0, mean, 1)[..., 0]
+    image = torch.fft.fft(rotate(rows, phase_rad), norm="ortho")
+    real, imag = image.real.contiguous(), image.imag.contiguous()
+    power = real * real + imag * imag
+    mean = power.mean((-2, -1), keepdim=True)
+    unit = power * torch.where(mean > 0, mean, 1).reciprocal()
+    log = torch.log(unit.clamp_min(torch.finfo(unit.dtype).tiny))
+    cells = unit.shape[-2] * unit.shape[-1]
+    cost = math.log(cells) - (unit * log).sum((-2, -1), dtype=torch.float64) / cells
+    model = torch.fft.ifft(torch.complex(real.mul_(log), imag.mul_(log)), norm="ortho")
+    turned = ((mirrored * model).sum(-2) * cis(phase_rad)).imag
+    return cost, 2 / cells * turned / torch.where(mean > 0, mean, 1)[..., 0]

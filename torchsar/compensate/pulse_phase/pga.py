@@ -11,9 +11,8 @@ best iteration to 0.4 rad after 20 iterations; with padding it stays at 0.03 rad
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import torch
@@ -22,138 +21,22 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.assess import conclude
 from torchsar.compensate.pulse_phase.data import (
     find_phases,
+    pair_phase,
+    pair_products,
     prepare,
     refuse_odd_counts,
     rotate,
+    running_sum,
     safe_angle,
     starting_phase,
     without_line,
 )
-from torchsar.compensate.pulse_phase.pairs import pair_phase, pair_products, running_sum
+from torchsar.compensate.pulse_phase.stages import PhaseEstimator, PhaseEstimatorFromStart
 from torchsar.core import Estimate, power_of, unit_phasor
-from torchsar.core.arguments import names_arguments
 
 Kernel = Literal["lumv", "ml", "synchronised", "eigenvector"]
+Windows = Literal["shrinking", "measured"] | Sequence[float]
 _PADDING = 2  # zero-padding of the pulses; the docstring of this module gives the reason
-
-
-@names_arguments
-@dataclass(frozen=True)
-class Shrinking:
-    """A PGA window that narrows by a constant factor per iteration.
-
-    Args:
-        first: First width as a fraction of the number of Doppler cells (1/2 in Ruan et al. 2013,
-            section 3.1).
-        factor: Factor by which the width changes per iteration (0.8 in Ruan et al. 2013, section
-            3.1).
-        floor: Smallest width in Doppler cells.
-
-    Raises:
-        ValueError: If `first` or `factor` is not in 0..1, or the floor is below 1 cell.
-    """
-
-    first: float = 0.5
-    factor: float = 0.8
-    floor: float = 5.0
-
-    def __post_init__(self) -> None:
-        if not (0 < self.first <= 1 and 0 < self.factor <= 1 and self.floor >= 1):
-            raise ValueError(
-                "Shrinking: first and factor must be above 0 and at most 1, and floor must be 1 Doppler cell or "
-                f"more, got {self}"
-            )
-
-    def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Compute the width of the PGA window, which narrows by a constant factor per iteration.
-
-        Args:
-            iteration: Number of the iteration, from 0.
-            n: Number of Doppler cells of the image.
-            profile: Not used.
-
-        Returns:
-            The width in Doppler cells, shape (1,).
-        """
-        return torch.tensor([max(self.floor, self.first * n * self.factor**iteration)])
-
-
-@names_arguments
-@dataclass(frozen=True)
-class Measured:
-    """A PGA window that follows the width of the blur.
-
-    The peak of each range cell is shifted to zero Doppler, and the power is summed over the range
-    cells. The width of the blur is that of the interval, centred on the peak of this sum, that
-    holds all cells at most `level_db` below the peak. The window is `margin` times as wide.
-
-    Args:
-        level_db: Level below the peak in dB, positive.
-        margin: Factor applied to the measured width.
-        floor: Smallest width in Doppler cells.
-
-    Reference:
-        Wahl et al. 1994 (10 dB and a margin of 50 %).
-    """
-
-    level_db: float = 10.0
-    margin: float = 1.5
-    floor: float = 5.0
-
-    def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Compute the width of the PGA window from the width of the blur.
-
-        Args:
-            iteration: Not used.
-            n: Number of Doppler cells of the image.
-            profile: Function that returns the power along Doppler, summed over the range cells with
-                their peaks shifted to index 0, shape (trial, n).
-
-        Returns:
-            The width in Doppler cells, shape (trial,).
-        """
-        about = profile()
-        folded = torch.maximum(about, about.flip(-1).roll(1, -1))[..., : n // 2 + 1]
-        above = folded >= 10 ** (-self.level_db / 10) * folded[..., :1]
-        reach = torch.where(above, torch.arange(folded.shape[-1], device=about.device), 0).amax(-1)
-        return (self.margin * (2.0 * reach + 1)).clamp(self.floor, n)
-
-
-@names_arguments
-@dataclass(frozen=True)
-class Listed:
-    """A list of PGA window widths, one per iteration; the last serves all further iterations.
-
-    Args:
-        cells: Widths in Doppler cells.
-
-    Raises:
-        ValueError: If the list is empty or a width is below 1 cell.
-    """
-
-    cells: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if not self.cells or not all(math.isfinite(w) and w >= 1 for w in self.cells):
-            raise ValueError(f"Listed: cells must hold window widths of 1 Doppler cell or more, got {self.cells}")
-
-    def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Look up the width of the PGA window of an iteration in the list.
-
-        Args:
-            iteration: Number of the iteration, from 0.
-            n: Not used.
-            profile: Not used.
-
-        Returns:
-            The width in Doppler cells, shape (1,).
-        """
-        return torch.tensor([self.cells[min(iteration, len(self.cells) - 1)]])
-
-
-# a schedule of window widths: `width` maps the number of the iteration, the number of Doppler
-# cells, and a function that returns the power about the peaks, to widths in Doppler cells
-Windows = Shrinking | Measured | Listed
 
 
 def pga(
@@ -161,7 +44,7 @@ def pga(
     *,
     kernel: Kernel = "lumv",
     start: Tensor | None = None,
-    windows: Windows | None = None,
+    windows: Windows = "shrinking",
     iterations: int = 20,
     patience: int = 6,
     assess: bool = True,
@@ -195,7 +78,11 @@ def pga(
             the phases of the first eigenvector of the covariance matrix between pulses,
             "synchronised" finds the unit phasors that best agree with this matrix.
         start: Phase to start from in rad, shape (..., pulse); by default zero.
-        windows: Schedule of window widths, by default `Shrinking()`.
+        windows: Widths of the window. "shrinking" begins with half of the image and narrows by the
+            factor 0.8 per iteration, to 5 Doppler cells. "measured" is 1.5 times as wide as the
+            blur 10 dB below the peak, of the power that is summed over the range cells with their
+            peaks at zero Doppler, and at least 5 cells. Widths in Doppler cells hold for one
+            iteration each, the last for all further ones.
         iterations: Largest number of iterations.
         patience: Number of iterations without a lower image entropy after which a trial ends.
         assess: Whether to add the standard deviation and the outcome.
@@ -205,17 +92,16 @@ def pga(
         quality, outcome and info as by `autofocus`.
 
     Raises:
-        TypeError: If the data are not complex, the start is not a tensor, or `windows` is not a
-            schedule.
+        TypeError: If the data are not complex, or the start is not a tensor.
         ValueError: If the data are empty or not finite, the start does not have one phase per
-            pulse, the kernel is unknown, or a number of iterations is not a whole number of 1 or
-            more.
+            pulse, the kernel or the windows are unknown, or a number of iterations is not a whole
+            number of 1 or more.
 
     Reference:
         Kernels: Eichel and Jakowatz 1989 ("lumv"); Jakowatz and Wahl 1993 ("ml", "eigenvector").
+        Windows: Ruan et al. 2013, section 3.1 ("shrinking"); Wahl et al. 1994 ("measured").
     """
-    pulses = prepare(data, "pga")
-    search = _Search(_solver(kernel), windows or Shrinking(), iterations, patience)
+    pulses, search = prepare(data, "pga"), _Search(kernel, windows, iterations, patience)
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> tuple[Tensor, Tensor]:
         return search(rows, present, torch.zeros_like(rows[:, 0].real) if begin is None else begin)
@@ -227,12 +113,19 @@ def pga_sca(
     data: Tensor,
     *,
     kernel: Kernel = "ml",
-    windows: Windows | None = None,
+    windows: Windows = "shrinking",
     iterations: int = 20,
     patience: int = 6,
     assess: bool = True,
 ) -> Estimate:
     """Estimate the phase of each pulse by phase gradient autofocus (PGA) that starts from `sca`.
+
+    >>> import torch
+    >>> from torchsar.compensate import pga_sca
+    >>> point = torch.zeros(32, 8, dtype=torch.complex64)  # pulses, range cells
+    >>> point[:, 3] = torch.exp(2j * torch.rand(32))
+    >>> pga_sca(point, assess=False)["phase_rad"].shape
+    torch.Size([32])
 
     A phase that is added to a pulse of the data is added to the estimate of `sca`. The size of the
     phase errors therefore has no effect on the result.
@@ -241,7 +134,7 @@ def pga_sca(
         data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
         kernel: Method that estimates the phase from the windowed data, see `pga`. "ml" forms the
             same products of adjacent pulses as `sca`.
-        windows: Schedule of window widths, by default `Shrinking()`.
+        windows: Widths of the window, see `pga`.
         iterations: Largest number of iterations.
         patience: Number of iterations without a lower image entropy after which a trial ends.
         assess: Whether to add the standard deviation and the outcome.
@@ -251,19 +144,18 @@ def pga_sca(
         quality, outcome and info as by `autofocus`.
 
     Raises:
-        TypeError: If the data are not complex or `windows` is not a schedule.
-        ValueError: If the data are empty or not finite, the kernel is unknown, or a number of
-            iterations is not a whole number of 1 or more.
+        TypeError: If the data are not complex.
+        ValueError: If the data are empty or not finite, the kernel or the windows are unknown, or a
+            number of iterations is not a whole number of 1 or more.
 
     Reference:
         Ruan et al. 2013, Eqs. (11)-(16).
     """
-    search = _Search(_solver(kernel), windows or Shrinking(), iterations, patience)
+    pulses, search = prepare(data, "pga_sca"), _Search(kernel, windows, iterations, patience)
 
     def find(rows: Tensor, present: Tensor, _: Tensor | None) -> tuple[Tensor, Tensor]:
         return search(rows, present, pair_phase(rows, present))
 
-    pulses = prepare(data, "pga_sca")
     return conclude(pulses, *find_phases(pulses, find), assess)
 
 
@@ -312,7 +204,67 @@ def sca(data: Tensor, *, assess: bool = True) -> Estimate:
     return conclude(pulses, *find_phases(pulses, find), assess)
 
 
-Solver = Callable[["_Rows", "_View"], Tensor]
+class Sca(PhaseEstimator):
+    """Phase per pulse by the spatial correlation algorithm; see `sca`.
+
+    Args:
+        assess: Whether to add the standard deviation and the outcome.
+    """
+
+    def __init__(self, assess: bool = True) -> None:
+        super().__init__(sca, assess=assess)
+
+
+class Pga(PhaseEstimatorFromStart):
+    """Phase per pulse by phase gradient autofocus; see `pga`.
+
+    Args:
+        kernel: Method that estimates the phase from the windowed data: "lumv", "ml", "synchronised"
+            or "eigenvector", see `pga`.
+        windows: Window widths: "shrinking", "measured", or a list of widths in Doppler cells, see
+            `pga`.
+        iterations: Largest number of iterations.
+        patience: Number of iterations without a lower image entropy after which a trial ends.
+        assess: Whether to add the standard deviation and the outcome.
+    """
+
+    def __init__(
+        self,
+        kernel: Kernel = "lumv",
+        windows: Literal["shrinking", "measured"] | list[float] = "shrinking",
+        iterations: int = 20,
+        patience: int = 6,
+        assess: bool = True,
+    ) -> None:
+        _Search(kernel, windows, iterations, patience)
+        super().__init__(pga, kernel=kernel, windows=windows, iterations=iterations, patience=patience, assess=assess)
+
+
+class PgaSca(PhaseEstimator):
+    """Phase per pulse by phase gradient autofocus started from SCA; see `pga_sca`.
+
+    Args:
+        kernel: Method that estimates the phase from the windowed data: "lumv", "ml", "synchronised"
+            or "eigenvector", see `pga`.
+        windows: Window widths: "shrinking", "measured", or a list of widths in Doppler cells, see
+            `pga`.
+        iterations: Largest number of iterations.
+        patience: Number of iterations without a lower image entropy after which a trial ends.
+        assess: Whether to add the standard deviation and the outcome.
+    """
+
+    def __init__(
+        self,
+        kernel: Kernel = "ml",
+        windows: Literal["shrinking", "measured"] | list[float] = "shrinking",
+        iterations: int = 20,
+        patience: int = 6,
+        assess: bool = True,
+    ) -> None:
+        _Search(kernel, windows, iterations, patience)
+        super().__init__(
+            pga_sca, kernel=kernel, windows=windows, iterations=iterations, patience=patience, assess=assess
+        )
 
 
 @dataclass(frozen=True)
@@ -324,17 +276,21 @@ class _Search:
     wide windows blur for many iterations what narrow ones sharpen later.
     """
 
-    solve: Solver
+    kernel: Kernel
     windows: Windows
     iterations: int
     patience: int
 
     def __post_init__(self) -> None:
         refuse_odd_counts("pga", 1, iterations=self.iterations, patience=self.patience)
-        if not hasattr(self.windows, "width"):
-            raise TypeError(
-                "pga: windows must be a schedule such as Shrinking(), Measured() or Listed((99.0, "
-                f"33.0, 11.0)), got {self.windows!r}"
+        if self.kernel not in _KERNELS:
+            raise ValueError(f"PGA kernel {self.kernel!r} is not known; choose one of {', '.join(_KERNELS)}")
+        if self.windows in ("shrinking", "measured"):
+            return
+        if isinstance(self.windows, str) or not self.windows or not all(1 <= w < math.inf for w in self.windows):
+            raise ValueError(
+                "pga: windows must be 'shrinking', 'measured' or a list of widths of 1 Doppler cell or more, "
+                f"got {self.windows!r}"
             )
 
     def __call__(self, rows: Tensor, present: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
@@ -342,7 +298,7 @@ class _Search:
         idle = made = torch.zeros_like(present[:, 0], dtype=torch.int64)
         narrows, last = torch.ones_like(present[:, 0]), torch.full_like(phase[:, 0], torch.inf)
         for iteration in range(self.iterations + 1):
-            view = _view(rows, phase)
+            view = View.of(rows, present, phase)
             # entropy of the images in nats
             total, tiny = view.power.sum((-2, -1)), torch.finfo(view.power.dtype).tiny
             terms = view.power.clamp_min(tiny).log_().mul_(view.power).sum((-2, -1))
@@ -353,86 +309,112 @@ class _Search:
             active = idle < self.patience
             if iteration == self.iterations or not bool(active.any()):
                 break
-            width = (
-                self.windows.width(iteration, rows.shape[-1], lambda view=view: _profile(view))
-                .to(phase)
-                .expand(len(phase))
-            )
+            width = window_width(self.windows, iteration, view).to(phase).expand(len(phase))
             narrows, last = width < last, width
-            # from the windowed rows with their peaks at zero Doppler
-            rows_about = _Rows(_windowed(view, (_PADDING * width / 2).floor().long()), view.image.shape[-1], present)
-            step = without_line(self.solve(rows_about, view), present)
+            cells = view.windowed((_PADDING * width / 2).floor().long())
+            step = without_line(_KERNELS[self.kernel](view, cells), present)
             phase = torch.where(active[:, None], phase + step, phase)
             made = made + active
         return best, made
 
 
-@dataclass(frozen=True)
-class _View:
-    """A padded image (trial, range, 2 n), its detached power, and the strongest cell of each row.
+def window_width(windows: Windows, iteration: int, view: View) -> Tensor:
+    """Compute the width of the window of an iteration.
 
-    The strongest cells have shape (trial, range).
+    Args:
+        windows: Widths of the window, see `pga`.
+        iteration: Number of the iteration, from 0.
+        view: The image.
+
+    Returns:
+        The width in Doppler cells, shape (1,) or (trial,).
+    """
+    n, floor = view.present.shape[-1], 5.0
+    if windows == "shrinking":
+        return torch.tensor([max(floor, 0.5 * n * 0.8**iteration)])
+    if windows != "measured":
+        return torch.tensor([windows[min(iteration, len(windows) - 1)]])
+    # power about the peaks, summed over the range cells; padded cells are skipped
+    index = torch.arange(0, _PADDING * n, _PADDING, device=view.peak.device) + view.peak[..., None]
+    about = view.power.gather(-1, torch.remainder(index, _PADDING * n)).sum(-2)
+    folded = torch.maximum(about, about.flip(-1).roll(1, -1))[..., : n // 2 + 1]
+    above = folded >= 10 ** (-10.0 / 10) * folded[..., :1]
+    reach = torch.where(above, torch.arange(folded.shape[-1], device=about.device), 0).amax(-1)
+    return (1.5 * (2.0 * reach + 1)).clamp(floor, n)
+
+
+@dataclass(frozen=True)
+class View:
+    """Padded image of pulses, and what is read in it.
+
+    Args:
+        image: Image, shape (trial, range, 2 pulse), complex.
+        power: Its power without derivatives.
+        peak: Strongest cell of each range cell, shape (trial, range).
+        present: False where a pulse holds only zeros, shape (trial, pulse).
     """
 
     image: Tensor
     power: Tensor
     peak: Tensor
-
-
-def _view(rows: Tensor, phase: Tensor) -> _View:
-    """Padded image of the pulses with a phase removed."""
-    image = torch.fft.fft(rotate(rows, phase), _PADDING * rows.shape[-1], norm="ortho")
-    power = power_of(image.detach())
-    return _View(image, power, power.max(-1).indices)
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Rows whose image holds only the cells (trial, range, 2 reach + 1) about zero Doppler.
-
-    `padded` is the number of all cells of the image, `present` (trial, pulse) of the pulses.
-    """
-
-    cells: Tensor
-    padded: int
     present: Tensor
 
-    def pulses(self) -> Tensor:
-        """The pulses (trial, range, pulse)."""
-        image = _spread(self.cells, self.padded)
-        return torch.fft.ifft(image, norm="ortho")[..., : self.present.shape[-1]]
+    @staticmethod
+    def of(rows: Tensor, present: Tensor, phase: Tensor) -> View:
+        """Form the image of pulses with a phase removed."""
+        image = torch.fft.fft(rotate(rows, phase), _PADDING * rows.shape[-1], norm="ortho")
+        power = power_of(image.detach())
+        return View(image, power, power.max(-1).indices, present)
 
-    def adjacent(self) -> tuple[Tensor, Tensor]:
+    def windowed(self, half: Tensor) -> Tensor:
+        """Take the cells within `half` (trial,) of the peak of each range cell, zero beyond.
+
+        The result has shape (trial, range, 2 reach + 1), with the peak in the middle.
+        """
+        padded = self.image.shape[-1]
+        reach = min(int(half.max()), padded // 2 - 1)
+        offsets = torch.arange(-reach, reach + 1, device=self.peak.device)
+        near = self.image.gather(-1, torch.remainder(self.peak[..., None] + offsets, padded))
+        return near * (offsets.abs() <= half[:, None, None]) if bool((half < reach).any()) else near
+
+    def pulses(self, cells: Tensor) -> Tensor:
+        """Transform cells about zero Doppler back to pulses, (trial, range, pulse)."""
+        return torch.fft.ifft(_spread(cells, self.image.shape[-1]), norm="ortho")[..., : self.present.shape[-1]]
+
+    def adjacent(self, cells: Tensor) -> tuple[Tensor, Tensor]:
         """Products (trial, pulse - 1) of pulses with the conjugate of the pulse before, summed over
         range, and powers of the pulse before.
 
         The sums hold only the differences of Doppler within the window. Where it is narrow, they
         are computed at fewer times than there are pulses and interpolated, which is exact.
         """
-        reach = self.cells.shape[-1] // 2
+        padded, reach = self.image.shape[-1], cells.shape[-1] // 2
         length = 1 << (4 * reach).bit_length()
-        if 2 * length > self.padded or not bool(self.present.all()):
-            g = self.pulses()
+        if 2 * length > padded or not bool(self.present.all()):
+            g = self.pulses(cells)
             return pair_products(g, self.present), power_of(g[..., :-1]).sum(-2)
-        offsets = torch.arange(-reach, reach + 1, dtype=torch.float64, device=self.cells.device)
-        earlier = self.cells * unit_phasor(-offsets / self.padded, self.cells.dtype)
-        now, before = (torch.fft.ifft(_spread(x, length), norm="forward") for x in (self.cells, earlier))
+        offsets = torch.arange(-reach, reach + 1, dtype=torch.float64, device=cells.device)
+        earlier = cells * unit_phasor(-offsets / padded, cells.dtype)
+        now, before = (torch.fft.ifft(_spread(x, length), norm="forward") for x in (cells, earlier))
         sums = torch.stack([(now * before.conj()).sum(-2), power_of(before).sum(-2).to(now.dtype)])
         harmonics = torch.fft.fftshift(torch.fft.fft(sums, norm="forward"), dim=-1)[..., 1:]
-        products, powers = torch.fft.ifft(_spread(harmonics, self.padded))[..., 1 : self.present.shape[-1]]
+        products, powers = torch.fft.ifft(_spread(harmonics, padded))[..., 1 : self.present.shape[-1]]
         return products, powers.real
 
+    def centred(self, cells: Tensor) -> Tensor:
+        """Pulses of cells with the interpolated peaks at zero Doppler, zero where one is missing.
 
-def _windowed(view: _View, half: Tensor) -> Tensor:
-    """The cells within `half` (trial,) of the peak of each row, and zeros beyond.
-
-    (trial, range, 2 reach + 1) with the peak in the middle.
-    """
-    padded = view.image.shape[-1]
-    reach = min(int(half.max()), padded // 2 - 1)
-    offsets = torch.arange(-reach, reach + 1, device=view.peak.device)
-    near = view.image.gather(-1, torch.remainder(view.peak[..., None] + offsets, padded))
-    return near * (offsets.abs() <= half[:, None, None]) if bool((half < reach).any()) else near
+        Kernels that are coherent over the aperture need the peaks to a fraction of a cell.
+        """
+        g, padded = self.pulses(cells), self.image.shape[-1]
+        k = torch.arange(g.shape[-1], dtype=torch.float64, device=g.device)
+        low, top, high = (
+            self.power.gather(-1, torch.remainder(self.peak[..., None] + d, padded))[..., 0].sqrt() for d in (-1, 0, 1)
+        )
+        bend = low - 2 * top + high  # of a parabola through three amplitudes
+        offset = torch.where(bend < 0, 0.5 * (low - high) / torch.where(bend < 0, bend, -1), 0).clamp(-0.5, 0.5)
+        turns = -(offset / padded)[..., None].double() * k
+        return g * unit_phasor(turns, g.dtype) * self.present[:, None, :]
 
 
 def _spread(cells: Tensor, n: int) -> Tensor:
@@ -442,41 +424,21 @@ def _spread(cells: Tensor, n: int) -> Tensor:
     return torch.cat([cells[..., reach:], zeros, cells[..., :reach]], -1)
 
 
-def _profile(view: _View) -> Tensor:
-    """Power about the peaks, summed over rows, peak first, (trial, n); padded cells are skipped."""
-    padded = view.power.shape[-1]
-    index = torch.remainder(torch.arange(0, padded, _PADDING, device=view.peak.device) + view.peak[..., None], padded)
-    return view.power.gather(-1, index).sum(-2)
-
-
-def _solver(kernel: Kernel) -> Solver:
-    """The function of a kernel."""
-    solvers: dict[str, Solver] = {
-        "lumv": _lumv,
-        "ml": lambda rows, _: running_sum(rows.adjacent()[0]),  # the phases between adjacent pulses
-        "synchronised": partial(_coherent, unit=True),
-        "eigenvector": partial(_coherent, unit=False),
-    }
-    if kernel not in solvers:
-        raise ValueError(f"PGA kernel {kernel!r} is not known; choose one of {', '.join(solvers)}")
-    return solvers[kernel]
-
-
-def _lumv(rows: _Rows, view: _View) -> Tensor:
+def _lumv(view: View, cells: Tensor) -> Tensor:
     """LUMV kernel: sum of Im(conj(g) dg) / sum |g|^2, with dg = g[k] - g[k - 1]."""
-    products, before = rows.adjacent()
+    products, before = view.adjacent(cells)
     step = products.imag / torch.where(before > 0, before, 1)
     return torch.cat([torch.zeros_like(step[..., :1]), step.cumsum(-1)], -1)
 
 
-def _coherent(rows: _Rows, view: _View, unit: bool) -> Tensor:
-    """Phases of the first eigenvector of the sum over rows of g g^H, by power steps.
+def _coherent(view: View, cells: Tensor, unit: bool) -> Tensor:
+    """Phases of the first eigenvector of the sum over rows of g g^H, by six power steps.
 
     With steps of unit modulus, the phases make the rows most coherent over the aperture.
     """
-    g = _centred(rows, view)
+    g = view.centred(cells)
     v = torch.ones_like(g[:, 0])
-    for _ in range(6):  # found by trial: accuracy against time
+    for _ in range(6):
         v = (g * (g.conj() * v[:, None, :]).sum(-1, keepdim=True)).sum(-2)
         largest = v.detach().abs().amax(-1, keepdim=True)
         v = v / torch.where(largest > 0, largest, 1)
@@ -484,17 +446,10 @@ def _coherent(rows: _Rows, view: _View, unit: bool) -> Tensor:
     return safe_angle(v)
 
 
-def _centred(rows: _Rows, view: _View) -> Tensor:
-    """The rows with their interpolated peaks at zero Doppler, and zeros for missing pulses.
-
-    Kernels that are coherent over the aperture need the peaks to a fraction of a cell.
-    """
-    g, padded = rows.pulses(), view.power.shape[-1]
-    k = torch.arange(g.shape[-1], dtype=torch.float64, device=g.device)
-    low, top, high = (
-        view.power.gather(-1, torch.remainder(view.peak[..., None] + d, padded))[..., 0].sqrt() for d in (-1, 0, 1)
-    )
-    bend = low - 2 * top + high  # of a parabola through three amplitudes
-    offset = torch.where(bend < 0, 0.5 * (low - high) / torch.where(bend < 0, bend, -1), 0).clamp(-0.5, 0.5)
-    turns = -(offset / padded)[..., None].double() * k
-    return g * unit_phasor(turns, g.dtype) * rows.present[:, None, :]
+# phases (trial, pulse) by each kernel, from the image and its windowed cells
+_KERNELS: dict[Kernel, Callable[[View, Tensor], Tensor]] = {
+    "lumv": _lumv,
+    "ml": lambda view, cells: running_sum(view.adjacent(cells)[0]),
+    "synchronised": lambda view, cells: _coherent(view, cells, True),
+    "eigenvector": lambda view, cells: _coherent(view, cells, False),
+}
