@@ -291,7 +291,6 @@ def entries() -> list[Entry]:
         Entry(
             "compensate.pulse_gain",
             pulse_gain,
-            sharpest_phase,
             (*nothing((PULSES, CELLS)), *(World("direct", gains(snr), snr) for snr in SNR_DB)),
             [Quantity("gain", math.log(10) / 20, gain_error, 0.02)],  # 1 dB
         ),

@@ -25,7 +25,7 @@ from torchsar.compensate.pulse_phase.likelihood import (
     windowed_spectrum,
 )
 from torchsar.compensate.pulse_phase.linking_assess import Judged, judged, outcome_of
-from torchsar.compensate.pulse_phase.stages import PhaseEstimatorFromStart
+from torchsar.compensate.pulse_phase.stages import _PhaseEstimatorFromStart
 from torchsar.core import Estimate, Outcome, cis, over_blocks
 
 # Longest block whose phases are found by themselves, in pulses; bands of their first guesses as
@@ -90,7 +90,7 @@ def link_phases(data: Tensor, *, start: Tensor | None = None, assess: bool = Tru
     return linked(pulses, starting_phase(start, pulses, "link_phases"), assess=assess)
 
 
-class LinkPhases(PhaseEstimatorFromStart):
+class LinkPhases(_PhaseEstimatorFromStart):
     """Phase per pulse of a homogeneous scene by maximum likelihood; see `link_phases`.
 
     Args:

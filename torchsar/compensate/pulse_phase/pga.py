@@ -31,7 +31,7 @@ from torchsar.compensate.pulse_phase.data import (
     starting_phase,
     without_line,
 )
-from torchsar.compensate.pulse_phase.stages import PhaseEstimator, PhaseEstimatorFromStart
+from torchsar.compensate.pulse_phase.stages import _PhaseEstimator, _PhaseEstimatorFromStart
 from torchsar.core import Estimate, power_of, unit_phasor
 
 Kernel = Literal["lumv", "ml", "synchronised", "eigenvector"]
@@ -204,7 +204,7 @@ def sca(data: Tensor, *, assess: bool = True) -> Estimate:
     return conclude(pulses, *find_phases(pulses, find), assess)
 
 
-class Sca(PhaseEstimator):
+class Sca(_PhaseEstimator):
     """Phase per pulse by the spatial correlation algorithm; see `sca`.
 
     Args:
@@ -215,7 +215,7 @@ class Sca(PhaseEstimator):
         super().__init__(sca, assess=assess)
 
 
-class Pga(PhaseEstimatorFromStart):
+class Pga(_PhaseEstimatorFromStart):
     """Phase per pulse by phase gradient autofocus; see `pga`.
 
     Args:
@@ -240,7 +240,7 @@ class Pga(PhaseEstimatorFromStart):
         super().__init__(pga, kernel=kernel, windows=windows, iterations=iterations, patience=patience, assess=assess)
 
 
-class PgaSca(PhaseEstimator):
+class PgaSca(_PhaseEstimator):
     """Phase per pulse by phase gradient autofocus started from SCA; see `pga_sca`.
 
     Args:

@@ -34,7 +34,7 @@ from torchsar.compensate.pulse_phase.homogeneous import describe, occupied_band
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.linking import link_phases, linked
 from torchsar.compensate.pulse_phase.points import phases_of_points
-from torchsar.compensate.pulse_phase.stages import PhaseEstimatorFromStart
+from torchsar.compensate.pulse_phase.stages import _PhaseEstimatorFromStart
 from torchsar.core import Estimate, Signal, fft_lines, host_value, power_of, true_positions
 from torchsar.focus import TargetImage
 from torchsar.metrics import entropy
@@ -270,7 +270,7 @@ def entropy_fixed_point(
     return conclude(pulses, *found, assess, through=through)
 
 
-class Autofocus(PhaseEstimatorFromStart):
+class Autofocus(_PhaseEstimatorFromStart):
     """Phase per pulse by the recommended autofocus; see `autofocus`.
 
     Args:
@@ -311,7 +311,7 @@ class Autofocus(PhaseEstimatorFromStart):
         return self.find(signal.data, start=start, imaging=imaging, **self.options)
 
 
-class EntropyFixedPoint(PhaseEstimatorFromStart):
+class EntropyFixedPoint(_PhaseEstimatorFromStart):
     """Phase per pulse by the entropy fixed point; see `entropy_fixed_point`.
 
     Args:

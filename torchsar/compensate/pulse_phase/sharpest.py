@@ -25,7 +25,7 @@ from torchsar.compensate.pulse_phase.data import (
 )
 from torchsar.compensate.pulse_phase.fixed_point import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
-from torchsar.compensate.pulse_phase.stages import PhaseEstimatorFromStart
+from torchsar.compensate.pulse_phase.stages import _PhaseEstimatorFromStart
 from torchsar.core import Estimate, centred_ifft, cis
 from torchsar.metrics.image import contrast, entropy
 from torchsar.optim import adam, lbfgs
@@ -165,7 +165,7 @@ def sharpest_phase(
     return conclude(pulses, phase, taken, assess, again)
 
 
-class SharpestPhase(PhaseEstimatorFromStart):
+class SharpestPhase(_PhaseEstimatorFromStart):
     """Phase per pulse of least image entropy or most contrast, by descent; see `sharpest_phase`.
 
     Args:

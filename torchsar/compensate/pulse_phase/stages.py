@@ -71,7 +71,7 @@ class CorrectPulsePhase(Stage):
         return signal.with_data(correct_pulse_phase(signal.data, phase_rad).contiguous())
 
 
-class PhaseEstimator(Stage):
+class _PhaseEstimator(Stage):
     """An estimator of the phase of every pulse, by a function with options."""
 
     provides = ("phase_rad",)
@@ -91,7 +91,7 @@ class PhaseEstimator(Stage):
         return self.find(signal.data, **self.options)
 
 
-class PhaseEstimatorFromStart(PhaseEstimator):
+class _PhaseEstimatorFromStart(_PhaseEstimator):
     """An estimator that can start from a phase."""
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
