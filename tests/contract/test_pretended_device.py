@@ -16,9 +16,10 @@ from torch import Tensor
 
 from tests.contract.places import PLACES, Place
 from tests.contract.pretended import DEVICE, Counts, pretended_device, to_device, to_host
-from tests.contract.test_stages import CASES, Case, entering, raw, results
-from tests.extremes.table import FUNCTIONS, NUMBERS, Entry, named, samples
 from tests.study.scenes import CORRECT, SCENES, TILES, loaded_as, world
+from tests.table.functions import FUNCTIONS, Entry, named, samples
+from tests.table.numbers import NUMBERS
+from tests.table.stages import CASES, Case, entering, raw, results
 from torchsar.core import Axis, Draws, Signal
 from torchsar.multichannel import detect
 from torchsar.study.settings.sections import Loaded

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 import torchsar
-from tests.extremes.table import Entry, dims, named, samples
+from tests.table.functions import Entry, dims, named, samples
 
 PACKAGE = str(Path(torchsar.__file__).parent)
 Results = dict[str, Tensor]

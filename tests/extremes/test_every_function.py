@@ -17,9 +17,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.contract import test_stages as contract
 from tests.extremes.judge import DTYPES, VIEWS, differences, has_nan, outcome, random_case, trial
-from tests.extremes.table import ENTRIES, NUMBERS, REASONS, Entry, dims, samples
+from tests.table import stages as contract
+from tests.table.functions import ENTRIES, Entry, dims, samples
+from tests.table.numbers import NUMBERS, REASONS
 from torchsar import compensate, core, metrics, repair
 from torchsar.core import Stage
 from torchsar.multichannel.velocity.stages import strongest_line

@@ -16,24 +16,18 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.extremes.judge import Results, trial
-from tests.extremes.table import Entry
 from tests.laws.table import (
     ALL,
-    ENERGY,
     ESTIMATORS,
     LINEAR,
-    NO_PHASE,
-    NOT_LINEAR,
-    NOT_SHIFTED,
     PAIRS,
-    RANGE_FREE,
-    STEPS,
     TO_SAMPLES,
     Pair,
     axes,
     called,
     draw,
 )
+from tests.table.functions import Entry
 
 EXAMPLES = int(os.environ.get("TORCHSAR_LAW_EXAMPLES", "0"))
 SEEDS = st.integers(0, 2**31 - 1)
@@ -76,14 +70,12 @@ def by_name(entry: Entry) -> str:
     return entry.name
 
 
-def test_tables_name_entries() -> None:
-    """Every name stands for an entry, and every entry of samples is linear or has a reason."""
-    known, linear = {e.name for e in ALL}, {e.name for e in LINEAR}
-    listed = {*NOT_LINEAR, *NO_PHASE, *RANGE_FREE, *ENERGY, *(n for names in NOT_SHIFTED.values() for n in names)}
-    assert not listed - known
-    assert set(NOT_LINEAR) | linear == {e.name for e in TO_SAMPLES} and set(ENERGY) <= linear
-    for axis, names in NOT_SHIFTED.items():
-        assert set(names) <= {e.name for e in LINEAR if axis in axes(e)}
+def test_laws_are_said_of_rows_that_they_can_hold_for() -> None:
+    for entry in ALL:
+        laws = entry.laws
+        assert entry in TO_SAMPLES or not (laws.linear or laws.pulse or laws.range or laws.energy), entry.name
+        assert entry in LINEAR or not (laws.pulse or laws.range or laws.energy), entry.name
+        assert {axis for axis in ("pulse", "range") if getattr(laws, axis)} <= set(axes(entry)), entry.name
 
 
 @pytest.mark.parametrize("entry", LINEAR, ids=by_name)
@@ -96,12 +88,12 @@ def test_linear(entry: Entry, seed: int, angle: float, level: float) -> None:
     # differences relative to the larger of the terms, which may cancel
     largest = max(abs(a) * float(of_x.abs().max()), float(of_y.abs().max()), 1e-300)
     assert float((of_both - a * of_x - of_y).abs().max()) <= 1e-9 * largest
-    if entry.name in ENERGY:
+    if entry.laws.energy:
         grown = float(of_x.abs().square().sum() / x.abs().square().sum())
-        assert grown == pytest.approx(ENERGY[entry.name], rel=1e-9)
+        assert grown == pytest.approx(entry.laws.energy, rel=1e-9)
 
 
-SHIFTED = [(entry, axis) for axis in NOT_SHIFTED for entry in LINEAR if axis in axes(entry)]
+SHIFTED = [(entry, axis) for axis in ("pulse", "range") for entry in LINEAR if axis in axes(entry)]
 
 
 @pytest.mark.parametrize(("entry", "axis"), SHIFTED, ids=[f"{entry.name} {axis}" for entry, axis in SHIFTED])
@@ -113,11 +105,11 @@ def test_shift(entry: Entry, axis: str, seed: int, cells: int) -> None:
     x = draw(entry, seed)
     found, plain = called(entry, x.roll(cells, dim))["data"], called(entry, x)["data"]
     same = gap(found, plain.roll(cells, dim)) <= 1e-9
-    assert same == (entry.name not in NOT_SHIFTED[axis])
+    assert same == (not getattr(entry.laws, axis))
 
 
 @few(8)
-@given(entry=st.sampled_from([e for e in ESTIMATORS if e.name in RANGE_FREE]), seed=SEEDS, cells=st.integers(1, 31))
+@given(entry=st.sampled_from([e for e in ESTIMATORS if e.laws.range_free]), seed=SEEDS, cells=st.integers(1, 31))
 def test_range_shift_of_estimators(entry: Entry, seed: int, cells: int) -> None:
     dim = axes(entry).index("range") - len(axes(entry)) if "range" in axes(entry) else -1
     x = draw(entry, seed)
@@ -127,7 +119,7 @@ def test_range_shift_of_estimators(entry: Entry, seed: int, cells: int) -> None:
 
 @few(12)
 @given(
-    entry=st.sampled_from([e for e in ALL if e.name not in NO_PHASE and e not in LINEAR]),
+    entry=st.sampled_from([e for e in ALL if not e.laws.phase and e not in LINEAR]),
     seed=SEEDS,
     angle=ANGLES,
     level=st.floats(-3, 3),
@@ -139,7 +131,7 @@ def test_phase_and_scale(entry: Entry, seed: int, angle: float, level: float) ->
     wanted = {}
     for name, value in plain.items():
         degree = entry.degree.get(name, 1 if name == "data" else 0)
-        if degree is None or (entry.name, name) in STEPS:
+        if degree is None or name in entry.laws.steps:
             continue
         follows = degree and (value.is_floating_point() or value.is_complex())
         factor = size**degree if follows else 1

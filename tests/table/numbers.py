@@ -1,0 +1,350 @@
+"""The table of functions of numbers, and of names that need no row, with the reason.
+
+`NUMBERS` are calls with numbers; `REASONS` says of every public name that has no row in `stages`,
+`functions` or here why it has none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from tests.table.functions import F64, REBUILD, ramp
+from tests.table.stages import BISTATIC, LADAR, RADAR, TURNTABLE
+from torchsar import compensate, core, echo, focus, metrics, multichannel, radar, repair, scene
+from torchsar.core import Draws, Stage
+
+REASONS: dict[str, str] = {
+    "core.Stage": "the base class of all stages",
+    "core.block_bytes_of": "takes a device only",
+    "core.is_plain": "whether a tensor has storage, whatever its values",
+    "core.over_blocks": "runs a function; takes no numbers",
+    "core.counts": "counts codes, not samples; tests/core/test_outcome.py",
+    "core.worst": "joins codes, not samples; tests/core/test_outcome.py",
+    "core.use": "names connections; takes no numbers",
+    "core.checked_samples": "the check itself; tests/core/test_core.py",
+    "core.refuse_non_finite": "the check itself; tests/core/test_core.py",
+    "core.refuse_non_finite_values": "the check itself; tests/core/test_core.py",
+    "core.best_of": "index arithmetic that callers inside the package have checked",
+    "core.is_out_of_memory": "takes an exception only",
+    "core.take": "index arithmetic that callers inside the package have checked",
+    "core.per_trial": "appends dimensions; no arithmetic",
+    "core.device_fault": "takes a device only; tests/core/test_host.py",
+    "core.host_value": "reads one number",
+    "core.host_values": "reads numbers",
+    "core.true_positions": "index arithmetic that callers inside the package have checked",
+    "core.validate": "takes the name of a mode; tests/core/test_validate.py",
+    "core.validation": "takes no arguments",
+    "core.check_value": "reads numbers; tests/core/test_host.py",
+    "core.gathered_checks": "takes no arguments; tests/core/test_host.py",
+    "core.is_traced": "whether a tensor has values, whatever they are; tests/core/test_host.py",
+    "core.untraced": "looks at the kinds of its arguments only; tests/core/test_host.py",
+    "core.numbers_on": "makes a tensor of numbers",
+    "core.linear_solve": "torch.linalg.solve; tests/core/test_host.py",
+    "core.matrix_inverse": "torch.linalg.inv; tests/core/test_host.py",
+    "core.cholesky_factor": "torch.linalg.cholesky; tests/core/test_host.py",
+    "core.host_largest": "reads one number",
+    "core.outer_phasor": "a product of two tables that phasor_tables has made",
+    "core.real_dtype": "takes a dtype only",
+    "radar.geometry_of": "builds a geometry, whose classes check their fields; tests/focus/test_spotlight.py",
+    "io.export_images": "writes files; tests/io/test_export.py",
+    "io.export_recording": "writes files; tests/io/test_export.py",
+    "io.import_recording": "reads and writes files; tests/io/test_sidecar.py",
+    "io.read_images": "reads a file; tests/io/test_export.py",
+    "io.write_arrays": "writes files; tests/io/test_export.py",
+    "io.write_netcdf": "writes a file; tests/io/test_export.py",
+    "io.read_inverse": "reads a file; tests/io/test_damaged.py",
+    "io.read_path": "reads a file; tests/io/test_damaged.py",
+    "io.samples_checksum": "a checksum of bytes; tests/io/test_strip.py",
+    "io.write_strip_geotiff": "writes a file; tests/io/test_geotiff.py",
+    "io.read_stripmap": "reads a file; tests/io/test_damaged.py",
+    "io.read": "reads a file; tests/io/test_formats.py",
+    "io.read_cphd": "reads a file; tests/io/test_formats.py",
+    "io.read_history": "reads a file; tests/io/test_formats.py",
+    "io.read_sicd": "reads a file; tests/io/test_formats.py",
+    "io.format_of": "takes a path only; tests/io/test_formats.py",
+    "io.write_cphd": "writes a file; tests/io/test_cphd.py",
+    "io.write_geotiff": "writes a file; tests/io/test_geotiff.py",
+    "io.write_sicd": "writes a file; tests/io/test_sicd.py",
+    "multichannel.ImageMovers": "needs seconds for one scene; tests/multichannel/test_scene_image.py",
+    "multichannel.MoversImage": "needs seconds for one scene; tests/multichannel/test_scene_image.py",
+    "multichannel.known_motion_chain": "builds a chain of stages that are all in the table",
+    "multichannel.body_echo": "works on the Body that find_body, which is in the table, has made",
+    "focus.PolarFormat": "resamples frequencies of a geometry; tests/focus/test_polar.py",
+    "focus.SpotlightBackprojection": "the stage of backproject_spotlight, which is in the table",
+    "focus.PathImage": "the base class of TileImage, OmegaKImage and DirectImage",
+    "focus.OmegaKImage": "the stage of compensated_omega_k; tests/focus/test_motion_compensation.py",
+    "focus.TileImage": "the stage of image_tiles, which is in the table; tests/focus/test_path_image.py",
+    "focus.SpotlightImage": "a TileImage on a grid of its own; tests/focus/test_spotlight_image.py",
+    "focus.scene_grid": "works on an AntennaPath, whose class checks it; tests/focus/test_spotlight_image.py",
+    "focus.DirectImage": "the stage of backproject, which is in the table; tests/focus/test_path_image.py",
+    "focus.focus_strip": "runs a stage over blocks of lines; tests/focus/test_strip.py",
+    "focus.focus_block": "runs a stage on one block of lines; tests/focus/test_strip.py",
+    "focus.write_strip": "writes a file; tests/focus/test_strip.py",
+    "focus.plan_strip": "counts lines and bytes; tests/focus/test_strip.py",
+    "focus.recommended_form": "takes requirements only",
+    "radar.orbit_range": "works on an Orbit, whose class checks it; tests/scene/test_orbit.py",
+    "radar.range_coefficients": "works on an Orbit, whose class checks it; tests/scene/test_orbit.py",
+    "radar.seen_point": "works on a satellite's position; tests/scene/test_orbit.py",
+    "radar.sweep_middles": "reads an axis that the radar has made",
+    "radar.timing_diagram": "checks all its arguments; tests/scene/test_orbit.py",
+    "scene.displacement_m": "adds motions, whose classes check them",
+    "scene.drawn_motion": "draws motions, whose classes check them",
+    "scene.start_phase_rad": "draws phases of effects, whose classes check them",
+    "echo.apply_impairments": "applies impairments, whose classes check them; tests/echo",
+    "echo.bistatic_echo": "the echo of simulate_bistatic, which is in the table",
+    "echo.path_echo": "the echo of simulate_path, which is in the table",
+    "echo.calibration_channel": "made of a fibre, whose class checks it; tests/repair/test_triangle_calibrate.py",
+    "echo.dechirped_echo": "the echo of simulate_turntable with a pulse length; tests/focus/test_dechirped.py",
+    "echo.ladar_echo": "the echo of simulate_ladar, which is in the table",
+    "echo.ladar_record": "the echo of simulate_ladar_record, which is in the table",
+    "echo.range_model_error_db": "compares two echoes of simulate_ladar; tests/echo/test_ladar.py",
+    "echo.sea_echo": "made of a Sea, whose class checks it; tests/echo/test_sea.py",
+    "echo.stripmap_echo": "the echo of simulate, which is in the table",
+    "echo.target_energy": "works on the truth of a simulation",
+    "echo.turntable_echo": "the echo of simulate_turntable, which is in the table",
+    "compensate.path_autofocus": "needs a path; tests/compensate/test_path_autofocus.py",
+    "compensate.path_phase": "compensate.autofocus, which is in the table, through tiles; tests/compensate/"
+    "test_path_autofocus.py",
+    "compensate.CorrectPath": "subtracts positions",
+    "compensate.PathAutofocus": "the stage of compensate.path_autofocus",
+    "compensate.strip_autofocus": "needs a path; tests/compensate/test_strip_autofocus.py",
+    "compensate.StripAutofocus": "the stage of compensate.strip_autofocus",
+    "compensate.PathPhase": "the stage of compensate.path_phase",
+    "metrics.line_of_sight_bound_m": "works on a scene of scatterers; tests/metrics/test_path_bounds.py",
+    "compensate.range_error": "integrates an estimate by integrated_range, which is in the table",
+    "compensate.turning_points": "reads an axis that the radar has made",
+    "multichannel.multichannel_limits": "checks its use of the radar; tests/multichannel/test_requirements.py",
+    "multichannel.multichannel_requirements": "checks its use of the radar; tests/multichannel/test_requirements.py",
+    "focus.inverse_requirements": "checks all its numbers; tests/study/test_requires.py",
+    "focus.ladar_limits": "checks all its numbers; tests/focus/test_ladar_requirements.py",
+    "focus.ladar_requirements": "checks all its numbers; tests/focus/test_ladar_requirements.py",
+    "focus.requirements": "works on a radar, whose class checks it; tests/study/test_requires.py",
+    "focus.profile_axes": "reads an axis that the radar has made",
+    "focus.quicklook_looks": "counts samples of a picture",
+    "focus.reach_lines": "works on a radar, whose class checks it; tests/focus/test_strip.py",
+    "metrics.finite_rms": "statistics of recorded sweeps; tests/metrics/test_intervals.py",
+    "metrics.half_width_ratio": "statistics of recorded sweeps; tests/metrics/test_intervals.py",
+    "metrics.share_interval": "statistics of recorded sweeps; tests/metrics/test_intervals.py",
+    "metrics.trial_statistics": "statistics of recorded sweeps; tests/metrics/test_intervals.py",
+    "metrics.pulse_phase_bound_of_scene_rad": "works on a scene of scatterers; tests/metrics/test_phase.py",
+    **{
+        f"optim.{name}": "minimises a function that is given; tests/optim"
+        for name in (
+            "adam",
+            "differential_evolution",
+            "genetic",
+            "gradient_minimum",
+            "grid_minimum",
+            "grid_search",
+            "lbfgs",
+            "newton",
+            "parabola_minimum",
+        )
+    },
+}
+
+# stages that have a reason only, and those with other settings than in a row, as they are built
+BUILT: list[Callable[[], Stage]] = [
+    compensate.CorrectPath,
+    compensate.PathAutofocus,
+    compensate.PathPhase,
+    lambda: compensate.StripAutofocus(100.0, 40.0, 6.0),
+    lambda: multichannel.MoversImage(
+        BISTATIC, multichannel.LeastSquares(2), "subtract", multichannel.Extraction(1.4, 4.0), multichannel.Detector()
+    ),
+    lambda: repair.SplitSweeps(LADAR, "search"),
+]
+
+LINE = LADAR.sweep_axes(8)[1]
+WARP = torch.tensor([1.0, 5.0], dtype=F64)
+ONES = torch.ones(4, dtype=F64)
+
+
+def _carrier_hz(wavelength_m: float) -> float:
+    return radar.LIGHT_M_S / wavelength_m if wavelength_m else math.inf
+
+
+def stripmap(range_m: float, wavelength_m: float) -> Any:
+    """One point seen at this range and wavelength, echo of eight pulses."""
+    seen = replace(RADAR, carrier_hz=_carrier_hz(wavelength_m), near_range_m=range_m)
+    world = scene.StripmapWorld(scene.Points([0.0], [30.0]), scene.AlwaysLit(), doppler_hz=0.0)
+    return echo.simulate(seen, world, 8, 64, Draws(1))[0].signal
+
+
+def turntable(range_m: float, wavelength_m: float) -> Any:
+    seen = replace(TURNTABLE, carrier_hz=_carrier_hz(wavelength_m), reference_range_m=range_m)
+    world = scene.TurntableWorld(scene.Points([0.0, 0.1], [0.0, 1.0]))
+    return echo.simulate_turntable(seen, world, 8, 64, Draws(1))[0].signal
+
+
+def bistatic(range_m: float, wavelength_m: float) -> Any:
+    seen = replace(BISTATIC, carrier_hz=_carrier_hz(wavelength_m), reference_range_m=range_m)
+    points = scene.MovingPoints([3.0], [1.0], [0.0], [0.0])
+    return echo.simulate_bistatic(seen, scene.BistaticWorld(points, scene.BandLimited(4.0)), 8, 16, Draws(1))[0].signal
+
+
+def ladar(simulated: Callable) -> Callable:
+    def call(range_m: float, wavelength_m: float) -> Any:
+        seen = replace(LADAR, carrier_hz=_carrier_hz(wavelength_m), reference_range_m=range_m)
+        return simulated(seen, scene.LadarWorld(scene.Points([0.0], [0.1])), 4, Draws(1))[0].signal
+
+    return call
+
+
+def _moving(f: Callable, **more: Any) -> Callable:
+    return lambda u_r_m_s, u_a_m_s, y0_m, range_m: f(
+        BISTATIC, multichannel.PointMotion.of(BISTATIC, ONES, u_r_m_s, u_a_m_s, y0_m, range_m), **more
+    )
+
+
+def any_path(range_m: float, wavelength_m: float) -> Any:
+    """One point seen from a straight path at this range and wavelength."""
+    seen = replace(TURNTABLE, carrier_hz=_carrier_hz(wavelength_m))
+    flight = scene.Flight(scene.StraightPath((-range_m, 0.0, 0.0), (0.0, 50.0, 0.0)))
+    world = scene.PathWorld(scene.Points([1.0], [2.0]), flight)
+    return echo.simulate_path(seen, world, 8, 16, Draws(1))[0].signal
+
+
+MOTION = {"u_r_m_s": 3.0, "u_a_m_s": 2.0, "y0_m": 5.0, "range_m": 5000.0}
+FAR = {"range_m": 4000.0, "wavelength_m": 0.03}
+# functions of numbers: the function, and arguments of which each in turn is made extreme
+NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
+    "core.cis": (core.cis, {"angle_rad": ONES}),
+    "core.legendre": (lambda u: core.legendre(u, 3), {"u": 0.3 * ONES}),
+    "core.linear_phasor": (
+        lambda turns, start: core.linear_phasor(turns, start, 5, torch.complex64),
+        {"turns": 0.1 * ONES, "start": -2.0},
+    ),
+    "core.phasor_tables": (
+        lambda turns, start: core.phasor_tables(turns, start, 5, torch.complex64),
+        {"turns": 0.1 * ONES, "start": -2.0},
+    ),
+    "core.reduced_turns": (core.reduced_turns, {"turns": ONES}),
+    "core.wrapped": (lambda x: core.wrapped(x, 3.0), {"x": ONES}),
+    "core.unit_phasor": (lambda turns: core.unit_phasor(turns, torch.complex64), {"turns": ONES}),
+    "core.settle": (core.settle, {"value": ONES, "fallback": 0.0}),
+    "core.power_of": (core.power_of, {"x": torch.ones(4, 4, dtype=torch.complex64)}),
+    "core.level_of": (core.level_of, {"x": torch.ones(4, 4)}),
+    "core.unit_level": (core.unit_level, {"x": torch.ones(4, 4)}),
+    "radar.geocentric": (
+        radar.geocentric,
+        {"latitude_deg": 48.0 * ONES, "longitude_deg": 11.0 * ONES, "height_m": 500.0 * ONES},
+    ),
+    "radar.resample_path": (
+        lambda **given: radar.resample_path(torch.arange(9, dtype=F64), pulse_time_s=0.5 + ramp(4, 2.0), **given),
+        {"position_m": torch.ones(9, 3, dtype=F64), "longest_gap_s": 2.0, "jump_m": 1.0},
+    ),
+    "radar.plane_wave_loss": (
+        radar.plane_wave_loss,
+        {"radius_m": 2.0, "range_m": 900.0, "aperture_rad": 0.1, "wavelength_m": 0.03, "elevation_rad": 0.2},
+    ),
+    "radar.polynomial_range": (radar.polynomial_range, {"coefficients": (1.0, 2.0), "time_s": ONES}),
+    "radar.receive_range": (
+        radar.receive_range,
+        {"time_s": ONES, **MOTION, "speed_m_s": 300.0, "channel_m": 1.0},
+    ),
+    "scene.gamma_from_normal": (scene.gamma_from_normal, {"x": 0.3 * ONES, "shape": 1.5}),
+    "echo.simulate": (stripmap, FAR),
+    "echo.simulate_turntable": (turntable, FAR),
+    "echo.simulate_bistatic": (bistatic, FAR),
+    "echo.simulate_path": (any_path, FAR),
+    "echo.simulate_ladar": (ladar(echo.simulate_ladar), {"range_m": 3000.0, "wavelength_m": 1.55e-6}),
+    "echo.simulate_ladar_record": (ladar(echo.simulate_ladar_record), {"range_m": 3000.0, "wavelength_m": 1.55e-6}),
+    "echo.smooth_response": (
+        lambda **terms: echo.smooth_response(**terms).phase_rad,
+        {"quadratic_rad": 0.5, "cubic_rad": 0.5, "ripple_rad": 0.1},
+    ),
+    "compensate.doppler_at": (
+        lambda **given: compensate.doppler_at(RADAR, **given),
+        {"azimuth_m": ONES, "slant_m": 4e3 * ONES, "frame_hz": 5.0, "velocity_m_s": 120.0, "crossing_s": 0.1},
+    ),
+    "compensate.geometric_velocity_m_s": (
+        lambda **given: compensate.geometric_velocity_m_s(LADAR, LINE, **given),
+        {"azimuth_m": 0.1, "relative_range_m": 0.2},
+    ),
+    "compensate.integrated_range": (
+        lambda velocity_m_s, at_s: compensate.integrated_range(velocity_m_s, LADAR, LADAR.sweep_axes(8)[1], at_s),
+        {"velocity_m_s": torch.ones(8, dtype=F64), "at_s": 1e-5 * ONES},
+    ),
+    "multichannel.ambiguity_number": (
+        _moving(lambda radar_, point: multichannel.ambiguity_number(radar_, point, point)),
+        MOTION,
+    ),
+    "multichannel.azimuth_filter": (
+        _moving(lambda radar_, point: multichannel.azimuth_filter(ONES, radar_, point, torch.complex64)),
+        MOTION,
+    ),
+    "multichannel.band_matrix": (_moving(multichannel.band_matrix, bands=3), MOTION),
+    "multichannel.condition_number": (_moving(multichannel.condition_number, bands=3), MOTION),
+    "multichannel.noise_gain_db": (_moving(multichannel.noise_gain_db, rebuild=REBUILD), MOTION),
+    "multichannel.doppler_offsets": (lambda prf_hz: multichannel.doppler_offsets(8, 3, prf_hz), {"prf_hz": 180.0}),
+    "focus.cross_range_of": (
+        lambda **given: focus.cross_range_of(k=WARP, **given),
+        {"doppler_hz": ONES, "omega_rad_s": 0.3, "wavelength_m": 0.03, "duration_s": 0.1},
+    ),
+    "focus.mean_rate": (lambda **given: focus.mean_rate(k=WARP, **given), {"omega_rad_s": 0.3, "duration_s": 0.1}),
+    "focus.lines_for": (focus.lines_for, {"cells": 5.0, "oversampling": 2.0}),
+    "focus.flat_reference": (
+        lambda sampling_hz: focus.flat_reference(RADAR.pulse, 64, sampling_hz),
+        {"sampling_hz": 5e7},
+    ),
+    "focus.matched_reference": (
+        lambda sampling_hz: focus.matched_reference(RADAR.pulse, 64, sampling_hz),
+        {"sampling_hz": 5e7},
+    ),
+    "focus.phase_reference": (
+        lambda sampling_hz: focus.phase_reference(RADAR.pulse, 64, sampling_hz),
+        {"sampling_hz": 5e7},
+    ),
+    "metrics.beam_centre_bound_hz": (
+        metrics.beam_centre_bound_hz,
+        {"gain": torch.hann_window(16, dtype=F64), "q": 100.0, "rate_hz_s": 20.0, "prf_hz": 400.0},
+    ),
+    "metrics.bistatic_bounds": (
+        lambda **given: metrics.bistatic_bounds(BISTATIC, 64, **given),
+        {"snr": 10.0, **MOTION},
+    ),
+    "metrics.integrated_range_detrended_bound_m": (
+        metrics.integrated_range_detrended_bound_m,
+        {"velocity_std_m_s": 0.1, "pulse_step_s": 1e-5, "n_period": 64.0},
+    ),
+    "metrics.pulse_phase_bound_rad": (lambda snr: metrics.pulse_phase_bound_rad(snr, 64), {"snr": 10.0}),
+    "metrics.radial_velocity_bound_m_s": (
+        lambda **given: metrics.radial_velocity_bound_m_s(BISTATIC, **given),
+        {"snr": 10.0, "n_seen": 64.0, "u_a_m_s": 2.0},
+    ),
+    "metrics.range_per_sweep_bound_m": (
+        metrics.range_per_sweep_bound_m,
+        {"snr": 10.0, "samples_per_sweep": 32.0, "wavelength_m": 1.55e-6},
+    ),
+    "metrics.reference_doppler_std_hz": (metrics.reference_doppler_std_hz, {"q": 100.0, "duration_s": 0.1}),
+    "metrics.tone_frequency_bound_hz": (metrics.tone_frequency_bound_hz, {"q": 100.0, "duration_s": 0.1}),
+    "metrics.velocity_bound_m_s": (
+        metrics.velocity_bound_m_s,
+        {"q": 100.0, "dwell_s": 0.1, "velocity_m_s": 120.0, "wavelength_m": 0.03, "range_m": 4e3},
+    ),
+    **{
+        f"metrics.velocity_{kind}_bound_m_s": (
+            getattr(metrics, f"velocity_{kind}_bound_m_s"),
+            {"snr": 10.0, "samples_per_sweep": 32.0, "wavelength_m": 1.55e-6, "sweep_s": 8e-6},
+        )
+        for kind in ("free_offset", "known_offset", "segmented")
+    },
+    "metrics.rotation_bounds": (
+        lambda **given: metrics.rotation_bounds(
+            cross_range_m=0.1 * torch.arange(6.0, dtype=F64),
+            range_m=torch.arange(6.0, dtype=F64),
+            amplitude=torch.ones(6, dtype=torch.complex128),
+            warp_k=WARP,
+            n_pulse=64,
+            **given,
+        ),
+        {"noise_std": 0.1, "omega_rad_s": 0.3, "wavelength_m": 0.03, "prf_hz": 400.0},
+    ),
+    "metrics.replica_zones": (lambda **given: metrics.replica_zones(BISTATIC, 3, **given), MOTION),
+}
