@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
-
 # names of frequency axes by convention; other names get the suffix "_frequency"
 _DUAL_NAME = {"pulse": "doppler", "range": "range_frequency"}
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Axis:
     """Uniform sampling grid of one dimension: sample i lies at `start + i * step`.

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor, nn
 
-from torchsar.core.arguments import names_arguments
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import gathered_checks
 from torchsar.core.show import Shown, Summary, kind_of, one_number
@@ -19,7 +18,6 @@ from torchsar.core.signal import Recording, Signal
 Given = Mapping[str, Tensor | Estimate]
 
 
-@names_arguments
 class Use(nn.Module):
     """Stage together with the sources of its keyword values; made by the function `use`.
 

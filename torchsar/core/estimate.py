@@ -8,12 +8,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.core.outcome import DOUBTFUL, FAILED, Outcome, counts
 from torchsar.core.show import Shown, Summary, content, one_number
 
 
-@names_arguments
 @dataclass(frozen=True, repr=False)
 class Estimate(Shown):
     """Estimated values with their predicted accuracy and their outcome in each trial.

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+import inspect
+import textwrap
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -10,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchsar.core.arguments import names_arguments
 from torchsar.core.check import checked_samples, refuse_non_finite_values
 from torchsar.core.estimate import Estimate
 from torchsar.core.host import gathered_checks
@@ -37,8 +39,8 @@ class Stage(nn.Module):
     - `takes_empty`: False if it refuses a batch without trials. Otherwise the result is empty, or a
       function that it calls refuses the batch.
 
-    If a constructor fails because of the type of an argument, the error names it
-    (`core.arguments`).
+    If a constructor fails with an error of Python, a note of the error names its parameters and the
+    arguments given.
 
     If a value that the stage provides is also one of the arguments of the call, such as a start or
     a value known a priori, this argument is the neutral value.
@@ -61,7 +63,7 @@ class Stage(nn.Module):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "__init__" in vars(cls):
-            names_arguments(cls)
+            cls.__init__ = _explained(cls.__init__)
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
         if torch.compiler.is_dynamo_compiling():
@@ -112,3 +114,18 @@ class Stage(nn.Module):
             self.register_parameter(name, value)
         else:
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float64))
+
+
+def _explained(init: Callable[..., None]) -> Callable[..., None]:
+    """The constructor of a stage, whose errors have a note with its parameters and arguments."""
+
+    @functools.wraps(init)
+    def explained(self: Any, *args: Any, **kwargs: Any) -> None:
+        try:
+            init(self, *args, **kwargs)
+        except (TypeError, AttributeError) as error:
+            given = textwrap.shorten(f"{args} and {kwargs}", 200)
+            error.add_note(f"{type(self).__name__}{inspect.signature(type(self))} was given {given}")
+            raise
+
+    return explained

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Signal, real_dtype, unit_phasor
-from torchsar.core.arguments import names_arguments
 from torchsar.radar import BistaticRadar
 from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite, stacked, with_dims
 
@@ -118,7 +117,6 @@ class Drift(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PolynomialDrift:
     """Polynomial drift of a clock, c0 + c1 t + c2 t^2 + ..., with the slow time t in seconds.
@@ -152,7 +150,6 @@ class PolynomialDrift:
         return total
 
 
-@names_arguments
 @dataclass(frozen=True)
 class SinusoidDrift:
     """Sinusoidal drift of a clock, amplitude sin(2 pi frequency_hz t + start_rad) at slow time t.
@@ -193,7 +190,6 @@ class SinusoidDrift:
         return amplitude * torch.sin(2 * math.pi * frequency * time_s + start)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class WalkDrift:
     """Random walk of a clock with normal steps from pulse to pulse, zero at the middle pulse.
@@ -225,7 +221,6 @@ class WalkDrift:
         return (walk - walk[..., time_s.numel() // 2, None]).to(time_s.device)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class SynchronisationError:
     """Impairment: phase and delay of every pulse due to clocks that drift apart.

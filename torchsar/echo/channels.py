@@ -9,11 +9,9 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite, stacked
 
 
-@names_arguments
 @dataclass(frozen=True)
 class ChannelImbalance:
     """Impairment: gain and phase of receiver channels that record the lines in turn.

@@ -14,11 +14,9 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, cis, per_trial, real_dtype, reduced_turns
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.trials import positive, refuse_other_trials, refuse_unless, refuse_unless_finite, with_dims
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Tone:
     """Impairment: a tone that is added to randomly chosen lines.
@@ -89,7 +87,6 @@ class Tone:
         return draws.uniform("tone.phase", (n_pulse,), device=frequency.device)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class WideInterferer:
     """Impairment: band-limited noise on randomly chosen lines, independent from line to line.
@@ -147,7 +144,6 @@ class WideInterferer:
         }
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Quantiser:
     """Impairment: an I/Q converter behind an automatic gain control, without dither.

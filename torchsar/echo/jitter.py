@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, linear_phasor, real_dtype, unit_phasor
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite, stacked, with_dims
 
 
@@ -33,7 +32,6 @@ def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
     return y
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PeriodicJitter:
     """Impairment: sample n of every line is taken at the instant n + e[n mod M], with M offsets e.

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.trials import refuse_other_trials, refuse_unless
 
 # line number of padding at the end of a trial, by convention: no line has a negative number
@@ -154,7 +153,6 @@ class LostLines:
         return _drop(recording, lost.scatter(-1, 1 + order, chosen.expand(order.shape)))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class LostGaps:
     """Impairment: gaps of consecutive lost lines, with at least one received line between gaps.
@@ -196,7 +194,6 @@ class LostGaps:
         return _drop(recording, _at(index, number.shape[-1]))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class RepeatedLines:
     """Impairment: lines that appear twice in succession, with the same number and samples.
@@ -237,7 +234,6 @@ class RepeatedLines:
         return take_lines(recording, source), {"repeated": starts == 0}
 
 
-@names_arguments
 @dataclass(frozen=True)
 class CorruptedNumbers:
     """Impairment: line numbers that are overwritten, while the samples are unchanged.

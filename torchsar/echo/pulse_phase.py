@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, unit_phasor
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.trials import finite, refuse_other_trials, refuse_unless, refuse_unless_finite, with_dims
 
 
@@ -33,7 +32,6 @@ def _pulses(recording: Recording) -> int:
     return recording.signal.data.shape[-2]
 
 
-@names_arguments
 @dataclass(frozen=True)
 class WhitePhase:
     """Impairment: an independent phase of each pulse, uniform within +-limit_rad.
@@ -59,7 +57,6 @@ class WhitePhase:
         return _turned(recording, 2 * limit * share - limit)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PhaseWalk:
     """Impairment: a random walk of the phase with normal steps from pulse to pulse.
@@ -84,7 +81,6 @@ class PhaseWalk:
         return _turned(recording, (with_dims(self.step_rad, 1, unit) * unit).cumsum(-1))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PhaseSinusoid:
     """Impairment: a sinusoidal phase with a random start, as of a vibration.

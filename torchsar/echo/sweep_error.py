@@ -11,13 +11,11 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, per_trial, unit_phasor
-from torchsar.core.arguments import names_arguments
 from torchsar.radar import TriangularLadar
 from torchsar.scene import CalibrationFibre, SweepError
 from torchsar.scene.trials import either, finite, positive, refuse_unless, refuse_unless_finite, with_dims
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PolynomialSweepError:
     """Frequency error of the sweep as a polynomial, sum_i c_i u^i.
@@ -64,7 +62,6 @@ class PolynomialSweepError:
         return total
 
 
-@names_arguments
 @dataclass(frozen=True)
 class SinusoidSweepError:
     """Frequency error of the sweep as a sinusoid, A sin(2 pi F u + phase).

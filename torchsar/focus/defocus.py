@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import checked_samples, outer_phasor, phasor_tables
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, refocus_turns_per_sample
 from torchsar.radar import StripmapRadar
 
@@ -30,7 +29,6 @@ def all_pass(reference: Tensor) -> Tensor:
     return torch.where(size > 0, reference / torch.where(size > 0, size, 1), 1)
 
 
-@names_arguments
 class InvertibleOmegaK:
     """Omega-K without Stolt interpolation and its adjoint, with filters stored for repeated use.
 

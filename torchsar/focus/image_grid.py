@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.antenna_path import refuse_unusable
 
 # largest accepted difference of the products of the axes from 1 and 0, by choice: axes computed in
@@ -45,7 +44,6 @@ def level_plane(
     return made[0], made[1]
 
 
-@names_arguments
 @dataclass(frozen=True, eq=False)
 class ImageGrid:
     """Pixels of a plane or of the ground above it, in local Cartesian coordinates.

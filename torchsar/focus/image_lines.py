@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import per_trial
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import smooth_length
 from torchsar.focus.warped_sums import whole_warp
 
@@ -107,7 +106,6 @@ def cross_range_of(
     return wavelength_m / 2 * doppler / (rate[..., None] if doppler.ndim else rate)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class DopplerLines:
     """Image lines at equal steps of Doppler.
@@ -154,7 +152,6 @@ class DopplerLines:
         return torch.full((), 1 / self.oversampling, dtype=torch.float64, device=k.device)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class CrossRangeLines:
     """Image lines at equal steps of cross range in metres, the same axis for all trials.

@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.requirements import Requirement
 from torchsar.radar import TriangularLadar
 
@@ -25,7 +24,6 @@ DRIFT_RAD, PHASE_RAD, CARRIER_CELLS = 0.5, 0.1, 0.1
 Verdict = Literal["ok", "warn", "refuse"]
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Limit:
     """One limit of a method, with the value of the limited quantity in a given scene.

@@ -43,7 +43,6 @@ from torchsar.core import (
     real_dtype,
     unit_phasor,
 )
-from torchsar.core.arguments import names_arguments
 from torchsar.core.warp import least_rate, warp, warp_rate
 from torchsar.focus.image_lines import CrossRangeLines, DopplerLines
 from torchsar.focus.transforms import Gridding, PulsesToLines, Transform
@@ -158,7 +157,6 @@ def matched_fourier(
     return operator.image(data)
 
 
-@names_arguments
 class MatchedFourierOperator:
     """Linear map of `matched_fourier` for one warp per trial, with its exact adjoint.
 

@@ -54,7 +54,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import checked_samples, unit_phasor
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.backprojection import direct_sum, expanded_history
 from torchsar.focus.gridding import PulseNufft
 from torchsar.focus.image_grid import ImageGrid
@@ -91,7 +90,6 @@ _PIXELS = 1 << 18
 _WORST_DB = -6.0
 
 
-@names_arguments
 @dataclass(frozen=True)
 class ProcessedBeam:
     """Angles ahead of broadside that are processed, with raised-cosine edges.

@@ -22,7 +22,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import checked_samples, host_largest, real_dtype
-from torchsar.core.arguments import names_arguments
 
 # fineness of the FFT grid relative to the samples, the usual choice in gridding
 OVERSAMPLING = 2
@@ -259,7 +258,6 @@ def _flat_index(first: Tensor, width: int) -> Tensor:
     return (first + row.view(*first.shape[:-1], 1)).reshape(-1)
 
 
-@names_arguments
 class Nufft:
     """Non-uniform FFT between uniform samples and their spectrum at arbitrary frequencies.
 

@@ -24,7 +24,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, block_bytes_of, real_dtype, unit_phasor
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import OVERSAMPLING, Kernel, Points, smooth_length
 from torchsar.focus.spotlight import GroundImager, aperture_weights, refuse_other_size
 from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, range_profiles
@@ -160,7 +159,6 @@ class _GridAxis:
         )
 
 
-@names_arguments
 class PolarOperator:
     """Linear map from range profiles to an image by polar format, with its exact adjoint.
 

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.omega_k import FrameGeometry, wavenumber
 from torchsar.focus.skew import EXCESS, skew_hz
 from torchsar.radar import StripmapRadar
@@ -26,7 +25,6 @@ EQUAL_WEIGHTS = "equal weights of range frequencies"
 COUPLING_RAD = 0.5
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Requirement:
     """One simplification and the largest phase that it neglects anywhere in the scene.

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Signal, Stage, checked_samples, real_dtype
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.backprojection import direct_sum
 from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, geometry_of
 
@@ -132,7 +131,6 @@ def backproject_spotlight(
     return image.unflatten(-1, shape) if shape else image[..., 0]
 
 
-@names_arguments
 @dataclass(frozen=True)
 class GroundGrid:
     """A square grid on the ground plane.

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Signal
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.path_image import TileImage
 from torchsar.radar import LIGHT_M_S, AntennaPath
 from torchsar.radar.spotlight import frequency_step_hz
@@ -22,7 +21,6 @@ _OVERSAMPLING = 1.25
 _MOST_PIXELS = 4_000_000
 
 
-@names_arguments
 @dataclass(frozen=True)
 class SceneGrid:
     """Extent, spacing and position of an image on a horizontal plane, as arguments of `PathImage`.

@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Signal, Stage
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import smooth_length
 from torchsar.focus.omega_k import BAND_EDGE, Focuser, OmegaK, raised_cosine_band
 from torchsar.focus.range_doppler import RangeDoppler
@@ -46,7 +45,6 @@ class Lines(Protocol):
     def __getitem__(self, key: Any, /) -> Any: ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class StripPlan:
     """Division of a strip into overlapping blocks of raw lines that fit the memory.

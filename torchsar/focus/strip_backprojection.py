@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Signal, checked_samples, per_trial, unit_phasor
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.backprojection import direct_sum
 from torchsar.focus.omega_k import Focuser, FrameGeometry
 from torchsar.radar import StripmapRadar
@@ -29,7 +28,6 @@ class Aperture(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class EveryPulse:
     """Aperture of all recorded pulses."""
@@ -45,7 +43,6 @@ class EveryPulse:
         return torch.ones_like(since_s)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Integration:
     """Aperture of the pulses within an integration time about the crossing of the pixel.
@@ -70,7 +67,6 @@ class Integration:
         return (since_s.abs() <= self.integration_s / 2).to(since_s.dtype)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class DopplerBand:
     """Aperture of the pulses in which the Doppler of the pixel lies in a band about the centroid.

@@ -5,12 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.tiles import TilePlan
 from torchsar.radar.spotlight import frequency_samples
 
 
-@names_arguments
 class TileOperator:
     """The image of range profiles by the tiles of a plan, and its adjoint, for autofocus.
 

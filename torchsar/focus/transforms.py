@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import Kernel
 from torchsar.focus.warped_sums import Compiled, Explicit, Gridded, Resampled, Sum
 
@@ -59,7 +58,6 @@ class PulsesToLines:
         return 1 / math.sqrt(self.n_pulse)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Gridding:
     """Sum over pulses by a non-uniform FFT with a Kaiser-Bessel gridding kernel, the default.
@@ -110,7 +108,6 @@ class Gridding:
         return Gridded(of.points, of.lines, self.kernel, of.dtype, of.scale)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class ExplicitSum:
     """Sum over pulses by direct evaluation: exact and slow, the reference for faster ways."""
@@ -127,7 +124,6 @@ class ExplicitSum:
         return Explicit(of.points, of.lines, of.dtype, of.scale)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Resampling:
     """Sum over pulses by interpolation to equal steps of rotation angle, then an FFT: a baseline.
@@ -162,7 +158,6 @@ class Resampling:
         return Resampled(of.warp_k, of.n_pulse, of.prf_hz, of.cells_per_line, of.lines, self.interpolation, of.scale)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class CompiledNufft:
     """Sum over pulses by the compiled library finufft, in float64 on the CPU.

@@ -31,7 +31,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Outcome, matrix_inverse, unit_level, unit_phasor, worst
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.migration import Frame, StaticBulk, correct_migration, envelope_phasor
 from torchsar.multichannel.motion import PointMotion, checked_channels
@@ -61,7 +60,6 @@ _GRID_HALF, _GRID_REFINEMENT, _GRIDS = 40, 10, 3
 _WIDE_ROUNDS, _NEAR_U_R_M_S, _NEAR_U_A_M_S, _LAST_U_R_M_S = 2, 2.0, 1.0, 1.0
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Extraction:
     """Extent of the data that are extracted for one body, an extended moving target.
@@ -482,7 +480,6 @@ def centred_motion(chip: Chip) -> PointMotion:
     return replace(chip.motion, y0_m=position, range_m=near)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Body:
     """Extended moving target (body) that was found in the data.

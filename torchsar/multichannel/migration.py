@@ -23,7 +23,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import Signal, Stage, block_bytes_of, checked_samples, linear_phasor, per_trial, unit_phasor
-from torchsar.core.arguments import names_arguments
 from torchsar.focus import keystone
 from torchsar.focus.nufft import nufft_type2
 from torchsar.multichannel.motion import Number, PointMotion
@@ -35,7 +34,6 @@ from torchsar.radar import BistaticRadar, receive_range
 _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-10}
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Frame:
     """Radar and axes of data (..., channel, pulse, range), from which range histories follow.
@@ -104,7 +102,6 @@ class Frame:
         return path - walks * time_s * rate_m_s
 
 
-@names_arguments
 @dataclass(frozen=True)
 class NoMigration:
     """No range migration correction."""
@@ -114,7 +111,6 @@ class NoMigration:
         return data
 
 
-@names_arguments
 @dataclass(frozen=True)
 class StaticBulk:
     """Migration correction by a shift of every pulse along range by a reference range history.
@@ -135,7 +131,6 @@ class StaticBulk:
         return _profiles(spectrum, frame, reference, 0.0) if self.whole_swath else torch.fft.ifft(spectrum)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Keystone:
     """Migration correction that removes the range walk of all targets by a keystone transform.

@@ -9,14 +9,12 @@ import torch
 from torch import Tensor
 
 from torchsar.core import check_value, checked_samples, per_trial
-from torchsar.core.arguments import names_arguments
 from torchsar.radar import BistaticRadar
 
 Number = Tensor | float
 _VALUES = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PointMotion:
     """Velocity and position of one point per trial, and the speed of the receiver.

@@ -36,7 +36,6 @@ from torchsar.core import (
     linear_solve,
     unit_phasor,
 )
-from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.radar import BistaticRadar
 
@@ -163,7 +162,6 @@ def doppler_centre_hz(radar: BistaticRadar, motion: PointMotion, left_k1_m_s: fl
     return (motion.u_r_m_s - left_k1_m_s) / radar.wavelength_m
 
 
-@names_arguments
 @dataclass(frozen=True)
 class ElementPattern:
     """Expected power over Doppler by the one-way antenna pattern of a channel.
@@ -188,7 +186,6 @@ class ElementPattern:
         return torch.sinc(radar.element_m * offset_hz / motion.along_m_s[(...,) + (None,) * offset_hz.ndim]).square()
 
 
-@names_arguments
 @dataclass(frozen=True)
 class FlatBand:
     """Expected power that is equal within a band about the Doppler centre and zero outside.
@@ -221,7 +218,6 @@ def _check_bands(bands: int) -> None:
         raise ValueError(f"a reconstruction needs a whole number of Doppler bands, at least one, got bands={bands}")
 
 
-@names_arguments
 @dataclass(frozen=True)
 class LeastSquares:
     """Reconstruction of Doppler bands by the pseudo-inverse of the channel responses.
@@ -268,7 +264,6 @@ class LeastSquares:
         return few if self.bands > channels else None
 
 
-@names_arguments
 @dataclass(frozen=True)
 class MinimumMeanSquare:
     """Reconstruction of Doppler bands with least mean square error, for an expected power.

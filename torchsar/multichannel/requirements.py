@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import cis
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement, phase_error_db
 from torchsar.multichannel.motion import PointMotion
@@ -49,7 +48,6 @@ _POINTS = 65
 Estimator = Literal["sir", "ati", "ml", "whitened"]
 
 
-@names_arguments
 @dataclass(frozen=True)
 class MultichannelUse:
     """Planned use of a radar: record, reconstruction, and bounds of the motion in the scene.

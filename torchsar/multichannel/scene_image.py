@@ -25,7 +25,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, fft_lines, linear_phasor, unit_level
-from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.body import Body, Extraction, body_echo, body_image, find_body, known_body
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
@@ -46,7 +45,6 @@ _SAME_VELOCITY_M_S, _SIDE_LOBES = 5.0, 20.0
 _LINES_BESIDE = 34
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Detector:
     """Settings of the detection of moving targets in images.
@@ -83,7 +81,6 @@ class Detector:
         return detect(image, self.threshold_db, self.extent_m, self.apart_m, self.most)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class SceneImage:
     """Images of a scene with moving targets.
@@ -496,7 +493,6 @@ def placed(image: Signal, body: Body, extraction: Extraction) -> Signal:
     return image.with_data(data)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Detection:
     """Position of one detection in an image.

@@ -9,10 +9,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import refuse_non_finite
-from torchsar.core.arguments import names_arguments
 
 
-@names_arguments
 @dataclass(frozen=True, eq=False)
 class AntennaPath:
     """Positions of transmitter and receiver at every pulse, and the paths to which phases refer.

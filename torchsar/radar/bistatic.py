@@ -10,12 +10,10 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, numbers_on
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.stripmap import LIGHT_M_S
 from torchsar.radar.waveform import LinearFM
 
 
-@names_arguments
 @dataclass(frozen=True)
 class BistaticRadar:
     """Bistatic radar: a far transmitter with a low pulse rate, and an airborne receiver.

@@ -7,11 +7,9 @@ from typing import Literal
 
 import torch
 
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.orbit import Orbit, range_coefficients, seen_point
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Ephemeris:
     """Orbit of a transmitter over a rotating spherical Earth, and its line of sight to the scene.

@@ -6,11 +6,9 @@ import math
 from dataclasses import dataclass
 
 from torchsar.core import Axis
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.stripmap import LIGHT_M_S
 
 
-@names_arguments
 @dataclass(frozen=True)
 class InverseRadar:
     """Inverse synthetic aperture radar or ladar whose range window follows the target.

@@ -10,14 +10,12 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.stripmap import LIGHT_M_S
 
 DechirpSign = Literal["lo_conj_echo", "echo_conj_lo"]
 Detection = Literal["complex", "real"]
 
 
-@names_arguments
 @dataclass(frozen=True)
 class TriangularLadar:
     """Symmetric triangular FMCW ladar that is dechirped on receive (STLFMCW).

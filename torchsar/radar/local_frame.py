@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.antenna_path import refuse_unusable
 from torchsar.radar.orbit import EARTH_RADIUS_M
 
@@ -51,7 +50,6 @@ def geocentric(latitude_deg: Tensor, longitude_deg: Tensor, height_m: Tensor) ->
     return torch.stack(torch.broadcast_tensors(around * torch.cos(longitude), around * torch.sin(longitude), z), -1)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class LocalFrame:
     """Local Cartesian coordinates (east, north, up) about a point on or above the Earth.

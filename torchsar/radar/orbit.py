@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import per_trial
-from torchsar.core.arguments import names_arguments
 
 EARTH_RADIUS_M = 6_378_137.0  # equatorial radius of WGS 84
 EARTH_GRAVITY_M3_S2 = 3.986004418e14  # GM of WGS 84
@@ -20,7 +19,6 @@ EARTH_RATE_RAD_S = 7.2921159e-5  # one rotation in a sidereal day of 86164.09 s
 _NEWTON_STEPS = 30
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Orbit:
     """Kepler orbit about a spherical Earth in the Earth-centred inertial frame.

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import centred_fft, centred_ifft, checked_samples
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.stripmap import LIGHT_M_S
 
 # Largest relative error of a frequency step: stored frequencies are rounded, by 6e-4 of a step in
@@ -86,7 +85,6 @@ def frequency_step_hz(frequency_hz: Tensor) -> float:
     return step
 
 
-@names_arguments
 @dataclass(frozen=True, eq=False)
 class FarField:
     """Plane-wave geometry: the range of a ground point (x, y) is direction . (x, y) + offset.
@@ -180,7 +178,6 @@ class FarField:
         return u[:, :1] * x + u[:, 1:] * y + self.offset_m[pulses, None]
 
 
-@names_arguments
 @dataclass(frozen=True, eq=False)
 class Spotlight:
     """Spotlight geometry: antenna positions about the scene centre, and reference ranges.
@@ -309,7 +306,6 @@ class Spotlight:
         return x + fit[0], y + fit[1]
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PlaneWaveLoss:
     """Displacement and defocus of a point that the plane-wave approximation causes.

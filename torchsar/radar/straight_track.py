@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.antenna_path import refuse_unusable
 
 
-@names_arguments
 @dataclass(frozen=True, eq=False)
 class StraightTrack:
     """Straight line with pulses at even steps.

@@ -9,13 +9,11 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, per_trial
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.waveform import LinearFM
 
 LIGHT_M_S = 299_792_458.0  # speed of light in vacuum, by definition of the metre
 
 
-@names_arguments
 @dataclass(frozen=True)
 class StripmapRadar:
     """Stripmap radar on a straight path, described in the slant plane.

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.orbit import EARTH_RADIUS_M
 from torchsar.radar.stripmap import LIGHT_M_S
 
 
-@names_arguments
 @dataclass(frozen=True)
 class TimingDiagram:
     """Ground positions whose echo overlaps a transmitted pulse or the nadir echo, for each PRF.

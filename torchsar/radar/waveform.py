@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import unit_phasor
-from torchsar.core.arguments import names_arguments
 
 # relative error of the product of duration and sampling rate, below which it is a whole number
 _ROUNDING = 1e-12
@@ -17,7 +16,6 @@ _ROUNDING = 1e-12
 _FINER = 16
 
 
-@names_arguments
 @dataclass(frozen=True)
 class LinearFM:
     """Linear frequency-modulated pulse exp(j pi k (t - T / 2)^2) for 0 <= t < T.

@@ -32,7 +32,6 @@ from torchsar.core import (
     real_dtype,
     refuse_non_finite_values,
 )
-from torchsar.core.arguments import names_arguments
 
 # Smallest distance of sample instants, in samples. Limit of conditioning, by choice: noise grows
 # about as 1 / gap.
@@ -238,7 +237,6 @@ def jittered(x: Tensor, offset_samples: Tensor) -> Tensor:
     return out
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Lagrange:
     """Correction of jitter by Lagrange interpolation: fast, but inaccurate near the band edges.
@@ -272,7 +270,6 @@ class Lagrange:
         return _interpolated(y, offset_samples, self.points, lagrange_weights)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class BandLimited:
     """Correction of jitter by the best local weights for a band-limited signal.
@@ -303,7 +300,6 @@ class BandLimited:
         return _interpolated(y, offset_samples, self.points, partial(band_limited_weights, band=self.band))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Exact:
     """Correction of jitter by exact periodic non-uniform reconstruction."""

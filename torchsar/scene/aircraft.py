@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.targets import Scatterers
 from torchsar.scene.trials import either, positive, refuse_unless, refuse_unless_finite, stacked, with_dims
 
@@ -61,7 +60,6 @@ def along_line(corners: Tensor, spacing_m: float) -> Tensor:
     return corners[part] + share[:, None] * (corners[part + 1] - corners[part])
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Aircraft:
     """Outline of an aircraft with swept wings, tail plane and fin, about 600 scatterers.
@@ -132,7 +130,6 @@ class Aircraft:
         )
 
 
-@names_arguments
 @dataclass(frozen=True)
 class SpreadRows:
     """Occupied range cells with several scatterers of unit amplitude in each.

@@ -11,7 +11,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.radar import BistaticRadar, Orbit, orbit_range, polynomial_range
 from torchsar.scene.moving import ExactRange, Movers, MovingScene, ReceiveRange
 from torchsar.scene.sea import Sea
@@ -35,7 +34,6 @@ class Gate(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class BandLimited:
     """Gate that passes each target for a limited time, equal in all channels.
@@ -76,7 +74,6 @@ class BandLimited:
         return ((time_s[:, None] - abreast[..., None, None, :]).abs() < duration / 2).to(torch.float64)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Pattern:
     """One-way pattern of a uniformly illuminated antenna element over the whole record.
@@ -133,7 +130,6 @@ class TransmitRange(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PolynomialTransmit:
     """Polynomial range from the transmitter, R_T(t) - R_T(0) = k1 t + k2 t^2 + ...
@@ -187,7 +183,6 @@ class PolynomialTransmit:
         return 2 * math.pi / radar.wavelength_m * float(torch.as_tensor(dropped, dtype=torch.float64).max())
 
 
-@names_arguments
 @dataclass(frozen=True)
 class OrbitTransmit:
     """Exact range from a satellite to a point of the scene that rotates with the Earth.
@@ -226,7 +221,6 @@ class OrbitTransmit:
         return orbit_range(self.orbit, stacked(self.point_m, time_s.device), self.epoch_s, time_s)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class BistaticWorld:
     """Moving targets, their receive gain, the sea beneath them and the noise.

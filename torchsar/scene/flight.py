@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, UnevenSpline, per_trial
-from torchsar.core.arguments import names_arguments
 from torchsar.radar.navigation import resample_path
 from torchsar.scene.fluctuation import MeasuredTrack, RandomMotion, drawn_motion
 from torchsar.scene.trials import refuse_other_trials, refuse_unless, refuse_unless_finite
@@ -50,7 +49,6 @@ class NominalPath(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class StraightPath:
     """Straight path of constant speed; a speed of zero is a fixed antenna.
@@ -83,7 +81,6 @@ class StraightPath:
         return start + time_s[:, None] * velocity
 
 
-@names_arguments
 @dataclass(frozen=True)
 class CircularPath:
     """Horizontal circle about the vertical axis through the origin, at constant speed.
@@ -123,7 +120,6 @@ class CircularPath:
         return torch.stack([x, y, torch.full_like(x, self.height_m)], -1)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Offset:
     """Constant displacement.
@@ -152,7 +148,6 @@ class Offset:
         return per_trial(self.metres, time_s.ndim, time_s) + torch.zeros_like(time_s)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Jitter:
     """Independent normally distributed displacements at equal steps, with a spline between them.
@@ -189,7 +184,6 @@ class Jitter:
         return MeasuredTrack(time_s, per_trial(self.rms_m, 1, unit) * unit)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class RandomWalk:
     """Sum of independent normally distributed steps, zero at the first pulse.
@@ -229,7 +223,6 @@ class RandomWalk:
         return MeasuredTrack(time_s, per_trial(self.m_per_root_s, 1, unit) * unit)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Sway:
     """Displacements in three axes, each a sum of motions.
@@ -283,7 +276,6 @@ class Sway:
         return torch.stack(torch.broadcast_tensors(*axes), -1)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Flight:
     """True path of an antenna: a nominal path and what it deviates by.
@@ -323,7 +315,6 @@ class Flight:
         return self.nominal.position_m(time_s) + self.motion.displacement_m(time_s)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Navigation:
     """What navigation records of a flight: late positions with errors, in whole steps.

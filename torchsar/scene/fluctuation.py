@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import ArrayFile, Draws, UniformSpline
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.trials import finite, positive, refuse_unless, refuse_unless_finite, with_dims
 from torchsar.scene.vibration import Motion
 
@@ -60,7 +59,6 @@ def drawn_motion(motion: Sequence[Motion | RandomMotion], draws: Draws, span_s: 
     ]
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Tones:
     """Sum of sinusoids, sum_i cosine_i cos(2 pi f_i t) + sine_i sin(2 pi f_i t).
@@ -111,7 +109,6 @@ class Tones:
         return (cosine[..., None, :] @ torch.cos(angle) + sine[..., None, :] @ torch.sin(angle))[..., 0, :]
 
 
-@names_arguments
 @dataclass(frozen=True)
 class VibrationSpectrum:
     """Random vibration whose power spectral density follows a power of the frequency.
@@ -158,7 +155,6 @@ class VibrationSpectrum:
         return random_tones(draws, self.rms_m, *_band(self.lowest_hz, self.highest_hz, span_s), self.slope, self.count)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PathFluctuation(VibrationSpectrum):
     """Fluctuation of the optical path by turbulent air.
@@ -186,7 +182,6 @@ class PathFluctuation(VibrationSpectrum):
     count: int = 64
 
 
-@names_arguments
 @dataclass(frozen=True)
 class LogAmplitude:
     """Scintillation: the echo amplitude is multiplied by exp(chi(t)), equally for all scatterers.
@@ -280,7 +275,6 @@ def random_tones(
     return Tones(middle, level * torch.cos(angle), level * torch.sin(angle))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class MeasuredTrack:
     """Measured displacement at equally spaced times, interpolated by a cubic spline.

@@ -10,7 +10,6 @@ from typing import Literal, Protocol, get_args
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.radar import TriangularLadar
 from torchsar.scene.fluctuation import LogAmplitude, RandomMotion
 from torchsar.scene.targets import Scatterers, Scene
@@ -25,7 +24,6 @@ _TIMES_A_PERIOD, _MOST_TIMES = 16, 1 << 22
 _SHORT_S = 1e-6
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Extremes:
     """Largest ranges and motions of a scene, from which neglected phases are predicted.
@@ -129,7 +127,6 @@ def omitted_phase_rad(without: Sequence[Effect], radar: TriangularLadar, extreme
     return {effect: phases[effect] for effect in without}
 
 
-@names_arguments
 @dataclass(frozen=True)
 class RangeHistory:
     """Range of scatterers relative to the reference range as a function of slow time.
@@ -272,7 +269,6 @@ class _Level:
         _refuse_effects(self.without)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class EverySample(_Level):
     """Range evaluated at every sample: the exact model, and the slowest.
@@ -309,7 +305,6 @@ class EverySample(_Level):
         return omitted_phase_rad(self.without, radar, extremes)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class QuadraticInSweep(_Level):
     """Quadratic phase of each scatterer in each sweep, with one curvature for all scatterers.
@@ -356,7 +351,6 @@ class QuadraticInSweep(_Level):
         return {"level": jerk + band, **omitted_phase_rad(self.without, radar, extremes)}
 
 
-@names_arguments
 @dataclass(frozen=True)
 class LinearInSweep(_Level):
     """Linear phase of each scatterer in each sweep: the range follows a straight line. The default.
@@ -402,7 +396,6 @@ class LinearInSweep(_Level):
         return {"level": bend + band, **omitted_phase_rad(self.without, radar, extremes)}
 
 
-@names_arguments
 @dataclass(frozen=True)
 class OnePerSweep(_Level):
     """Stop-and-go approximation: the range is constant during each sweep.
@@ -448,7 +441,6 @@ class OnePerSweep(_Level):
         }
 
 
-@names_arguments
 @dataclass(frozen=True)
 class OnePerPeriod(_Level):
     """Stop-and-go approximation by period, with the range at the turning point for both sweeps.
@@ -511,7 +503,6 @@ class SweepError(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class CalibrationFibre:
     """Internal channel that mixes the sweep with a copy of itself from a fibre of known delay.
@@ -541,7 +532,6 @@ class CalibrationFibre:
         refuse_unless_finite("snr_db of a calibration fibre", self.snr_db)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class LadarWorld:
     """Scene, motion, propagation, laser errors and noise of a ladar acquisition.

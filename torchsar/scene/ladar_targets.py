@@ -10,12 +10,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.core import Draws
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.targets import Scatterers
 from torchsar.scene.trials import finite, refuse_unless, refuse_unless_finite, with_dims
 
 
-@names_arguments
 @dataclass(frozen=True)
 class LetterE:
     """Letter E of 62 points of amplitude 1.
@@ -70,7 +68,6 @@ class LetterE:
         )
 
 
-@names_arguments
 @dataclass(frozen=True)
 class RetroAndBrokenLine:
     """Retro-reflector, and behind it a broken line of 9 points with random phases.

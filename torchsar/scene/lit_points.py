@@ -9,7 +9,6 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.radar import BistaticRadar, receive_range
 from torchsar.scene.bistatic import Gate
 from torchsar.scene.moving import ExactRange, Movers, ReceiveRange
@@ -18,7 +17,6 @@ from torchsar.scene.moving import ExactRange, Movers, ReceiveRange
 _PULSES, _BAND = 513, 17
 
 
-@names_arguments
 @dataclass(frozen=True)
 class LitPoints:
     """Moving points, one per row, with the times at which they are illuminated and processed.

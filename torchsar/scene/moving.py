@@ -12,14 +12,12 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, per_trial
-from torchsar.core.arguments import names_arguments
 from torchsar.radar import BistaticRadar, receive_range
 from torchsar.scene.trials import refuse_unless, refuse_unless_finite, with_dims
 
 Numbers = Sequence[Tensor | float] | Tensor
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Bend:
     """Deviation of a real motion from uniform motion in the slant plane.
@@ -94,7 +92,6 @@ class Bend:
         return -t * (self.transmit_m_s[..., None, None, :] + t / 2 * self.transmit_m_s2[..., None, None, :])
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Movers:
     """Point targets and their motion.
@@ -248,7 +245,6 @@ def _phases(turns: Tensor) -> Tensor:
     return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class MovingPoints:
     """Points with given positions, in uniform motion.
@@ -304,7 +300,6 @@ class MovingPoints:
         return Movers(*torch.broadcast_tensors(*real, level.to(torch.complex128)))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Ship:
     """Extended target: scatterers of common motion at random positions along track.
@@ -373,7 +368,6 @@ class Ship:
         return Movers(*torch.broadcast_tensors(u_r, u_a, y0, range_m + line * cell, amplitude))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class GroundMovers:
     """Points that move on flat ground, followed exactly in three dimensions.
@@ -458,7 +452,6 @@ class GroundMovers:
         return replace(points, bend=bend)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Fleet:
     """Several moving scenes in one.
@@ -531,7 +524,6 @@ class ReceiveRange(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class ExactRange:
     """Exact range by the square root: the default, as fast as any series."""
@@ -563,7 +555,6 @@ class ExactRange:
         return torch.zeros(movers.range_m.shape[:-1], dtype=torch.float64, device=time_s.device)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class TaylorRange:
     """Power series of the range to the receiver about the closest range.

@@ -9,7 +9,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.radar import StripmapRadar
 from torchsar.scene.trials import refuse_unless, with_dims
 
@@ -48,7 +47,6 @@ class Path(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Hyperbola:
     """Exact range history of a straight path, r(t) = sqrt(r0^2 + v^2 t^2), constant during a pulse.
@@ -89,7 +87,6 @@ class Hyperbola:
         return 2 * math.pi * closing / radar.wavelength_m * radar.pulse.duration_s
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Parabola:
     """Second-order range history, r(t) = r0 + v^2 t^2 / (2 r0).
@@ -176,7 +173,6 @@ class Beam(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class AlwaysLit:
     """Beam that illuminates every target in every pulse."""
@@ -197,7 +193,6 @@ class AlwaysLit:
         return torch.ones_like(since_s)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Dwell:
     """Beam of constant gain and limited dwell time.
@@ -232,7 +227,6 @@ class Dwell:
         return (since_s.abs() <= half * (1 + _TIE)).to(since_s.dtype)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Antenna:
     """Beam of a uniform aperture, side lobes included.

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import per_trial
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.flight import Flight, Navigation
 from torchsar.scene.targets import Scene
 from torchsar.scene.trials import positive, refuse_unless, refuse_unless_finite
@@ -37,7 +36,6 @@ class Ground(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PlaneGround:
     """Plane z = height + slope_x x + slope_y y.
@@ -73,7 +71,6 @@ class PlaneGround:
         return level + a * x_m + b * y_m
 
 
-@names_arguments
 @dataclass(frozen=True, eq=False)
 class GridGround:
     """Heights on a grid, interpolated linearly in both directions.
@@ -131,7 +128,6 @@ class GridGround:
         return cell.long(), at - cell
 
 
-@names_arguments
 @dataclass(frozen=True)
 class SideBeam:
     """Beam of a uniform aperture along the heading, with pointing errors.
@@ -198,7 +194,6 @@ class SideBeam:
         return beam.gain(time_s, ahead.expand(_SWAY_TIMES, -1)).pow(4).mean(-2)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PathWorld:
     """Scene seen from any path, by one antenna or by a transmitter and a receiver.

@@ -13,12 +13,10 @@ import torch
 from torch import Tensor
 
 from torchsar.core import per_trial
-from torchsar.core.arguments import names_arguments
 from torchsar.core.warp import least_rate, warp, warp_rate
 from torchsar.scene.trials import refuse_unless_finite
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PolynomialRotation:
     """Rotation with a polynomial angle, theta(t) = omega (t + k1 t^2 / 2! + k2 t^3 / 3! + ...).

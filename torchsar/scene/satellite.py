@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.targets import Scatterers
 from torchsar.scene.trials import either, positive, refuse_unless, refuse_unless_finite, stacked, with_dims
 
@@ -142,7 +141,6 @@ _PARTS: Mapping[str, _Part] = {
 }
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Satellite:
     """Satellite of random scatterers: box, two gridded panels, dish and boom.

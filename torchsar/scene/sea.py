@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import ArrayFile, Draws, real_dtype, refuse_non_finite
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.trials import positive, refuse_unless, refuse_unless_finite, with_dims
 
 # limits of the shape of a gamma distribution, between which the table is checked
@@ -24,7 +23,6 @@ _SHAPES = (0.1, 1000.0)
 _REACH, _NODES = 9.0, 4097
 
 
-@names_arguments
 @dataclass(frozen=True, kw_only=True)
 class Sea(ABC):
     """Surface of independent circular Gaussian scatterers with a local mean intensity.
@@ -122,7 +120,6 @@ def _entries(table: Tensor, index: Tensor, dim: int) -> Tensor:
     return table.expand(*trials, -1, -1).gather(dim, index.expand(*trials, *shape))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class KSea(Sea):
     """K-distributed clutter: speckle with a gamma-distributed texture.
@@ -198,7 +195,6 @@ class KSea(Sea):
         return gamma_from_normal(normal, with_dims(self.shape, 2, row)), row, column
 
 
-@names_arguments
 @dataclass(frozen=True, eq=False)
 class ImageReflectivity(Sea):
     """Surface whose mean intensity is a given image; each trial draws its own speckle.

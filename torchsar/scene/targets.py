@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.trials import finite, refuse_unless, refuse_unless_finite, stacked, with_dims
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Scatterers:
     """Point scatterers, relative to the middle of the recorded frame.
@@ -78,7 +76,6 @@ class Scene(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Points:
     """Given points.
@@ -127,7 +124,6 @@ class Points:
         return Scatterers(x, r, torch.polar(level, 2 * math.pi * turns))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class RandomPoints:
     """Points at random positions in a rectangle, with random powers and phases.
@@ -173,7 +169,6 @@ class RandomPoints:
         return Scatterers(x, r, torch.polar(*torch.broadcast_tensors(level, phase)))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Speckle:
     """Rectangle of fully developed speckle: circular Gaussian scatterers at random positions.
@@ -232,7 +227,6 @@ def _in_rectangle(scene: RandomPoints | Speckle, draws: Draws, purpose: str) -> 
     return x, r
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Together:
     """Several scenes in one.

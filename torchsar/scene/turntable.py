@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.radar import InverseRadar
 from torchsar.scene.rotation import PolynomialRotation
 from torchsar.scene.targets import Scene
@@ -20,7 +19,6 @@ from torchsar.scene.vibration import Motion, PulsePhase, displacement_m
 _GRID = 65
 
 
-@names_arguments
 @dataclass(frozen=True)
 class PhaseOnly:
     """Range-compressed pulses with fixed envelopes, in which only the phases change.
@@ -127,7 +125,6 @@ class PhaseOnly:
         return 10 * math.log10(max(float(error), 1e-30))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Dechirped:
     """Dechirped pulses with the range evaluated at every sample.
@@ -194,7 +191,6 @@ class Dechirped:
 Fidelity = PhaseOnly | Dechirped
 
 
-@names_arguments
 @dataclass(frozen=True)
 class TurntableWorld:
     """Scene that rotates while it moves along the line of sight.

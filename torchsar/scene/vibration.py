@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, per_trial
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.trials import refuse_unless_finite
 
 # metres of the units in which vibrations are published
@@ -42,7 +41,6 @@ class Motion(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Sinusoid:
     """Sinusoidal vibration, d(t) = A sin(2 pi f t + phase).
@@ -118,7 +116,6 @@ class Sinusoid:
         return amplitude * torch.sin(2 * math.pi * (turns - torch.round(turns.detach())))
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Polynomial:
     """Translation d(t) = c1 t + c2 t^2 + ...
@@ -191,7 +188,6 @@ class PulsePhase(Protocol):
         ...
 
 
-@names_arguments
 @dataclass(frozen=True)
 class StartPhase:
     """Independent normally distributed phase of each pulse.
@@ -222,7 +218,6 @@ class StartPhase:
         return per_trial(self.sigma_rad, 1, unit) * unit
 
 
-@names_arguments
 @dataclass(frozen=True)
 class UniformStartPhase:
     """Independent phase of each pulse, uniform in 0 to 2 pi: pulses are incoherent."""

@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.scene.path import AlwaysLit, Beam, Hyperbola, Path
 from torchsar.scene.targets import Scene
 from torchsar.scene.trials import refuse_unless_finite
 
 
-@names_arguments
 @dataclass(frozen=True)
 class StripmapWorld:
     """Scene seen from a straight path.

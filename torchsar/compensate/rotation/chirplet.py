@@ -24,7 +24,6 @@ from torchsar.core import (
     take,
     unit_phasor,
 )
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.radar import InverseRadar
@@ -34,7 +33,6 @@ from torchsar.radar import InverseRadar
 _PARTS, _PAD = 4, 2
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Chirplets:
     """Chirps found in every range cell, in the order in which they were found, and their image.

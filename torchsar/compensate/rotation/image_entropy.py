@@ -17,7 +17,6 @@ from torch import Tensor
 
 from torchsar.compensate.rotation.motion import Sampling
 from torchsar.core import Signal, block_bytes_of, checked_samples, power_of, unit_level
-from torchsar.core.arguments import names_arguments
 from torchsar.core.warp import k_of_shape, least_rate, shape_of, warp
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier, range_phase
@@ -254,7 +253,6 @@ def uniform_rotation(radar: InverseRadar, names: Iterable[str], yc_m: Tensor | f
     return {name: known.get(name, 0.0) for name in names}
 
 
-@names_arguments
 @dataclass(frozen=True)
 class EntropyObjective:
     """Settings of the image entropy as a function of the rotation of a target, see `ImageEntropy`.

@@ -14,7 +14,6 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from torchsar.core import block_bytes_of, checked_samples, is_traced, over_blocks, untraced
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.backprojection import direct_sum, expanded_history
 from torchsar.focus.image_grid import ImageGrid
 from torchsar.focus.tiles.choice import Lit, Scene, Weight, choose, part_bounds, tile_centres, tile_heights
@@ -64,7 +63,6 @@ class _Kept(dict):
         return self.count * dtype.itemsize <= _KEPT_BYTES
 
 
-@names_arguments
 class TilePlan:
     """Images of one geometry, as exact as wanted, at several times the speed of the direct sum.
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.model import TINY, point_phasor
 from torchsar.multichannel.velocity.whitening import Whitening
@@ -23,7 +22,6 @@ _LEAST_SHARE = 0.8
 _DARK = 0.35
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Dwell:
     """Expected amplitude 1 for a duration centred on the time at broadside, 0 outside.
@@ -61,7 +59,6 @@ class Dwell:
         return (since.abs() < self.duration_s / 2).to(torch.float64)
 
 
-@names_arguments
 @dataclass(frozen=True)
 class ElementBeam:
     """Expected amplitude by the one-way antenna pattern of a channel.

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import host_values, level_of, per_trial, unit_phasor
-from torchsar.core.arguments import names_arguments
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
@@ -25,7 +24,6 @@ from torchsar.radar import BistaticRadar
 _BLOCK_BYTES = 64 << 20  # limits the memory of a block of hypotheses
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Search:
     """Extent and steps of a search over the velocities and the position of a point.

@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import cholesky_factor, matrix_inverse
-from torchsar.core.arguments import names_arguments
 from torchsar.multichannel.motion import PointMotion, checked_channels
 from torchsar.multichannel.reconstruct import shared_response
 from torchsar.radar import BistaticRadar
@@ -35,7 +34,6 @@ _SAMPLES = 60
 _TAPER = 16
 
 
-@names_arguments
 @dataclass(frozen=True)
 class Whitening:
     """Matrices that whiten the channels in each Doppler bin of the unitary FFT over pulses.
