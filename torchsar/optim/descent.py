@@ -13,16 +13,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.optim.checks import check_cost, check_limits, check_start, check_tolerances, described, norm
-
 # maps points (..., n) to costs (...,), with with_gradient=True also to gradients (..., n)
 Objective = Callable[[Tensor], Any]
 
 # sufficient decrease (Armijo) and curvature (strong Wolfe) constants of the line search, the values
 # that Nocedal and Wright 2006, section 3.1, give for quasi-Newton methods
-_SUFFICIENT, _CURVATURE = 1e-4, 0.9
-# chosen safeguard: a new point of the line search keeps this share of the bracket from its ends
-_EDGE = 0.1
+SUFFICIENT, _CURVATURE = 1e-4, 0.9
 
 
 @dataclass(frozen=True)
@@ -64,6 +60,11 @@ def lbfgs(
     with_gradient: bool = False,
 ) -> Descent:
     """Minimise a smooth cost per trial by limited-memory BFGS with a strong Wolfe line search.
+
+    >>> import torch
+    >>> from torchsar.optim import lbfgs
+    >>> lbfgs(lambda x: (x - torch.tensor([1.0, 2.0])).square().sum(-1), torch.zeros(2)).x
+    tensor([1., 2.])
 
     Every call of the objective evaluates all trials, each at the current point of its own search,
     so that no result depends on the other trials. A finished trial is still evaluated, at its
@@ -107,12 +108,35 @@ def lbfgs(
     check_start(start)
     check_limits("lbfgs", steps=steps, history=history, search=search, first_step=first_step)
     check_tolerances("lbfgs", gradient_tolerance, value_tolerance)
-    rules = _Rules(steps, gradient_tolerance, value_tolerance, first_step, search)
     with torch.no_grad():
         scaled = _Scaled(objective, start, with_gradient)
-        state = _opening(scaled, history, rules)
+        none, count = scaled.start.new_zeros(history, *start.shape), torch.zeros_like(scaled.finite, dtype=torch.int64)
+        pairs = _Pairs(none, none, none[..., 0])
+        flat = scaled.finite & (scaled.norm == 0)
+        state = _State(
+            x=scaled.start,
+            cost=scaled.cost,
+            gradient=scaled.gradient,
+            pairs=pairs,
+            search=_new_search(scaled.cost, scaled.gradient, pairs, first_step),
+            steps=count,
+            evaluations=count + 1,
+            active=scaled.finite & ~flat,
+            converged=flat,
+            ok=scaled.finite,
+        )
         while bool(state.active.any()):
-            state = _advance(state, scaled, rules)
+            line, accepted = _probe(state, scaled)
+            state = state._replace(search=line, evaluations=state.evaluations + state.active)
+            ended = state.active & (accepted | (line.tries >= search))
+            if not bool(ended.any()):
+                continue
+            # where a line search has ended, move and start a new one
+            not_finite = ended & ~accepted & torch.isinf(line.high.rise)
+            state = _move(state, ended, not_finite, gradient_tolerance * scaled.norm, value_tolerance)
+            begun = _new_search(state.cost, state.gradient, state.pairs, first_step)
+            active = state.active & (state.steps < steps)
+            state = state._replace(search=_where(ended, begun, state.search), active=active)
     gradient_norm = norm(state.gradient) * scaled.scale
     return Descent(state.x, state.cost, gradient_norm, state.steps, state.evaluations, state.converged, state.ok)
 
@@ -130,6 +154,12 @@ def adam(
     with_gradient: bool = False,
 ) -> Descent:
     """Minimise a cost per trial by Adam at a constant rate, and return the best point visited.
+
+    >>> import torch
+    >>> from torchsar.optim import adam
+    >>> found = adam(lambda x: (x - 1).square().sum(-1), torch.zeros(2))
+    >>> bool((found.x - 1).abs().max() < 0.01)
+    True
 
     Adam suits costs that are noisy, or rough on the scale of a step; on a smooth cost `lbfgs`
     reaches a lower cost in fewer evaluations. Each step evaluates the objective once.
@@ -170,25 +200,36 @@ def adam(
         raise ValueError(f"adam: both betas must satisfy 0 <= beta < 1, such as (0.9, 0.999), got {betas}")
     with torch.no_grad():
         scaled = _Scaled(objective, start, with_gradient)
-        walk = _first_walk(scaled, gradient_tolerance)
+        x, gradient, mean, square = scaled.start, scaled.gradient, 0 * scaled.start, 0 * scaled.start
+        best = _Point(scaled.start, scaled.cost, scaled.norm)
+        mark, ok = scaled.cost, scaled.finite
+        waited = taken = torch.zeros_like(ok, dtype=torch.int64)
+        converged = ok & (scaled.norm == 0)
+        active = ok & ~converged
         for count in range(1, steps + 1):
-            if not bool(walk.active.any()):
+            if not bool(active.any()):
                 break
-            walk = _walk(walk, scaled, count, rate, betas)
-            walk = _ended(walk, scaled, gradient_tolerance, value_tolerance, patience)
-    return Descent(
-        walk.best, walk.best_cost, walk.best_norm * scaled.scale, walk.steps, walk.steps + 1, walk.converged, walk.ok
-    )
+            mean = betas[0] * mean + (1 - betas[0]) * gradient
+            square = betas[1] * square + (1 - betas[1]) * gradient.square()
+            move = rate * (mean / (1 - betas[0] ** count)) / ((square / (1 - betas[1] ** count)).sqrt() + 1e-8)
+            x = _where(active, x - move, x)
+            cost, gradient, finite = scaled(x)
+            better = active & finite & (cost < best.cost)
+            best = _where(better, _Point(x, cost, norm(gradient)), best)
+            taken, ok, active = taken + active, ok & (finite | ~active), active & finite
+            gain = mark - best.cost > value_tolerance * torch.maximum(mark.abs(), best.cost.abs())
+            mark, waited = torch.where(gain, best.cost, mark), torch.where(gain, 0, waited + 1)
+            ended = active & ((best.norm <= gradient_tolerance * scaled.norm) | (waited >= patience))
+            active, converged = active & ~ended, converged | ended
+    return Descent(best.x, best.cost, best.norm * scaled.scale, taken, taken + 1, converged, ok)
 
 
-class _Rules(NamedTuple):
-    """Limits and tolerances of `lbfgs`."""
+class _Point(NamedTuple):
+    """A point (..., n), its cost and its norm of the gradient, (...,)."""
 
-    steps: int
-    gradient_tolerance: float
-    value_tolerance: float
-    first_step: float
-    search: int
+    x: Tensor
+    cost: Tensor
+    norm: Tensor
 
 
 class _Scaled:
@@ -213,7 +254,7 @@ class _Scaled:
         return cost, gradient / self.scale[..., None], finite
 
 
-class _Point(NamedTuple):
+class _Along(NamedTuple):
     """A point of the line search: step along the direction, and rise of the cost and slope relative
     to the slope at step 0, where the slope is -1.
     """
@@ -224,12 +265,16 @@ class _Point(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """A line search: `low` is the lowest point with sufficient decrease, with its cost and
-    gradient; `high` is the other end of the bracket, at step inf until there is one.
+    """A line search: its direction, the decrease of the cost along it per unit step, and a bracket.
+
+    `low` is the lowest point with sufficient decrease, with its cost and gradient; `high` is the
+    other end of the bracket, at step inf until there is one.
     """
 
-    low: _Point
-    high: _Point
+    direction: Tensor
+    descent: Tensor
+    low: _Along
+    high: _Along
     cost: Tensor
     gradient: Tensor
     step: Tensor
@@ -252,8 +297,6 @@ class _State(NamedTuple):
     x: Tensor
     cost: Tensor
     gradient: Tensor
-    direction: Tensor
-    descent: Tensor
     pairs: _Pairs
     search: _Search
     steps: Tensor
@@ -263,66 +306,29 @@ class _State(NamedTuple):
     ok: Tensor
 
 
-def _opening(scaled: _Scaled, history: int, rules: _Rules) -> _State:
-    """State at the start, with a line search per trial that has not been evaluated."""
-    none = scaled.start.new_zeros(history, *scaled.start.shape)
-    pairs = _Pairs(none, none, none[..., 0])
-    converged = scaled.finite & (scaled.norm == 0)
-    direction, descent, search = _new_search(scaled.cost, scaled.gradient, pairs, rules)
-    steps = torch.zeros_like(converged, dtype=torch.int64)
-    active = scaled.finite & ~converged
-    return _State(
-        scaled.start,
-        scaled.cost,
-        scaled.gradient,
-        direction,
-        descent,
-        pairs,
-        search,
-        steps,
-        steps + 1,
-        active,
-        converged,
-        scaled.finite,
-    )
-
-
-def _advance(state: _State, scaled: _Scaled, rules: _Rules) -> _State:
-    """Evaluate every active trial once; where a line search has ended, move and start a new one."""
-    search, accepted = _probe(state, scaled)
-    state = state._replace(search=search, evaluations=state.evaluations + state.active)
-    ended = state.active & (accepted | (search.tries >= rules.search))
-    if not bool(ended.any()):
-        return state
-    not_finite = ended & ~accepted & torch.isinf(search.high.rise)
-    return _restart(_move(state, ended, not_finite, scaled, rules), ended, rules)
-
-
 def _probe(state: _State, scaled: _Scaled) -> tuple[_Search, Tensor]:
     """Evaluate the next point of each line search; return the searches and whether the point is
     accepted.
     """
     search = state.search
     cost, gradient, finite = scaled(_where(state.active, _along(state, search.step), state.x))
-    rise = _relative(cost - state.cost, state, scaled)
-    slope = _dot(gradient, state.direction) / state.descent
-    point = _Point(search.step, torch.where(finite, rise, torch.inf), slope)
+    rise = ((cost - state.cost) / scaled.scale).to(state.x.dtype) / search.descent
+    point = _Along(search.step, torch.where(finite, rise, torch.inf), _dot(gradient, search.direction) / search.descent)
     # near the minimum a rise of the cost by a few units of rounding is ignored, and the slope
     # decides
-    rounding = _relative(4 * torch.finfo(cost.dtype).eps * state.cost.abs(), state, scaled)
+    rounding = (4 * torch.finfo(cost.dtype).eps * state.cost.abs() / scaled.scale).to(state.x.dtype) / search.descent
     low, high, step, higher, accepted = _narrow(search.low, search.high, point, rounding)
-    return _Search(
-        low, high, _where(higher, search.cost, cost), _where(higher, search.gradient, gradient), step, search.tries + 1
-    ), accepted
+    cost, gradient = _where(higher, search.cost, cost), _where(higher, search.gradient, gradient)
+    return _Search(search.direction, search.descent, low, high, cost, gradient, step, search.tries + 1), accepted
 
 
 def _narrow(
-    low: _Point, high: _Point, point: _Point, rounding: Tensor
-) -> tuple[_Point, _Point, Tensor, Tensor, Tensor]:
+    low: _Along, high: _Along, point: _Along, rounding: Tensor
+) -> tuple[_Along, _Along, Tensor, Tensor, Tensor]:
     """One round of the strong Wolfe search: new ends, next step, whether the point is too high, and
     whether it is accepted.
     """
-    higher = ~(point.rise <= torch.minimum(-_SUFFICIENT * point.step, low.rise) + rounding)
+    higher = ~(point.rise <= torch.minimum(-SUFFICIENT * point.step, low.rise) + rounding)
     accepted = ~higher & (point.slope.abs() <= _CURVATURE)
     turned = ~higher & (torch.sign(point.slope) * torch.sign(high.step - low.step) > 0)
     next_low = _where(higher, low, point)
@@ -331,14 +337,14 @@ def _narrow(
     return next_low, next_high, step, higher, accepted
 
 
-def _between(low: _Point, high: _Point) -> Tensor:
+def _between(low: _Along, high: _Along) -> Tensor:
     """Next step inside a bracket: the minimum of the cubic, kept away from the ends."""
     width = high.step - low.step
     part = (_cubic(low, high) - low.step) / width
-    return low.step + width * torch.where(torch.isfinite(part), part, 0.5).clamp(_EDGE, 1 - _EDGE)
+    return low.step + width * torch.where(torch.isfinite(part), part, 0.5).clamp(0.1, 1 - 0.1)  # a tenth of the bracket
 
 
-def _beyond(low: _Point, point: _Point) -> Tensor:
+def _beyond(low: _Along, point: _Along) -> Tensor:
     """Next step where there is no bracket yet: 1.1 to 4 times farther, by the cubic where it has a
     minimum.
     """
@@ -347,7 +353,7 @@ def _beyond(low: _Point, point: _Point) -> Tensor:
     return point.step + width * torch.where(torch.isfinite(part) & (part > 0), part, 4.0).clamp(1.1, 4.0)
 
 
-def _cubic(a: _Point, b: _Point) -> Tensor:
+def _cubic(a: _Along, b: _Along) -> Tensor:
     """Minimum of the cubic through two points and their slopes; NaN where it has none."""
     width = b.step - a.step
     bend = a.slope + b.slope - 3 * (b.rise - a.rise) / width
@@ -355,7 +361,7 @@ def _cubic(a: _Point, b: _Point) -> Tensor:
     return b.step - width * (b.slope + root - bend) / (b.slope - a.slope + 2 * root)
 
 
-def _move(state: _State, ended: Tensor, not_finite: Tensor, scaled: _Scaled, rules: _Rules) -> _State:
+def _move(state: _State, ended: Tensor, not_finite: Tensor, flat_norm: Tensor, value_tolerance: float) -> _State:
     """Move to the lowest point of each search that has ended, store the pair, and mark finished
     trials.
     """
@@ -367,55 +373,43 @@ def _move(state: _State, ended: Tensor, not_finite: Tensor, scaled: _Scaled, rul
         _where(moved, search.gradient, state.gradient),
     )
     # a gain of a few units of rounding is noise
-    tolerance = max(rules.value_tolerance, 4 * torch.finfo(cost.dtype).eps) if rules.value_tolerance else 0.0
+    tolerance = max(value_tolerance, 4 * torch.finfo(cost.dtype).eps) if value_tolerance else 0.0
     lowered = state.cost - cost <= tolerance * torch.maximum(cost.abs(), state.cost.abs())
-    converged = moved & ((lowered & ~not_finite) | (norm(gradient) <= rules.gradient_tolerance * scaled.norm))
-    steps = state.steps + moved
+    converged = moved & ((lowered & ~not_finite) | (norm(gradient) <= flat_norm))
     stuck = ended & ~moved & (state.pairs.inverse == 0).all(0)
     pairs = _append(state.pairs, x - state.x, gradient - state.gradient, moved)
-    pairs = pairs._replace(inverse=torch.where(ended & ~moved, 0, pairs.inverse))
-    active = state.active & ~(converged | stuck | not_finite | (steps >= rules.steps))
     return state._replace(
         x=x,
         cost=cost,
         gradient=gradient,
-        pairs=pairs,
-        steps=steps,
-        active=active,
+        pairs=pairs._replace(inverse=torch.where(ended & ~moved, 0, pairs.inverse)),
+        steps=state.steps + moved,
+        active=state.active & ~(converged | stuck | not_finite),
         converged=state.converged | converged,
         ok=state.ok & (~not_finite | converged),
     )
 
 
-def _restart(state: _State, ended: Tensor, rules: _Rules) -> _State:
-    """Start a new line search where one has ended."""
-    direction, descent, search = _new_search(state.cost, state.gradient, state.pairs, rules)
-    return state._replace(
-        direction=_where(ended, direction, state.direction),
-        descent=_where(ended, descent, state.descent),
-        search=_where(ended, search, state.search),
-    )
-
-
-def _new_search(cost: Tensor, gradient: Tensor, pairs: _Pairs, rules: _Rules) -> tuple[Tensor, Tensor, _Search]:
-    """The quasi-Newton direction (steepest descent without pairs), the decrease along it per unit
-    step, and a line search at step 0.
+def _new_search(cost: Tensor, gradient: Tensor, pairs: _Pairs, first_step: float) -> _Search:
+    """A line search at step 0 along the quasi-Newton direction, or the steepest descent if there
+    are no pairs.
     """
     newton = _two_loops(gradient, pairs)
     decrease = -_dot(gradient, newton)
     usable = (pairs.inverse[-1] > 0) & torch.isfinite(decrease) & (decrease > 0)
-    direction = _where(usable, newton, -gradient)
     size = norm(gradient)
-    step = torch.where(usable, 1.0, rules.first_step / torch.where(size > 0, size, 1))
-    descent = torch.where(usable, decrease, size.square())
+    step = torch.where(usable, 1.0, first_step / torch.where(size > 0, size, 1))
     zero = torch.zeros_like(step)
-    low = _Point(zero, zero, zero - 1)
-    return (
-        direction,
-        descent,
-        _Search(
-            low, low._replace(step=zero + torch.inf), cost, gradient, step, torch.zeros_like(step, dtype=torch.int64)
-        ),
+    low = _Along(zero, zero, zero - 1)
+    return _Search(
+        direction=_where(usable, newton, -gradient),
+        descent=torch.where(usable, decrease, size.square()),
+        low=low,
+        high=low._replace(step=zero + torch.inf),
+        cost=cost,
+        gradient=gradient,
+        step=step,
+        tries=torch.zeros_like(step, dtype=torch.int64),
     )
 
 
@@ -447,90 +441,7 @@ def _append(pairs: _Pairs, move: Tensor, change: Tensor, moved: Tensor) -> _Pair
 
 def _along(state: _State, step: Tensor) -> Tensor:
     """Point at a step along the direction of the search."""
-    return state.x + step[..., None] * state.direction
-
-
-def _relative(difference: Tensor, state: _State, scaled: _Scaled) -> Tensor:
-    """A difference of costs relative to the slope at the start of the search."""
-    return (difference / scaled.scale).to(state.x.dtype) / state.descent
-
-
-class _Walk(NamedTuple):
-    """State of `adam` between two steps, per trial."""
-
-    x: Tensor
-    gradient: Tensor
-    mean: Tensor
-    square: Tensor
-    best: Tensor
-    best_cost: Tensor
-    best_norm: Tensor
-    mark: Tensor
-    waited: Tensor
-    steps: Tensor
-    active: Tensor
-    converged: Tensor
-    ok: Tensor
-
-
-def _first_walk(scaled: _Scaled, gradient_tolerance: float) -> _Walk:
-    """State of `adam` at the start."""
-    none, count = torch.zeros_like(scaled.start), torch.zeros_like(scaled.finite, dtype=torch.int64)
-    converged = scaled.finite & (scaled.norm == 0)
-    active = scaled.finite & ~converged
-    return _Walk(
-        scaled.start,
-        scaled.gradient,
-        none,
-        none,
-        scaled.start,
-        scaled.cost,
-        scaled.norm,
-        scaled.cost,
-        count,
-        count,
-        active,
-        converged,
-        scaled.finite,
-    )
-
-
-def _walk(walk: _Walk, scaled: _Scaled, count: int, rate: float, betas: tuple[float, float]) -> _Walk:
-    """One step of the active trials, and the best point so far."""
-    active = walk.active
-    mean = betas[0] * walk.mean + (1 - betas[0]) * walk.gradient
-    square = betas[1] * walk.square + (1 - betas[1]) * walk.gradient.square()
-    move = rate * (mean / (1 - betas[0] ** count)) / ((square / (1 - betas[1] ** count)).sqrt() + 1e-8)
-    x = _where(active, walk.x - move, walk.x)
-    cost, gradient, finite = scaled(x)
-    better = active & finite & (cost < walk.best_cost)
-    return walk._replace(
-        x=x,
-        gradient=gradient,
-        mean=mean,
-        square=square,
-        best=_where(better, x, walk.best),
-        best_cost=_where(better, cost, walk.best_cost),
-        best_norm=_where(better, norm(gradient), walk.best_norm),
-        steps=walk.steps + active,
-        active=active & finite,
-        ok=walk.ok & (finite | ~active),
-    )
-
-
-def _ended(walk: _Walk, scaled: _Scaled, gradient_tolerance: float, value_tolerance: float, patience: int) -> _Walk:
-    """Mark trials as converged: small gradient at the best point, or no gain during `patience`
-    steps.
-    """
-    gain = walk.mark - walk.best_cost > value_tolerance * torch.maximum(walk.mark.abs(), walk.best_cost.abs())
-    waited = torch.where(gain, 0, walk.waited + 1)
-    converged = walk.active & ((walk.best_norm <= gradient_tolerance * scaled.norm) | (waited >= patience))
-    return walk._replace(
-        mark=torch.where(gain, walk.best_cost, walk.mark),
-        waited=waited,
-        active=walk.active & ~converged,
-        converged=walk.converged | converged,
-    )
+    return state.x + step[..., None] * state.search.direction
 
 
 def _derived(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -576,3 +487,99 @@ def _where(mask: Tensor, yes: Any, no: Any) -> Any:
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     """Inner product over the unknowns."""
     return (a * b).sum(-1)
+
+
+def check_start(start: Tensor) -> None:
+    """Check that the first point of a search is a real tensor of shape (..., n) for n unknowns.
+
+    Args:
+        start: First point of the search.
+
+    Raises:
+        TypeError: If `start` is neither float32 nor float64.
+        ValueError: If `start` has no dimension, or its last dimension, the unknowns, is empty.
+    """
+    if start.dtype not in (torch.float32, torch.float64):
+        raise TypeError(
+            f"start must be a tensor of float32 or float64, got {start.dtype}; give complex unknowns "
+            "as their real and imaginary parts"
+        )
+    if start.ndim == 0 or start.shape[-1] == 0:
+        raise ValueError(
+            "start must have the shape (..., n), with n >= 1 unknowns in the last dimension, got "
+            f"shape {tuple(start.shape)}"
+        )
+
+
+def check_limits(method: str, **limits: float) -> None:
+    """Check that limits such as the number of steps are positive.
+
+    Args:
+        method: Name of the optimiser, for the message.
+        **limits: Values by the names of their parameters.
+
+    Raises:
+        ValueError: If a value is not positive.
+    """
+    for name, value in limits.items():
+        if not value > 0:
+            raise ValueError(f"{method}: {name} is {value}; choose a positive number")
+
+
+def check_tolerances(method: str, gradient_tolerance: float, value_tolerance: float) -> None:
+    """Check that both relative tolerances are at least 0.
+
+    Args:
+        method: Name of the optimiser, for the message.
+        gradient_tolerance: Relative tolerance of the gradient norm.
+        value_tolerance: Relative tolerance of the cost.
+
+    Raises:
+        ValueError: If a tolerance is negative or not a number.
+    """
+    if not (gradient_tolerance >= 0 and value_tolerance >= 0):
+        raise ValueError(
+            f"{method}: gradient_tolerance and value_tolerance must be relative tolerances of at least 0, "
+            f"such as 1e-6, got {gradient_tolerance} and {value_tolerance}"
+        )
+
+
+def check_cost(cost: Any, x: Tensor) -> None:
+    """Check that an objective returned one real cost per trial.
+
+    Args:
+        cost: Value that the objective returned.
+        x: Point at which it was called, shape (..., n).
+
+    Raises:
+        ValueError: If the cost is not a real tensor of shape (...,).
+    """
+    if not isinstance(cost, Tensor) or cost.shape != x.shape[:-1] or not cost.is_floating_point():
+        raise ValueError(
+            f"the objective returned {described(cost)} for x of shape {tuple(x.shape)}; return one "
+            f"real cost per trial, shape {tuple(x.shape[:-1])}"
+        )
+
+
+def described(value: Any) -> str:
+    """Describe a value for messages: dtype and shape of a tensor, or the type of another value.
+
+    Args:
+        value: Any value.
+
+    Returns:
+        A few words for a message.
+    """
+    return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+
+
+def norm(x: Tensor) -> Tensor:
+    """Compute the Euclidean norm of each trial over its unknowns.
+
+    Args:
+        x: Values, shape (..., n).
+
+    Returns:
+        Norms, shape (...,).
+    """
+    return torch.linalg.vector_norm(x, dim=-1)

@@ -7,13 +7,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.optim.checks import check_cost, check_limits, check_start, check_tolerances, norm
-from torchsar.optim.descent import Descent, Objective
-
-# sufficient decrease (Armijo) of the line search, the value of Nocedal and Wright 2006, section 3.1
-_SUFFICIENT = 1e-4
-# chosen: damping raises the least eigenvalue of the Hessian to this share of the largest
-_LEAST = 1e-6
+from torchsar.optim.descent import (
+    SUFFICIENT,
+    Descent,
+    Objective,
+    check_cost,
+    check_limits,
+    check_start,
+    check_tolerances,
+    norm,
+)
 
 
 def newton(
@@ -27,6 +30,11 @@ def newton(
     value_tolerance: float = 1e-9,
 ) -> Descent:
     """Minimise a smooth cost of few unknowns per trial by Newton's method.
+
+    >>> import torch
+    >>> from torchsar.optim import newton
+    >>> newton(lambda x: (x - 2).square().sum(-1) + 0.5 * x.square().sum(-1), torch.zeros(1)).x
+    tensor([1.3333])
 
     With `damped`, a multiple of the identity is added to the Hessian H (Levenberg). It is so large
     that a negative least eigenvalue changes its sign, and that the least eigenvalue is at least
@@ -72,31 +80,36 @@ def newton(
     check_start(start)
     check_limits("newton", steps=steps, search=search)
     check_tolerances("newton", gradient_tolerance, value_tolerance)
-    begin = _evaluated(objective, start.detach().clone())
-    rules = _Rules(
-        damped,
-        search,
-        gradient_tolerance * norm(begin.gradient),
-        max(value_tolerance, 4 * torch.finfo(start.dtype).eps),
-    )
-    state = _opening(begin)
+    here = begin = _evaluated(objective, start.detach().clone())
+    value_tolerance = max(value_tolerance, 4 * torch.finfo(start.dtype).eps)
+    taken, lost = torch.zeros_like(begin.finite, dtype=torch.int64), torch.zeros_like(begin.finite)
+    evaluations = taken + 1
+    converged = begin.finite & (norm(begin.gradient) == 0)
+    active = begin.finite & ~converged
     for _ in range(steps):
-        if not bool(state.active.any()):
+        if not bool(active.any()):
             break
-        state = _advance(objective, state, rules)
-    here = state.point
+        step = _step(here, damped)
+        usable, tried = torch.isfinite(step).all(-1), torch.zeros_like(taken)
+        if damped:
+            step, tried = _shortened(objective, here, step, active & usable, search)
+        moved = active & usable & (step != 0).any(-1)
+        there = _evaluated(objective, torch.where(moved[..., None], here.x + step, here.x))
+        arrived = moved & there.finite
+        level = (there.cost - here.cost).abs() <= value_tolerance * torch.maximum(there.cost.abs(), here.cost.abs())
+        ended = arrived & ((norm(there.gradient) <= gradient_tolerance * norm(begin.gradient)) | level)
+        here = _Point(
+            *(
+                torch.where(arrived[(...,) + (None,) * (new.ndim - arrived.ndim)], new, old)
+                for new, old in zip(there, here, strict=True)
+            )
+        )
+        taken, evaluations = taken + arrived, evaluations + tried + moved
+        lost = lost | (active & ~(usable & (arrived | ~moved)))
+        active, converged = arrived & ~ended, converged | ended
     convex = _curvatures(here)[0][..., 0] > 0
-    ok = begin.finite & ~state.lost & convex & (here.cost <= begin.cost) & (state.converged | damped)
-    return Descent(here.x, here.cost, norm(here.gradient), state.steps, state.evaluations, state.converged, ok)
-
-
-class _Rules(NamedTuple):
-    """Limits and tolerances of `newton`."""
-
-    damped: bool
-    search: int
-    gradient_norm: Tensor
-    value_tolerance: float
+    ok = begin.finite & ~lost & convex & (here.cost <= begin.cost) & (converged | damped)
+    return Descent(here.x, here.cost, norm(here.gradient), taken, evaluations, converged, ok)
 
 
 class _Point(NamedTuple):
@@ -107,51 +120,6 @@ class _Point(NamedTuple):
     gradient: Tensor
     hessian: Tensor
     finite: Tensor
-
-
-class _State(NamedTuple):
-    """State between two steps; `lost` marks trials that met values that are not finite."""
-
-    point: _Point
-    steps: Tensor
-    evaluations: Tensor
-    active: Tensor
-    converged: Tensor
-    lost: Tensor
-
-
-def _opening(begin: _Point) -> _State:
-    """State at the start."""
-    none = torch.zeros_like(begin.finite, dtype=torch.int64)
-    level = begin.finite & (norm(begin.gradient) == 0)
-    return _State(begin, none, none + 1, begin.finite & ~level, level, torch.zeros_like(level))
-
-
-def _advance(objective: Objective, state: _State, rules: _Rules) -> _State:
-    """One step of every active trial."""
-    here = state.point
-    step = _step(here, rules.damped)
-    usable, tried = torch.isfinite(step).all(-1), torch.zeros_like(state.steps)
-    if rules.damped:
-        step, tried = _shortened(objective, here, step, state.active & usable, rules.search)
-    moved = state.active & usable & (step != 0).any(-1)
-    there = _evaluated(objective, torch.where(moved[..., None], here.x + step, here.x))
-    arrived = moved & there.finite
-    level = (there.cost - here.cost).abs() <= rules.value_tolerance * torch.maximum(there.cost.abs(), here.cost.abs())
-    ended = arrived & ((norm(there.gradient) <= rules.gradient_norm) | level)
-    return _State(
-        point=_Point(
-            *(
-                torch.where(arrived[(...,) + (None,) * (new.ndim - arrived.ndim)], new, old)
-                for new, old in zip(there, here, strict=True)
-            )
-        ),
-        steps=state.steps + arrived,
-        evaluations=state.evaluations + tried + moved,
-        active=arrived & ~ended,
-        converged=state.converged | ended,
-        lost=state.lost | (state.active & ~(usable & (arrived | ~moved))),
-    )
 
 
 def _evaluated(objective: Objective, x: Tensor) -> _Point:
@@ -192,7 +160,7 @@ def _step(point: _Point, damped: bool) -> Tensor:
     values, vectors = _curvatures(point)
     if damped:
         least = values[..., 0]
-        values = values + torch.maximum(-2 * least, _LEAST * values.abs().amax(-1) - least).clamp_min(0)[..., None]
+        values = values + torch.maximum(-2 * least, 1e-6 * values.abs().amax(-1) - least).clamp_min(0)[..., None]
     along = (vectors.mT @ point.gradient[..., None])[..., 0]
     return -(vectors @ (along / values)[..., None])[..., 0]
 
@@ -210,7 +178,7 @@ def _shortened(objective: Objective, point: _Point, step: Tensor, active: Tensor
             if not bool(searching.any()):
                 break
             cost = objective(torch.where(searching[..., None], point.x + scale[..., None] * step, point.x))
-            low = searching & (cost - point.cost <= _SUFFICIENT * scale * slope + rounding)
+            low = searching & (cost - point.cost <= SUFFICIENT * scale * slope + rounding)
             tries, found, searching = tries + searching, found | low, searching & ~low
             scale = torch.where(searching, scale / 2, scale)
     return torch.where(found[..., None], scale[..., None] * step, 0), tries
