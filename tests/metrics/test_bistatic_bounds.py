@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from tests.multichannel.helpers import published_radar, range_of, time_of
-from torchsar.metrics import bistatic_bounds, radial_velocity_bound_m_s
-from torchsar.metrics.bistatic_bounds import UNKNOWNS
+from torchsar.metrics.bistatic_bounds import UNKNOWNS, bistatic_bounds, radial_velocity_bound_m_s
 
 F64 = torch.float64
 RADAR = published_radar()

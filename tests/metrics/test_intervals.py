@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from torchsar.metrics import half_width_ratio, share_interval, trial_statistics
+from torchsar.metrics.intervals import half_width_ratio, share_interval, trial_statistics
 
 NAN, INF = np.nan, np.inf
 FIELDS = ("n", "mean", "median", "rmse", "std", "mean_interval", "median_interval", "rmse_interval")

@@ -17,7 +17,7 @@ import yaml
 
 from tests.program import Program
 from torchsar.core import Draws
-from torchsar.optim import gradient_minimum
+from torchsar.optim import lbfgs
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo.engines import engine
 from torchsar.study.montecarlo.loop import Plan, run_plan
@@ -259,7 +259,7 @@ def batch_of_every_system(folder: Path) -> int:
     """Run a small batch of each system, and return how many costly modules that has imported."""
     for system in CONFIGS:
         Bench(loaded(system, folder)).batch(Draws(3, "a", [0]))
-    gradient_minimum(torch.square, torch.ones(2), 1.0, 1e-3)
+    lbfgs(lambda x: x.square().sum(-1), torch.ones(2))
     costly = {"sympy", "torch._dynamo"} & set(sys.modules)
     print(*costly)
     return len(costly)

@@ -34,7 +34,7 @@ from torchsar import compensate, core, focus, metrics, multichannel, radar, repa
 from torchsar.compensate.group import RangeGroup
 from torchsar.core import Draws, Estimate, Signal, Stage
 from torchsar.echo.turntable import fast_time_axis
-from torchsar.optim import parabola_minimum
+from torchsar.optim.scalar import parabola_minimum
 from torchsar.radar import FarField
 
 DECHIRPED = replace(TURNTABLE, pulse_s=1e-6)

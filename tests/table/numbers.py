@@ -127,9 +127,6 @@ REASONS: dict[str, str] = {
     "focus.profile_axes": "reads an axis that the radar has made",
     "focus.quicklook_looks": "counts samples of a picture",
     "focus.reach_lines": "works on a radar, whose class checks it; tests/focus/test_strip.py",
-    "metrics.finite_rms": "statistics of recorded sweeps; tests/metrics/test_intervals.py",
-    "metrics.half_width_ratio": "statistics of recorded sweeps; tests/metrics/test_intervals.py",
-    "metrics.share_interval": "statistics of recorded sweeps; tests/metrics/test_intervals.py",
     "metrics.trial_statistics": "statistics of recorded sweeps; tests/metrics/test_intervals.py",
     "metrics.pulse_phase_bound_of_scene_rad": "works on a scene of scatterers; tests/metrics/test_phase.py",
     **{
@@ -138,12 +135,9 @@ REASONS: dict[str, str] = {
             "adam",
             "differential_evolution",
             "genetic",
-            "gradient_minimum",
-            "grid_minimum",
             "grid_search",
             "lbfgs",
             "newton",
-            "parabola_minimum",
         )
     },
 }
@@ -314,10 +308,6 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
         {"velocity_std_m_s": 0.1, "pulse_step_s": 1e-5, "n_period": 64.0},
     ),
     "metrics.pulse_phase_bound_rad": (lambda snr: metrics.pulse_phase_bound_rad(snr, 64), {"snr": 10.0}),
-    "metrics.radial_velocity_bound_m_s": (
-        lambda **given: metrics.radial_velocity_bound_m_s(BISTATIC, **given),
-        {"snr": 10.0, "n_seen": 64.0, "u_a_m_s": 2.0},
-    ),
     "metrics.range_per_sweep_bound_m": (
         metrics.range_per_sweep_bound_m,
         {"snr": 10.0, "samples_per_sweep": 32.0, "wavelength_m": 1.55e-6},

@@ -140,7 +140,7 @@ def minimum_entropy_velocity(
         dwell_s: Time that a target stays in the beam, in seconds.
         reach_m_s: Half width of the search about the nominal velocity of the radar, in m/s; at most
             half the nominal velocity is searched.
-        refine: `parabola_minimum` or `gradient_minimum` of `torchsar.optim.scalar`.
+        refine: Minimiser of one unknown, `torchsar.optim.scalar.parabola_minimum`.
         tolerance_m_s: Tolerance of the refinement in m/s.
         assess: Whether to add the standard deviation, the quality and the outcome.
 
@@ -248,7 +248,7 @@ class EffectiveVelocity(Stage):
         focuser: Focusing stage of the chain, whose radar and range reference spectrum are used.
         reach_m_s: Largest error of the nominal velocity in m/s.
         lines: Number of range cells that are used, at least 16.
-        refine: `parabola_minimum` or `gradient_minimum` of `torchsar.optim.scalar`.
+        refine: Minimiser of one unknown, `torchsar.optim.scalar.parabola_minimum`.
         tolerance_m_s: Tolerance of the refinement in m/s.
         assess: Whether to add the standard deviation, the quality and the outcome.
 

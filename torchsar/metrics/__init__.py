@@ -1,6 +1,6 @@
 """Image quality, errors of estimates, and Cramer-Rao bounds."""
 
-from torchsar.metrics.bistatic_bounds import bistatic_bounds, radial_velocity_bound_m_s
+from torchsar.metrics.bistatic_bounds import bistatic_bounds
 from torchsar.metrics.bounds import (
     beam_centre_bound_hz,
     pulse_phase_bound_of_scene_rad,
@@ -11,7 +11,7 @@ from torchsar.metrics.bounds import (
 )
 from torchsar.metrics.image import contrast, correlation, entropy, error_after_gain_db, error_db
 from torchsar.metrics.impulse import impulse_response
-from torchsar.metrics.intervals import finite_rms, half_width_ratio, share_interval, trial_statistics
+from torchsar.metrics.intervals import trial_statistics
 from torchsar.metrics.ladar_bounds import (
     integrated_range_detrended_bound_m,
     range_per_sweep_bound_m,
@@ -34,15 +34,12 @@ __all__ = [
     "entropy",
     "error_after_gain_db",
     "error_db",
-    "finite_rms",
-    "half_width_ratio",
     "impulse_response",
     "integrated_range_detrended_bound_m",
     "line_of_sight_bound_m",
     "phase_rmse",
     "pulse_phase_bound_of_scene_rad",
     "pulse_phase_bound_rad",
-    "radial_velocity_bound_m_s",
     "range_per_sweep_bound_m",
     "reference_doppler_std_hz",
     "registered_error_db",
@@ -50,7 +47,6 @@ __all__ = [
     "replica_zones",
     "residual_phase",
     "rotation_bounds",
-    "share_interval",
     "strehl",
     "tone_frequency_bound_hz",
     "trial_statistics",

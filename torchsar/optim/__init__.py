@@ -2,7 +2,6 @@
 
 from torchsar.optim.descent import Descent, adam, lbfgs
 from torchsar.optim.newton import newton
-from torchsar.optim.scalar import gradient_minimum, grid_minimum, parabola_minimum
 from torchsar.optim.search import Searched, differential_evolution, genetic, grid_search
 
 __all__ = [
@@ -11,10 +10,7 @@ __all__ = [
     "adam",
     "differential_evolution",
     "genetic",
-    "gradient_minimum",
-    "grid_minimum",
     "grid_search",
     "lbfgs",
     "newton",
-    "parabola_minimum",
 ]

@@ -77,67 +77,7 @@ def parabola_minimum(
             inside = vertex.abs() < 0.99
             half = torch.where(active & inside, half / 4, half)
             active = active & (half > tolerance)
-            if _finished(active):
+            # inside vmap values cannot be read, and all rounds are made
+            if not host_value(active.any(), True):
                 break
     return x, curvature
-
-
-def gradient_minimum(
-    cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12
-) -> tuple[Tensor, Tensor]:
-    """Minimise a differentiable cost of one unknown per trial by the secant method on its slope.
-
-    The first bracket is start +- step. Where the slopes at the ends show that the minimum lies
-    outside, the bracket is extended downhill, by at most one more step.
-
-    Args:
-        cost: Maps points (...,) to costs (...,), differentiable by autograd.
-        start: First point, shape (...,).
-        step: Half width of the first bracket, in the unit of the unknown.
-        tolerance: A trial stops when it moves by at most this in one round.
-        rounds: Largest number of rounds.
-
-    Returns:
-        The position of the minimum, and the second derivative of the cost from the last two slopes,
-        at least 0, each of shape (...,).
-    """
-    left, right = start - step, start + step
-    slope_left, slope_right = _slope(cost, left), _slope(cost, right)
-    x, last, slope_last = start, left, slope_left
-    curvature = torch.zeros_like(start)
-    active = torch.ones_like(start, dtype=torch.bool)
-    for _ in range(rounds):
-        slope = _slope(cost, x)
-        move = x - last
-        curvature = torch.where(active & (move != 0), (slope - slope_last) / torch.where(move != 0, move, 1), curvature)
-        left, slope_left = torch.where(slope < 0, x, left), torch.where(slope < 0, slope, slope_left)
-        right, slope_right = torch.where(slope < 0, right, x), torch.where(slope < 0, slope_right, slope)
-        newton = x - slope / torch.where(curvature > 0, curvature, 1)
-        usable = (curvature > 0) & (newton > left) & (newton < right)
-        next_x = torch.where(usable, newton, 0.5 * (left + right))
-        # no sign change at the ends: the minimum lies outside, shift the bracket
-        next_x = torch.where(slope_right < 0, right + step, torch.where(slope_left > 0, left - step, next_x))
-        next_x = torch.clamp(next_x, start - 2 * step, start + 2 * step)
-        left, right = torch.minimum(left, next_x), torch.maximum(right, next_x)
-        last, slope_last = torch.where(active, x, last), torch.where(active, slope, slope_last)
-        moved = torch.where(active, next_x, x)
-        active = active & ((moved - x).abs() > tolerance)
-        x = moved
-        if _finished(active):
-            break
-    return x, curvature.clamp_min(0)
-
-
-def _finished(active: Tensor) -> bool:
-    """Whether no trial is active; False inside vmap, where values cannot be read and all rounds are
-    made.
-    """
-    return not host_value(active.any(), True)
-
-
-def _slope(cost: Cost, x: Tensor) -> Tensor:
-    """Derivative of the cost per trial."""
-    # torch.func.grad would import the compiler of torch, which takes seconds
-    with torch.enable_grad():
-        x = x.detach().requires_grad_()
-        return torch.autograd.grad(cost(x).sum(), x)[0]

@@ -17,12 +17,9 @@ from torchsar.compensate.pulse_phase import CorrectPulsePhase
 from torchsar.core import Alternate, Turn
 from torchsar.echo import PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift
 from torchsar.focus import OmegaK, PaddedLines, TargetImage
-from torchsar.optim.scalar import gradient_minimum, parabola_minimum
 from torchsar.radar import LIGHT_M_S, FarField, InverseRadar, Spotlight, StripmapRadar
 from torchsar.repair import BandLimited, CorrectJitter, Lagrange
 from torchsar.scene import Dechirped, ImageReflectivity, KSea, Polynomial
-
-_REFINE = {"gradient": gradient_minimum, "parabola": parabola_minimum}
 
 
 def effective_velocity(
@@ -30,7 +27,6 @@ def effective_velocity(
     reference: Literal["matched", "flat", "phase"] | None = "matched",
     reach_m_s: float = 80.0,
     lines: int = 512,
-    refine: Literal["gradient", "parabola"] = "parabola",
     tolerance_m_s: float = 0.01,
     assess: bool = True,
 ) -> EffectiveVelocity:
@@ -40,11 +36,10 @@ def effective_velocity(
         reference: Reference of the range compression; None if the lines are already compressed.
         reach_m_s: Largest error of the nominal velocity in m/s.
         lines: Number of range cells that are used, at least 16.
-        refine: Method that refines the minimum.
         tolerance_m_s: Tolerance of the refinement in m/s.
         assess: Whether to add the standard deviation and the outcome.
     """
-    return EffectiveVelocity(OmegaK(radar, reference), reach_m_s, lines, _REFINE[refine], tolerance_m_s, assess=assess)
+    return EffectiveVelocity(OmegaK(radar, reference), reach_m_s, lines, tolerance_m_s=tolerance_m_s, assess=assess)
 
 
 def omega_k_padded(
