@@ -13,7 +13,8 @@ import zarr
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 from torchsar.core import Axis, Signal
-from torchsar.io import read, read_images, write_arrays, write_netcdf
+from torchsar.io import read, read_images, write_netcdf
+from torchsar.io.arrays import write_arrays
 from torchsar.study.commands import run as run_command
 
 h5py = pytest.importorskip("h5py", reason="the extra `formats` is not installed")

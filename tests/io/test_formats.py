@@ -14,7 +14,8 @@ from tests.io.test_damaged import PATH, PROFILES, SPOTLIGHT, STRIPMAP, TURNTABLE
 from torchsar.cli import main
 from torchsar.core import Recording
 from torchsar.focus import DirectImage
-from torchsar.io import FORMATS, read, read_cphd, read_history, read_sicd, write_cphd, write_geotiff, write_sicd
+from torchsar.io import read, read_cphd, read_history, read_sicd, write_cphd, write_geotiff, write_sicd
+from torchsar.io.formats import FORMATS
 
 
 @pytest.mark.parametrize("members", [STRIPMAP, PROFILES, TURNTABLE, SPOTLIGHT, PATH])

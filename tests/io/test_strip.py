@@ -8,7 +8,8 @@ import torch
 
 from tests.io.test_recorded import archive
 from torchsar.core import ArrayFile, Axis
-from torchsar.io import StripImage, StripRecording, read_images, read_stripmap, samples_checksum
+from torchsar.io import StripImage, read_images, read_stripmap
+from torchsar.io.strip import StripRecording, samples_checksum
 
 AXES = (Axis("azimuth", 700, 5.0, 2.0, "m"), Axis("range", 30, 100.0, 3.0, "m"))
 

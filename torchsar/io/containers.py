@@ -16,13 +16,11 @@ import numpy as np
 
 from torchsar.core import ArrayFile
 from torchsar.io.extras import library, reading
-from torchsar.io.fields import complex_type, joined
+from torchsar.io.fields import complex_type, joined, refuse_absent
 from torchsar.io.matlab import MatlabFile
 from torchsar.spelling import did_you_mean
 
 Slices = tuple[slice, ...]
-# the signature of HDF5 is at one of these bytes, after data of another program, such as MATLAB
-_HDF5, _HDF5_AT = b"\x89HDF\r\n\x1a\n", (0, 512, 1024, 2048)
 # names of the real and the imaginary part in a compound type, in lower case
 _PARTS = (("r", "i"), ("re", "im"), ("real", "imag"), ("i", "q"))
 
@@ -136,15 +134,16 @@ def open_container(path: Path, stack: ExitStack) -> Container | None:
         ValueError: If the file is damaged or cut off.
         ModuleNotFoundError: If the library of the format is not installed.
     """
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{path} {'is no file' if path.exists() else 'does not exist'}; give the path of a file"
-        )
+    refuse_absent(path, "a file")
     with path.open("rb") as file:
-        start = file.read(max(_HDF5_AT) + len(_HDF5))
+        start = file.read(4096)
     if start.startswith(b"MATLAB 5.0"):
-        return _matlab(path)
-    if any(start.startswith(_HDF5, at) for at in _HDF5_AT) or start.startswith(b"MATLAB 7.3"):
+        with reading(path, "MATLAB 5"):
+            variables = MatlabFile(path)
+        return Container(path, "MATLAB 5", lambda name: _whole(variables.load(name)), lambda: variables.names)
+    # the signature of HDF5 is at one of these bytes, after data of another program, such as MATLAB
+    hdf5 = any(start.startswith(b"\x89HDF\r\n\x1a\n", at) for at in (0, 512, 1024, 2048))
+    if hdf5 or start.startswith(b"MATLAB 7.3"):
         return _hdf5(path, stack, start.startswith(b"MATLAB"))
     if start.startswith((b"\x93NUMPY", b"PK\x03\x04")):
         held = ArrayFile(path)
@@ -203,14 +202,6 @@ def _hdf5(path: Path, stack: ExitStack, matlab: bool) -> Container:
         return found
 
     return Container(path, kind, find, names)
-
-
-def _matlab(path: Path) -> Container:
-    """A file of MATLAB 5 to 7, whose variables are read as a whole."""
-    kind = "MATLAB 5"
-    with reading(path, kind):
-        file = MatlabFile(path)
-    return Container(path, kind, lambda name: _whole(file.load(name)), lambda: file.names)
 
 
 def _whole(array: Any) -> tuple[Any, Callable[[Slices], np.ndarray]]:

@@ -1,8 +1,9 @@
-"""Checks of the fields of an archive of recorded data, before they are loaded."""
+"""Fields of an archive of recorded data: checks before they are loaded, and the recording."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,9 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import ArrayFile, StoredArray
+from torchsar.core import ArrayFile, Recording, StoredArray
 
-_SHORT = 64  # bytes of the longest value that messages show
+_ACCEPTED: dict[str, Callable[[float], bool]] = {
+    "positive number": lambda x: x > 0,
+    "number other than zero": bool,
+    "whole number": float.is_integer,
+}
 
 
 class Described(NamedTuple):
@@ -23,11 +28,54 @@ class Described(NamedTuple):
         samples: The sample array.
         radar: Description of the instrument.
         aux: Side data by name, as for `Recording.from_arrays`.
+        formed: Function that forms the matrix (pulse, range) of the samples, whole or some of the
+            pulses.
     """
 
     samples: StoredArray
     radar: Any
     aux: dict[str, Any]
+    formed: Callable[[np.ndarray], Tensor | np.ndarray]
+
+
+def read_described(
+    path: str | Path, dtype: torch.dtype, content: str, describe: Callable[[Mapping[str, StoredArray], Path], Described]
+) -> Recording:
+    """Read the recording in an archive of one kind.
+
+    Args:
+        path: Path of the archive.
+        dtype: complex64 or complex128, dtype of the samples.
+        content: What the archive should hold, for messages.
+        describe: Function that checks the fields of such an archive.
+
+    Returns:
+        The recording.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is not such an archive.
+    """
+    path = Path(path)
+    found = describe(archive(path, content), path)
+    with naming(path):
+        data = found.formed(found.samples.load())
+        return Recording.from_arrays(data, found.radar, dtype=dtype, what=str(path), **found.aux)
+
+
+def refuse_absent(path: Path, wanted: str) -> None:
+    """Check that a file exists.
+
+    Args:
+        path: Path of the file.
+        wanted: What the file should be, for the message.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+    """
+    if not path.is_file():
+        what = "is no file" if path.exists() else "does not exist"
+        raise FileNotFoundError(f"{path} {what}; give the path of {wanted}")
 
 
 def archive(path: Path, content: str) -> ArrayFile:
@@ -44,9 +92,7 @@ def archive(path: Path, content: str) -> ArrayFile:
         FileNotFoundError: If there is no such file.
         ValueError: If the file is not an archive.
     """
-    if not path.is_file():
-        what = "is no file" if path.exists() else "does not exist"
-        raise FileNotFoundError(f"data.file: {path} {what}; give the path of an .npz file with {content}")
+    refuse_absent(path, f"an .npz file with {content}, such as data.file")
     fields = ArrayFile(path)
     if "" in fields:
         raise ValueError(f"{path} must be a numpy archive (.npz) with {content}, but it holds a single array (.npy)")
@@ -89,25 +135,23 @@ def refuse_missing(fields: Mapping[str, StoredArray], path: Path, keys: tuple[st
         )
 
 
-def number(field: StoredArray, signed: bool = False) -> float:
+def number(field: StoredArray, accepted: str = "positive number") -> float:
     """Load one number.
 
     Args:
         field: The field.
-        signed: Whether the number may be negative.
+        accepted: "positive number", "number other than zero" or "whole number".
 
     Returns:
-        The number, finite and not zero.
+        The number, which is finite.
 
     Raises:
         ValueError: If the field holds anything else.
     """
-    accepted = "number other than zero" if signed else "positive number"
-    if field.shape != () or field.dtype.kind not in "iuf":
-        raise ValueError(f"{field.what} must be one {accepted}, got {shown(field)}")
-    value = float(field.load())
-    if not (np.isfinite(value) and (value != 0 if signed else value > 0)):
-        raise ValueError(f"{field.what} must be one {accepted}, got {value}")
+    real = field.shape == () and field.dtype.kind in "iuf"
+    value = float(field.load()) if real else math.nan
+    if not (math.isfinite(value) and _ACCEPTED[accepted](value)):
+        raise ValueError(f"{field.what} must be one {accepted}, got {value if real else shown(field)}")
     return value
 
 
@@ -141,7 +185,7 @@ def shown(field: StoredArray) -> str:
     Returns:
         The value of a short field without dimensions, the type and the shape of any other.
     """
-    short = not field.shape and field.dtype.itemsize <= _SHORT
+    short = not field.shape and field.dtype.itemsize <= 64  # bytes of a value that fits a message
     return repr(field.load().item()) if short else field.described
 
 

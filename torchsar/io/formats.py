@@ -10,7 +10,7 @@ import torch
 
 from torchsar.core import Recording, Signal
 from torchsar.io.cphd import read_cphd
-from torchsar.io.fields import archive
+from torchsar.io.fields import archive, refuse_absent
 from torchsar.io.inverse import read_inverse
 from torchsar.io.path import read_path
 from torchsar.io.recorded import read_stripmap
@@ -25,13 +25,14 @@ class Format:
         name: Its name.
         suffixes: Endings of its files, in lower case.
         magic: Bytes with which its files may begin.
-        read: Function that reads a file as a dtype.
+        read: Function that reads a file as a dtype; or the reason why it is not read, with what to
+            do, as the end of a sentence.
     """
 
     name: str
     suffixes: tuple[str, ...]
     magic: tuple[bytes, ...]
-    read: Callable[[Path, torch.dtype], Recording | Signal]
+    read: Callable[[Path, torch.dtype], Recording | Signal] | str
 
 
 def _read_archive(path: Path, dtype: torch.dtype) -> Recording:
@@ -42,27 +43,21 @@ def _read_archive(path: Path, dtype: torch.dtype) -> Recording:
     return (read_path if "history" in keys or "fp" in keys else read_inverse)(path, dtype)
 
 
-def _refuse_crsd(path: Path, dtype: torch.dtype) -> Recording:
-    raise ValueError(
-        f"{path} holds received signals before range compression (CRSD), which are not read; convert it to compensated "
-        "phase histories (CPHD)"
-    )
-
-
-def _refuse_without_sidecar(path: Path, dtype: torch.dtype) -> Recording:
-    raise ValueError(
-        f"{path} must be imported first: torchsar import FILE --sidecar YAML --out RECORDING.npz, where the sidecar "
-        "says what the file holds"
-    )
-
-
+_NEEDS_SIDECAR = (
+    "must be imported first: torchsar import FILE --sidecar YAML --out RECORDING.npz, where the sidecar says what the "
+    "file holds"
+)
+_NOT_COMPRESSED = (
+    "holds received signals before range compression (CRSD), which are not read; convert it to compensated phase "
+    "histories (CPHD)"
+)
 # the content decides, then the ending
 FORMATS = (
     Format("CPHD", (".cphd",), (b"CPHD/",), read_cphd),
-    Format("CRSD", (".crsd",), (b"CRSDsar/", b"CRSDtx/", b"CRSDrcv/"), _refuse_crsd),
+    Format("CRSD", (".crsd",), (b"CRSDsar/", b"CRSDtx/", b"CRSDrcv/"), _NOT_COMPRESSED),
     Format("SICD", (".nitf", ".ntf", ".sicd"), (b"NITF", b"NSIF"), read_sicd),
-    Format("HDF5", (".h5", ".hdf5"), (b"\x89HDF\r\n\x1a\n",), _refuse_without_sidecar),
-    Format("MATLAB", (".mat",), (b"MATLAB 5.0", b"MATLAB 7.3"), _refuse_without_sidecar),
+    Format("HDF5", (".h5", ".hdf5"), (b"\x89HDF\r\n\x1a\n",), _NEEDS_SIDECAR),
+    Format("MATLAB", (".mat",), (b"MATLAB 5.0", b"MATLAB 7.3"), _NEEDS_SIDECAR),
     Format("numpy archive", (".npz",), (b"PK\x03\x04", b"PK\x05\x06", b"\x93NUMPY"), _read_archive),
 )
 
@@ -81,9 +76,7 @@ def format_of(path: str | Path) -> Format:
         ValueError: If the format is not known.
     """
     path = Path(path)
-    if not path.is_file():
-        what = "is no file" if path.exists() else "does not exist"
-        raise FileNotFoundError(f"data.file: {path} {what}; give the path of a data file")
+    refuse_absent(path, "a data file")
     with path.open("rb") as file:
         head = file.read(16)
     matches = (
@@ -117,8 +110,10 @@ def read(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording | 
             extra.
         ValueError: If the format is not known, or the file is damaged.
     """
-    path = Path(path)
-    return format_of(path).read(path, dtype)
+    path, reader = Path(path), format_of(path).read
+    if isinstance(reader, str):
+        raise ValueError(f"{path} {reader}")
+    return reader(path, dtype)
 
 
 def read_history(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
@@ -136,11 +131,10 @@ def read_history(path: str | Path, dtype: torch.dtype = torch.complex64) -> Reco
         ModuleNotFoundError: If a library for the format is not installed.
         ValueError: If the file is damaged, of no known format, or has no such content.
     """
-    path = Path(path)
     found = format_of(path)
     if found.read is _read_archive:
         return read_path(path, dtype)
-    recording = found.read(path, dtype)
+    recording = read(path, dtype)
     if not isinstance(recording, Recording) or "transmitter_m" not in recording.aux:
         raise ValueError(f"{path}: {found.name} holds no phase history with positions of the antennas")
     return recording

@@ -4,30 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchsar.core import Recording, StoredArray, refuse_non_finite
-from torchsar.io.fields import Described, archive, naming, number, refuse_missing, shown, vector
+from torchsar.io.fields import Described, naming, number, read_described, refuse_missing, shown, vector
 from torchsar.radar import LIGHT_M_S, InverseRadar, range_profiles
 from torchsar.radar.spotlight import frequency_step_hz
-
-# sample array of each kind of data, and the keys that it requires
-_SCHEMAS = {
-    "profiles": ("range_step_m", "bandwidth_hz", "prf_hz"),
-    "sig": ("freq_hz", "angle_deg"),
-    "fp": ("freq_hz", "x_m", "y_m", "z_m", "r0_m"),
-}
-# C band, commonly given in the literature for the Yak-42 recording, not verified; `profiles`
-# without `f0_hz` are taken for data of this kind
-UNSTATED_CARRIER_HZ = 5.52e9
 
 
 def read_inverse(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
     """Read range profiles, a turntable sweep or a spotlight phase history from a numpy archive.
+
+    >>> import numpy, pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "turntable.npz"
+    >>> sig, freq_hz = numpy.ones((3, 2), complex), [1e9, 2e9, 3e9]
+    >>> numpy.savez(path, sig=sig, freq_hz=freq_hz, angle_deg=[0, 1])
+    >>> read_inverse(path).radar.carrier_hz
+    2000000000.0
 
     The archive (.npz, without pickled objects) holds exactly one of three complex sample arrays,
     each with further keys:
@@ -63,14 +62,7 @@ def read_inverse(path: str | Path, dtype: torch.dtype = torch.complex64) -> Reco
         FileNotFoundError: If there is no such file.
         ValueError: If the file is not such an archive, or a key is missing or invalid.
     """
-    path = Path(path)
-    samples, radar, aux = describe_inverse(archive(path, "range profiles or phase history"), path)
-    with naming(path):
-        data = torch.from_numpy(samples.load()).T
-        if aux:  # profiles of a target in flight have none
-            refuse_non_finite(data, samples.what)  # the transform would spread them
-            data = range_profiles(data.to(torch.complex128))
-        return Recording.from_arrays(data.contiguous(), radar, dtype=dtype, what=str(path), **aux)
+    return read_described(path, dtype, "range profiles or phase history", describe_inverse)
 
 
 def describe_inverse(fields: Mapping[str, StoredArray], path: Path) -> Described:
@@ -86,33 +78,106 @@ def describe_inverse(fields: Mapping[str, StoredArray], path: Path) -> Described
     Raises:
         ValueError: If a key is missing or invalid.
     """
-    kind = _kind(fields, path)
-    samples = _samples(fields[kind], kind)
-    with naming(path):
-        return Described(samples, *_READERS[kind](fields, samples.shape))
-
-
-def _kind(fields: Mapping[str, StoredArray], path: Path) -> str:
-    """Key of the only sample array in the archive; raise ValueError if keys are missing."""
-    found = [kind for kind in _SCHEMAS if kind in fields]
+    found = [kind for kind in _READERS if kind in fields]
     if len(found) != 1:
-        choices = "; ".join(f"{kind} with {', '.join(keys)}" for kind, keys in _SCHEMAS.items())
+        choices = "; ".join(f"{kind} with {', '.join(keys)}" for kind, (keys, _) in _READERS.items())
         raise ValueError(
             f"{path} must hold exactly one of the sample arrays ({choices}), got {found or 'none'} among "
             f"the keys {sorted(fields)}"
         )
-    refuse_missing(fields, path, _SCHEMAS[found[0]], f"an archive with {found[0]!r}")
-    return found[0]
+    keys, reader = _READERS[found[0]]
+    refuse_missing(fields, path, keys, f"an archive with {found[0]!r}")
+    samples = matrix(fields[found[0]], "range" if found[0] == "profiles" else "frequency")
+    with naming(path):
+        radar, aux = reader(fields, samples.shape)
+    if found[0] == "profiles":
+        return Described(samples, radar, aux, lambda x: np.ascontiguousarray(x.T))
+    return Described(samples, radar, aux, partial(profiles_of, what=samples.what))
 
 
-def _samples(field: StoredArray, key: str) -> StoredArray:
-    """The sample array, of two dimensions and complex."""
+def matrix(field: StoredArray, rows: str) -> StoredArray:
+    """Check that a field holds complex samples of two dimensions.
+
+    Args:
+        field: The field.
+        rows: Name of the first dimension, for messages.
+
+    Returns:
+        The field.
+
+    Raises:
+        ValueError: If it has another type or shape.
+    """
     if field.dtype.kind != "c" or len(field.shape) != 2 or min(field.shape) < 2:
-        rows = "range" if key == "profiles" else "frequency"
         raise ValueError(
             f"{field.what} must be a complex array ({rows}, pulse) of at least 2 x 2 samples, got {shown(field)}"
         )
     return field
+
+
+def profiles_of(history: np.ndarray, what: str) -> Tensor:
+    """Form range profiles of the samples of a phase history.
+
+    Args:
+        history: Samples, shape (frequency, pulse), complex.
+        what: Name of the samples for messages.
+
+    Returns:
+        Profiles, shape (pulse, range), complex128.
+
+    Raises:
+        ValueError: If a sample is not finite.
+    """
+    data = torch.from_numpy(history).T
+    refuse_non_finite(data, what)  # the transform would spread them
+    return range_profiles(data.to(torch.complex128)).contiguous()
+
+
+def history_radar(
+    frequency_hz: Tensor, prf_hz: float, reference_m: float, rotation_rad_s: float | None = None
+) -> InverseRadar:
+    """Return the radar of frequency samples in equal steps.
+
+    Args:
+        frequency_hz: Frequencies in Hz, shape (n,).
+        prf_hz: Pulse repetition frequency in Hz.
+        reference_m: Range in metres at which range coordinates are zero.
+        rotation_rad_s: Mean rotation rate of the line of sight in rad/s; None or 0 if it does not
+            turn.
+
+    Returns:
+        The radar.
+
+    Raises:
+        ValueError: If the frequencies do not rise in equal steps.
+    """
+    n = len(frequency_hz)
+    return InverseRadar(
+        carrier_hz=float(frequency_hz[n // 2]),
+        bandwidth_hz=n * frequency_step_hz(frequency_hz),
+        prf_hz=prf_hz,
+        rotation_rad_s=rotation_rad_s or None,
+        reference_range_m=reference_m,
+    )
+
+
+def frequencies(field: StoredArray, n: int) -> Tensor:
+    """Load frequencies that rise in equal steps.
+
+    Args:
+        field: The field.
+        n: How many frequencies it must hold.
+
+    Returns:
+        Frequencies in Hz, shape (n,), float64.
+
+    Raises:
+        ValueError: If the field holds anything else.
+    """
+    frequency = vector(field, n)
+    with naming(field.what):
+        frequency_step_hz(frequency)
+    return frequency
 
 
 def _profiles_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
@@ -124,21 +189,23 @@ def _profiles_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) -
             f"range_step_m must be at most c / (2 B) for the bandwidth_hz B = {bandwidth:g}, "
             f"got {step:g} m, which samples only {sampled:g} Hz"
         )
-    carrier = number(fields["f0_hz"]) if "f0_hz" in fields else UNSTATED_CARRIER_HZ
+    # C band, commonly given in the literature for the Yak-42 recording, not verified
+    carrier = number(fields["f0_hz"]) if "f0_hz" in fields else 5.52e9
     return InverseRadar(carrier, sampled, number(fields["prf_hz"])), {}
 
 
 def _turntable_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
     """Radar and side data of a turntable sweep."""
-    frequency = _frequency(fields["freq_hz"], shape[0])
+    frequency = frequencies(fields["freq_hz"], shape[0])
     angle = torch.deg2rad(vector(fields["angle_deg"], shape[1]))
-    turn = float((angle[-1] - angle[0]).abs())
-    return _radar(fields, frequency, shape, turn, 0.0), {"frequency_hz": frequency, "angle_rad": angle}
+    prf = number(fields["prf_hz"]) if "prf_hz" in fields else 1.0
+    turn = float((angle[-1] - angle[0]).abs()) * prf / (shape[1] - 1)
+    return history_radar(frequency, prf, 0.0, turn), {"frequency_hz": frequency, "angle_rad": angle}
 
 
 def _spotlight_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) -> tuple[InverseRadar, dict[str, Any]]:
     """Radar and side data of a spotlight phase history."""
-    frequency = _frequency(fields["freq_hz"], shape[0])
+    frequency = frequencies(fields["freq_hz"], shape[0])
     position = torch.stack([vector(fields[key], shape[1]) for key in ("x_m", "y_m", "z_m")], -1)
     reference = vector(fields["r0_m"], shape[1])
     if not bool((reference > 0).all() and (torch.linalg.vector_norm(position, dim=-1) > 0).all()):
@@ -146,38 +213,17 @@ def _spotlight_radar(fields: Mapping[str, StoredArray], shape: tuple[int, ...]) 
             "r0_m must be positive and the antenna must not be at the scene centre, "
             f"got a least r0_m of {float(reference.min()):g}"
         )
-    aux = {"frequency_hz": frequency, "position_m": position, "reference_m": reference}
-    return _radar(fields, frequency, shape, _turn_rad(position), float(reference.mean())), aux
-
-
-_READERS = {"profiles": _profiles_radar, "sig": _turntable_radar, "fp": _spotlight_radar}
-
-
-def _radar(
-    fields: Mapping[str, StoredArray], frequency: Tensor, shape: tuple[int, ...], turn_rad: float, reference_m: float
-) -> InverseRadar:
-    """Radar of frequency samples whose line of sight turns by turn_rad from first to last pulse."""
     prf = number(fields["prf_hz"]) if "prf_hz" in fields else 1.0
-    n = shape[0]
-    rotation = turn_rad * prf / (shape[1] - 1)
-    return InverseRadar(
-        carrier_hz=float(frequency[n // 2]),
-        bandwidth_hz=n * frequency_step_hz(frequency),
-        prf_hz=prf,
-        rotation_rad_s=rotation if rotation > 0 else None,
-        reference_range_m=reference_m,
-    )
-
-
-def _turn_rad(position: Tensor) -> float:
-    """Angle between the first and the last line of sight, radians."""
     first, last = (position[i] / torch.linalg.vector_norm(position[i]) for i in (0, -1))
-    return 2 * math.asin(min(1.0, float(torch.linalg.vector_norm(last - first)) / 2))
+    chord = float(torch.linalg.vector_norm(last - first))
+    turn = 2 * math.asin(min(1.0, chord / 2)) * prf / (shape[1] - 1)
+    aux = {"frequency_hz": frequency, "position_m": position, "reference_m": reference}
+    return history_radar(frequency, prf, float(reference.mean()), turn), aux
 
 
-def _frequency(field: StoredArray, n: int) -> Tensor:
-    """Frequencies in Hz, rising in equal steps."""
-    frequency = vector(field, n)
-    with naming(field.what):
-        frequency_step_hz(frequency)
-    return frequency
+# sample array of each kind of data, the keys that it requires, and the function for them
+_READERS = {
+    "profiles": (("range_step_m", "bandwidth_hz", "prf_hz"), _profiles_radar),
+    "sig": (("freq_hz", "angle_deg"), _turntable_radar),
+    "fp": (("freq_hz", "x_m", "y_m", "z_m", "r0_m"), _spotlight_radar),
+}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +12,22 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Recording, StoredArray, refuse_non_finite
-from torchsar.io.fields import Described, archive, naming, number, refuse_missing, shown, vector
-from torchsar.io.inverse import read_inverse
-from torchsar.radar import AntennaPath, InverseRadar, LocalFrame, range_profiles, resample_path
-from torchsar.radar.spotlight import frequency_step_hz
+from torchsar.io.fields import Described, naming, number, read_described, refuse_missing, shown, vector
+from torchsar.io.inverse import describe_inverse, frequencies, history_radar, matrix, profiles_of
+from torchsar.radar import AntennaPath, LocalFrame, resample_path
 
 _REQUIRED = ("history", "freq_hz", "transmitter_m", "path_reference_m")
 
 
 def read_path(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
     """Read the phase history of an antenna or a pair of antennas on any path.
+
+    >>> import numpy, pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "flight.npz"
+    >>> places = dict(transmitter_m=[[0, -5e3, 3e3], [1, -5e3, 3e3]], path_reference_m=[11e3, 11e3])
+    >>> numpy.savez(path, history=numpy.ones((3, 2), complex), freq_hz=[1e9, 2e9, 3e9], **places)
+    >>> sorted(read_path(path).aux)
+    ['frequency_hz', 'path_reference_m', 'position_m', 'reference_m', 'transmitter_m']
 
     The archive (.npz, without pickled objects) holds the complex samples `history` (frequency,
     pulse), in which the point x has the phase -2 pi f (|transmitter - x| + |x - receiver| -
@@ -55,22 +61,11 @@ def read_path(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recordi
         FileNotFoundError: If there is no such file.
         ValueError: If the file is not such an archive, or a key is missing or invalid.
     """
-    path = Path(path)
-    fields = archive(path, "phase history")
-    if "fp" in fields:
-        recording = read_inverse(path, dtype)
-        antennas = AntennaPath(recording.aux["position_m"], None, 2 * recording.aux["reference_m"])
-        return replace(recording, aux={**recording.aux, **antennas.side_data()})
-    samples, radar, aux = describe_path(fields, path)
-    with naming(path):
-        data = torch.from_numpy(samples.load()).T
-        refuse_non_finite(data, samples.what)  # the transform would spread them
-        data = range_profiles(data.to(torch.complex128)).contiguous()
-        return Recording.from_arrays(data, radar, dtype=dtype, what=str(path), **aux)
+    return read_described(path, dtype, "phase history", describe_path)
 
 
 def describe_path(fields: Mapping[str, StoredArray], path: Path) -> Described:
-    """Check the fields of an archive with `history` for `read_path`, without loading the samples.
+    """Check the fields of an archive for `read_path`, without loading the samples.
 
     Args:
         fields: The fields by key.
@@ -82,27 +77,26 @@ def describe_path(fields: Mapping[str, StoredArray], path: Path) -> Described:
     Raises:
         ValueError: If a key is missing or invalid.
     """
+    if "fp" in fields:
+        found = describe_inverse(fields, path)
+        antennas = AntennaPath(found.aux["position_m"], None, 2 * found.aux["reference_m"])
+        return found._replace(aux={**found.aux, **antennas.side_data()})
     refuse_missing(fields, path, _REQUIRED, "an archive with the history of any path")
-    samples = fields["history"]
-    if samples.dtype.kind != "c" or len(samples.shape) != 2 or min(samples.shape) < 2:
-        raise ValueError(
-            f"{samples.what} must be a complex array (frequency, pulse) of at least 2 x 2 samples, got {shown(samples)}"
-        )
+    samples = matrix(fields["history"], "frequency")
     with naming(path):
         n, pulses = samples.shape
-        frequency = vector(fields["freq_hz"], n)
-        with naming(fields["freq_hz"].what):
-            step_hz = frequency_step_hz(frequency)
+        frequency = frequencies(fields["freq_hz"], n)
         time = vector(fields["pulse_time_s"], pulses) if "pulse_time_s" in fields else None
-        places = [_places(fields, name, pulses, time) for name in ("transmitter", "receiver")]
-        assert places[0] is not None
-        antennas = AntennaPath(places[0], places[1], vector(fields["path_reference_m"], pulses))
+        transmitter, receiver = (_places(fields, name, pulses, time) for name in ("transmitter", "receiver"))
+        assert transmitter is not None
+        antennas = AntennaPath(transmitter, receiver, vector(fields["path_reference_m"], pulses))
         reference_m = float(antennas.reference_m.mean()) / 2
         if not reference_m >= 0:
             raise ValueError(f"path_reference_m must be paths of 0 m or more, got a mean of {2 * reference_m:g} m")
-        radar = InverseRadar(float(frequency[n // 2]), n * step_hz, _prf_hz(fields, time), None, None, reference_m)
+        radar = history_radar(frequency, _prf_hz(fields, time), reference_m)
         origin = {"origin_deg_m": vector(fields["origin_deg_m"], 3)} if "origin_deg_m" in fields else {}
-    return Described(samples, radar, {"frequency_hz": frequency, **antennas.side_data(), **origin})
+    aux = {"frequency_hz": frequency, **antennas.side_data(), **origin}
+    return Described(samples, radar, aux, partial(profiles_of, what=samples.what))
 
 
 def _places(fields: Mapping[str, StoredArray], antenna: str, pulses: int, time: Tensor | None) -> Tensor | None:
@@ -116,7 +110,8 @@ def _places(fields: Mapping[str, StoredArray], antenna: str, pulses: int, time: 
         raise ValueError(
             f"{field.what} must be real numbers of shape {' or '.join(map(str, accepted))}, got {shown(field)}"
         )
-    place = _finite(field)
+    place = torch.from_numpy(field.load().astype(np.float64))
+    refuse_non_finite(place, field.what, "interpolate the gaps of the record", "values")
     if "origin_deg_m" in fields:
         origin = vector(fields["origin_deg_m"], 3).tolist()
         with naming(fields["origin_deg_m"].what):
@@ -127,13 +122,6 @@ def _places(fields: Mapping[str, StoredArray], antenna: str, pulses: int, time: 
         raise ValueError(f"{records.what} needs pulse_time_s, the times of the pulses on the same clock; add it")
     with naming(field.what):
         return resample_path(vector(records, n), place, time)
-
-
-def _finite(field: StoredArray) -> Tensor:
-    """Load finite real numbers of any shape, float64."""
-    value = torch.from_numpy(field.load().astype(np.float64))
-    refuse_non_finite(value, field.what, "interpolate the gaps of the record", "values")
-    return value
 
 
 def _prf_hz(fields: Mapping[str, StoredArray], time: Tensor | None) -> float:

@@ -11,10 +11,9 @@ import io
 import math
 import re
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -35,39 +34,54 @@ _BLOCK_BYTES = 32 << 20
 
 
 class _Kind(NamedTuple):
-    """Dims of a sample array, its numbers, and its side arrays."""
+    """Dims of a sample array, and the keys beside it with their units: numbers of the radar, and
+    side arrays, each with the dim whose length it has.
+    """
 
     dims: tuple[str, str]
-    radar: tuple[str, ...]
-    side: tuple[str, ...]
+    radar: dict[str, str]
+    side: dict[str, tuple[str, str]]
     describe: Callable[[Mapping[str, StoredArray], Path], Described]
 
 
-_STRIPMAP = ("fs_hz", "prf_hz", "f0_hz", "chirp_rate_hz_s", "pulse_s", "slant_range_cell1_m", "v_eff_m_s")
-_TIMES = ("pulse_time_s", "transmitter_time_s", "receiver_time_s")
+_PRF, _FREQUENCY = {"prf_hz": "Hz"}, {"freq_hz": ("Hz", "frequency")}
 # sample arrays with their keys, as the readers take them
 _KINDS = {
     "iq": _Kind(
         ("pulse", "range"),
-        (*_STRIPMAP, "first_cell", "c_m_s"),
-        ("agc_db", "line_number", "pilot"),
+        {
+            **{"fs_hz": "Hz", "prf_hz": "Hz", "f0_hz": "Hz", "chirp_rate_hz_s": "Hz/s", "pulse_s": "s"},
+            **{"slant_range_cell1_m": "m", "v_eff_m_s": "m/s", "first_cell": "", "c_m_s": "m/s"},
+        },
+        {"agc_db": ("dB", "pulse"), "line_number": ("", "pulse"), "pilot": ("", "range")},
         describe_stripmap,
     ),
-    "profiles": _Kind(("range", "pulse"), ("range_step_m", "bandwidth_hz", "prf_hz", "f0_hz"), (), describe_inverse),
-    "sig": _Kind(("frequency", "pulse"), ("prf_hz",), ("freq_hz", "angle_deg"), describe_inverse),
-    "fp": _Kind(("frequency", "pulse"), ("prf_hz",), ("freq_hz", "x_m", "y_m", "z_m", "r0_m"), describe_inverse),
+    "profiles": _Kind(
+        ("range", "pulse"),
+        {"range_step_m": "m", "bandwidth_hz": "Hz", "prf_hz": "Hz", "f0_hz": "Hz"},
+        {},
+        describe_inverse,
+    ),
+    "sig": _Kind(("frequency", "pulse"), _PRF, {**_FREQUENCY, "angle_deg": ("deg", "pulse")}, describe_inverse),
+    "fp": _Kind(
+        ("frequency", "pulse"),
+        _PRF,
+        {**_FREQUENCY, **dict.fromkeys(("x_m", "y_m", "z_m", "r0_m"), ("m", "pulse"))},
+        describe_inverse,
+    ),
     "history": _Kind(
         ("frequency", "pulse"),
-        ("prf_hz",),
-        ("freq_hz", "transmitter_m", "receiver_m", "path_reference_m", *_TIMES, "origin_deg_m"),
+        _PRF,
+        {
+            **_FREQUENCY,
+            **{"transmitter_m": ("m", ""), "receiver_m": ("m", ""), "path_reference_m": ("m", "pulse")},
+            **{"pulse_time_s": ("s", "pulse"), "transmitter_time_s": ("s", ""), "receiver_time_s": ("s", "")},
+            "origin_deg_m": ("", ""),
+        },
         describe_path,
     ),
 }
 _SYSTEMS = {"stripmap": ("iq",), "isal": ("profiles", "sig", "fp"), "path": ("history", "fp")}
-# side arrays whose length is that of a dim of the samples
-_ALONG = {"freq_hz": "frequency", "pilot": "range"} | dict.fromkeys(
-    ("angle_deg", "x_m", "y_m", "z_m", "r0_m", "agc_db", "line_number", "path_reference_m", "pulse_time_s"), "pulse"
-)
 # factors of other units for each unit of a key
 _UNITS = {
     "Hz": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "GHz": 1e9, "THz": 1e12},
@@ -78,11 +92,11 @@ _UNITS = {
     "deg": {"deg": 1.0, "rad": 180 / math.pi},
     "dB": {"dB": 1.0},
 }
-# ends of keys with their units, the longest first
-_ENDS = {"_hz_s": "Hz/s", "_m_s": "m/s", "_hz": "Hz", "_deg": "deg", "_db": "dB", "_s": "s", "_m": "m"}
 _WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?) *([A-Za-z/]+)")
-_REAL = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float16", "float32", "float64")
-_DTYPES = (*_REAL, "complex64", "complex128")
+_DTYPES = (
+    *("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float16", "float32", "float64"),
+    *("complex64", "complex128"),
+)
 _FLAT = ("dtype", "byte_order", "header_bytes", "shape")
 _SAMPLES = ("key", "name", "dims", "imag", "conjugate", *_FLAT)
 _ENTRY = ("name", "file", "unit", "transpose", "first", "step", *_FLAT)
@@ -130,193 +144,145 @@ def import_recording(path: str | Path, sidecar: Mapping[str, Any], out: str | Pa
             written then.
         ModuleNotFoundError: If the library of the format is not installed.
     """
-    path, out = Path(path), Path(out)
+    path, out, name = Path(path), Path(out), str(Path(name))
     if out.suffix != ".npz":
         raise ValueError(f"{out}: the name of the new archive must end in .npz")
     if out.exists() or out.is_symlink():
         raise FileExistsError(f"{out} exists and is not replaced; move it, or choose another name")
+    tree = _section(sidecar, name, ("system", "samples", "radar", "side"))
+    keys = _SYSTEMS[_choice(tree.get("system"), f"{name}: system", _SYSTEMS)]
+    layout = _section(tree.get("samples"), f"{name}: samples", _SAMPLES)
+    key = _choice(layout.get("key", keys[0] if "profiles" not in keys else None), f"{name}: samples.key", keys)
+    kind = _KINDS[key]
     with ExitStack() as stack:
-        key, samples, arrays = _Import(path, sidecar, name, stack).planned()
-        write_whole(out, lambda part: _write(part, key, samples, arrays))
+        file = _File(path, cache(partial(open_container, stack=stack)))
+        samples, slow = _samples(file, layout, f"{name}: samples", kind.dims)
+        turned = slow != kind.dims[0]
+        shape = samples.shape[::-1] if turned else samples.shape
+        lengths, arrays, stored = dict(zip(kind.dims, shape, strict=True)), {}, {}
+        sections = {"radar": {one: (unit, "") for one, unit in kind.radar.items()}, "side": kind.side}
+        for section, known in sections.items():
+            where, held = f"{name}: {section}", tree.get(section)
+            for one, value in _section({} if held is None else held, where, tuple(known)).items():
+                unit, along = known[one]
+                x = _value(file, value, f"{where}.{one}", unit, lengths.get(along))
+                arrays[one] = x = x.reshape(()) if section == "radar" and x.size == 1 else x
+                stored[one] = StoredArray(f"{where}.{one}", x.shape, x.dtype, partial(_stream, x))
+        stored[key] = StoredArray(f"{name}: samples", shape, samples.dtype, partial(_stream, np.zeros(())))
+        found = kind.describe(stored, Path(name))
+        with naming(name):  # side data that only a recording checks, with one sample per line
+            lines = torch.ones(lengths["pulse"], 1, dtype=torch.complex64)
+            Recording.from_arrays(lines, found.radar, what=name, **found.aux)
+        write_whole(out, lambda part: _write(part, key, samples, slow, turned, arrays))
     return out
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """The samples in a file, and how they become complex numbers of two dimensions.
+class _File(NamedTuple):
+    """The file of the data, and a function that opens it and others, each of them once."""
 
-    Args:
-        parts: One array, or those of the real and imaginary parts.
-        dims: Names of the dims of each.
-        order: Names of the two dims of the result.
-        conjugate: Whether the imaginary part changes its sign.
+    path: Path
+    opened: Callable[[Path], Container | None]
+
+
+def _samples(file: _File, tree: Mapping[str, Any], where: str, order: tuple[str, str]) -> tuple[BlockArray, str]:
+    """The samples as one complex array (slow, fast), in the order of the file, and the name of its
+    slow dim.
     """
+    dims = tree.get("dims")
+    if not isinstance(dims, (list, tuple)) or sorted(map(str, dims)) not in (sorted(order), sorted((*order, "iq"))):
+        raise ValueError(
+            f"{where}.dims must be the dims of the array in the order of the file, {order[0]} and {order[1]}, and "
+            f"iq if there is one for real and imaginary part, got {dims!r}"
+        )
+    parts = [_array(file, file.path, tree, where)]
+    if "imag" in tree:
+        imag = _kept(tree, "imag", where, str, "the name of an array or file")
+        flat = "dtype" in tree
+        path, layout = (file.path.parent / imag, tree) if flat else (file.path, {"name": imag})
+        parts.append(_array(file, path, layout, where))
+    kinds, pair = {part.dtype.kind for part in parts}, "iq" in dims
+    for part in parts:
+        if part.shape != parts[0].shape or len(part.shape) != len(dims) or 0 in part.shape:
+            raise ValueError(f"{part.what} has the shape {part.shape}, and {where}.dims are {list(dims)}")
+    if pair and (parts[0].shape[dims.index("iq")] != 2 or "c" in kinds):
+        raise ValueError(
+            f"{where}.dims: the dim iq must have 2 real numbers, got {parts[0].dtype.name} of shape "
+            f"{parts[0].shape} for the dims {list(dims)}"
+        )
+    if pair + len(parts) != 1 + ("c" not in kinds) or (len(parts) == 2 and "c" in kinds):
+        raise ValueError(
+            f"{where}: samples must be complex, or real with one dim iq or one array imag, got "
+            f"{parts[0].dtype.name} with the dims {list(dims)}{' and imag' if len(parts) == 2 else ''}"
+        )
+    conjugate = _kept(tree, "conjugate", where, bool, "true or false", False)
+    slow = next(one for one in dims if one != "iq")
 
-    parts: Sequence[BlockArray]
-    dims: tuple[str, ...]
-    order: tuple[str, str]
-    conjugate: bool
+    def complex_part(slices: tuple[slice, ...]) -> np.ndarray:
+        held = [part.read((slice(None),) * dims.index(slow) + slices) for part in parts]
+        real_imag = np.moveaxis(held[0], dims.index("iq"), 0) if pair else held
+        block = joined(*real_imag) if len(real_imag) == 2 and "c" not in kinds else held[0]
+        return np.conj(block) if conjugate else block
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        first, second = (self.parts[0].shape[self.dims.index(name)] for name in self.order)
-        return first, second
-
-    @property
-    def dtype(self) -> np.dtype:
-        return complex_type(np.result_type(*(part.dtype for part in self.parts)))
-
-    @property
-    def slow(self) -> str:
-        """The outer one of the two dims in the file."""
-        return next(name for name in self.dims if name != "iq")
-
-    def blocks(self) -> Iterator[np.ndarray]:
-        """Blocks of the samples along the outer dim, (slow, fast), from first to last."""
-        axis, n = self.dims.index(self.slow), self.shape[self.order.index(self.slow)]
-        rows = max(1, _BLOCK_BYTES * n // (math.prod(self.shape) * self.dtype.itemsize))
-        for first in range(0, n, rows):
-            last = min(first + rows, n)
-            block = self._complex([part.read((slice(None),) * axis + (slice(first, last),)) for part in self.parts])
-            block = block.astype(self.dtype, copy=False)
-            if not np.isfinite(block).all():
-                bad = int((~np.isfinite(block)).sum())
-                raise ValueError(
-                    f"{self.parts[0].what}: {bad} samples are NaN or Inf at indices {first} to {last - 1} of the dim "
-                    f"{self.slow!r}; set missing samples to zero"
-                )
-            yield np.conj(block) if self.conjugate else block
-
-    def _complex(self, parts: list[np.ndarray]) -> np.ndarray:
-        if "iq" in self.dims:
-            parts = list(np.moveaxis(parts[0], self.dims.index("iq"), 0))
-        return joined(*parts) if len(parts) == 2 else parts[0]
+    shape = tuple(n for n, one in zip(parts[0].shape, dims, strict=True) if one != "iq")
+    dtype = complex_type(np.result_type(*(part.dtype for part in parts)))
+    return BlockArray(parts[0].path, parts[0].kind, parts[0].name, shape, dtype, complex_part), slow
 
 
-class _Import:
-    """The sections of a sidecar, checked, with the arrays that they name."""
-
-    def __init__(self, path: Path, sidecar: Any, name: str, stack: ExitStack) -> None:
-        self.path, self.stack = path, stack
-        self.name = name = str(Path(name))
-        self.opened: dict[Path, Container | None] = {}
-        tree = _section(sidecar, name, ("system", "samples", "radar", "side"))
-        system = _choice(tree.get("system"), f"{name}: system", _SYSTEMS)
-        self.samples = _section(tree.get("samples"), f"{name}: samples", _SAMPLES)
-        keys = _SYSTEMS[system]
-        key = self.samples.get("key", keys[0] if system != "isal" else None)
-        self.key = _choice(key, f"{name}: samples.key", keys)
-        self.kind = _KINDS[self.key]
-        self.tree = {
-            f"{name}: {section}": _section(
-                {} if tree.get(section) is None else tree[section], f"{name}: {section}", keys
-            )
-            for section, keys in (("radar", self.kind.radar), ("side", self.kind.side))
-        }
-
-    def planned(self) -> tuple[str, _Samples, dict[str, np.ndarray]]:
-        """The key of the samples, the samples, and all other arrays by key; all are checked."""
-        samples = self._samples()
-        lengths = dict(zip(samples.order, samples.shape))
-        arrays: dict[str, np.ndarray] = {}
-        stored: dict[str, StoredArray] = {}
-        for section, tree in self.tree.items():
-            for key, value in tree.items():
-                x = arrays[key] = self._value(value, key, f"{section}.{key}", lengths)
-                stored[key] = StoredArray(f"{section}.{key}", x.shape, x.dtype, partial(_opened, x))
-        what, file = f"{self.name}: samples", Path(self.name)
-        stored[self.key] = StoredArray(what, samples.shape, samples.dtype, partial(_opened, np.zeros(())))
-        found = self.kind.describe(stored, file)
-        with naming(file):  # side data that only a recording checks, with one sample per line
-            lines = torch.ones(lengths["pulse"], 1, dtype=torch.complex64)
-            Recording.from_arrays(lines, found.radar, what=self.name, **found.aux)
-        return self.key, samples, arrays
-
-    def _samples(self) -> _Samples:
-        tree, where, order = self.samples, f"{self.name}: samples", self.kind.dims
-        dims = tree.get("dims")
-        if not isinstance(dims, (list, tuple)) or sorted(map(str, dims)) not in (sorted(order), sorted((*order, "iq"))):
-            raise ValueError(
-                f"{where}.dims must be the dims of the array in the order of the file, {order[0]} and {order[1]}, and "
-                f"iq if there is one for real and imaginary part, got {dims!r}"
-            )
-        parts = [self._array(self.path, tree, where)]
-        if "imag" in tree:
-            imag = _kept(tree, "imag", where, str, "the name of an array or file")
-            parts.append(
-                self._array(self.path.parent / imag, tree, where)
-                if "dtype" in tree
-                else self._array(self.path, {"name": imag}, where)
-            )
-        kinds, pair = {part.dtype.kind for part in parts}, "iq" in dims
-        for part in parts:
-            if part.shape != parts[0].shape or len(part.shape) != len(dims) or 0 in part.shape:
-                raise ValueError(f"{part.what} has the shape {part.shape}, and {where}.dims are {list(dims)}")
-        if pair and (parts[0].shape[dims.index("iq")] != 2 or "c" in kinds):
-            raise ValueError(
-                f"{where}.dims: the dim iq must have 2 real numbers, got {parts[0].dtype.name} of shape "
-                f"{parts[0].shape} for the dims {list(dims)}"
-            )
-        if pair + len(parts) != 1 + ("c" not in kinds) or (len(parts) == 2 and "c" in kinds):
-            raise ValueError(
-                f"{where}: samples must be complex, or real with one dim iq or one array imag, got "
-                f"{parts[0].dtype.name} with the dims {list(dims)}{' and imag' if len(parts) == 2 else ''}"
-            )
-        conjugate = _kept(tree, "conjugate", where, bool, "true or false", False)
-        return _Samples(parts, tuple(dims), order, conjugate)
-
-    def _array(self, path: Path, tree: Mapping[str, Any], where: str) -> BlockArray:
-        """The array in a file that `name` or the layout of a flat binary file describes."""
-        if path not in self.opened:
-            self.opened[path] = open_container(path, self.stack)
-        container = self.opened[path]
-        flat = [key for key in _FLAT if key in tree]
-        if container is not None:
-            if flat:
-                raise ValueError(f"{where}.{flat[0]}: {path} is a {container.kind} file; give name instead")
-            held = "the name of an array in the file"
-            with naming(where):
-                return container.array(_kept(tree, "name", where, str, held))
-        if "name" in tree or not flat:
-            raise ValueError(
-                f"{where}: {path} is no HDF5, MATLAB or numpy file; if it is flat binary, give dtype and shape, and no "
-                "name"
-            )
-        dtype = np.dtype(_choice(tree.get("dtype"), f"{where}.dtype", _DTYPES))
-        order = _choice(tree.get("byte_order", "little"), f"{where}.byte_order", ("little", "big"))
-        shape, header = tree.get("shape"), _kept(tree, "header_bytes", where, int, "a number of bytes", 0)
-        whole = isinstance(shape, (list, tuple)) and all(type(n) is int and n > 0 for n in shape)
-        if not shape or not whole or header < 0:
-            raise ValueError(
-                f"{where}: shape must be a list of numbers of at least 1, and header_bytes at least 0, got {shape!r} "
-                f"and {header!r}"
-            )
+def _array(file: _File, path: Path, tree: Mapping[str, Any], where: str) -> BlockArray:
+    """The array in a file that `name` or the layout of a flat binary file describes."""
+    container = file.opened(path)
+    flat = [key for key in _FLAT if key in tree]
+    if container is not None:
+        if flat:
+            raise ValueError(f"{where}.{flat[0]}: {path} is a {container.kind} file; give name instead")
         with naming(where):
-            return flat_array(path, dtype.newbyteorder("<" if order == "little" else ">"), tuple(shape), header)
+            return container.array(_kept(tree, "name", where, str, "the name of an array in the file"))
+    if "name" in tree or not flat:
+        raise ValueError(
+            f"{where}: {path} is no HDF5, MATLAB or numpy file; if it is flat binary, give dtype and shape, and no name"
+        )
+    dtype = np.dtype(_choice(tree.get("dtype"), f"{where}.dtype", _DTYPES))
+    order = _choice(tree.get("byte_order", "little"), f"{where}.byte_order", ("little", "big"))
+    shape, header = tree.get("shape"), _kept(tree, "header_bytes", where, int, "a number of bytes", 0)
+    whole = isinstance(shape, (list, tuple)) and all(type(n) is int and n > 0 for n in shape)
+    if not shape or not whole or header < 0:
+        raise ValueError(
+            f"{where}: shape must be a list of numbers of at least 1, and header_bytes at least 0, got {shape!r} "
+            f"and {header!r}"
+        )
+    with naming(where):
+        return flat_array(path, dtype.newbyteorder("<" if order == "little" else ">"), tuple(shape), header)
 
-    def _value(self, value: Any, key: str, where: str, lengths: Mapping[str, int]) -> np.ndarray:
-        """The numbers of a key in its unit."""
-        own, unit = _unit_of(key), None
-        if isinstance(value, str):
-            match = _WITH_UNIT.fullmatch(value.strip())
-            value, unit = (float(match[1]), match[2]) if match else ({"name": value}, None)
-        if isinstance(value, Mapping):
-            tree = _section(value, where, _ENTRY)
-            unit = _kept(tree, "unit", where, str, "a unit", None)
-            along = lengths.get(_ALONG.get(key, ""))
-            array = _steps(tree, where, along) if {"first", "step"} & set(tree) else self._entry(tree, where)
-        else:
-            array = _numbers(value, where, own)
-        # MATLAB has no numbers and no vectors, only matrices
-        array = array.reshape(-1) if array.size == max(array.shape, default=0) else array
-        array = array.reshape(()) if key in self.kind.radar and array.size == 1 else array
-        return array if unit in (None, own) else array.astype(np.float64) * _factor(unit, own, where)
 
-    def _entry(self, tree: Mapping[str, Any], where: str) -> np.ndarray:
-        file = _kept(tree, "file", where, str, "the name of a file", None)
-        path = self.path if file is None else self.path.parent / file
-        array = self._array(path, tree, where).read()
-        return array.T if _kept(tree, "transpose", where, bool, "true or false", False) else array
+def _value(file: _File, value: Any, where: str, own: str, n: int | None) -> np.ndarray:
+    """The numbers of a key in its own unit; n is their number if it is that of a dim."""
+    unit = None
+    if isinstance(value, str):
+        match = _WITH_UNIT.fullmatch(value.strip())
+        value, unit = (float(match[1]), match[2]) if match else ({"name": value}, None)
+    if isinstance(value, Mapping):
+        tree = _section(value, where, _ENTRY)
+        unit = _kept(tree, "unit", where, str, "a unit", None)
+        array = _steps(tree, where, n) if {"first", "step"} & set(tree) else _entry(file, tree, where)
+    else:
+        array = _numbers(value, where, own)
+    # MATLAB has no numbers and no vectors, only matrices
+    array = array.reshape(-1) if array.size == max(array.shape, default=0) else array
+    if unit in (None, own):
+        return array
+    accepted = _UNITS.get(own, {})
+    if unit not in accepted:
+        expected = f"{own} is expected" if own else "numbers without a unit are expected"
+        raise ValueError(f"{where} has the unit {unit!r}, and {expected}{did_you_mean(unit, accepted)}")
+    return array.astype(np.float64) * accepted[unit]
+
+
+def _entry(file: _File, tree: Mapping[str, Any], where: str) -> np.ndarray:
+    """The numbers of an array in a file."""
+    other = _kept(tree, "file", where, str, "the name of a file", None)
+    path = file.path if other is None else file.path.parent / other
+    array = _array(file, path, tree, where).read()
+    return array.T if _kept(tree, "transpose", where, bool, "true or false", False) else array
 
 
 def _section(tree: Any, where: str, accepted: Sequence[str]) -> dict[str, Any]:
@@ -328,20 +294,6 @@ def _section(tree: Any, where: str, accepted: Sequence[str]) -> dict[str, Any]:
         if key not in accepted:
             raise ValueError(f"{where}: key {key!r} is not known{did_you_mean(str(key), accepted)}")
     return dict(tree)
-
-
-def _unit_of(key: str) -> str:
-    """Unit of a key; empty for keys without a single unit."""
-    return "" if key == "origin_deg_m" else next((unit for end, unit in _ENDS.items() if key.endswith(end)), "")
-
-
-def _factor(unit: str, own: str, where: str) -> float:
-    """Factor that converts a unit to that of a key."""
-    accepted = _UNITS.get(own, {})
-    if unit not in accepted:
-        expected = f"{own} is expected" if own else "numbers without a unit are expected"
-        raise ValueError(f"{where} has the unit {unit!r}, and {expected}{did_you_mean(unit, accepted)}")
-    return accepted[unit]
 
 
 def _numbers(value: Any, where: str, unit: str) -> np.ndarray:
@@ -386,23 +338,36 @@ def _choice(value: Any, where: str, accepted: Sequence[str] | Mapping[str, Any])
     return value
 
 
-def _opened(array: np.ndarray) -> IO[bytes]:
+def _stream(array: np.ndarray) -> IO[bytes]:
     """An array in memory as a file in the format .npy."""
     stream = io.BytesIO()
-    np.lib.format.write_array(stream, array, allow_pickle=False)
+    np.save(stream, array, allow_pickle=False)
     stream.seek(0)
     return stream
 
 
-def _write(path: Path, key: str, samples: _Samples, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write the archive; the samples are stored in the order of the file they come from."""
+def _write(
+    path: Path, key: str, samples: BlockArray, slow: str, turned: bool, arrays: Mapping[str, np.ndarray]
+) -> None:
+    """Write the archive; the samples (slow, fast) are stored in the order of the file they come
+    from, which is turned where the slow dim is the second one of the array in the archive.
+    """
     with zipfile.ZipFile(path, "x") as archive:
         for name, array in arrays.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)
         with archive.open(zipfile.ZipInfo(f"{key}.npy"), "w", force_zip64=True) as member:
-            turned = samples.slow != samples.order[0]
-            header = {"descr": samples.dtype.str, "fortran_order": turned, "shape": samples.shape}
-            np.lib.format.write_array_header_2_0(member, header)
-            for block in samples.blocks():
+            shape = samples.shape[::-1] if turned else samples.shape
+            np.lib.format.write_array_header_2_0(
+                member, {"descr": samples.dtype.str, "fortran_order": turned, "shape": shape}
+            )
+            rows = max(1, _BLOCK_BYTES // (samples.shape[1] * samples.dtype.itemsize))
+            for first in range(0, samples.shape[0], rows):
+                block = samples.read((slice(first, first + rows),))
+                bad = int((~np.isfinite(block)).sum())
+                if bad:
+                    raise ValueError(
+                        f"{samples.what}: {bad} samples are NaN or Inf at indices {first} to {first + len(block) - 1} "
+                        f"of the dim {slow!r}; set missing samples to zero"
+                    )
                 member.write(np.ascontiguousarray(block).data)

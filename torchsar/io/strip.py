@@ -14,7 +14,7 @@ from torchsar.core import Axis, Recording, Signal
 from torchsar.focus.detection import QuickLook
 from torchsar.io.arrays import put
 from torchsar.io.extras import library, reading
-from torchsar.io.fields import archive, joined, naming
+from torchsar.io.fields import archive, naming
 from torchsar.io.recorded import describe_stripmap
 from torchsar.io.seal import canonical, group_attributes, sealed
 
@@ -48,13 +48,13 @@ class StripRecording:
     def __init__(self, path: str | Path, dtype: torch.dtype = torch.complex64) -> None:
         self.path, self.dtype = Path(path), dtype
         found = describe_stripmap(archive(self.path, "raw stripmap data"), self.path)
-        self._samples, self.radar, self._aux = found
+        self._held, self.radar = found, found.radar
         self.shape: tuple[int, int] = found.samples.shape[:2]  # pyright: ignore[reportAttributeAccessIssue]
         self.axes = self.radar.raw_axes(*self.shape)
         for name in _PER_LINE:
-            if name in self._aux and self._aux[name].shape != self.shape[:1]:
+            if name in found.aux and found.aux[name].shape != self.shape[:1]:
                 raise ValueError(
-                    f"{path}: {name} must have one entry per line, {self.shape[0]}, got {self._aux[name].shape}"
+                    f"{path}: {name} must have one entry per line, {self.shape[0]}, got {found.aux[name].shape}"
                 )
         found.samples.rows(0, 1)
 
@@ -71,10 +71,9 @@ class StripRecording:
         Raises:
             ValueError: If a sample or side data are not valid, as for `read_stripmap`.
         """
-        aux = {name: x[first:last] if name in _PER_LINE else x for name, x in self._aux.items()}
+        aux = {name: x[first:last] if name in _PER_LINE else x for name, x in self._held.aux.items()}
         with naming(self.path):
-            iq = self._samples.rows(first, last)
-            data = iq if iq.ndim == 2 else joined(iq[..., 0], iq[..., 1])
+            data = self._held.formed(self._held.samples.rows(first, last))
             start_s, what = self.axes[0].start + first * self.axes[0].step, f"{self.path}: lines {first} to {last - 1}"
             return Recording.from_arrays(data, self.radar, dtype=self.dtype, start_s=start_s, what=what, **aux)
 

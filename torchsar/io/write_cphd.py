@@ -23,13 +23,6 @@ _CHANNEL = "1"
 UNKNOWN_START = datetime(1970, 1, 1, tzinfo=UTC)
 # samples per delay that the file declares as valid: the recommendation of the standard is 1.2
 _OVERSAMPLING = 1.25
-# a reference path that differs by less from that over the reference point is the same, in metres
-_SAME_M = 1e-8
-# numbers per vector of each parameter, in the order of the schema
-_SIZES: dict[str, int] = {
-    **{"TxTime": 1, "TxPos": 3, "TxVel": 3, "RcvTime": 1, "RcvPos": 3, "RcvVel": 3, "SRPPos": 3, "aFDOP": 1},
-    **{"aFRR1": 1, "aFRR2": 1, "FX1": 1, "FX2": 1, "TOA1": 1, "TOA2": 1, "TDTropoSRP": 1, "SC0": 1, "SCSS": 1},
-}
 
 
 @quiet()
@@ -72,18 +65,34 @@ def write_cphd(
     point = torch.zeros_like(antennas.transmitter_m)
     if "scene_reference_m" in recording.aux:
         point = single(recording.aux["scene_reference_m"], 2, "scene_reference_m")
-    samples = _samples(single(recording.signal.data, 2, "the signal"), frequency, antennas, point)
-    vectors = _vectors(antennas, frequency, point, pulse_time_s(recording), frame)
+    legs = [torch.linalg.vector_norm(place - point, dim=-1) for place in antennas.places]
+    samples = frequency_samples(single(recording.signal.data, 2, "the signal").to(torch.complex128))
+    longer = antennas.reference_m - (legs[0] + legs[-1])
+    if float(longer.abs().max()) > 1e-8:  # metres; the phases refer to another point
+        samples = samples * unit_phasor(-longer[:, None] * frequency / LIGHT_M_S, samples.dtype)
+    samples = samples.to(torch.complex64).numpy()
+    half = LIGHT_M_S / (4 * frequency_step_hz(frequency) * _OVERSAMPLING)
+    corners = torch.tensor([[-half, -half], [half, half]], dtype=torch.float64)
+    if "scene_corners_m" in recording.aux:
+        corners = single(recording.aux["scene_corners_m"], 2, "scene_corners_m")[:, :2]
+    vectors = _vectors(antennas, legs, frequency, point, pulse_time_s(recording), frame)
     tree = etree.Element(f"{{{_NAMESPACE}}}CPHD").getroottree()
-    area = _area(recording, frequency, antennas)
-    content = _content(samples.shape, vectors, antennas, area, frame, start, mode)
-    sarkit.ElementWrapper(tree.getroot()).from_dict(content)
+    root = sarkit.ElementWrapper(tree.getroot())
+    root.from_dict(_content(samples.shape, vectors, antennas, corners, frame, start, mode))
     packed: Any = np.zeros(len(samples), sarkit.get_pvp_dtype(tree))
     for name, value in vectors.items():
         packed[name] = value
-    tree.getroot().find("{*}PVP").addnext(_dwell(sarkit, tree, packed))
+    seen = sarkit.compute_t_ref_from_pvps(packed[[0, -1]])
+    root["Dwell"] = {  # all points of the scene are seen by all vectors
+        "NumCODTimes": 1,
+        "CODTime": [{"Identifier": _CHANNEL, "CODTimePoly": np.array([[seen.mean()]])}],
+        "NumDwellTimes": 1,
+        "DwellTime": [{"Identifier": _CHANNEL, "DwellTimePoly": np.array([[math.fabs(seen[1] - seen[0])]])}],
+    }
+    dwell = root["Dwell"].elem
+    tree.getroot().find("{*}PVP").addnext(dwell)
     with np.errstate(invalid="ignore"):  # an antenna at rest has no cone angle, for which 90 degrees stand
-        tree.getroot().find("{*}Dwell").addnext(sarkit.compute_reference_geometry(tree, packed))
+        dwell.addnext(sarkit.compute_reference_geometry(tree, packed))
 
     def write(part: Path) -> None:
         with part.open("wb") as file, sarkit.Writer(file, sarkit.Metadata(xmltree=tree)) as writer:
@@ -93,75 +102,61 @@ def write_cphd(
     write_whole(path, write)
 
 
-def _samples(data: Tensor, frequency: Tensor, antennas: AntennaPath, point: Tensor) -> np.ndarray:
-    """Frequency samples whose phases refer to the reference point of each pulse."""
-    history = frequency_samples(data.to(torch.complex128))
-    over = torch.stack([torch.linalg.vector_norm(place - point, dim=-1) for place in antennas.places])
-    longer = antennas.reference_m - over.sum(0) * (2 if len(over) == 1 else 1)
-    if float(longer.abs().max()) > _SAME_M:
-        history = history * unit_phasor(-longer[:, None] * frequency / LIGHT_M_S, history.dtype)
-    return history.to(torch.complex64).numpy()
-
-
 def _vectors(
-    antennas: AntennaPath, frequency: Tensor, point: Tensor, time: Tensor, frame: LocalFrame
-) -> dict[str, np.ndarray | float]:
-    """Parameters of the vectors by name."""
+    antennas: AntennaPath, legs: list[Tensor], frequency: Tensor, point: Tensor, time: Tensor, frame: LocalFrame
+) -> dict[str, Any]:
+    """Parameters of the vectors by name, in the order of the schema."""
     step = frequency_step_hz(frequency)
-    one = len(antennas.places) == 1
-    places = {"Tx": antennas.places[0], "Rcv": antennas.places[-1]}
-    legs = {side: torch.linalg.vector_norm(place - point, dim=-1) for side, place in places.items()}
-    if float(time[0]) < 0:
-        time = time - time[0]
-    times = {"Tx": time, "Rcv": time + (legs["Tx"] + legs["Rcv"]) / LIGHT_M_S}
     swath = 1 / (_OVERSAMPLING * step)
-    found: dict[str, np.ndarray | float] = dict.fromkeys(("aFDOP", "aFRR1", "aFRR2", "TDTropoSRP"), 0.0)
-    for side, place in places.items():
-        earth = frame.geocentric_m(place).numpy()
-        clock = times["Tx" if one else side].numpy()  # one antenna has one place for both times
-        found |= {
-            f"{side}Time": times[side].numpy(),
-            f"{side}Pos": earth,
-            f"{side}Vel": np.gradient(earth, clock, axis=0, edge_order=2 if len(clock) > 2 else 1),
-        }
-    return found | {
+    sent = (time - time[0] if float(time[0]) < 0 else time).numpy()
+    found: dict[str, Any] = {}
+    for side, index in (("Tx", 0), ("Rcv", -1)):
+        clock = sent if side == "Tx" else sent + ((legs[0] + legs[-1]) / LIGHT_M_S).numpy()
+        earth = frame.geocentric_m(antennas.places[index]).numpy()
+        moved = sent if len(antennas.places) == 1 else clock  # one antenna has one place for both times
+        speed = np.gradient(earth, moved, axis=0, edge_order=2 if len(moved) > 2 else 1)
+        found |= {f"{side}Time": clock, f"{side}Pos": earth, f"{side}Vel": speed}
+    return {
+        **found,
         "SRPPos": frame.geocentric_m(point).numpy(),
-        "FX1": float(frequency[0]),
-        "FX2": float(frequency[-1]),
-        "TOA1": -swath / 2,
-        "TOA2": swath / 2,
-        "SC0": float(frequency[0]),
-        "SCSS": step,
+        **dict.fromkeys(("aFDOP", "aFRR1", "aFRR2"), 0.0),
+        **{"FX1": float(frequency[0]), "FX2": float(frequency[-1]), "TOA1": -swath / 2, "TOA2": swath / 2},
+        **{"TDTropoSRP": 0.0, "SC0": float(frequency[0]), "SCSS": step},
     }
-
-
-def _area(recording: Recording, frequency: Tensor, antennas: AntennaPath) -> np.ndarray:
-    """West, south, east and north limits of the imaged area in metres."""
-    if "scene_corners_m" in recording.aux:
-        corners = single(recording.aux["scene_corners_m"], 2, "scene_corners_m")[:, :2]
-        return np.array([*corners.amin(0).tolist(), *corners.amax(0).tolist()])
-    half = LIGHT_M_S / (4 * frequency_step_hz(frequency) * _OVERSAMPLING)
-    return np.array([-half, -half, half, half])
 
 
 def _content(
     shape: tuple[int, ...],
     vectors: dict[str, Any],
     antennas: AntennaPath,
-    area: np.ndarray,
+    corners: Tensor,
     frame: LocalFrame,
     start: datetime,
     mode: str,
 ) -> dict[str, Any]:
-    """Content of the XML header by element, but for dwell and reference geometry."""
+    """Content of the XML header by element, but for dwell and reference geometry.
+
+    corners: opposite corners of the imaged area in metres, (corner, 2).
+    """
+    wgs84 = library("sarkit.wgs84", "formats", "geodetic coordinates")
     origin = frame.geocentric_m(torch.zeros(3, dtype=torch.float64))
     east, north, _ = (frame.geocentric_m(torch.eye(3, dtype=torch.float64)) - origin).numpy()
-    west_m, south_m, east_m, north_m = area.tolist()
-    corners = [(west_m, south_m), (west_m, north_m), (east_m, north_m), (east_m, south_m)]
-    offsets = np.cumsum([0, *_SIZES.values()]).tolist()
+    low, high = corners.amin(0).tolist(), corners.amax(0).tolist()  # west and south, east and north
+    ring = [low, (low[0], high[1]), high, (high[0], low[1])]
+    edges = frame.geocentric_m(torch.tensor([[*point, 0.0] for point in ring], dtype=torch.float64)).numpy()
+    sizes = [3 if np.ndim(value) == 2 else 1 for value in vectors.values()]
+    offsets = np.cumsum([0, *sizes]).tolist()
     band, swath = vectors["FX2"] - vectors["FX1"], vectors["TOA2"] - vectors["TOA1"]
     fixed = bool((vectors["SRPPos"] == vectors["SRPPos"][0]).all())
     bistatic = {} if antennas.receiver_m is None else {"IlluminatorName": "transmitter"}
+    # grid of an image of the area with the spacing of the resolution, whose lines run east
+    spacing = LIGHT_M_S / (2 * band)
+    counts = [max(1, math.ceil((high[i] - low[i]) / spacing)) for i in (0, 1)]
+    grid = {
+        "IARPLocation": [round(-low[i] / spacing - 0.5) for i in (0, 1)],  # lines before the origin
+        "IAXExtent": {"LineSpacing": spacing, "FirstLine": 0, "NumLines": counts[0]},
+        "IAYExtent": {"SampleSpacing": spacing, "FirstSample": 0, "NumSamples": counts[1]},
+    }
     return {
         "CollectionID": {
             "CollectorName": "receiver" if bistatic else "radar",
@@ -187,9 +182,9 @@ def _content(
             "EarthModel": "WGS_84",
             "IARP": {"ECF": origin.numpy(), "LLH": [frame.latitude_deg, frame.longitude_deg, frame.height_m]},
             "ReferenceSurface": {"Planar": {"uIAX": east, "uIAY": north}},
-            "ImageArea": {"X1Y1": [west_m, south_m], "X2Y2": [east_m, north_m]},
-            "ImageAreaCornerPoints": _geodetic(frame, corners),
-            "ImageGrid": _grid(area, LIGHT_M_S / (2 * band)),
+            "ImageArea": {"X1Y1": low, "X2Y2": high},
+            "ImageAreaCornerPoints": wgs84.cartesian_to_geodetic(edges)[:, :2],
+            "ImageGrid": grid,
         },
         "Data": {
             "SignalArrayFormat": "CF8",
@@ -228,37 +223,6 @@ def _content(
         },
         "PVP": {
             name: {"Offset": at, "Size": size, "dtype": np.dtype("f8" if size == 1 else "3f8")}
-            for (name, size), at in zip(_SIZES.items(), offsets, strict=False)
+            for name, size, at in zip(vectors, sizes, offsets, strict=False)
         },
     }
-
-
-def _grid(area: np.ndarray, spacing_m: float) -> dict[str, Any]:
-    """Grid of an image of the area with the spacing of the resolution, whose lines run east."""
-    counts = [max(1, math.ceil((area[i + 2] - area[i]) / spacing_m)) for i in (0, 1)]
-    first = [round(-area[i] / spacing_m - 0.5) for i in (0, 1)]  # lines before the origin
-    return {
-        "IARPLocation": first,
-        "IAXExtent": {"LineSpacing": spacing_m, "FirstLine": 0, "NumLines": counts[0]},
-        "IAYExtent": {"SampleSpacing": spacing_m, "FirstSample": 0, "NumSamples": counts[1]},
-    }
-
-
-def _geodetic(frame: LocalFrame, points: list[tuple[float, float]]) -> np.ndarray:
-    """Latitudes and longitudes in degrees of points in the plane of a frame, (point, 2)."""
-    wgs84 = library("sarkit.wgs84", "formats", "geodetic coordinates")
-    local = torch.tensor([[*point, 0.0] for point in points], dtype=torch.float64)
-    return wgs84.cartesian_to_geodetic(frame.geocentric_m(local).numpy())[:, :2]
-
-
-def _dwell(sarkit: Any, tree: Any, vectors: np.ndarray) -> Any:
-    """The element Dwell: all points of the scene are seen by all vectors."""
-    seen = sarkit.compute_t_ref_from_pvps(vectors[[0, -1]])
-    root = sarkit.ElementWrapper(tree.getroot())
-    root["Dwell"] = {
-        "NumCODTimes": 1,
-        "CODTime": [{"Identifier": _CHANNEL, "CODTimePoly": np.array([[seen.mean()]])}],
-        "NumDwellTimes": 1,
-        "DwellTime": [{"Identifier": _CHANNEL, "DwellTimePoly": np.array([[math.fabs(seen[1] - seen[0])]])}],
-    }
-    return root["Dwell"].elem

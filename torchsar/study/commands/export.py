@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchsar.io import export_images, export_recording, read_images
+from torchsar.io import read_images
+from torchsar.io.export import export_images, export_recording
 from torchsar.radar import LocalFrame
 from torchsar.study.output.folder import fresh_result
 from torchsar.study.settings.cases import cases_of, key_of

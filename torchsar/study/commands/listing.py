@@ -37,7 +37,9 @@ def listing(systems: Mapping[str, System]) -> str:
         lines += ["", title, *_entries(catalogue, catalogue.entries)]
     lines += ["", "DATA (data.file=PATH, a numpy archive; of system path also CPHD)"]
     for name, reader in (("stripmap", read_stripmap), ("isal", read_inverse), ("path", read_path)):
-        lines += [f"  system {name}", textwrap.indent(inspect.cleandoc(reader.__doc__ or "").split("\n\n")[1], "    ")]
+        parts = inspect.cleandoc(reader.__doc__ or "").split("\n\n")[1:]
+        about = next(part for part in parts if not part.startswith(">>>"))
+        lines += [f"  system {name}", textwrap.indent(about, "    ")]
     return "\n".join(lines)
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Outcome, counts
-from torchsar.io import write_arrays
+from torchsar.io.arrays import write_arrays
 from torchsar.study.commands.requires import refuse_beyond_limits
 from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
