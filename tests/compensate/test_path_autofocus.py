@@ -12,10 +12,9 @@ import torch
 
 from torchsar.compensate import CorrectPath, PathAutofocus, PathPhase, path_autofocus, path_phase
 from torchsar.compensate.path import assess
-from torchsar.compensate.path.axes import Found
-from torchsar.compensate.path.envelopes import drift_m, moved
-from torchsar.compensate.path.fringes import rough_near, roughness, smooth_near, smoothest
+from torchsar.compensate.path.fringes import drift_m, moved, rough_near, roughness, smooth_near, smoothest
 from torchsar.compensate.path.ground import ground_image
+from torchsar.compensate.path.joint import Found
 from torchsar.compensate.path.search import Starts
 from torchsar.core import Draws, Estimate, Outcome, Recording, unit_phasor
 from torchsar.echo import simulate_path

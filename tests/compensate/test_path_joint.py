@@ -8,12 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.compensate.path import axes as joint
-from torchsar.compensate.path import scene as of_scene
-from torchsar.compensate.path.axes import three_axes
+from torchsar.compensate.path import joint
 from torchsar.compensate.path.ground import FINE_STEP, ground_image, line_free
-from torchsar.compensate.path.motion import Motion
-from torchsar.compensate.path.scene import scene_of
+from torchsar.compensate.path.joint import Motion, scene_of, three_axes
 from torchsar.core import Draws
 from torchsar.echo import simulate_path
 from torchsar.metrics import error_db, phase_rmse
@@ -55,7 +52,7 @@ def dense(motion: Motion) -> tuple[Tensor, Tensor]:
     whole = torch.zeros(pulses, cells, pulses, 3, dtype=torch.complex128)
     whole[torch.arange(pulses), :, torch.arange(pulses)] = motion.unit
     whole = whole.reshape(pulses * cells, -1)
-    basis, ridge = motion._prior
+    basis, ridge = motion.basis, motion.ridge
     inverse = torch.zeros(pulses, 3, pulses, 3, dtype=F64)
     for axis, part in zip((1, 2), ridge.chunk(2), strict=True):
         inverse[:, axis, :, axis] = basis @ (part[:, None] * basis.mT)
@@ -89,15 +86,13 @@ def test_what_motions_explain_is_removed_by_a_symmetric_positive_map() -> None:
     assert motion.without(motion.echo(step)).abs().max() < 1e-9
 
 
-def test_the_joint_scene_solves_the_dense_equations(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(of_scene, "_STEPS", 400)
-    monkeypatch.setattr(of_scene, "_LEFT", 1e-26)
+def test_the_joint_scene_solves_the_dense_equations() -> None:
     rows, frequency, path = seen(RandomPoints(3, 4.0, 4.0))
     operator = ground_image(frequency, path, 0.0, 5.0, FINE_STEP)
-    scene = scene_of(rows, operator)
+    scene = scene_of(rows, operator, ends=(400, 1e-26))
     motion = Motion(normal(PULSES, CELLS, 3), torch.rand(PULSES, dtype=F64), scene.noise)
     cells, left = scene.fitted(motion.without)
-    pull = scene.image_of(left - motion.echo(motion.of(left)))
+    pull = scene.size * operator.image((left - motion.echo(motion.of(left)))[None])[0]
     torch.testing.assert_close(scene.size * pull, scene.noise * cells, rtol=1e-6, atol=1e-9 * float(pull.abs().max()))
     torch.testing.assert_close(left, rows - operator.adjoint(cells[None])[0])
 

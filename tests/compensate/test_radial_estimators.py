@@ -7,8 +7,8 @@ import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, ONE, rms, seen, velocity_rms
 from tests.echo.ladars import COMMON, table1
-from torchsar.compensate import geometric_velocity_m_s
-from torchsar.compensate.radial.peak import from_beats
+from torchsar.compensate.radial.beats import from_beats
+from torchsar.compensate.radial.trajectory import geometric_velocity_m_s
 from torchsar.scene import Points, Polynomial
 
 RADAR = table1()

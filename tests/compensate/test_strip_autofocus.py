@@ -10,9 +10,9 @@ from torch import Tensor
 
 from tests.compensate.strips import CELLS, PULSES, RADAR, STRIP, judged, path_of, strips
 from torchsar.compensate import CorrectPath, StripAutofocus, strip_autofocus
-from torchsar.compensate.path.curve import Curve
-from torchsar.compensate.path.motion import cosines
+from torchsar.compensate.path.joint import cosines
 from torchsar.compensate.path.scatterers import Echoes, prominent_places
+from torchsar.compensate.path.strip import Curve
 from torchsar.core import Outcome
 from torchsar.focus import ImageGrid, ProcessedBeam, TileImage
 from torchsar.metrics import phase_rmse, registered_error_db

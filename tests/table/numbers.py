@@ -111,8 +111,7 @@ REASONS: dict[str, str] = {
     "compensate.StripAutofocus": "the stage of compensate.strip_autofocus",
     "compensate.PathPhase": "the stage of compensate.path_phase",
     "metrics.line_of_sight_bound_m": "works on a scene of scatterers; tests/metrics/test_path_bounds.py",
-    "compensate.range_error": "integrates an estimate by integrated_range, which is in the table",
-    "compensate.turning_points": "reads an axis that the radar has made",
+    "compensate.range_error": "integrates an estimate; tests/compensate/test_radial_compensate.py",
     "multichannel.multichannel_limits": "checks its use of the radar; tests/multichannel/test_requirements.py",
     "multichannel.multichannel_requirements": "checks its use of the radar; tests/multichannel/test_requirements.py",
     "focus.inverse_requirements": "checks all its numbers; tests/study/test_requires.py",
@@ -251,14 +250,6 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
     "compensate.doppler_at": (
         lambda **given: compensate.doppler_at(RADAR, **given),
         {"azimuth_m": ONES, "slant_m": 4e3 * ONES, "frame_hz": 5.0, "velocity_m_s": 120.0, "crossing_s": 0.1},
-    ),
-    "compensate.geometric_velocity_m_s": (
-        lambda **given: compensate.geometric_velocity_m_s(LADAR, LINE, **given),
-        {"azimuth_m": 0.1, "relative_range_m": 0.2},
-    ),
-    "compensate.integrated_range": (
-        lambda velocity_m_s, at_s: compensate.integrated_range(velocity_m_s, LADAR, LADAR.sweep_axes(8)[1], at_s),
-        {"velocity_m_s": torch.ones(8, dtype=F64), "at_s": 1e-5 * ONES},
     ),
     "multichannel.ambiguity_number": (
         _moving(lambda radar_, point: multichannel.ambiguity_number(radar_, point, point)),

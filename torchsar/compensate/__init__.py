@@ -55,8 +55,6 @@ from torchsar.compensate.radial import (
     SpectrumCorrelation,
     compensate_motion,
     equalise_pulses,
-    geometric_velocity_m_s,
-    integrated_range,
     mirror_product,
     ml_peak,
     phase_polish,
@@ -65,7 +63,6 @@ from torchsar.compensate.radial import (
     range_error,
     segmented_interference,
     spectrum_correlation,
-    turning_points,
 )
 from torchsar.compensate.rotation import (
     ChirpletClean,
@@ -152,8 +149,6 @@ __all__ = [
     "equalise_pulses",
     "evolve_rotation",
     "genetic_rotation",
-    "geometric_velocity_m_s",
-    "integrated_range",
     "lag_products",
     "link_phases",
     "minimum_entropy_velocity",
@@ -180,6 +175,5 @@ __all__ = [
     "shift_range",
     "spectrum_correlation",
     "strip_autofocus",
-    "turning_points",
     "uneven_rotation",
 ]

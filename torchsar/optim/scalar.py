@@ -81,3 +81,18 @@ def parabola_minimum(
             if not host_value(active.any(), True):
                 break
     return x, curvature
+
+
+def vertex(low: Tensor, middle: Tensor, high: Tensor) -> Tensor:
+    """Return where the parabola through three equally spaced values has its maximum.
+
+    Args:
+        low: Values before the middle, any shape.
+        middle: Values in the middle, same shape.
+        high: Values after the middle, same shape.
+
+    Returns:
+        Offset from the middle in steps, same shape; 0 where the parabola has no maximum.
+    """
+    bend = low - 2 * middle + high
+    return torch.where(bend < 0, 0.5 * (low - high) / torch.where(bend < 0, bend, -1), 0)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
+from torch.utils._pytree import tree_map
 
 from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.core import Estimate, Outcome, checked_samples
@@ -59,12 +60,12 @@ def nothing(present: Tensor, info: dict[str, float], outcome: Outcome | None) ->
         Estimate of no errors.
     """
     zero = torch.zeros(len(present), dtype=torch.float64, device=present.device)
-    none = zero.new_zeros(())
     value = {"line_of_sight_m": zero, "offset_m": zero[:, None].expand(-1, 3)}
-    found = Estimate(value, quality=none + 1, info={name: none + number for name, number in info.items()})
+    numbers = {name: zero.new_tensor(number) for name, number in info.items()}
     if outcome is None:
-        return found
-    return replace(found, std={"line_of_sight_m": zero + 1}, quality=none, outcome=outcome.like(none))
+        return Estimate(value, quality=zero.new_ones(()), info=numbers)
+    none = zero.new_zeros(())
+    return Estimate(value, {"line_of_sight_m": zero + 1}, none, outcome.like(none), numbers)
 
 
 def for_each(
@@ -85,15 +86,21 @@ def for_each(
     """
     data, every = profiles.expand(*trials, *profiles.shape[-2:]), itertools.product(*map(range, trials))
     found = [find(data[index], antennas.of_trial(index, trials)) for index in every]
+    return tree_map(lambda *parts: torch.stack(parts).reshape((*trials, *parts[0].shape)), *found)
 
-    def joined(parts: list[Tensor]) -> Tensor:
-        return torch.stack(parts).reshape((*trials, *parts[0].shape))
 
-    def table(name: str) -> dict[str, Tensor]:
-        return {key: joined([getattr(one, name)[key] for one in found]) for key in getattr(found[0], name)}
+def corrected(antennas: AntennaPath, offset_m: Tensor) -> AntennaPath:
+    """Subtract the errors of the positions from a recorded path.
 
-    quality, outcome = (joined([getattr(one, name) for one in found]) for name in ("quality", "outcome"))
-    return Estimate(table("value"), table("std"), quality, outcome, table("info"))
+    Args:
+        antennas: Recorded path.
+        offset_m: Errors in metres, recorded minus true, of both antennas alike, (..., pulse, 3).
+
+    Returns:
+        The path without these errors.
+    """
+    receiver = None if antennas.receiver_m is None else antennas.receiver_m - offset_m
+    return AntennaPath(antennas.transmitter_m - offset_m, receiver, antennas.reference_m)
 
 
 def line_free(range_m: Tensor, present: Tensor) -> Tensor:
@@ -132,8 +139,7 @@ def slope(places: Sequence[Tensor], points_m: Tensor) -> Tensor:
     Returns:
         Gradient of half the path, (..., 3); a unit vector if both share one place.
     """
-    ways = [place - points_m for place in places]
-    units = [way / torch.linalg.vector_norm(way, dim=-1, keepdim=True) for way in ways]
+    units = [normalize(place - points_m, dim=-1, eps=0.0) for place in places]
     return torch.stack(torch.broadcast_tensors(*units)).mean(0)
 
 
@@ -157,8 +163,7 @@ def ground_image(
     Raises:
         ValueError: If the line of sight does not turn over the ground.
     """
-    middle = torch.zeros(3, dtype=torch.float64, device=frequency_hz.device)
-    middle[2] = height_m
+    middle = torch.tensor([0.0, 0.0, height_m], dtype=torch.float64, device=frequency_hz.device)
     with torch.no_grad():
         by_place = -2 * slope(antennas.places, middle)[:, :2]  # change of the path per metre, (pulse, 2)
         away = by_place.mean(0)
@@ -175,8 +180,7 @@ def ground_image(
         extent = min(extent[0], extent_m), min(extent[1], extent_m)
     spacing = step * min(wavelength / span, LIGHT_M_S / (band * steep))
     counts = tuple(max(2, math.ceil(x / spacing)) for x in extent)
-    axes = torch.zeros(2, 3, dtype=torch.float64, device=frequency_hz.device)
-    axes[0, :2], axes[1, :2] = across, away / steep
+    axes = torch.nn.functional.pad(torch.stack([across, away / steep]), (0, 1))
     corner = middle - spacing * sum(n // 2 * axis for n, axis in zip(counts, axes, strict=True))
     grid = ImageGrid(corner, axes, (counts[0], counts[1]), spacing)
     places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m

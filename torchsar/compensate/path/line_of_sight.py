@@ -6,6 +6,7 @@ Errors of the path move phases and envelopes; a phase per pulse leaves the envel
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from numbers import Integral
@@ -14,18 +15,13 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.path import assess as assessment
-from torchsar.compensate.path.axes import three_axes
 from torchsar.compensate.path.ground import FINE_STEP, for_each, ground_image, nothing, trials_of
+from torchsar.compensate.path.joint import three_axes
 from torchsar.compensate.path.search import Search, found_from_starts
 from torchsar.compensate.pulse_phase.recommended import autofocus
-from torchsar.core import Estimate, Outcome
+from torchsar.core import Estimate, Outcome, Signal, Stage
 from torchsar.metrics import entropy
 from torchsar.radar import AntennaPath
-
-# noise as a share of the mean power of the samples below which the last rounds take finer cells,
-# their spacing in resolution cells, and most rounds, by trial: at 20 dB and errors of 5 cm the
-# error of the line of sight fell from 1.66 to 1.50 bounds, at 10 dB it did not change
-_CLEAR, _FINEST_STEP, _LAST_ROUNDS = 0.05, 0.33, 2
 
 
 def path_autofocus(
@@ -39,6 +35,19 @@ def path_autofocus(
     assess: bool = True,
 ) -> Estimate:
     """Estimate the error of the recorded path at each pulse, along and across the line of sight.
+
+    >>> import torch
+    >>> from torchsar.compensate import path_autofocus
+    >>> from torchsar.radar import AntennaPath
+    >>> y = torch.linspace(-20, 20, 32, dtype=torch.float64)
+    >>> place_m = torch.stack([0 * y - 700, y, 0 * y + 700], -1)
+    >>> path = AntennaPath(place_m, None, 2 * place_m.norm(dim=-1))
+    >>> frequency_hz = 9.6e9 + 1e7 * torch.arange(-16, 16, dtype=torch.float64)
+    >>> profiles = torch.zeros(32, 32, dtype=torch.complex64)
+    >>> profiles[:, 16] = 1  # a point at the origin
+    >>> found = path_autofocus(profiles, frequency_hz, path, rounds=1)
+    >>> bool(found["line_of_sight_m"].abs().max() < 1e-4)
+    True
 
     The recommended autofocus of antennas on any path, for spotlight scenes. The phase of a pulse
     gives its error along the line of sight modulo a fringe, half a wavelength; the envelope of its
@@ -132,8 +141,10 @@ def path_autofocus(
         search = Search(some, frequency_hz, coarse, present)
         results = found_from_starts(search, imaging(FINE_STEP), rounds)
         best = results.best
-        if best.noise < _CLEAR * some.abs().square().double().mean():
-            last = three_axes(some, imaging(_FINEST_STEP), best.motion_m, present, _LAST_ROUNDS, exact=True)
+        # where noise is below a twentieth of the power, up to two rounds take finer cells, by
+        # trial: at 20 dB and errors of 5 cm the error fell from 1.66 to 1.50 bounds
+        if best.noise < 0.05 * some.abs().square().double().mean():
+            last = three_axes(some, imaging(0.33), best.motion_m, present, 2, ends=(120, 0.001))
             if last.noise <= best.noise and last.restless <= assessment.RESTLESS:
                 best = replace(best, motion_m=last.motion_m, offset_m=last.offset_m)
         value = {"line_of_sight_m": best.motion_m[:, 0], "offset_m": best.offset_m}
@@ -171,6 +182,19 @@ def path_phase(
 ) -> Estimate:
     """Estimate the phase of each pulse that sharpens the image of a spotlight scene on any path.
 
+    >>> import torch
+    >>> from torchsar.compensate import path_phase
+    >>> from torchsar.radar import AntennaPath
+    >>> y = torch.linspace(-20, 20, 32, dtype=torch.float64)
+    >>> place_m = torch.stack([0 * y - 700, y, 0 * y + 700], -1)
+    >>> path = AntennaPath(place_m, None, 2 * place_m.norm(dim=-1))
+    >>> frequency_hz = 9.6e9 + 1e7 * torch.arange(-16, 16, dtype=torch.float64)
+    >>> profiles = torch.zeros(32, 32, dtype=torch.complex64)
+    >>> profiles[:, 16] = 1  # a point at the origin
+    >>> found = path_phase(profiles, frequency_hz, path)
+    >>> found["phase_rad"].shape
+    torch.Size([32])
+
     It is `autofocus` with images by tiles along the recorded path, in which scatterers do not
     migrate. They cover the whole unambiguous ground. The middle of the scene, to which phases
     refer, is the origin.
@@ -206,3 +230,116 @@ def path_phase(
     if antennas.trials.numel() == 1:
         return find(profiles, antennas.of_trial((0,) * len(antennas.trials)))
     return for_each(find, profiles, antennas, trials)
+
+
+class PathEstimator(Stage):
+    """Base class of the stages that estimate errors of pulses through the image along a path.
+
+    Args:
+        settings: Options of the function `find` of the stage.
+    """
+
+    # function of profiles, frequencies and antennas, and its further settings
+    find: Callable[..., Estimate]
+
+    def __init__(self, **settings: float | tuple[float, float] | None) -> None:
+        super().__init__()
+        self.settings = settings
+
+    def forward(
+        self,
+        signal: Signal,
+        frequency_hz: Tensor,
+        transmitter_m: Tensor,
+        path_reference_m: Tensor,
+        receiver_m: Tensor | None = None,
+    ) -> Estimate:
+        """Estimate the errors of the pulses of a signal with the axes (pulse, range).
+
+        Args:
+            signal: Range profiles.
+            frequency_hz: Frequencies in Hz, float64 (range,).
+            transmitter_m: Recorded positions of the transmitter in metres, float64 (..., pulse, 3).
+            path_reference_m: Path to which phases refer in metres, float64 (..., pulse).
+            receiver_m: Recorded positions of the receiver in metres; None if both share an antenna.
+
+        Returns:
+            `Estimate` with the values that the stage provides, by pulse.
+        """
+        antennas = AntennaPath(transmitter_m, receiver_m, path_reference_m)
+        return type(self).find(signal.data, frequency_hz, antennas, **self.settings)
+
+
+class PathPhase(PathEstimator):
+    """Phase per pulse that sharpens the image along any path; see `path_phase`.
+
+    Args:
+        height_m: Height z of the imaged plane in metres.
+        search: Largest number of iterations of the entropy fixed point, approximately.
+        polish: Largest number of further iterations, which compare each pulse with a Wiener
+            estimate of the scene.
+        assess: Whether to add the standard deviation, the quality and the outcome.
+    """
+
+    provides = ("phase_rad",)
+    neutral = {"phase_rad": 0.0}
+    find = staticmethod(path_phase)
+
+    def __init__(self, height_m: float = 0.0, search: int = 120, polish: int = 20, assess: bool = True) -> None:
+        super().__init__(height_m=height_m, search=search, polish=polish, assess=assess)
+
+
+class PathAutofocus(PathEstimator):
+    """Error of the recorded path at every pulse, along and across the line of sight.
+
+    See `path_autofocus`.
+
+    Args:
+        extent_m: Side of the imaged square about the origin in metres; None for the whole
+            unambiguous ground.
+        height_m: Height z of the imaged plane in metres.
+        rounds: Largest number of rounds of the last step, at least 1.
+        assess: Whether to add the standard deviation, the quality and the outcome.
+    """
+
+    provides = ("line_of_sight_m", "offset_m")
+    neutral = {"line_of_sight_m": 0.0, "offset_m": 0.0}
+    find = staticmethod(path_autofocus)
+
+    def __init__(
+        self, extent_m: float | None = None, height_m: float = 0.0, rounds: int = 6, assess: bool = True
+    ) -> None:
+        super().__init__(extent_m=extent_m, height_m=height_m, rounds=rounds, assess=assess)
+
+
+class CorrectPath(Stage):
+    """Recorded positions less their estimated errors, for the stages that image any path.
+
+    The signal stays as it is. A chain connects an autofocus before and an image after it:
+
+        correct = use(CorrectPath(), offset_m="autofocus", transmitter_m="aux.transmitter_m")
+        image = use(TileImage(...), transmitter_m="correct", ...)
+    """
+
+    provides = ("transmitter_m", "receiver_m")
+    neutral = dict.fromkeys(provides, "positions are corrected by an offset, which is itself neutral in doubt")
+
+    def forward(
+        self, signal: Signal, offset_m: Tensor, transmitter_m: Tensor, receiver_m: Tensor | None = None
+    ) -> Estimate:
+        """Subtract the errors from the recorded positions.
+
+        Args:
+            signal: Range profiles.
+            offset_m: Errors of the recorded positions in metres, recorded minus true, float64 (...,
+                pulse, 3), the same for both antennas.
+            transmitter_m: Recorded positions of the transmitter in metres, float64 (..., pulse, 3).
+            receiver_m: Recorded positions of the receiver in metres; None if both share an antenna.
+
+        Returns:
+            `Estimate` of `transmitter_m`, and of `receiver_m` if there is one, float64 (..., pulse,
+            3), not assessed; a chain replaces an offset whose estimate failed by zero.
+        """
+        places = {"transmitter_m": transmitter_m, "receiver_m": receiver_m}
+        value = {name: place - offset_m for name, place in places.items() if place is not None}
+        return Estimate(value, quality=signal.data.real.new_ones(value["transmitter_m"].shape[:-2]))

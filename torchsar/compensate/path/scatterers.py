@@ -14,16 +14,8 @@ from torch.nn.functional import max_pool2d
 from torchsar.compensate.path.ground import slope
 from torchsar.core import power_of, unit_phasor
 from torchsar.focus import ImageGrid
+from torchsar.optim.scalar import vertex
 from torchsar.radar import LIGHT_M_S, AntennaPath
-
-# a scatterer is the strongest one within the first, in resolution cells, and not weaker than a
-# share of the strongest one within the second, whose side lobes it may be, by choice
-_ALONE_CELLS, _LOBE_CELLS, _LOBE_SHARE = (6, 2), (100, 2), 0.01
-# path differences in range cells up to which echoes are separated, and steps of the table of the
-# response, by choice
-_REACH_CELLS, _TABLE = 4.0, 1024
-# samples of a block of echoes, by choice
-_BLOCK = 1 << 21
 
 
 def prominent_places(image: Tensor, grid: ImageGrid, cells: tuple[float, float], most: int) -> Tensor:
@@ -50,7 +42,9 @@ def prominent_places(image: Tensor, grid: ImageGrid, cells: tuple[float, float],
         ]
         return max_pool2d(power[None], (2 * half[0] + 1, 2 * half[1] + 1), 1, (half[0], half[1]))[0]
 
-    alone = (power == strongest(_ALONE_CELLS)) & (power > _LOBE_SHARE * strongest(_LOBE_CELLS))
+    # the strongest one within the first, and not weaker than a hundredth of the strongest one
+    # within the second, whose side lobe it may be, by choice
+    alone = (power == strongest((6, 2))) & (power > 0.01 * strongest((100, 2)))
     # by choice: speckle of a million cells exceeds 14 times its mean in half of the images, and 20
     # times it in one of 500
     at = (alone & (power > 20.0 * clutter)).nonzero()
@@ -62,13 +56,10 @@ def prominent_places(image: Tensor, grid: ImageGrid, cells: tuple[float, float],
 
 def _refined(log: Tensor, at: Tensor, dim: int) -> Tensor:
     """Maximum of the parabola through three pixels along one axis, as an index."""
-    step = torch.zeros(2, dtype=torch.int64, device=at.device)
-    step[dim] = 1
+    step = torch.eye(2, dtype=torch.int64, device=at.device)[dim]
     inside = (at[:, dim] > 0) & (at[:, dim] < log.shape[dim] - 1)
-    left, middle, right = (log[tuple((at + side * step * inside[:, None]).mT)] for side in (-1, 0, 1))
-    bend = left - 2 * middle + right
-    offset = torch.where(bend < 0, (left - right) / (2 * bend), 0.0).clamp(-0.5, 0.5)
-    return at[:, dim] + offset
+    near = (log[tuple((at + side * step * inside[:, None]).mT)] for side in (-1, 0, 1))
+    return at[:, dim] + vertex(*near).clamp(-0.5, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,14 +119,14 @@ class Echoes:
         at = [place[pulses] for place in antennas.places]
         legs = [torch.linalg.vector_norm(place - places_m[:, None], dim=-1) for place in at]
         path = (2 if len(legs) == 1 else 1) * torch.stack(legs).sum(0) - antennas.reference_m[pulses]
-        samples = torch.empty(path.shape, dtype=torch.complex128, device=history.device)
         weighted = history * weights.to(history.real.dtype)
-        step = max(1, _BLOCK // max(1, length * len(frequency_hz)))
-        for first in range(0, len(path), step):
-            some = slice(first, first + step)
-            turns = path[some, :, None] / LIGHT_M_S * frequency_hz
-            samples[some] = (weighted[pulses[some]] * unit_phasor(turns, history.dtype)).sum(-1).to(samples.dtype)
-        return Echoes(pulses, seen, path, slope(at, places_m[:, None]), samples * seen, frequency_hz, weights)
+        step = max(1, (1 << 21) // max(1, length * len(frequency_hz)))  # blocks of two million samples, by choice
+        parts = [
+            (weighted[number] * unit_phasor(way[..., None] / LIGHT_M_S * frequency_hz, history.dtype)).sum(-1)
+            for way, number in zip(path.split(step), pulses.split(step), strict=True)
+        ]
+        samples = torch.cat(parts).to(torch.complex128) * seen
+        return Echoes(pulses, seen, path, slope(at, places_m[:, None]), samples, frequency_hz, weights)
 
     @property
     def wave(self) -> float:
@@ -160,7 +151,8 @@ class Echoes:
         """Pairs of scatterers at nearly the same range: the numbers of both, the indices of the
         pulses of the first among those of the second, and the response there.
         """
-        reach = _REACH_CELLS * LIGHT_M_S / float(self.frequency_hz[-1] - self.frequency_hz[0])
+        # echoes are separated up to path differences of four range cells, by choice
+        reach, steps = 4.0 * LIGHT_M_S / float(self.frequency_hz[-1] - self.frequency_hz[0]), 1024
         first, middle = self.pulses[:, 0], self.path_m.mean(1)
         near = (middle[:, None] - middle).abs() < 2 * reach
         near &= (first[:, None] - first).abs() < self.pulses.shape[1]
@@ -173,9 +165,9 @@ class Echoes:
         off = self.path_m[one] - self.path_m[other].gather(1, at)
         carrier = float(self.weights @ self.frequency_hz)
         # response to path differences without the carrier, from a table
-        grid = torch.linspace(0, 1, _TABLE, dtype=torch.float64, device=off.device) * reach
+        grid = torch.linspace(0, 1, steps, dtype=torch.float64, device=off.device) * reach
         table = torch.cos(torch.outer(grid, self.frequency_hz - carrier) * (2 * math.pi / LIGHT_M_S)) @ self.weights
-        place = (off / reach).abs() * (_TABLE - 1)
-        low = place.long().clamp(max=_TABLE - 2)
-        response = torch.where(place < _TABLE - 1, torch.lerp(table[low], table[low + 1], place - low), 0.0) * both
+        place = (off / reach).abs() * (steps - 1)
+        low = place.long().clamp(max=steps - 2)
+        response = torch.where(place < steps - 1, torch.lerp(table[low], table[low + 1], place - low), 0.0) * both
         return one, other, at, response * unit_phasor(off * (carrier / LIGHT_M_S), torch.complex128)

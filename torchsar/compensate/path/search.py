@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.path.axes import Found, three_axes
-from torchsar.compensate.path.envelopes import drift_m, matched_m, moved
-from torchsar.compensate.path.fringes import rough_near, roughness, smooth_near, smoothest
+from torchsar.compensate.path.fringes import drift_m, matched_m, moved, rough_near, roughness, smooth_near, smoothest
 from torchsar.compensate.path.ground import FINE_STEP, line_free, placed
+from torchsar.compensate.path.joint import Found, three_axes
 from torchsar.compensate.pulse_phase.data import pair_phase
-from torchsar.compensate.pulse_phase.fixed_point import Run, Weights, Wiener, fixed_point, weighted
+from torchsar.compensate.pulse_phase.fixed_point import Run, Wiener, fixed_point, weighted
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.sharpness import sharpness_beyond_speckle, sharpness_of_noise
 from torchsar.core import cis, real_dtype
@@ -23,16 +22,9 @@ from torchsar.metrics import entropy, residual_phase
 from torchsar.radar import LIGHT_M_S
 from torchsar.radar.spotlight import frequency_samples, range_profiles
 
-# rounds of the search, which end when the line of sight changes by less, rms, in fringes
-_ROUNDS, _SETTLED_FRINGES = 6, 1.0
-# largest errors of the envelopes that the first, the second and the later rounds of the search
-# correct, in range cells, by trial
-_REACH_CELLS = (4.0, 2.0, 0.5)
-# share of the band in the first, the second and the later rounds of the search
-_BANDS = (0.5, 1.0, 1.0)
 # roughness below which a line of sight is smooth: it was 0.3 to 0.6 for smooth errors, and 1.0 for
-# random walks; and assumed standard deviation of a measurement by envelopes in fringes
-_ROUGH, _NEAR_FRINGES = 0.75, 2.0
+# random walks
+_ROUGH = 0.75
 # factor by which another start may leave more of the samples than the sharpest image and still
 # count as a second opinion on it, by trial: those whose results were as good left up to 1.05 times
 # as much, those that had not come as far 1.1 to 1.35 times
@@ -49,10 +41,6 @@ def _surprise(power: Tensor, mean: Tensor) -> Tensor:
     share = power / (mean * (power.shape[-1] * power.shape[-2]))
     log = torch.log(share.clamp_min(torch.finfo(share.dtype).tiny))
     return (log - (share * log).sum((-2, -1), keepdim=True)).clamp_min(0)
-
-
-# what a search sharpens by, most iterations and phase step at which they end, by trial
-_BOTH: list[tuple[Weights, int, float]] = [(_intensity, 30, 0.03), (_surprise, 12, 0.03)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +68,6 @@ class Search:
         """Range that has a phase."""
         return phase_rad.double() * (self.fringe_m / (2 * math.pi))
 
-    def line_free(self, range_m: Tensor) -> Tensor:
-        """Ranges without constant and linear terms of time."""
-        return line_free(range_m, self.present)
-
     def windowed(self, share: float) -> Tensor:
         """Profiles with Hann windows over pulses and over a share of the band."""
         pulses, n = self.rows.shape
@@ -94,54 +78,47 @@ class Search:
         samples = frequency_samples(self.rows) * (over_pulses[:, None] * over_band)
         return range_profiles(samples)
 
-    def sharpened(
-        self, rows: Tensor, range_m: Tensor, runs: list[tuple[Weights, int, float]], start: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def sharpened(self, rows: Tensor, range_m: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor]:
         """Phases that sharpen the image of rows at a line of sight, and the corrected rows."""
         at = moved(rows, self.frequency_hz, range_m)
         columns = at.mT[None].contiguous()
         phase = torch.zeros_like(columns[:, 0].real) if start is None else start[None]
-        for weights, count, tolerance in runs:
-            phase = fixed_point(columns, phase, Run(weights, Through(self.imaging), count, 1.0, tolerance))[0]
+        for weights, iterations in ((_intensity, 30), (_surprise, 12)):  # both end at steps of 0.03 rad, by trial
+            phase = fixed_point(columns, phase, Run(weights, Through(self.imaging), iterations, 1.0, 0.03))[0]
         return phase[0], at
 
-    def by_phases(self) -> Tensor:
-        """Line of sight within a fringe: phases that sharpen the image, with envelopes at rest."""
-        rows, rest = self.windowed(1.0), torch.zeros(len(self.rows), dtype=torch.float64, device=self.rows.device)
-        return self.metres(self.sharpened(rows, rest, _BOTH, self.adjacent(rows))[0])
-
-    def adjacent(self, rows: Tensor) -> Tensor:
-        """Phases of the pulses from those between adjacent pulses, (pulse,)."""
-        columns = rows.mT[None]
-        return pair_phase(columns, torch.ones_like(columns[:, 0].real, dtype=torch.bool))[0]
+    def by_phases(self, share: float) -> Tensor:
+        """Phases (pulse,) that sharpen the image in a share of the band, with envelopes at rest."""
+        rows = self.windowed(share)
+        columns, rest = rows.mT[None], torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
+        start = pair_phase(columns, torch.ones_like(columns[:, 0].real, dtype=torch.bool))[0]
+        return self.sharpened(rows, rest, start)[0]
 
     def by_envelopes(self, first_band: float) -> tuple[Tensor, Tensor]:
         """Line of sight with whole fringes before the last step, and its roughness.
 
         first_band: Share of the band in which the first phases are found.
         """
-        cell = LIGHT_M_S / (2 * float(self.frequency_hz[-1] - self.frequency_hz[0]))
-        range_m = torch.zeros(len(self.rows), dtype=torch.float64, device=self.rows.device)
-        rows = self.windowed(first_band)
-        phase, _ = self.sharpened(rows, range_m, _BOTH, self.adjacent(rows))
+        cell, fringe = LIGHT_M_S / (2 * float(self.frequency_hz[-1] - self.frequency_hz[0])), self.fringe_m
+        phase = self.by_phases(first_band)
         carrier = self.metres(phase)
-        rough = roughness(carrier, self.fringe_m)
+        range_m, rough = torch.zeros_like(carrier), roughness(carrier, fringe)
         if rough < _ROUGH:
-            range_m, phase = self.line_free(smoothest(carrier, self.fringe_m)), None
-        for turn in range(_ROUNDS):
-            share, reach = _BANDS[min(turn, 2)], _REACH_CELLS[min(turn, 2)]
+            range_m, phase = line_free(smoothest(carrier, fringe), self.present), None
+        # each round corrects the envelopes in a share of the band by some range cells, by trial
+        for turn, (share, reach) in enumerate(((0.5, 4.0), (1.0, 2.0), *[(1.0, 0.5)] * 4)):
             rows, before = self.windowed(share), range_m
-            phase, at = self.sharpened(rows, range_m, _BOTH, phase)
-            rough = roughness(range_m + self.metres(phase), self.fringe_m)
+            phase, at = self.sharpened(rows, range_m, phase)
+            rough = roughness(range_m + self.metres(phase), fringe)
             if share < 1 and rough >= _ROUGH:
                 continue
             range_m, phase = self.with_envelopes(range_m, phase, at, reach * cell, rough), None
             if share == 1:
                 rows = moved(rows, self.frequency_hz, range_m)
                 drift = drift_m(rows, self.frequency_hz, self.imaging, slopes=turn == 1)
-                range_m = range_m + self.fringe_m * torch.round(drift / self.fringe_m)
-            range_m = self.line_free(range_m)
-            if turn > 1 and (range_m - before).square().mean().sqrt() < _SETTLED_FRINGES * self.fringe_m:
+                range_m = range_m + fringe * torch.round(drift / fringe)
+            range_m = line_free(range_m, self.present)
+            if turn > 1 and (range_m - before).square().mean().sqrt() < fringe:
                 break
         return range_m, rough
 
@@ -154,7 +131,7 @@ class Search:
         # by trial: more iterations drift off, as errors across the line of sight are not known yet
         run = Run(Wiener(), Through(imaging), 10, 1.0, 1e-3)
         phase, _ = fixed_point(columns, torch.zeros_like(columns[:, 0].real), run)
-        return self.line_free(range_m + self.metres(phase[0]))
+        return line_free(range_m + self.metres(phase[0]), self.present)
 
     def with_envelopes(self, range_m: Tensor, phase: Tensor, at: Tensor, reach_m: float, rough: Tensor) -> Tensor:
         """Line of sight at which envelopes and phases match the image that phases sharpen."""
@@ -166,8 +143,9 @@ class Search:
         if rough >= _ROUGH:
             return rough_near(carrier[None], near[None], range_m[None], self.fringe_m)[0]
         bends = rough * (self.fringe_m / math.sqrt(12))
-        near_std = _NEAR_FRINGES * self.fringe_m
-        return smooth_near(carrier[None], near[None], range_m[None], self.fringe_m, near_std, bends[None])[0]
+        # measurements by envelopes are taken to err by two fringes
+        known = (self.fringe_m, 2 * self.fringe_m, bends[None])
+        return smooth_near(carrier[None], near[None], range_m[None], *known)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +201,7 @@ def found_from_starts(search: Search, fine: TileOperator, rounds: int) -> Starts
 
     # in a quarter of the band range cells are four times as long; a third start takes half of it
     range_m, rough = search.by_envelopes(0.25)
-    results = [refined(range_m), refined(search.by_phases())]
+    results = [refined(range_m), refined(search.metres(search.by_phases(1.0)))]
     both = Starts.of(results, search, rough)
     spread = 2 * both.best.std_m.square().mean() + both.square_m2.amin()
     alone = both.others[0].noise > _AS_WELL * both.best.noise

@@ -8,11 +8,12 @@ from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchsar.compensate.path import assess as assessment
-from torchsar.compensate.path.curve import Curve
-from torchsar.compensate.path.ground import ERROR_DB, for_each, nothing, slope, trials_of
-from torchsar.compensate.path.motion import cosines, expected_power
+from torchsar.compensate.path.ground import ERROR_DB, corrected, for_each, nothing, slope, trials_of
+from torchsar.compensate.path.joint import cosines, expected_power
+from torchsar.compensate.path.line_of_sight import PathEstimator
 from torchsar.compensate.path.scatterers import Echoes, prominent_places
 from torchsar.compensate.pulse_phase.data import or_one, without_line
 from torchsar.core import Estimate, Outcome, cis
@@ -21,21 +22,6 @@ from torchsar.focus.image_grid import level_plane
 from torchsar.focus.spotlight import window_weights
 from torchsar.radar import LIGHT_M_S, AntennaPath, StraightTrack
 from torchsar.radar.spotlight import frequency_samples
-
-# half periods of the fastest cosine while a scatterer is seen, and most cosines, by choice
-_BENDS, _COSINES = 32, 512
-# most scatterers, by choice
-_SCATTERERS, _FIRST_SCATTERERS = 300, 300
-# rounds of the search by phase increments and of the fit, iterations of a fit, by trial
-_SEARCHES, _FITS, _STEPS = 3, 4, 6
-# change at which the search ends, in fringes; and the fit, in standard deviations, by choice
-_NEAR, _SETTLED = 0.15, 0.3
-# pulses between two phases of an increment, and over which echoes are averaged before, as shares of
-# the pulses that see a scatterer, by trial; the same for the amplitude of an echo
-_LAG, _MEAN, _SMOOTH = 1 / 64, 1 / 64, 1 / 8
-# standard deviation of the range of a scatterer in the image, in range cells: by clutter, by trial;
-# and by noise, times the root of its signal-to-noise ratio in the image, with a Hann window
-_PLACED, _PLACED_IN_NOISE = 0.07, 0.7
 
 
 def strip_autofocus(
@@ -53,6 +39,19 @@ def strip_autofocus(
     assess: bool = True,
 ) -> Estimate:
     """Estimate the slow errors of the recorded path of a strip.
+
+    >>> import torch
+    >>> from torchsar.compensate import strip_autofocus
+    >>> from torchsar.radar import AntennaPath
+    >>> y = torch.linspace(-20, 20, 64, dtype=torch.float64)
+    >>> place_m = torch.stack([0 * y - 290, y, 0 * y + 75], -1)
+    >>> path = AntennaPath(place_m, None, 2 * place_m.norm(dim=-1))
+    >>> frequency_hz = 9.6e9 + 1e7 * torch.arange(-8, 8, dtype=torch.float64)
+    >>> profiles = torch.zeros(64, 16, dtype=torch.complex64)
+    >>> strip = {"azimuth_m": 20.0, "range_m": 10.0, "beam_deg": 4.0}
+    >>> found = strip_autofocus(profiles, frequency_hz, path, **strip)
+    >>> found["offset_m"].shape, bool(found.ok)  # nothing is seen in zeros
+    (torch.Size([64, 3]), False)
 
     The recommended autofocus of strips, in which a beam sees each scatterer for a part of the
     pulses. Prominent scatterers are found in the image, up to 300. Each gives a phase per pulse
@@ -124,19 +123,19 @@ def strip_autofocus(
         strip = Strip.of(rows, frequency_hz, one, beam, axes, middle, (azimuth_m, range_m))
         outcome = Outcome.NOISE if bool((rows != 0).any()) else Outcome.EMPTY
         none = nothing(strip.judged, {"scatterers": 0.0}, outcome if assess else None)
-        for _ in range(_SEARCHES):
+        for _ in range(3):
             after = strip.with_increments()
             if after is None:
                 return none
             change, strip = strip.changed_m2(after), after
-            if change.sqrt() < _NEAR * strip.fringe_m:
+            if change.sqrt() < 0.15 * strip.fringe_m:
                 break
         # increments show slow errors best: their spectrum would forbid fast ones
         size = strip.line_free(strip.motion_m[:, 0])[strip.judged].square().mean()
         power = torch.full_like(strip.basis[:2], float(size) * strip.basis.shape[0] / strip.basis.shape[1])
         free = torch.stack([strip.line_free(cosine) for cosine in strip.basis.mT], -1)
         change, std, echoes = size, torch.zeros_like(free[:, 0]), None
-        for _ in range(_FITS):
+        for _ in range(4):
             fitted = strip.fitted(power)
             if fitted is None:
                 return none
@@ -144,7 +143,7 @@ def strip_autofocus(
             # without a line over the judged pulses
             std = ((free @ covariance) * free).sum(-1).clamp_min(0).sqrt()
             change, strip = strip.changed_m2(after), after
-            if change < _SETTLED**2 * std[strip.judged].square().mean():
+            if change < 0.3**2 * std[strip.judged].square().mean():
                 break
         assert echoes is not None
         value = {"line_of_sight_m": strip.line_free(strip.motion_m[:, 0]), "offset_m": strip.offset_m}
@@ -154,6 +153,47 @@ def strip_autofocus(
         return assessment.of_strip(found, strip.judged, strip.fringe_m, seen, std, change) if assess else found
 
     return for_each(find, profiles, antennas, trials)
+
+
+class StripAutofocus(PathEstimator):
+    """Slow errors of the recorded path of a strip; see `strip_autofocus`.
+
+    Args:
+        azimuth_m: Extent of the imaged strip along its azimuth axis in metres.
+        range_m: Extent along its range axis in metres.
+        beam_deg: Width of the beam in degrees, see `ProcessedBeam`.
+        centre_m: Position of the centre in metres along (range axis, azimuth axis).
+        range_axis_rad: Direction of the range axis in rad, from ground coordinate x towards y.
+        height_m: Height z of the imaged plane in metres.
+        squint_deg: Angle of the middle of the beam ahead of broadside in degrees.
+        assess: Whether to add the standard deviation, the quality and the outcome.
+    """
+
+    provides = ("line_of_sight_m", "offset_m")
+    neutral = {"line_of_sight_m": 0.0, "offset_m": 0.0}
+    find = staticmethod(strip_autofocus)
+
+    def __init__(
+        self,
+        azimuth_m: float,
+        range_m: float,
+        beam_deg: float,
+        centre_m: tuple[float, float] = (0.0, 0.0),
+        range_axis_rad: float = 0.0,
+        height_m: float = 0.0,
+        squint_deg: float = 0.0,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(
+            azimuth_m=azimuth_m,
+            range_m=range_m,
+            beam_deg=beam_deg,
+            centre_m=(centre_m[0], centre_m[1]),
+            range_axis_rad=range_axis_rad,
+            height_m=height_m,
+            squint_deg=squint_deg,
+            assess=assess,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +241,7 @@ class Strip:
         track = StraightTrack.fitted(place)
         points = track.abeam_m(place, middle_m)
         sight = slope(antennas.places, points)
-        across = torch.linalg.cross(sight, track.along.expand_as(sight), dim=-1)
-        across = across / or_one(torch.linalg.vector_norm(across, dim=-1, keepdim=True))
+        across = normalize(torch.linalg.cross(sight, track.along.expand_as(sight), dim=-1), dim=-1)
         axes = torch.stack([sight / sight.square().sum(-1, keepdim=True), across], 1)
         # a scatterer outside of the strip is seen together with those in it
         away = torch.linalg.vector_norm(place - points, dim=-1).mean()
@@ -226,7 +265,8 @@ class Strip:
             raise ValueError("no pulse sees the strip within the beam; check its centre, extents and the squint")
         seen = beam.lit_pulses(place, points[pulses // 2][None])
         per = max(1, int(seen[0, 1] - seen[0, 0]))
-        count = max(1, min(pulses - 2, _COSINES, math.ceil(_BENDS * pulses / per)))
+        # by choice: 16 periods of the fastest cosine while a scatterer is seen
+        count = max(1, min(pulses - 2, 512, math.ceil(32 * pulses / per)))
         weights = window_weights("hann", len(frequency_hz), rows.device)
         return Strip(
             frequency_samples(rows),
@@ -252,13 +292,6 @@ class Strip:
         """Errors of the positions, (pulse, 3)."""
         return (self.motion_m[:, None] @ self.axes)[:, 0]
 
-    @property
-    def antennas(self) -> AntennaPath:
-        """The path less the errors found so far."""
-        recorded, receiver = self.recorded, self.recorded.receiver_m
-        moved = None if receiver is None else receiver - self.offset_m
-        return AntennaPath(recorded.transmitter_m - self.offset_m, moved, recorded.reference_m)
-
     def changed_m2(self, after: Strip) -> Tensor:
         """Mean square by which another round has changed the line of sight."""
         return self.line_free((after.motion_m - self.motion_m)[:, 0])[self.judged].square().mean()
@@ -267,14 +300,14 @@ class Strip:
         """Ranges (pulse,) without constant and linear terms over the judged pulses."""
         return without_line(range_m, self.judged)
 
-    def echoes(self, most: int) -> tuple[Echoes, Curve] | None:
+    def echoes(self) -> tuple[Echoes, Curve] | None:
         """Echoes of the prominent scatterers, and their phases; None if there are too few."""
-        antennas = self.antennas
+        antennas = corrected(self.recorded, self.offset_m)
         lit = partial(self.beam.lit_pulses, antennas.places[-1])
         places = antennas.transmitter_m, antennas.receiver_m, antennas.reference_m
         plan = TilePlan(self.frequency_hz, *places, self.grid, ERROR_DB, lit)
         image = plan.image(self.history * self.weights.to(self.history.real.dtype))
-        found = prominent_places(image, self.grid, self.cells, most)
+        found = prominent_places(image, self.grid, self.cells, 300)
         if len(found) < assessment.LEAST_SCATTERERS:
             return None
         echoes = Echoes.of(self.history, self.frequency_hz, self.weights, antennas, found, lit)
@@ -291,12 +324,13 @@ class Strip:
 
     def with_increments(self) -> Strip | None:
         """The strip with the motion that the increments of the phases show."""
-        found = self.echoes(_FIRST_SCATTERERS)
+        found = self.echoes()
         if found is None:
             return None
         echoes, curve = found
+        # the lag of an increment and the mean of echoes before take a 64th of the pulses, by trial
         seen = echoes.seen.shape[1]
-        lag, near = max(1, round(_LAG * seen)), 2 * round(_MEAN * seen / 2) + 1
+        lag, near = max(1, round(seen / 64)), 2 * round(seen / 128) + 1
         smooth = _smooth(echoes.samples, near) * echoes.seen
         left = (echoes.samples - smooth) * echoes.seen
         noise = _mean(left.abs().square()[..., None], echoes.seen)[..., 0] / near
@@ -319,11 +353,11 @@ class Strip:
         """The strip with the most probable motion, the covariance of its cosines along the line of
         sight, the power of its cosines, and the echoes.
         """
-        found = self.echoes(_SCATTERERS)
+        found = self.echoes()
         if found is None:
             return None
         echoes, curve = found
-        near = 2 * round(_SMOOTH * echoes.seen.shape[1] / 2) + 1
+        near = 2 * round(echoes.seen.shape[1] / 16) + 1  # over an eighth of the pulses, by trial
         # phases are those along the path less what has been found
         before = curve.phase(self.motion_m)
         steep = torch.linalg.vector_norm(_mean(echoes.slope @ self.grid.axes.mT, echoes.seen), dim=-1)[:, 0]
@@ -331,7 +365,7 @@ class Strip:
         turned = torch.zeros_like(before)
         model = torch.zeros_like(echoes.samples)
         gain, motion, covariance = echoes.seen.double(), self.motion_m, torch.zeros_like(power)
-        for _ in range(_STEPS):
+        for _ in range(6):
             alone = (echoes.samples - echoes.crossed(model)) * cis(-turned) * echoes.seen
             mean = (alone * gain).sum(1, keepdim=True)
             way = mean / or_one(mean.abs())
@@ -342,8 +376,9 @@ class Strip:
             faded = gain < 0.2 * gain.amax(1, keepdim=True)
             weight = torch.where(faded, 0.0, 2 * gain.square() / or_one(noise))
             phase = torch.where(faded, 0.0, alone.imag / or_one(gain))
-            # the range of a scatterer is known from the image; its phase and azimuth are free
-            spread = cell**2 * (_PLACED**2 + _PLACED_IN_NOISE**2 / or_one(weight.sum(1) / 2))
+            # The range of a scatterer is known from the image, to 0.07 cells in clutter, by trial,
+            # and to 0.7 over the root of the SNR in noise. Its phase and azimuth are free.
+            spread = cell**2 * (0.07**2 + 0.7**2 / or_one(weight.sum(1) / 2))
             known = torch.stack([torch.zeros_like(spread), steep.square() / spread, torch.zeros_like(spread)], -1)
             coefficient, covariance, own = curve.solved(phase + turned + before, weight, power, known)
             motion, covariance = self.basis @ coefficient.mT, covariance[: power.shape[1], : power.shape[1]]
@@ -363,3 +398,76 @@ def _smooth(x: Tensor, length: int) -> Tensor:
 def _mean(x: Tensor, seen: Tensor) -> Tensor:
     """Mean of (scatterer, seen, term) over the pulses that are seen, (scatterer, 1, term)."""
     return (x * seen[..., None]).sum(1, keepdim=True) / or_one(seen.sum(1).to(x.dtype))[:, None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Phases of scatterers as functions of a motion, which is a sum of cosines.
+
+    The phase of a scatterer is that of the motion of the antennas, plus terms of its own: a
+    constant, and displacements of its place.
+
+    Args:
+        basis: Cosines, float64 (pulse, cosine).
+        pulses: Numbers of the pulses that see each scatterer, int64 (scatterer, seen).
+        lever: Change of the phase by a motion along each axis in rad per metre, float64 (scatterer,
+            seen, axis).
+        own: Change of the phase by the terms of the scatterer, float64 (scatterer, seen, term).
+    """
+
+    basis: Tensor
+    pulses: Tensor
+    lever: Tensor
+    own: Tensor
+
+    def phase(self, motion_m: Tensor) -> Tensor:
+        """Phase by a motion (pulse, axis), float64 (scatterer, seen)."""
+        return (self.lever * motion_m[self.pulses]).sum(-1)
+
+    def solved(self, phase: Tensor, weight: Tensor, power: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the most probable motion and terms of the scatterers.
+
+        The coefficients of the motion and the terms of the scatterers are independent and Gaussian.
+
+        Args:
+            phase: Measured phases in rad, float64 (scatterer, seen).
+            weight: Inverse variances of their errors, float64 (scatterer, seen).
+            power: Expected power of the coefficients in square metres, float64 (axis, cosine).
+            known: Inverse variances of the terms of the scatterers, whose mean is zero, float64
+                (scatterer, term).
+
+        Returns:
+            Coefficients of the motion, float64 (axis, cosine); their covariance, float64 (axis *
+            cosine, axis * cosine); and the phase that the terms of each scatterer add, float64
+            (scatterer, seen).
+        """
+        axes, count, ridge = *power.shape, 1e-9  # share by which information grows, against rounding
+        pull = weight[..., None] * self.own
+        normal = pull.mT @ self.own
+        seen = normal.diagonal(dim1=-2, dim2=-1)  # zero for a scatterer that no pulse sees
+        raised = torch.where(seen > 0, ridge * seen + known, 1.0)
+        inverse = torch.linalg.inv(normal + torch.diag_embed(raised))
+        own = (pull.mT @ phase[..., None])[..., 0]
+        weighted, at = weight[..., None] * self.lever, self.pulses.flatten()
+        share, drive = (
+            phase.new_zeros(len(self.basis), *x.shape[2:]).index_add_(0, at, x.flatten(0, 1))
+            for x in (weighted[..., None] * self.lever[..., None, :], weighted * phase[..., None])
+        )
+        whole = torch.einsum("pm,pik,pn->imkn", self.basis, share, self.basis).reshape(axes * count, -1)
+        whole.diagonal().mul_(1 + ridge)
+        cross = torch.cat([self._through(pull * self.lever[..., i : i + 1]) for i in range(axes)], -1)
+        tied = inverse @ cross
+        whole = whole - cross.flatten(0, 1).mT @ tied.flatten(0, 1) + torch.diag(1 / power.flatten())
+        right = (self.basis.mT @ drive).mT.flatten() - tied.flatten(0, 1).mT @ own.flatten()
+        factor = torch.linalg.cholesky(whole)
+        found = torch.cholesky_solve(right[:, None], factor)[:, 0]
+        terms = (inverse @ own[..., None])[..., 0] - tied @ found
+        added = (self.own @ terms[..., None])[..., 0]
+        return found.reshape(axes, count), torch.cholesky_inverse(factor), added
+
+    def _through(self, terms: Tensor) -> Tensor:
+        """Products of terms (scatterer, seen, term) with the cosines, (scatterer, term, cosine),
+        some scatterers at once.
+        """
+        parts = zip(terms.split(16), self.pulses.split(16), strict=True)
+        return torch.cat([term.mT @ self.basis[pulses] for term, pulses in parts])

@@ -4,26 +4,13 @@ A period is an up sweep followed by a down sweep. Velocities refer to the turnin
 at which the up sweeps end and the down sweeps begin, and are positive for receding targets (dR/dt).
 """
 
-from torchsar.compensate.radial.compensate import compensate_motion
-from torchsar.compensate.radial.correlation import spectrum_correlation
-from torchsar.compensate.radial.equalise import equalise_pulses, pulse_gain
-from torchsar.compensate.radial.mirror import mirror_product
-from torchsar.compensate.radial.peak import ml_peak
-from torchsar.compensate.radial.polish import phase_polish
-from torchsar.compensate.radial.recommended import radial_motion, range_error
-from torchsar.compensate.radial.segmented import segmented_interference
-from torchsar.compensate.radial.stages import (
-    CompensateMotion,
-    EqualisePulses,
-    MirrorProduct,
-    MlPeak,
-    PhasePolish,
-    PulseGain,
-    RadialMotion,
-    SegmentedInterference,
-    SpectrumCorrelation,
-)
-from torchsar.compensate.radial.trajectory import geometric_velocity_m_s, integrated_range, turning_points
+from torchsar.compensate.radial.beats import MlPeak, SpectrumCorrelation, ml_peak, spectrum_correlation
+from torchsar.compensate.radial.equalise import EqualisePulses, PulseGain, equalise_pulses, pulse_gain
+from torchsar.compensate.radial.mirror import MirrorProduct, mirror_product
+from torchsar.compensate.radial.phases import PhasePolish, phase_polish
+from torchsar.compensate.radial.recommended import RadialMotion, radial_motion, range_error
+from torchsar.compensate.radial.segmented import SegmentedInterference, segmented_interference
+from torchsar.compensate.radial.trajectory import CompensateMotion, compensate_motion
 
 __all__ = [
     "CompensateMotion",
@@ -37,8 +24,6 @@ __all__ = [
     "SpectrumCorrelation",
     "compensate_motion",
     "equalise_pulses",
-    "geometric_velocity_m_s",
-    "integrated_range",
     "mirror_product",
     "ml_peak",
     "phase_polish",
@@ -47,5 +32,4 @@ __all__ = [
     "range_error",
     "segmented_interference",
     "spectrum_correlation",
-    "turning_points",
 ]

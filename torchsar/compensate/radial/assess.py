@@ -12,30 +12,14 @@ from torchsar.compensate.pulse_phase.data import pair_phase, prepare
 from torchsar.compensate.pulse_phase.fixed_point import LogAbove, Run, fixed_point
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.radial.bands import filled
-from torchsar.compensate.radial.dense import SAME_RAD, Walk
 from torchsar.compensate.radial.measured import LEAST_SQUARED, TINY, Intercept, Levels, Measured, mean_of
+from torchsar.compensate.radial.phases import SAME_RAD, Walk
 from torchsar.compensate.radial.product import mirror_velocity
 from torchsar.core import Axis, Estimate, Outcome, cis, host_value, power_of, true_positions, worst
 from torchsar.metrics.phase import phase_rmse
 
-# SNR of the product of both sweeps, 9 dB, below which noise alone may make its peak, by trial
-_NOISE = 10**0.9
-# a velocity at which both sweeps have so much more power in common, in more than so many periods
-_HIGHER, _CHANCE = 1.1, 0.05
-# periods for which the deviation that white noise explains counts beside the measured one
-_EXPECTED = 4.0
-# standard deviation, in halves of wavelength over sweep length, beyond which a velocity is of no
-# use; noise alone gives 0.05 where the SNR is just enough
-_USELESS = 0.07
-# Phases: least number of periods with an echo; number of periods from which on their power tells
-# whether scatterers interfere; largest standard deviation, a Strehl ratio of exp(-0.25) = 0.78
-LEAST_PERIODS, _FEW, ENOUGH_STD_RAD = 8, 32, 0.5
-# effective range cells below which a scene is a single range cell, and relative modulation of the
-# power of its pulses, besides so many standard deviations of noise, that shows several scatterers
-_ONE_CELL, _MODULATION, _SURE = 1.5, 0.1, 4.0
-# least entropy, as in `autofocus`; twice its rms difference from right phases was 0.11 to 0.15 rad,
-# and 0.43 and more where both were wrong at -10 dB
-_SHARPEN, _ENOUGH_APART_RAD = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01), 0.35
+# least number of periods with an echo from which phases are estimated
+LEAST_PERIODS = 8
 
 
 @torch.no_grad()
@@ -73,12 +57,14 @@ def assessed_velocity(found: Estimate, measured: Measured, pulse: Axis) -> Estim
     m = measured.still.shape[-1]
     highest = torch.fft.fft(measured.still, 2 * m).abs().amax(-1).to(torch.float64) / m
     best = Levels.of(highest, product)
-    elsewhere = mean_of((highest > _HIGHER * measured.common).to(torch.float64), lit)[..., 0]
-    useless = mean_of(square, product.lit)[..., 0] >= (_USELESS * bin_m_s) ** 2
+    elsewhere = mean_of((highest > 1.1 * measured.common).to(torch.float64), lit)[..., 0]
+    # a velocity is of no use from 0.07 bins on; noise alone gives 0.05 where the SNR is just enough
+    useless = mean_of(square, product.lit)[..., 0] >= (0.07 * bin_m_s) ** 2
     outcome = worst(
         (Outcome.INEXACT, ~measured.enough | useless),
-        (Outcome.AMBIGUOUS, (best.squared >= LEAST_SQUARED) & (elsewhere > _CHANCE)),
-        (Outcome.NOISE, ~lit.any(-1) | (~measured.enough & (best.squared < _NOISE))),
+        (Outcome.AMBIGUOUS, (best.squared >= LEAST_SQUARED) & (elsewhere > 0.05)),
+        # noise alone may make the peak of the product of both sweeps below 9 dB, by trial
+        (Outcome.NOISE, ~lit.any(-1) | (~measured.enough & (best.squared < 10**0.9))),
         (Outcome.EMPTY, (measured.common == 0).all(-1)),
     )
     return replace(found, std={**found.std, "velocity_m_s": square.sqrt()}, outcome=outcome)
@@ -94,10 +80,12 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
     def variance(changes: Tensor) -> Tensor:
         # a constant part is that of the detector or of the laser: sweeps that differ in power
         changes = changes - mean_of(changes * share, clear) / weight
-        counted = count * mean_of(changes.square() * share, clear) + _EXPECTED * white
-        return counted / ((count - 1).clamp_min(0) + _EXPECTED)
+        # the deviation that white noise explains counts as that of four periods
+        counted = count * mean_of(changes.square() * share, clear) + 4 * white
+        return counted / ((count - 1).clamp_min(0) + 4)
 
-    changes = _changes_of_product(measured, law.intercept or "free") if law.changes is None else law.changes()
+    of_product = _changes_of_product(measured, law.intercept or "free")
+    changes = of_product if law.changes is None else law.changes()
     square = filled(variance(changes) / share, clear)
     slope, bend = (_rms_difference(measured.raw_m_s, clear, order) for order in (1, 2))
     # 1 / 32: mean square of the time between two samples of a product over 24 squared periods
@@ -106,10 +94,9 @@ def _variance(measured: Measured, pulse: Axis) -> Tensor:
     if law.intercept:
         return square
     away = measured.velocity_m_s - mirror_velocity(measured.product, "free")[0]
-    own = variance(changes if law.changes is None else _changes_of_product(measured, "free"))
     # that the edges of the window leave
     bias = 5e-4 * measured.product.radar.ambiguous_velocity_m_s
-    apart = mean_of(away.square() - own / share, clear) - bias**2
+    apart = mean_of(away.square() - variance(of_product) / share, clear) - bias**2
     judged = (measured.levels.squared >= LEAST_SQUARED)[..., None]
     return torch.where(judged, torch.maximum(square, apart), square)
 
@@ -188,21 +175,26 @@ def assessed_motion(found: Estimate, cells: Tensor, walk: Walk) -> Estimate:
     power = power_of(lines).sum(-1, dtype=torch.float64)
     # standard deviation over mean of the power of the lit pulses
     modulation = mean_of((power / mean_of(power, lit).clamp_min(TINY) - 1).square(), lit)[:, 0].sqrt()
-    modulated = (modulation > _MODULATION + _SURE * math.sqrt(2) * walk.std_rad[:, 0]) & (n >= _FEW)
+    # a relative modulation of the power of 0.1, besides four standard deviations of noise, shows
+    # several scatterers; it is measured from 32 periods on
+    modulated = (modulation > 0.1 + 4 * math.sqrt(2) * walk.std_rad[:, 0]) & (n >= 32)
     sparse = walk.apart_rad.isnan()
-    one_cell = modulated & sparse & (range_cells < _ONE_CELL)
+    one_cell = modulated & sparse & (range_cells < 1.5)
     compared = modulated & sparse & ~one_cell & found.ok.flatten()
     std, apart = walk.std_rad, torch.zeros_like(walk.apart_rad)
     count = host_value(compared.sum(), 0)
     if count:
         at = true_positions(compared, count)
         pulses = prepare(lines[at], "radial_motion")
-        other = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
+        sharpen = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)  # least entropy, as in `autofocus`
+        other = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), sharpen)[0]
         apart = apart.index_put((at,), 2 * phase_rmse(walk.phase_rad[at], other, lit[at]))
         std = (std.square() + apart[:, None].square()).sqrt()
     reasons = worst(
-        (Outcome.INEXACT, mean_of(std.square(), lit)[:, 0] >= ENOUGH_STD_RAD**2),
-        (Outcome.AMBIGUOUS, (walk.apart_rad >= SAME_RAD) | (apart >= _ENOUGH_APART_RAD)),
+        (Outcome.INEXACT, mean_of(std.square(), lit)[:, 0] >= 0.5**2),
+        # twice the rms difference of least entropy from right phases was 0.11 to 0.15 rad, and 0.43
+        # and more where both were wrong at -10 dB
+        (Outcome.AMBIGUOUS, (walk.apart_rad >= SAME_RAD) | (apart >= 0.35)),
         (Outcome.TOO_FEW, one_cell | ((lines != 0).any(-1).sum(-1) < LEAST_PERIODS)),
     )
     shape = found.outcome.shape

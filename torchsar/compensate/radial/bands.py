@@ -15,15 +15,10 @@ from torch import Tensor
 from torchsar.core import Axis, checked_samples, cis, level_of, power_of, real_dtype
 from torchsar.radar import TriangularLadar
 
+SWEEPS = ("ramp", "pulse", "fast_time")  # axes of the signals of the stages
 # periods over which envelopes are averaged, found by trial: more raise the SNR, fewer follow
 # vibration
 _BLOCK = 8
-# correlation coefficients, found by trial: that of averaged envelopes that noise alone does not
-# reach; that of one period above which its envelopes overrule those of the neighbouring periods
-_ALIKE, _SURELY_ALIKE = 0.35, 0.7
-# bins by which the shift of a single period may differ from those of its neighbours; lag beyond
-# which a match belongs to another scatterer, illuminated in one sweep only
-_ALONE, _FURTHEST = 3, 14
 
 
 @dataclass(frozen=True)
@@ -212,7 +207,7 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     n = blocks.shape[-1]
     blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
     likeness, lag = _best_lag(torch.fft.fftshift(blocks, dim=-1), 2 * n)
-    alike = likeness > _ALIKE
+    alike = likeness > 0.35  # by trial: noise alone does not reach it
     lag = filled(_median_of_three(filled(lag.to(torch.float64), alike)), alike)
     shift = torch.round(_through_blocks(lag, pulses) / 2).to(torch.int64)
     return shift, alike.repeat_interleave(_BLOCK, -1)[..., :pulses]
@@ -257,8 +252,7 @@ def _median_of_three(x: Tensor) -> Tensor:
     """Median of every entry and its two neighbours along the last dimension; ends are unchanged."""
     if x.shape[-1] < 3:
         return x
-    inner = torch.stack([x[..., :-2], x[..., 1:-1], x[..., 2:]]).median(0).values
-    return torch.cat([x[..., :1], inner, x[..., -1:]], -1)
+    return torch.cat([x[..., :1], x.unfold(-1, 3, 1).median(-1).values, x[..., -1:]], -1)
 
 
 def _through_blocks(values: Tensor, pulses: int) -> Tensor:
@@ -397,10 +391,12 @@ def _corrected_shift(smooth: Tensor, shift: Tensor, first: int, lines: int) -> t
     """
     power = power_of(_in_window(smooth, shift, first, lines))
     likeness, lag = _best_lag(power, 2 ** math.ceil(math.log2(2 * lines)))
-    certain = (likeness > _SURELY_ALIKE) & (lag.abs() <= _FURTHEST)
+    # by trial: envelopes so similar overrule those of the neighbouring periods; a lag beyond 14
+    # bins is that to another scatterer, illuminated in one sweep only
+    certain = (likeness > 0.7) & (lag.abs() <= 14)
     own = shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0)
     typical = _median_of_three(own)
-    return torch.where((own - typical).abs() >= _ALONE, typical, own), certain
+    return torch.where((own - typical).abs() >= 3, typical, own), certain
 
 
 def _in_window(spectrum: Tensor, shift: Tensor, first: int, lines: int) -> Tensor:

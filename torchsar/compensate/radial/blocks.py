@@ -1,20 +1,35 @@
-"""Evaluation of an estimator on many trials, in blocks of trials that fit into the cache."""
+"""Estimators of radial velocities as stages and functions of many trials.
+
+A block of trials fits into the cache.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.radial.assess import assessed_velocity
-from torchsar.compensate.radial.bands import Spectra
+from torchsar.compensate.radial.bands import SWEEPS, Spectra, refuse_other_sweeps
 from torchsar.compensate.radial.measured import Measured
-from torchsar.core import Axis, Estimate, block_bytes_of, over_blocks, refuse_non_finite
+from torchsar.core import (
+    Axis,
+    Estimate,
+    Signal,
+    Stage,
+    block_bytes_of,
+    over_blocks,
+    refuse_non_finite,
+)
 from torchsar.radar import TriangularLadar
+
+Window = tuple[float, float] | list[float] | None
 
 
 def velocities(
+    name: str,
     measure: Callable[[Spectra], Measured],
     sweeps: Tensor,
     radar: TriangularLadar,
@@ -25,6 +40,7 @@ def velocities(
     """Estimate radial velocities in blocks of trials, and assess them if asked to.
 
     Args:
+        name: Name of the calling function for error messages.
         measure: Method that measures the velocities in the spectra of the sweeps.
         sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
         radar: Ladar parameters.
@@ -44,11 +60,16 @@ def velocities(
         found = measured.estimate(pulse, azimuth_m)
         return assessed_velocity(found, measured, pulse) if assess else found
 
-    return by_trials(estimator, sweeps, azimuth_m)
+    return by_trials(name, estimator, sweeps, radar, pulse, azimuth_m)
 
 
 def by_trials(
-    estimator: Callable[[Tensor, Tensor | float], Estimate], sweeps: Tensor, azimuth_m: Tensor | float
+    name: str,
+    estimator: Callable[[Tensor, Tensor | float], Estimate],
+    sweeps: Tensor,
+    radar: TriangularLadar,
+    pulse: Axis,
+    azimuth_m: Tensor | float,
 ) -> Estimate:
     """Apply an estimator to blocks of trials, in as many threads as torch uses.
 
@@ -56,16 +77,22 @@ def by_trials(
     trials are processed at once if gradients are required.
 
     Args:
+        name: Name of the calling function for error messages.
         estimator: Function of (sweeps, azimuth_m) that returns an estimate.
         sweeps: Up and down sweeps of N samples each, shape (..., 2, pulse, N), complex.
+        radar: Ladar parameters.
+        pulse: Slow-time axis; each entry is a period of one up and one down sweep.
         azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
 
     Returns:
         The estimate of all trials.
 
     Raises:
-        ValueError: If `azimuth_m` is not finite, or neither one number nor one per trial.
+        TypeError: If the sweeps are not a complex tensor.
+        ValueError: If the sweeps have another shape, are not finite, or do not match the axis; or
+            if `azimuth_m` is not finite, or neither one number nor one per trial.
     """
+    refuse_other_sweeps(sweeps, radar, name, pulse)
     trials, azimuth = sweeps.shape[:-3], torch.as_tensor(azimuth_m, dtype=torch.float64, device=sweeps.device)
     if azimuth.ndim and azimuth.shape != trials:
         raise ValueError(
@@ -88,3 +115,53 @@ def by_trials(
 
     over_blocks(work, starts, sweeps)
     return Estimate.joined([parts[first] for first in starts], trials)
+
+
+class SweepEstimator(Stage):
+    """An estimator of the radial velocity from both sweeps of a range window.
+
+    Args:
+        radar: Ladar parameters.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
+        azimuth_m: Azimuth of the scene centre in metres.
+        assess: False leaves out standard deviation and outcome.
+        options: Further options of the function `estimator` of the stage.
+    """
+
+    works_on = SWEEPS
+    provides = ("velocity_m_s",)
+    neutral = {"velocity_m_s": 0.0}
+    estimator: Callable[..., Estimate]
+    azimuth_m: Tensor
+
+    def __init__(
+        self, radar: TriangularLadar, window_m: Window, azimuth_m: float, assess: bool, **options: Any
+    ) -> None:
+        super().__init__()
+        if window_m is not None and len(window_m) != 2:
+            raise ValueError(
+                "window_m must be two ranges (low, high) in metres relative to the reference range, got "
+                f"{list(window_m)}"
+            )
+        self.radar, self.window_m = radar, None if window_m is None else (float(window_m[0]), float(window_m[1]))
+        self.assess, self.options = assess, options
+        self.hold("azimuth_m", azimuth_m)
+
+    def forward(self, signal: Signal) -> Estimate:
+        """Estimate the radial motion from up and down sweeps of axes (ramp, pulse, fast_time).
+
+        Returns:
+            The values that the stage provides, shape (..., pulse) each: `velocity_m_s` at the
+            turning points (ends of the up sweeps), receding positive, and for `RadialMotion` the
+            residual `phase_rad` of the up sweeps.
+        """
+        return self.estimator(
+            signal.data,
+            self.radar,
+            signal.axis("pulse"),
+            window_m=self.window_m,
+            azimuth_m=self.azimuth_m,
+            assess=self.assess,
+            **self.options,
+        )

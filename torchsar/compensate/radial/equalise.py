@@ -8,7 +8,16 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import prepare
-from torchsar.core import Estimate, Outcome, checked_samples, cis, power_of, refuse_non_finite_values
+from torchsar.core import (
+    Estimate,
+    Outcome,
+    Signal,
+    Stage,
+    checked_samples,
+    cis,
+    power_of,
+    refuse_non_finite_values,
+)
 
 LEAST_GAIN = 0.05  # least gain of a pulse: a lost pulse is not amplified more than 20 times
 _PAD = 4  # zero-padding of the transform: a peak is then found to an eighth of a cell
@@ -95,3 +104,43 @@ def equalise_pulses(data: Tensor, gain: Tensor) -> Tensor:
             "of 1 and set its samples to zero"
         )
     return data / gain[..., None].to(data.real.dtype)
+
+
+class PulseGain(Stage):
+    """Amplitude of every pulse relative to steady scatterers; see `pulse_gain`.
+
+    Provides `gain` of shape (..., pulse), by which `EqualisePulses` divides the pulses.
+
+    Args:
+        assess: False leaves out the outcome.
+    """
+
+    provides = ("gain",)
+    neutral = {"gain": 1.0}
+
+    def __init__(self, assess: bool = True) -> None:
+        super().__init__()
+        self.assess = assess
+
+    def forward(self, signal: Signal) -> Estimate:
+        """Estimate `gain` of a signal of axes (pulse, range)."""
+        return pulse_gain(signal.data, assess=self.assess)
+
+
+class EqualisePulses(Stage):
+    """Stage that divides every pulse by its `gain`; see `equalise_pulses`.
+
+    The gain usually comes from an earlier stage such as `PulseGain`.
+    """
+
+    def forward(self, signal: Signal, gain: Tensor) -> Signal:
+        """Divide the pulses of a signal of axes (pulse, range) by their gains.
+
+        Args:
+            signal: Pulses, shape (..., pulse, range), complex.
+            gain: Gains, shape (..., pulse).
+
+        Returns:
+            The equalised signal.
+        """
+        return signal.with_data(equalise_pulses(signal.data, gain))

@@ -20,9 +20,6 @@ TINY = torch.finfo(torch.float64).tiny
 # 1 slip in 1000 periods at 13 dB, none from 14 dB on; the measured SNR errs by a decibel or two.
 # The same for a product of sweeps, after the squaring loss, 15 dB, found by trial
 _LEAST_SNR, LEAST_SQUARED = 10**1.6, 10**1.5
-# SNR after the squaring loss, 12 dB, below which a period has faded, because noise may exceed its
-# peak; share of the mean power below which it has faded too, because interference spoils the phase
-_FADED, _DEEP = 10**1.2, 0.05
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ class Levels(NamedTuple):
         scene = torch.where(shared > 1.5 * chance, shared, 0).clamp_max(total)
         ratio = _ratio(scene, total - scene)
         after = ratio * bands.noise_lines
-        return Levels(scene / total.clamp_min(TINY), total - scene, after, after / _loss(ratio))
+        return Levels(scene / total.clamp_min(TINY), total - scene, after, after / (1 + 1 / (2 * ratio)))
 
 
 @dataclass(frozen=True)
@@ -138,8 +135,10 @@ class Measured:
         levels = Levels.of(common, product)
         counted = lit | ~lit.any(-1, keepdim=True)
         own = _ratio(common, levels.noise[..., None])
-        clear = common > _DEEP * mean_of(common, counted)
-        clear = lit & clear & (own * product.noise_lines / _loss(own) >= _FADED)
+        # a period has faded below 12 dB, where noise may exceed its peak, and below a twentieth of
+        # the mean power, where interference spoils the phase
+        clear = common > 0.05 * mean_of(common, counted)
+        clear = lit & clear & (own * product.noise_lines / (1 + 1 / (2 * own)) >= 10**1.2)
         return Measured(filled(raw, clear), raw, product, still, common, levels, lit, clear, law, info)
 
     @property
@@ -197,8 +196,3 @@ def mean_of(x: Tensor, counted: Tensor) -> Tensor:
 def _ratio(signal: Tensor, noise: Tensor) -> Tensor:
     """Signal over noise within the limits of numbers."""
     return (signal / noise.clamp_min(TINY)).clamp(1e-6, 1e18)
-
-
-def _loss(ratio: Tensor) -> Tensor:
-    """Loss of SNR of a product of two sweeps whose samples have this SNR."""
-    return 1 + 1 / (2 * ratio)

@@ -6,11 +6,14 @@ from typing import get_args
 
 from torch import Tensor
 
-from torchsar.compensate.radial.bands import refuse_other_sweeps
-from torchsar.compensate.radial.blocks import velocities
-from torchsar.compensate.radial.measured import Intercept
-from torchsar.compensate.radial.product import mirror_measured
-from torchsar.core import Axis, Estimate
+from torchsar.compensate.radial.bands import Bands
+from torchsar.compensate.radial.blocks import SweepEstimator, Window, velocities
+from torchsar.compensate.radial.measured import Intercept, Law, Measured
+from torchsar.compensate.radial.product import mirror_velocity
+from torchsar.core import (
+    Axis,
+    Estimate,
+)
 from torchsar.radar import TriangularLadar
 
 
@@ -81,9 +84,9 @@ def mirror_product(
         TypeError: If the sweeps are not complex.
         ValueError: If the sweeps, the window or the intercept are invalid.
     """
-    refuse_other_sweeps(sweeps, radar, "mirror_product", pulse)
     refuse_other_intercept(intercept)
     return velocities(
+        "mirror_product",
         lambda spectra: mirror_measured(spectra.bands(window_m, taper, oversampling=2), intercept),
         sweeps,
         radar,
@@ -91,6 +94,20 @@ def mirror_product(
         azimuth_m,
         assess,
     )
+
+
+def mirror_measured(bands: Bands, intercept: Intercept) -> Measured:
+    """Measure the radial velocity as `mirror_product` does, in sweeps that are already filtered.
+
+    Args:
+        bands: Sweeps filtered to the range window, with two samples per bin.
+        intercept: "known", "record" or "free", see `mirror_product`.
+
+    Returns:
+        The velocities.
+    """
+    velocity, info = mirror_velocity(bands, intercept)
+    return Measured.of(velocity, bands, Law(3.0 if intercept == "free" else 0.75, intercept), **info)
 
 
 def refuse_other_intercept(intercept: str) -> None:
@@ -104,3 +121,37 @@ def refuse_other_intercept(intercept: str) -> None:
     """
     if intercept not in get_args(Intercept):
         raise ValueError(f"intercept must be 'known', 'record' or 'free', got {intercept!r}")
+
+
+class MirrorProduct(SweepEstimator):
+    """Radial velocity by the product of up and mirrored down sweeps; see `mirror_product`.
+
+    Provides `velocity_m_s` of shape (..., pulse) at the turning points (ends of the up sweeps),
+    receding positive.
+
+    Args:
+        radar: Ladar parameters.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
+        intercept: What is assumed of the phase of the product of up and mirrored down sweep at the
+            turning point: "known", "record" or "free", see `mirror_product`.
+        taper: Share of the window that its edges take, see `Spectra.bands`.
+        azimuth_m: Azimuth of the scene centre in metres.
+        assess: False leaves out standard deviation and outcome.
+
+    Raises:
+        ValueError: If the window does not have two values.
+    """
+
+    estimator = staticmethod(mirror_product)
+
+    def __init__(
+        self,
+        radar: TriangularLadar,
+        window_m: Window = None,
+        intercept: Intercept = "known",
+        taper: float = 1.0,
+        azimuth_m: float = 0.0,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(radar, window_m, azimuth_m, assess, intercept=intercept, taper=taper)

@@ -1,4 +1,8 @@
-"""Radial velocity in the product of the up sweep and the mirrored down sweep."""
+"""Velocity of greatest likelihood in the product of the up sweep and the mirrored down sweep.
+
+Peaks are found in transforms and refined by Newton steps. Gradients pass through the steps, but not
+through the search.
+"""
 
 from __future__ import annotations
 
@@ -8,26 +12,14 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands
-from torchsar.compensate.radial.measured import Intercept, Law, Measured
-from torchsar.compensate.radial.newton import climbed, step_uphill
-from torchsar.core import cis, power_of, take
-
-# zero-padding of the transform and number of Newton steps, found by trial: enough to converge
-_PAD, _NEWTON = 2, 3
-
-
-def mirror_measured(bands: Bands, intercept: Intercept) -> Measured:
-    """Measure the radial velocity as `mirror_product` does, in sweeps that are already filtered.
-
-    Args:
-        bands: Sweeps filtered to the range window, with two samples per bin.
-        intercept: "known", "record" or "free", see `mirror_product`.
-
-    Returns:
-        The velocities.
-    """
-    velocity, info = mirror_velocity(bands, intercept)
-    return Measured.of(velocity, bands, Law(3.0 if intercept == "free" else 0.75, intercept), **info)
+from torchsar.compensate.radial.measured import Intercept
+from torchsar.core import (
+    cis,
+    linear_phasor,
+    power_of,
+    take,
+)
+from torchsar.optim.scalar import vertex
 
 
 def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[str, Tensor]]:
@@ -47,7 +39,7 @@ def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[st
     u = bands.time_s[inner]
     z = bands.product()[..., inner]
     z = z / z.detach().abs().mean(-1, keepdim=True).clamp_min(torch.finfo(z.real.dtype).tiny)
-    free = _slope(z, u, bands, 1 if intercept == "known" else _NEWTON)
+    free = _slope(z, u, bands, 1 if intercept == "known" else 3)
     if intercept == "free":
         return bands.shift_m_s + free, {}
     if intercept == "known":
@@ -76,15 +68,12 @@ def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
     The peak of a zero-padded transform, refined by Newton steps.
     """
     n, per = z.shape[-1], 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s
-    power = power_of(torch.fft.fft(z.detach(), _PAD * n))
+    power = power_of(torch.fft.fft(z.detach(), 2 * n))
     # 6 bins about the removed shift, which is right to a bin or two
-    reach = min(round(6 * _PAD * n / bands.time_s.shape[-1]), n // 2)
+    reach = min(round(6 * 2 * n / bands.time_s.shape[-1]), n // 2)
     best = torch.cat([power[..., -reach:], power[..., : reach + 1]], -1).argmax(-1) - reach
-    # the vertex of the parabola through a peak and its neighbours
-    low, mid, high = (take(power, (best + k) % power.shape[-1]) for k in (-1, 0, 1))
-    bend = low - 2 * mid + high
-    best = best + torch.where(bend < 0, 0.5 * (low - high) / torch.where(bend < 0, bend, -1), 0)
-    v = best.to(torch.float64) / (_PAD * n * (u[1] - u[0]) * per)
+    best = best + vertex(*(take(power, (best + k) % power.shape[-1]) for k in (-1, 0, 1)))
+    v = best.to(torch.float64) / (2 * n * (u[1] - u[0]) * per)
     return climbed(z, float(bands.radar.sweep_s / bands.time_s.shape[-1] * per), v, steps)
 
 
@@ -94,7 +83,48 @@ def _through_zero(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
     The phase of the product is then zero at the turning point.
     """
     w = _weights(u, bands).to(z.real.dtype)
-    for _ in range(_NEWTON):
+    for _ in range(3):  # by trial, enough to converge
         turned = _turned(z, u, v, bands)
         v = v + step_uphill((turned.imag * w).sum(-1), -(turned.real * w * w).sum(-1))
     return v
+
+
+def climbed(x: Tensor, turns: float, value: Tensor, steps: int) -> Tensor:
+    """Refine, by Newton steps, the value v for which |sum_i x_i exp(-2j pi turns i v)| is greatest.
+
+    Differentiable.
+
+    Args:
+        x: Samples x_i, shape (..., m), complex.
+        turns: Change of phase from sample to sample, in turns per unit of v.
+        value: Values of v to start from, shape (...,).
+        steps: Number of Newton steps.
+
+    Returns:
+        The refined values, shape (...,), float64.
+    """
+    n = x.shape[-1]
+    middle = (n - 1) / 2
+    w = (torch.arange(n, dtype=torch.float64, device=x.device) - middle) * (2 * math.pi * turns)
+    powers = torch.stack([torch.ones_like(w), w, w * w], -1).to(x.dtype)
+    for _ in range(steps):
+        turned = x * linear_phasor(-turns * value, -middle, n, x.dtype)
+        s0, s1, s2 = (turned @ powers).unbind(-1)
+        gradient = 2 * (s0.conj() * s1).imag
+        bend = 2 * (power_of(s1) - (s0.conj() * s2).real)
+        value = value + step_uphill(gradient, bend)
+    return value
+
+
+def step_uphill(gradient: Tensor, bend: Tensor) -> Tensor:
+    """Compute the Newton step towards a maximum; zero where the objective is not concave.
+
+    Args:
+        gradient: First derivative of the objective, any shape.
+        bend: Second derivative of the objective, same shape.
+
+    Returns:
+        The step, same shape, float64.
+    """
+    concave = bend < 0
+    return torch.where(concave, -gradient / torch.where(concave, bend, -1), 0).to(torch.float64)

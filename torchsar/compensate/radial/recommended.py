@@ -15,29 +15,27 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase import pga
 from torchsar.compensate.pulse_phase.data import prepare, rotate, starting_phase
 from torchsar.compensate.radial.assess import LEAST_PERIODS, assessed_motion, assessed_velocity
-from torchsar.compensate.radial.bands import Bands, Spectra, filled, refuse_other_sweeps
-from torchsar.compensate.radial.blocks import by_trials
-from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
-from torchsar.compensate.radial.dense import Walk, linked_walk
+from torchsar.compensate.radial.bands import Bands, Spectra, filled
+from torchsar.compensate.radial.blocks import SweepEstimator, Window, by_trials
 from torchsar.compensate.radial.measured import Intercept
-from torchsar.compensate.radial.mirror import refuse_other_intercept
-from torchsar.compensate.radial.polish import scene_cells, sharpened
-from torchsar.compensate.radial.product import mirror_measured
-from torchsar.compensate.radial.trajectory import integrated_range, sweep_motion
-from torchsar.core import Axis, Estimate, host_value, true_positions
+from torchsar.compensate.radial.mirror import mirror_measured, refuse_other_intercept
+from torchsar.compensate.radial.phases import Walk, linked_walk, scene_cells, sharpened
+from torchsar.compensate.radial.trajectory import (
+    carrier_turns,
+    integrated_range,
+    polynomial_phasor,
+    sweep_motion,
+)
+from torchsar.core import (
+    Axis,
+    Estimate,
+    host_value,
+    true_positions,
+)
 from torchsar.core.spline import UniformSpline
 from torchsar.focus.triangular import deramp_azimuth, profile_axes
 from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
 from torchsar.radar import TriangularLadar, sweep_middles
-
-# random walk of the integrated velocities beyond which the polish is started from PGA, found by
-# trial: beyond a radian the polish alone may end in an image of two peaks; least number of periods
-# for that, because the first window of PGA is as wide
-_FAR_RAD, _FEW_PERIODS = 0.4, 32
-# scenes of more effective image cells are dense
-_DENSE_CELLS = 20.0
-# windows of PGA in Doppler cells, found by trial: a random walk blurs by few cells
-_WINDOWS = (31.0, 21.0, 15.0, 9.0, 9.0, 9.0)
 
 
 def radial_motion(
@@ -104,7 +102,6 @@ def radial_motion(
         TypeError: If the sweeps are not complex.
         ValueError: If the sweeps, the window or the intercept are invalid.
     """
-    refuse_other_sweeps(sweeps, radar, "radial_motion", pulse)
     refuse_other_intercept(intercept)
 
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
@@ -115,7 +112,7 @@ def radial_motion(
         found, walk = polished(cells, coarse, measured.enough, pulse, radar, iterations, tolerance_rad)
         return assessed_motion(assessed_velocity(found, measured, pulse), cells, walk) if assess else found
 
-    return by_trials(estimator, sweeps, azimuth_m)
+    return by_trials("radial_motion", estimator, sweeps, radar, pulse, azimuth_m)
 
 
 def polished(
@@ -151,7 +148,7 @@ def polished(
     phase = _unwrapped(torch.where(shows[:, None], phase, 0).to(torch.float64), lit)
     std = (1 / torch.sqrt(2 * 10 ** (coarse.info["snr_db"].detach().flatten() / 10))).clamp_max(math.pi)
     walk = Walk(phase, std[:, None].expand_as(phase), torch.full_like(std, torch.nan))
-    dense = enough.flatten() & (image_cells > _DENSE_CELLS) & (pulse.n >= _FEW_PERIODS)
+    dense = enough.flatten() & (image_cells > 20) & (pulse.n >= 32)
     count = host_value(dense.sum(), 0)
     if count:
         at = true_positions(dense, count)
@@ -179,13 +176,17 @@ def _unwrapped(phase: Tensor, lit: Tensor) -> Tensor:
 def _start(cells: Tensor, coarse: Estimate, enough: Tensor, radar: TriangularLadar, pulse: Axis) -> Tensor | None:
     """Phases (..., pulse) by PGA for trials whose velocities integrate to more than 0.4 rad.
 
-    The bound is that of the random walk of integrated velocities. Zero for the other trials.
+    The bound is that of the random walk of integrated velocities, by trial: beyond a radian the
+    polish alone may end in an image of two peaks. Zero for the other trials, and below 32 periods,
+    because the first window is as wide.
     """
     walk_m = integrated_range_detrended_bound_m(coarse.info["noise_m_s"], pulse.step, pulse.n)
-    far = enough & (4 * math.pi / radar.wavelength_m * walk_m > _FAR_RAD)
-    if pulse.n < _FEW_PERIODS or not bool(far.any()):
+    far = enough & (4 * math.pi / radar.wavelength_m * walk_m > 0.4)
+    if pulse.n < 32 or not bool(far.any()):
         return None
-    found = pga(cells.detach(), windows=_WINDOWS, iterations=len(_WINDOWS), assess=False)
+    # in Doppler cells, by trial: a random walk blurs by few cells
+    windows = (31.0, 21.0, 15.0, 9.0, 9.0, 9.0)
+    found = pga(cells.detach(), windows=windows, iterations=6, assess=False)
     return torch.where(far[..., None], found["phase_rad"], 0)
 
 
@@ -245,3 +246,52 @@ def range_error(estimate: Estimate, radar: TriangularLadar, pulse: Axis, at_s: T
             else fine.reshape(*fine.shape[:-1], *(1,) * at_s.ndim).expand(*fine.shape[:-1], *at_s.shape)
         )
     return total
+
+
+class RadialMotion(SweepEstimator):
+    """Radial motion by the recommended estimator; see `radial_motion`.
+
+    Provides `velocity_m_s`, which `CompensateMotion` can compensate, and the residual `phase_rad`,
+    which `CorrectPulsePhase` can then remove.
+
+    Args:
+        radar: Ladar parameters.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
+        intercept: What is assumed of the phase of the product of up and mirrored down sweep at the
+            turning point: "known", "record" or "free", see `mirror_product`.
+        taper: Share of the window that its edges take, see `Spectra.bands`.
+        azimuth_m: Azimuth of the scene centre in metres.
+        iterations: Largest number of iterations, see `phase_polish`.
+        tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.
+        assess: False leaves out standard deviation and outcome.
+
+    Raises:
+        ValueError: If the window does not have two values.
+    """
+
+    provides = ("velocity_m_s", "phase_rad")
+    neutral = {"velocity_m_s": 0.0, "phase_rad": 0.0}
+    estimator = staticmethod(radial_motion)
+
+    def __init__(
+        self,
+        radar: TriangularLadar,
+        window_m: Window = None,
+        intercept: Intercept = "known",
+        taper: float = 1.0,
+        azimuth_m: float = 0.0,
+        iterations: int = 80,
+        tolerance_rad: float = 0.005,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(
+            radar,
+            window_m,
+            azimuth_m,
+            assess,
+            intercept=intercept,
+            taper=taper,
+            iterations=iterations,
+            tolerance_rad=tolerance_rad,
+        )

@@ -10,12 +10,17 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.compensate.radial.bands import Bands, Spectra, inside, refuse_other_sweeps, window_lines
-from torchsar.compensate.radial.blocks import velocities
-from torchsar.compensate.radial.correlation import envelope_lag
+from torchsar.compensate.radial.bands import Bands, Spectra, inside, window_lines
+from torchsar.compensate.radial.beats import envelope_lag, from_beats, shining
+from torchsar.compensate.radial.blocks import SweepEstimator, Window, velocities
 from torchsar.compensate.radial.measured import Law, Measured
-from torchsar.compensate.radial.peak import from_beats, shining
-from torchsar.core import Axis, Estimate, cis, power_of, take
+from torchsar.core import (
+    Axis,
+    Estimate,
+    cis,
+    power_of,
+    take,
+)
 from torchsar.radar import TriangularLadar
 
 Bins = Literal["peak", "sum"]
@@ -103,7 +108,6 @@ def segmented_interference(
     Reference:
         Remote Sens. 2024, 16, 793, Eqs. (14)-(20), corrected.
     """
-    refuse_other_sweeps(sweeps, radar, "segmented_interference", pulse)
     if bins not in ("peak", "sum") or unwrap not in ("gradient", "per_pulse"):
         raise ValueError(
             f"bins must be 'peak' or 'sum' and unwrap 'gradient' or 'per_pulse', got bins {bins!r} and unwrap "
@@ -133,11 +137,10 @@ def segmented_interference(
         bands = replace(bands, lit=bands.lit & (weights > 0).any(-2))
         phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
         doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
-        per_rad = radar.ambiguous_velocity_m_s / (2 * math.pi)
         return Measured.of(
             from_beats(doppler, -doppler, bands),
             spectra.bands(window_m, taper=0.5, oversampling=2),
-            Law(4.0, changes=lambda: _weighted(of_power(), weights) * per_rad),
+            Law(4.0, changes=lambda: _weighted(of_power(), weights) * radar.ambiguous_velocity_m_s / (2 * math.pi)),
             bands.lit,
             phase_rad=phase,
             integer=integer + bands.shift,
@@ -145,7 +148,7 @@ def segmented_interference(
             weights=weights.mean(-1),
         )
 
-    return velocities(measure, sweeps, radar, pulse, azimuth_m, assess)
+    return velocities("segmented_interference", measure, sweeps, radar, pulse, azimuth_m, assess)
 
 
 def _halves(bands: Bands, padding: int, hann: bool) -> tuple[Tensor, ...]:
@@ -179,15 +182,13 @@ def _summed(
     phase = (torch.angle(first * second.conj()).to(torch.float64) - 2 * math.pi * coarse)[..., None, :]
 
     def changed(up: Tensor, down: Tensor, both: Tensor) -> Tensor:
-        return (power_of(up).sum(-1) - power_of(down).sum(-1)) / (2 * both.abs()).clamp_min(
-            torch.finfo(both.dtype).tiny
-        )
+        tiny = torch.finfo(both.dtype).tiny
+        return (power_of(up).sum(-1) - power_of(down).sum(-1)) / (2 * both.abs()).clamp_min(tiny)
 
-    return (
-        phase,
-        torch.ones_like(phase),
-        lambda: (changed(up1, down2, first) - changed(up2, down1, second)).to(torch.float64)[..., None, :],
-    )
+    def changes() -> Tensor:
+        return (changed(up1, down2, first) - changed(up2, down1, second)).to(torch.float64)[..., None, :]
+
+    return phase, torch.ones_like(phase), changes
 
 
 def _at_peaks(
@@ -200,15 +201,18 @@ def _at_peaks(
     """
     up, down = (power_of(first) + power_of(second) for first, second in (halves[:2], halves[2:]))
     both = (up + down).detach()
-    peaks = _strongest(torch.where(searched, both.mean(-2), -1), scatterers, padding)
     phases, weights, picked = [], [], []
-    for peak in peaks.unbind(-1):
+    for peak in _strongest(torch.where(searched, both.mean(-2), -1), scatterers, padding).unbind(-1):
         near = (_around(power.detach(), peak, padding) for power in (up, down))
         at_up, at_down = (take(index, level.argmax(-1)) for index, level in near)
         up1, up2, down1, down2 = (take(x, at) for x, at in zip(halves, (at_up, at_up, at_down, at_down), strict=True))
         phases.append(torch.angle(up1 * up2.conj() * down1 * down2.conj()).to(torch.float64))
         picked.append(torch.stack([up1, up2, down1, down2]))
-        weight = _contrast_about(both, peak, padding).to(torch.float64)
+        # Eq. (18), made independent of scale: deviation over mean of the amplitudes near a peak
+        part = _around(both, peak, 4 * padding)[1].sqrt()
+        mean = part.mean((-2, -1))
+        spread = (part - mean[..., None, None]).square().mean((-2, -1)).sqrt()
+        weight = torch.where(mean > 0, spread / torch.where(mean > 0, mean, 1), 0).to(torch.float64)
         weights.append(weight[..., None] * shining(take(up, at_up), take(down, at_down)))
 
     def changes() -> Tensor:
@@ -236,17 +240,6 @@ def _around(power: Tensor, peak: Tensor, reach: int) -> tuple[Tensor, Tensor]:
     near = (peak[..., None] + torch.arange(-reach, reach + 1, device=power.device)) % power.shape[-1]
     near = near[..., None, :].expand(*power.shape[:-1], -1)
     return near, power.gather(-1, near)
-
-
-def _contrast_about(power: Tensor, peak: Tensor, reach: int) -> Tensor:
-    """Standard deviation over mean of amplitudes in a window about a peak (...,).
-
-    Eq. (18) of the paper, made independent of scale. power: (..., pulse, n).
-    """
-    part = _around(power, peak, 4 * reach)[1].sqrt()
-    mean = part.mean((-2, -1))
-    spread = (part - mean[..., None, None]).square().mean((-2, -1)).sqrt()
-    return torch.where(mean > 0, spread / torch.where(mean > 0, mean, 1), 0)
 
 
 def _unwrapped(
@@ -278,3 +271,51 @@ def _unwrapped(
 def _weighted(x: Tensor, weights: Tensor) -> Tensor:
     """Weighted mean over scatterers, (..., pulse); zero where all weights are zero."""
     return (x * weights).sum(-2) / weights.sum(-2).clamp_min(torch.finfo(weights.dtype).tiny)
+
+
+class SegmentedInterference(SweepEstimator):
+    """Radial velocity by segmented interference; see `segmented_interference`.
+
+    Args:
+        radar: Ladar parameters.
+        bins: Frequency bins in which the phase is read: "peak" (those of the strongest scatterers)
+            or "sum" (all).
+        unwrap: How the whole turns of the phase are found: "gradient" (from period to period) or
+            "per_pulse" (from the envelopes of every period).
+        scatterers: Number of scatterers with "peak".
+        padding: Factor of the zero-padding of the halves, 1..16.
+        hann: True applies a Hann window to each half.
+        window_m: Lowest and highest range in metres, relative to the reference range; None for the
+            whole band.
+        azimuth_m: Azimuth of the scene centre in metres.
+        assess: False leaves out standard deviation and outcome.
+
+    Raises:
+        ValueError: If the window does not have two values.
+    """
+
+    estimator = staticmethod(segmented_interference)
+
+    def __init__(
+        self,
+        radar: TriangularLadar,
+        bins: Bins = "peak",
+        unwrap: Unwrap = "gradient",
+        scatterers: int = 1,
+        padding: int = 4,
+        hann: bool = False,
+        window_m: Window = None,
+        azimuth_m: float = 0.0,
+        assess: bool = True,
+    ) -> None:
+        super().__init__(
+            radar,
+            window_m,
+            azimuth_m,
+            assess,
+            bins=bins,
+            unwrap=unwrap,
+            scatterers=scatterers,
+            padding=padding,
+            hann=hann,
+        )

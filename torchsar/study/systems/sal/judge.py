@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.radial import integrated_range
+from torchsar.compensate.radial.trajectory import integrated_range
 from torchsar.core import Axis, Chain, Signal, Trace, unit_phasor
 from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import TriangularLadar, sweep_middles
