@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         Trace,
         Truth,
         use,
+        validate,
     )
     from torchsar.study.memory import keep_freed_memory
 
@@ -58,6 +59,7 @@ __all__ = [
     "repair",
     "scene",
     "use",
+    "validate",
 ]
 
 

@@ -45,7 +45,7 @@ def _returns(entry: Entry) -> object:
     """Return type of the function, or of the `forward` of the stage."""
     name = entry.name.split(":")[0]
     if "." in name:
-        package, name = name.split(".")
+        package, _, name = name.rpartition(".")
         function = getattr(importlib.import_module(f"torchsar.{package}"), name)
     else:
         function = next(getattr(module, name) for module in STAGES_IN if hasattr(module, name)).forward

@@ -22,11 +22,11 @@ from torchsar.multichannel import (
     MinimumMeanSquare,
     PointMotion,
     Reconstruct,
-    azimuth_filter,
     doppler_offsets,
     focus_azimuth,
     reconstruct,
 )
+from torchsar.multichannel.azimuth import azimuth_filter
 
 F64 = torch.float64
 RADAR = published_radar()

@@ -206,9 +206,9 @@ def test_trials_are_independent_and_empty_ones_not_ok():
 
 def test_refusals():
     radar = published_radar()
-    with pytest.raises(ValueError, match="the radar has one"):
+    with pytest.raises(ValueError, match="at least two positions"):
         estimate_balance(torch.zeros(1, 8, 64, dtype=torch.complex128), published_radar(channel_m=(0.0,)))
-    with pytest.raises(ValueError, match=r"data \(\.\.\., 3, pulse, range\)"):
+    with pytest.raises(ValueError, match="each of the 3 positions"):
         estimate_balance(torch.zeros(2, 8, 64, dtype=torch.complex128), radar)
     with pytest.raises(ValueError, match="gain_db .* got shape \\(2,\\)"):
         correct_balance(torch.zeros(3, 8, 64, dtype=torch.complex128), radar, PHASE, GAIN[:2])

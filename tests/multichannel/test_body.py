@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchsar.multichannel import Extraction, Frame, PointMotion, body_echo, find_body
-from torchsar.multichannel.body import Segments, body_image, centred_motion, chip_about, known_body
+from torchsar.multichannel import Extraction, Frame, PointMotion
+from torchsar.multichannel.body import body_echo, body_image, centred_motion, find_body, known_body
+from torchsar.multichannel.chip import Segments, chip_about
 
 from .helpers import compressed_echo
 from .ocean import EXTRACTION, GATE_S, RADAR, frame_of, ship

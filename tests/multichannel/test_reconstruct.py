@@ -17,7 +17,6 @@ from torchsar.multichannel import (
     PointMotion,
     Reconstruct,
     reconstruct,
-    reconstruct_lines,
 )
 
 F64 = torch.float64
@@ -92,7 +91,7 @@ def test_range_lines_are_rebuilt_one_by_one():
     radar, data = published_radar(), torch.randn(2, 3, 50, 6, dtype=torch.complex128)
     motion = PointMotion.of(radar, data, torch.tensor([3.0, -8.0], dtype=F64))
     for rebuild in (LeastSquares(2), MinimumMeanSquare()):
-        together = reconstruct_lines(data, radar, motion, rebuild)
+        together = reconstruct(data, radar, motion, rebuild, with_range=True)
         torch.testing.assert_close(
             together[..., 4], reconstruct(data[..., 4], radar, motion, rebuild), atol=1e-10, rtol=0
         )
@@ -171,7 +170,7 @@ def test_refusals():
     radar = published_radar()
     with pytest.raises(ValueError, match="4 Doppler bands cannot be separated by 3 channels"):
         Reconstruct(radar, LeastSquares(4))
-    with pytest.raises(ValueError, match="expects 3 channels .* got data with 2"):
+    with pytest.raises(ValueError, match="3 positions in the radar.* got the shape .2, 8."):
         Reconstruct(radar)(
             Signal(torch.ones(2, 8, dtype=torch.complex64), published_radar(channel_m=(0.0, 1.0)).axes(8))
         )

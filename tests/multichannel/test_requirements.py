@@ -21,7 +21,7 @@ from torchsar.multichannel import (
     multichannel_requirements,
     reconstruct,
 )
-from torchsar.multichannel.requirements import singular_speeds_m_s
+from torchsar.multichannel.limits import singular_speeds_m_s
 
 RADAR = published_radar(transmit_range=(-243.0, 0.0208, 1e-6, 1e-9))
 STILL: dict[str, Any] = {"u_r_m_s": (0.0, 0.0), "u_a_m_s": (0.0, 0.0)}

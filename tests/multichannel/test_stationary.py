@@ -15,7 +15,7 @@ from torchsar.multichannel import (
     MinimumMeanSquare,
     PointMotion,
     StationaryImage,
-    reconstruct_lines,
+    reconstruct,
     stationary_image,
 )
 
@@ -65,7 +65,7 @@ def test_unaliased_pulses_are_those_of_a_fast_radar():
         compressed_echo(fast, 1200, 32, [{"r0": 5010.0}], gate_s=2.5),
     )
     motion = PointMotion.of(RADAR, slow.data.real)
-    got = centred_ifft(reconstruct_lines(slow.data, RADAR, motion, LeastSquares()), dim=-2)
+    got = centred_ifft(reconstruct(slow.data, RADAR, motion, LeastSquares(), with_range=True), dim=-2)
     inside = slice(200, 1000)
     assert (got - want.data[0])[inside].norm() < 0.03 * want.data[0][inside].norm()
 

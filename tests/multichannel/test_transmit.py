@@ -14,11 +14,11 @@ from torchsar.multichannel import (
     LeastSquares,
     PointMotion,
     RemoveTransmitRange,
-    azimuth_filter,
     doppler_offsets,
     reconstruct,
     remove_transmit_range,
 )
+from torchsar.multichannel.azimuth import azimuth_filter
 from torchsar.multichannel.reconstruct import doppler_centre_hz
 from torchsar.multichannel.transmit import neglected_transmit_phase_rad
 

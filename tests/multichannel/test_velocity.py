@@ -22,15 +22,13 @@ from torchsar.multichannel import (
     PointMotion,
     Search,
     WalkAmbiguity,
-    explained_energy,
-    line_whitening,
-    maximum_likelihood,
     moving_point_velocity,
 )
 from torchsar.multichannel.velocity.aperture import SeenAperture
 from torchsar.multichannel.velocity.bank import bank_search
-from torchsar.multichannel.velocity.likelihood import PointLikelihood
+from torchsar.multichannel.velocity.likelihood import PointLikelihood, explained_energy, maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, moved, noise_beside, phase_slopes, point_phasor
+from torchsar.multichannel.velocity.whitening import line_whitening
 from torchsar.scene import KSea, Pattern
 
 F64, C128 = torch.float64, torch.complex128

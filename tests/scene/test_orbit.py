@@ -12,7 +12,6 @@ from torchsar.radar.orbit import (
     EARTH_GRAVITY_M3_S2,
     EARTH_RADIUS_M,
     earth_velocity_m_s,
-    gravity_m_s2,
     turned_with_earth,
 )
 from torchsar.radar.timing import ground_slant_m, off_nadir_ground_m
@@ -27,6 +26,10 @@ def over_a_turn(orbit: Orbit, n: int = 181) -> torch.Tensor:
     return torch.linspace(
         0, 2 * math.pi * math.sqrt(float(orbit.semi_major_m) ** 3 / EARTH_GRAVITY_M3_S2), n, dtype=torch.float64
     )
+
+
+def gravity_m_s2(position):
+    return -EARTH_GRAVITY_M3_S2 * position / torch.linalg.vector_norm(position, dim=-1, keepdim=True) ** 3
 
 
 @pytest.mark.parametrize("orbit", [PAPER, ECCENTRIC], ids=["paper", "eccentric"])

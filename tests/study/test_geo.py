@@ -20,7 +20,7 @@ from tests.study.scenes import (
 )
 from torchsar.core import Draws
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import ElementPattern, FlatBand, clutter_covariance, condition_number
+from torchsar.multichannel.reconstruct import condition_number, noise_and_clutter
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo import sweep
 from torchsar.study.settings.errors import ConfigError
@@ -151,8 +151,8 @@ def test_the_sea_is_as_strong_as_said(tmp_path: Path) -> None:
 
 def test_clutter_is_coherent_over_channels(tmp_path: Path) -> None:
     radar = bench_of(tmp_path, "geo").radar
-    for prior in (FlatBand(300.0**2 * 4.5 / (radar.wavelength_m * 5000.0)), ElementPattern()):
-        clutter = clutter_covariance(radar, prior, 256, 21)
+    for lit_s in (4.5, None):
+        clutter = noise_and_clutter(radar, lit_s, 256, 60.0)
         power = clutter.diagonal(dim1=-2, dim2=-1).real
         # three channels see one surface: the strongest eigenvalues hold nearly all of the power
         values = torch.linalg.eigvalsh(clutter)

@@ -34,6 +34,11 @@ from torchsar import compensate, core, focus, metrics, multichannel, radar, repa
 from torchsar.compensate.group import RangeGroup
 from torchsar.core import Draws, Estimate, Signal, Stage
 from torchsar.echo.turntable import fast_time_axis
+from torchsar.multichannel.body import find_body
+from torchsar.multichannel.velocity.along_track import along_track_velocity
+from torchsar.multichannel.velocity.likelihood import explained_energy, maximum_likelihood
+from torchsar.multichannel.velocity.stages import gradient_likelihood
+from torchsar.multichannel.velocity.whitening import line_whitening, sample_whitening
 from torchsar.optim.scalar import parabola_minimum
 from torchsar.radar import FarField
 
@@ -488,20 +493,20 @@ FUNCTIONS = [
     ),
     # multichannel
     _entry(
-        "multichannel.along_track_velocity",
+        "multichannel.velocity.along_track.along_track_velocity",
         "line",
-        lambda x: multichannel.along_track_velocity(x, BISTATIC, motion(x), LIT),
+        lambda x: along_track_velocity(x, BISTATIC, motion(x), LIT),
     ),
     _entry("multichannel.interferometry", "line", lambda x: multichannel.interferometry(x, BISTATIC, motion(x), LIT)),
     _entry(
-        "multichannel.gradient_likelihood",
+        "multichannel.velocity.stages.gradient_likelihood",
         "line",
-        lambda x: multichannel.gradient_likelihood(x, BISTATIC, motion(x), LIT, steps=5),
+        lambda x: gradient_likelihood(x, BISTATIC, motion(x), LIT, steps=5),
     ),
     _entry(
-        "multichannel.maximum_likelihood",
+        "multichannel.velocity.likelihood.maximum_likelihood",
         "line",
-        lambda x: multichannel.maximum_likelihood(x, BISTATIC, motion(x), LIT),
+        lambda x: maximum_likelihood(x, BISTATIC, motion(x), LIT),
         {"amplitude": 1, "noise_power": 2, "energy": 2},
     ),
     _entry(
@@ -510,21 +515,21 @@ FUNCTIONS = [
         lambda x: multichannel.moving_point_velocity(x, BISTATIC, LIT, stages.FEW_VELOCITIES),
     ),
     _entry(
-        "multichannel.explained_energy",
+        "multichannel.velocity.likelihood.explained_energy",
         "line",
-        lambda x: multichannel.explained_energy(x, BISTATIC, motion(x), torch.ones(x.shape[-1], dtype=F64)),
+        lambda x: explained_energy(x, BISTATIC, motion(x), torch.ones(x.shape[-1], dtype=F64)),
         2,
     ),
     _entry(
-        "multichannel.sample_whitening",
+        "multichannel.velocity.whitening.sample_whitening",
         "line",
-        lambda x: multichannel.sample_whitening(x, BISTATIC),
+        lambda x: sample_whitening(x, BISTATIC),
         {"factor": -1, "log_det": None},
     ),
     _entry(
-        "multichannel.line_whitening",
+        "multichannel.velocity.whitening.line_whitening",
         "range",
-        lambda x: multichannel.line_whitening(x.movedim(-1, -3), BISTATIC),
+        lambda x: line_whitening(x.movedim(-1, -3), BISTATIC),
         {"factor": -1, "log_det": None},
     ),
     _entry(
@@ -534,9 +539,9 @@ FUNCTIONS = [
         laws=Laws(pulse=NEW_AXIS),
     ),
     _entry(
-        "multichannel.reconstruct_lines",
+        "multichannel.reconstruct:range",
         "range",
-        lambda x: multichannel.reconstruct_lines(x, BISTATIC, motion(x), REBUILD),
+        lambda x: multichannel.reconstruct(x, BISTATIC, motion(x), REBUILD, with_range=True),
         laws=Laws(pulse=NEW_AXIS),
     ),
     _entry(
@@ -545,12 +550,6 @@ FUNCTIONS = [
         lambda x: multichannel.remove_transmit_range(
             x, times(x), BISTATIC.transmit_range, BISTATIC.wavelength_m, False
         ),
-        laws=Laws(pulse=LINE_NUMBER, energy=1),
-    ),
-    _entry(
-        "multichannel.scale_azimuth",
-        "line",
-        lambda x: multichannel.scale_azimuth(x, BISTATIC, times(x), motion(x), with_range=False),
         laws=Laws(pulse=LINE_NUMBER, energy=1),
     ),
     _entry(
@@ -593,11 +592,11 @@ FUNCTIONS = [
         ),
     ),
     _entry(
-        "multichannel.find_body",
+        "multichannel.body.find_body",
         "one range",
         on(
             "one range",
-            lambda s: multichannel.find_body(
+            lambda s: find_body(
                 s.data, multichannel.Frame.of(BISTATIC, s), 0.0, 5000.0, multichannel.Extraction(60.0, 5.0)
             ),
         ),

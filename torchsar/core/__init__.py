@@ -27,6 +27,7 @@ from torchsar.core.fft import (
     transform_in_blocks,
 )
 from torchsar.core.host import (
+    Validation,
     check_value,
     device_fault,
     gathered_checks,
@@ -36,6 +37,8 @@ from torchsar.core.host import (
     is_out_of_memory,
     is_traced,
     untraced,
+    validate,
+    validation,
 )
 from torchsar.core.linear import cholesky_factor, linear_solve, matrix_inverse
 from torchsar.core.outcome import Outcome, counts, worst
@@ -76,6 +79,7 @@ __all__ = [
     "UnevenSpline",
     "UniformSpline",
     "Use",
+    "Validation",
     "best_of",
     "block_bytes_of",
     "centred_fft",
@@ -120,6 +124,8 @@ __all__ = [
     "unit_phasor",
     "untraced",
     "use",
+    "validate",
+    "validation",
     "worst",
     "wrapped",
 ]

@@ -281,7 +281,7 @@ class PolarOperator:
 class PolarFormat(GroundImager):
     """Stage that images the ground plane by polar format; arguments as in `GroundImager`.
 
-    The curvature of the wavefront is neglected; `plane_wave_loss` bounds the resulting error. The
+    The curvature of the wavefront is neglected; `Spotlight.neglected_range_m` gives the error. The
     operator of the last geometry is stored; `operator` returns it for use in autofocus loops.
     """
 

@@ -7,20 +7,17 @@ the velocity of the target.
 
 from torchsar.multichannel.azimuth import (
     FocusAzimuth,
-    FocusPlan,
-    azimuth_filter,
     focus_azimuth,
-    known_motion_chain,
 )
 from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
-from torchsar.multichannel.body import Body, Extraction, body_echo, find_body
+from torchsar.multichannel.chip import Extraction
+from torchsar.multichannel.limits import multichannel_limits
 from torchsar.multichannel.migration import (
     CorrectMigration,
     Frame,
     Keystone,
     NoMigration,
     StaticBulk,
-    ambiguity_number,
     correct_migration,
 )
 from torchsar.multichannel.motion import PointMotion
@@ -30,15 +27,13 @@ from torchsar.multichannel.reconstruct import (
     LeastSquares,
     MinimumMeanSquare,
     Reconstruct,
-    band_matrix,
     condition_number,
     doppler_offsets,
     noise_gain_db,
     reconstruct,
-    reconstruct_lines,
 )
-from torchsar.multichannel.requirements import MultichannelUse, multichannel_limits, multichannel_requirements
-from torchsar.multichannel.scene_image import Detection, Detector, ImageMovers, MoversImage, SceneImage, detect
+from torchsar.multichannel.requirements import MultichannelUse, multichannel_requirements
+from torchsar.multichannel.scene_image import Detector, ImageMovers, MoversImage, SceneImage, detect
 from torchsar.multichannel.stationary import StationaryImage, stationary_image
 from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation
 from torchsar.multichannel.transmit import (
@@ -46,39 +41,27 @@ from torchsar.multichannel.transmit import (
     CompressChannels,
     RemoveTransmitRange,
     remove_transmit_range,
-    scale_azimuth,
 )
-from torchsar.multichannel.velocity import (
+from torchsar.multichannel.velocity.along_track import interferometry
+from torchsar.multichannel.velocity.aperture import Dwell, ElementBeam
+from torchsar.multichannel.velocity.bank import Search
+from torchsar.multichannel.velocity.recommended import moving_point_velocity
+from torchsar.multichannel.velocity.sir import SignalIntensityRatio
+from torchsar.multichannel.velocity.stages import (
     AlongTrackAutofocus,
-    Dwell,
-    ElementBeam,
     GradientVelocity,
     Interferometry,
     LikelihoodVelocity,
     MovingPointVelocity,
-    Search,
-    SignalIntensityRatio,
-    WalkAmbiguity,
-    Whitening,
-    along_track_velocity,
-    explained_energy,
-    gradient_likelihood,
-    interferometry,
-    line_whitening,
-    maximum_likelihood,
-    moving_point_velocity,
-    sample_whitening,
 )
-from torchsar.multichannel.velocity.walk import MigratingLines
+from torchsar.multichannel.velocity.walk import MigratingLines, WalkAmbiguity
 
 __all__ = [
     "AlongTrackAutofocus",
     "AzimuthScaling",
-    "Body",
     "CompressChannels",
     "CorrectBalance",
     "CorrectMigration",
-    "Detection",
     "Detector",
     "Dwell",
     "ElementBeam",
@@ -88,7 +71,6 @@ __all__ = [
     "Extraction",
     "FlatBand",
     "FocusAzimuth",
-    "FocusPlan",
     "Frame",
     "GradientVelocity",
     "ImageMovers",
@@ -112,34 +94,19 @@ __all__ = [
     "StaticBulk",
     "StationaryImage",
     "WalkAmbiguity",
-    "Whitening",
-    "along_track_velocity",
-    "ambiguity_number",
-    "azimuth_filter",
-    "band_matrix",
-    "body_echo",
     "condition_number",
     "correct_balance",
     "correct_migration",
     "detect",
     "doppler_offsets",
     "estimate_balance",
-    "explained_energy",
-    "find_body",
     "focus_azimuth",
-    "gradient_likelihood",
     "interferometry",
-    "known_motion_chain",
-    "line_whitening",
-    "maximum_likelihood",
     "moving_point_velocity",
     "multichannel_limits",
     "multichannel_requirements",
     "noise_gain_db",
     "reconstruct",
-    "reconstruct_lines",
     "remove_transmit_range",
-    "sample_whitening",
-    "scale_azimuth",
     "stationary_image",
 ]

@@ -25,16 +25,15 @@ from torchsar.core import (
     Outcome,
     Signal,
     Stage,
-    checked_samples,
     fft_lines,
     refuse_non_finite_values,
     unit_level,
     unit_phasor,
 )
 from torchsar.multichannel.balance_assess import assessed_balance
+from torchsar.multichannel.channels import ChannelStage, checked_channels, refuse_other_count
 from torchsar.multichannel.clutter_fit import ClutterModel, hann
 from torchsar.multichannel.migration import envelope_phasor
-from torchsar.multichannel.motion import checked_channels
 from torchsar.multichannel.reconstruct import ElementPattern, Prior
 from torchsar.radar import BistaticRadar
 
@@ -72,12 +71,9 @@ def correct_balance(
     dims = "channel, pulse, range" if with_range else "channel, pulse"
     data = checked_channels(data, radar, "correct_balance", dims, finite=False)
     refuse_non_finite_values("correct_balance", phase_rad=phase_rad, gain_db=gain_db, delay_s=delay_s)
-    for name, value in (("phase_rad", phase_rad), ("gain_db", gain_db), ("delay_s", delay_s)):
-        if value is not None and value.shape[-1:] != (radar.channels,):
-            raise ValueError(
-                f"correct_balance needs {name} of shape (..., {radar.channels}), one value per channel, got "
-                f"shape {tuple(value.shape)}"
-            )
+    refuse_other_count(
+        "correct_balance", radar.channels, "channel", phase_rad=phase_rad, gain_db=gain_db, delay_s=delay_s
+    )
     factor = (unit_phasor(-phase_rad / (2 * math.pi), torch.complex128) * 10 ** (-gain_db / 20)).to(data.dtype)
     delay_s = None if delay_s is None else delay_s[..., None]
     return without_errors(data, radar, factor[..., None], delay_s, with_range)
@@ -180,13 +176,18 @@ def estimate_balance(
             channel, the shape of the data does not match it, `bands` is below 1, or `blocks` does
             not fit the range band.
     """
-    data = checked_samples(data, "estimate_balance", "channel, pulse, range")
-    _check_data(data, radar, blocks, bands)
+    data = checked_channels(data, radar, "estimate_balance", "channel, pulse, range")
+    inside = int(data.shape[-1] * radar.pulse.bandwidth_hz / radar.sampling_hz)
+    if radar.channels < 2 or not (bands is None or bands >= 1) or not 2 <= blocks <= inside:
+        raise ValueError(
+            "the balance between channels needs at least two positions in channel_m, one of the Doppler bands, and 2 "
+            f"to {inside} blocks, the number of range frequencies of {data.shape[-1]} range samples within the "
+            f"bandwidth of the pulse, got channel_m={radar.channel_m}, bands={bands} and blocks={blocks}"
+        )
     with torch.no_grad():
         lines, frequency = _band_lines(unit_level(data, 3), radar, blocks)
         power = lines.abs().square().mean((-2, -1))
-        own = power.mean(-1)[..., None, None, None]
-        no_power = (power == 0).any(-1)
+        own, no_power = power.mean(-1)[..., None, None, None], (power == 0).any(-1)
         lines = lines / torch.where(own > 0, own, 1.0).sqrt()
         bands = bands or math.ceil(2 * radar.speed_m_s / (radar.wavelength_m * radar.prf_hz))
         model = ClutterModel.of(radar, prior or ElementPattern(), data.shape[-2], bands, data.device)
@@ -235,27 +236,6 @@ def estimate_balance(
             "delay_s": turn_std / (2 * math.pi * highest),
         }
         return Estimate(value, std, quality, outcome, {"snr_db": snr_db})
-
-
-def _check_data(data: Tensor, radar: BistaticRadar, blocks: int, bands: int | None) -> None:
-    """Raise ValueError unless data, blocks and bands suit the radar."""
-    if radar.channels < 2:
-        raise ValueError(
-            "the balance between channels needs at least two positions in channel_m, but the radar has one"
-        )
-    if data.ndim < 3 or data.shape[-3] != radar.channels:
-        raise ValueError(
-            f"the balance is estimated from data (..., {radar.channels}, pulse, range) with one channel for each "
-            f"position in the radar's channel_m, got shape {tuple(data.shape)}"
-        )
-    if bands is not None and bands < 1:
-        raise ValueError(f"bands must be at least 1, the number of Doppler bands with clutter, got {bands}")
-    inside = int(data.shape[-1] * radar.pulse.bandwidth_hz / radar.sampling_hz)
-    if not 2 <= blocks <= inside:
-        raise ValueError(
-            f"blocks must be at least 2 and at most {inside}, the number of range frequencies of {data.shape[-1]} "
-            f"range samples within the bandwidth of the pulse, got {blocks}"
-        )
 
 
 def _band_lines(data: Tensor, radar: BistaticRadar, blocks: int) -> tuple[Tensor, Tensor]:
@@ -332,8 +312,7 @@ class EstimateBalance(Stage):
         assess: bool = True,
     ) -> None:
         super().__init__()
-        self.radar, self.prior, self.bands, self.delays, self.blocks = radar, prior, bands, delays, blocks
-        self.assess = assess
+        self.radar, self.settings, self.assess = radar, (prior, bands, delays, blocks), assess
 
     def forward(self, signal: Signal) -> Estimate:
         """Estimate phase, gain and delay of each channel from stationary clutter.
@@ -345,12 +324,10 @@ class EstimateBalance(Stage):
         Returns:
             `phase_rad`, `gain_db` and `delay_s` of shape (..., channel), see `estimate_balance`.
         """
-        return estimate_balance(
-            signal.data, self.radar, self.prior, self.bands, self.delays, self.blocks, assess=self.assess
-        )
+        return estimate_balance(signal.data, self.radar, *self.settings, assess=self.assess)
 
 
-class CorrectBalance(Stage):
+class CorrectBalance(ChannelStage):
     """Stage that removes estimated or measured phases, gains and delays of the channels.
 
     See `correct_balance`. After a stage "balance" that estimates the values, connect it as
@@ -359,13 +336,6 @@ class CorrectBalance(Stage):
     Args:
         radar: Radar parameters.
     """
-
-    works_on = ("channel", "pulse")
-    also_on = (("channel", "pulse", "range"),)
-
-    def __init__(self, radar: BistaticRadar) -> None:
-        super().__init__()
-        self.radar = radar
 
     def forward(self, signal: Signal, phase_rad: Tensor, gain_db: Tensor, delay_s: Tensor | None = None) -> Signal:
         """Remove phase, gain and delay of each channel.

@@ -18,23 +18,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Outcome, matrix_inverse, worst
-from torchsar.multichannel.clutter_fit import HANN_LOOKS, ClutterModel, Fit
-
-# Blocks of range cells, of range frequencies and of Doppler bins, by choice: 32 give a standard
-# deviation to 13 %.
-_CELL_BLOCKS, _BIN_BLOCKS = 32, 16
-# Curvature below which a combination of unknowns is not determined, per look, and the standard
-# deviation in rad or neper of what is not determined.
-_LEAST_CURVED, _UNKNOWN = 1e-10, 1e3
-# Ratio of deviations by the scatter of Doppler bins and of range cells from which the prior is
-# taken to be wrong, and least number of parts of the swath that hold the power, both by choice. The
-# ratio is at most 1.8 where the prior suits; a point that holds 58 % of the power leaves 3 parts.
-_MISFIT, _LEAST_PARTS = 2.5, 3.0
-# Convention: a linear phase error of 0.1 rad, three times as much, already makes false targets of
-# about -20 dB when three bands are reconstructed at a PRF of 180 Hz. So do amplitudes. Phases that
-# delays turn over the range band weigh less, since their mean is zero.
-_LARGEST_STD_RAD, _LARGEST_ACROSS_RAD = 0.033, 0.1
-_TINY = torch.finfo(torch.float64).tiny
+from torchsar.multichannel.clutter_fit import ClutterModel, Fit
 
 
 def assessed_balance(
@@ -65,47 +49,48 @@ def assessed_balance(
         Those of gains contain the difference that remains between the powers of the balanced
         channels, as with a wrong prior.
     """
-    inverse = matrix_inverse(model.noisy(snr_db))
+    inverse, channels = matrix_inverse(model.noisy(snr_db)), lines.shape[-3]
     inner = (inverse @ lines.movedim(-3, -2)).movedim(-2, -3)
     cells, within = (torch.fft.ifft(x, norm="ortho") for x in (lines, inner))
-    along = _covariance(_score(cells, within, -2), _CELL_BLOCKS)
-    over_bins = _covariance(_score(lines, inner, -1), _BIN_BLOCKS)
-    hessian, determined = _inverse(fit.hessian, reference, lines.shape[-3])
+    along, over_bins = _covariance(_score(cells, within, -2)), _covariance(_score(lines, inner, -1), 16)
+    hessian, determined = _inverse(fit.hessian, reference, channels)
 
-    def std(covariance: Tensor, rows: Tensor) -> Tensor:
+    def std(covariance: Tensor, rows: Tensor, unknown: float = 1e3) -> Tensor:
+        """Deviations in rad or neper, 1e3 of what is not determined."""
         variance = ((rows @ covariance) * rows).sum(-1).clamp_min(0)
-        return torch.where(determined[..., None], variance.sqrt(), _UNKNOWN).clamp_max(_UNKNOWN)
+        return torch.where(determined[..., None], variance.sqrt(), unknown).clamp_max(unknown)
 
-    channels = lines.shape[-3]
     rows = hessian[..., : 2 * channels, : 2 * channels].clone()
     rows[..., :channels, :] -= rows[..., reference, None, :].clone()
     log_std, phase_std = std(along, rows).unflatten(-1, (2, -1)).unbind(-2)
-    turn_std = torch.zeros_like(phase_std)
+    turn_std, tiny = torch.zeros_like(phase_std), torch.finfo(torch.float64).tiny
     if position is not None:
         turning = torch.cat([_score(lines, inner, -2), position * (lines.conj() * inner).mean(-2).imag], -2)
-        turn_std = std(_covariance(turning, _CELL_BLOCKS), hessian[..., 2 * channels :, :])
-    misfit = std(over_bins, rows).square().sum(-1) / std(along, rows).square().sum(-1).clamp_min(_TINY)
-    power = (cells.abs().square().mean((-3, -2)) - 10 ** (-snr_db[..., None] / 10)).clamp_min(0)
-    share = _blocks(power, _CELL_BLOCKS)
-    share = share / share.sum(-1, keepdim=True).clamp_min(_TINY)
-    # balanced channels have equal power, but with a wrong prior other gains are more likely: it is
-    # taken to be wrong where the powers differ by four times as much as by chance, by choice
-    looks = lines.shape[-2] * lines.shape[-1] * HANN_LOOKS
-    level = lines.abs().square().mean((-2, -1))
+        turn_std = std(_covariance(turning), hessian[..., 2 * channels :, :])
+    misfit = std(over_bins, rows).square().sum(-1) / std(along, rows).square().sum(-1).clamp_min(tiny)
+    share = _blocks((cells.abs().square().mean((-3, -2)) - 10 ** (-snr_db[..., None] / 10)).clamp_min(0))
+    share = share / share.sum(-1, keepdim=True).clamp_min(tiny)
+    # Balanced channels have equal power, but with a wrong prior other gains are more likely. It is
+    # taken to be wrong where the powers differ by four times as much as by chance, by choice. Hann
+    # weights leave 18 / 35 independent looks per pulse: (mean square)^2 / mean fourth power.
+    looks, level = lines.shape[-2] * lines.shape[-1] * 18 / 35, lines.abs().square().mean((-2, -1))
     uneven = torch.log((level / level[..., reference, None].clamp_min(1e-300)).clamp_min(1e-3)).abs() / 2
     chance = model.chance(snr_db, reference, looks) / 2
     log_std = torch.where(uneven > 4.0 * chance, torch.hypot(log_std, uneven), log_std)
-    largest = torch.maximum(phase_std, log_std).amax(-1)
-    # rms phase over the range band by a delay
-    across = turn_std.amax(-1) / math.sqrt(3)
-    relative = torch.maximum(largest / _LARGEST_STD_RAD, across / _LARGEST_ACROSS_RAD)
-    # the logarithm of the likelihood ratio to clutter displaced by whole bands must be 100, and the
-    # standard deviation of a phase .25 rad at most, both by choice
+    # A linear phase error of 0.1 rad, three times the first limit, already makes false targets of
+    # about -20 dB when three bands are reconstructed at a PRF of 180 Hz; so do amplitudes. Phases
+    # that delays turn over the range band, here their rms, weigh less, since their mean is zero.
+    largest, across = torch.maximum(phase_std, log_std).amax(-1), turn_std.amax(-1) / math.sqrt(3)
+    relative = torch.maximum(largest / 0.033, across / 0.1)
+    # By choice: the ratio of deviations by the scatter of Doppler bins and of range cells is at
+    # most 1.8 where the prior suits; a point that holds 58 % of the power leaves 3 of 32 parts of
+    # the swath; the logarithm of the likelihood ratio to clutter displaced by whole bands must be
+    # 100, and the standard deviation of a phase .25 rad at most.
     outcome = worst(
         (Outcome.INEXACT, ~(relative < 1)),
-        (Outcome.MISFIT, misfit.sqrt() >= _MISFIT),
+        (Outcome.MISFIT, misfit.sqrt() >= 2.5),
         (Outcome.AMBIGUOUS, no_power if lead is None else lead * looks <= 100.0),
-        (Outcome.TOO_FEW, share.square().sum(-1) * _LEAST_PARTS >= 1),
+        (Outcome.TOO_FEW, share.square().sum(-1) * 3.0 >= 1),
         (Outcome.NOISE, phase_std.amax(-1) > 0.25),
         (Outcome.EMPTY, no_power),
         (Outcome.SINGULAR, ~determined & ~no_power),
@@ -125,29 +110,33 @@ def _score(lines: Tensor, inner: Tensor, dim: int) -> Tensor:
     return torch.cat([product.real - 1, product.imag], -2)
 
 
-def _blocks(values: Tensor, blocks: int) -> Tensor:
-    """Add neighbouring values along the last dimension to at most this number of blocks."""
-    count = values.shape[-1]
-    at = torch.arange(count, device=values.device) * min(blocks, count) // count
-    total = torch.zeros(*values.shape[:-1], min(blocks, count), dtype=values.dtype, device=values.device)
+def _blocks(values: Tensor, blocks: int = 32) -> Tensor:
+    """Add neighbouring values along the last dimension to at most this number of blocks.
+
+    By choice, 32 of range cells or frequencies, which give a standard deviation to 13 %.
+    """
+    count, blocks = values.shape[-1], min(blocks, values.shape[-1])
+    at = torch.arange(count, device=values.device) * blocks // count
+    total = torch.zeros(*values.shape[:-1], blocks, dtype=values.dtype, device=values.device)
     return total.index_add(-1, at, values)
 
 
-def _covariance(score: Tensor, blocks: int) -> Tensor:
+def _covariance(score: Tensor, blocks: int = 32) -> Tensor:
     """Return the covariance (..., n, n) of the mean of scores (..., n, cell) from their blocks."""
     total = _blocks(score, blocks) / score.shape[-1]
     count = total.shape[-1]
     return total @ total.mT * (count / max(1, count - 1))
 
 
-def _inverse(hessian: Tensor, reference: int, channels: int) -> tuple[Tensor, Tensor]:
+def _inverse(hessian: Tensor, reference: int, channels: int, least: float = 1e-10) -> tuple[Tensor, Tensor]:
     """Return the inverse of a Hessian, and whether it is that of a minimum, (...,).
 
-    Phase and turn of all channels together are not determined: those of the reference are zero.
+    Phase and turn of all channels together are not determined: those of the reference are zero. A
+    combination of unknowns with a curvature below `least`, per look, is not determined either.
     """
     kept = [i for i in range(hessian.shape[-1]) if i < channels or (i - reference) % channels]
     free = torch.tensor(kept, device=hessian.device)
     values, vectors = torch.linalg.eigh(hessian[..., free[:, None], free])
     inverse = torch.zeros_like(hessian)
-    inverse[..., free[:, None], free] = (vectors / values.clamp_min(_LEAST_CURVED)[..., None, :]) @ vectors.mT
-    return inverse, values[..., 0] > _LEAST_CURVED
+    inverse[..., free[:, None], free] = (vectors / values.clamp_min(least)[..., None, :]) @ vectors.mT
+    return inverse, values[..., 0] > least

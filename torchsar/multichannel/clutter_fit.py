@@ -18,24 +18,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import linear_solve, matrix_inverse, take
+from torchsar.core import linear_solve, matrix_inverse
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import Prior, band_matrix, doppler_offsets, first_bin, shared_response
+from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
-
-# Found by trial: after 12 Newton steps phases still err by 3e-5 rad with a flat band and by 8e-3
-# rad with the element pattern; after 25 they have converged.
-_ROUNDS = 25
-# SNR values tried in dB, and the steps by which the best one is refined.
-_LEVELS_DB, _FINER_DB = tuple(range(-18, 97, 6)), (2.0, 0.5)
-# (mean square)^2 / mean fourth power of the Hann weights: independent looks per pulse.
-HANN_LOOKS = 18 / 35
-# Points per Doppler bin at which the prior is smoothed by the taper, and reach in bins. By choice:
-# beyond 8 bins the side lobes lie below -70 dB.
-_POINTS, _REACH = 8, 8
-# Rounds in which the power over Doppler is found, by trial, and neighbours of a bin over which it
-# is averaged, by choice: 9 bins of 80 range cells give it to 5 %.
-_POWER_ROUNDS, _NEAR = 30, 4
 
 
 def hann(radar: BistaticRadar, n_pulse: int, device: torch.device) -> Tensor:
@@ -56,9 +43,9 @@ def hann(radar: BistaticRadar, n_pulse: int, device: torch.device) -> Tensor:
     if n_pulse <= 2:
         return torch.ones(radar.channels, n_pulse, dtype=torch.float64, device=device)
     later = radar.channels_at(device) * (radar.prf_hz / radar.speed_m_s)
-    later = later - (later.amax() + later.amin()) / 2
+    later = (later - (later.amax() + later.amin()) / 2)[:, None]
     half = (n_pulse + 1) / 2 - later.abs().amax().clamp_max(n_pulse / 4)
-    at = (torch.arange(n_pulse, dtype=torch.float64, device=device) - (n_pulse - 1) / 2 - later[:, None]) / half
+    at = (torch.arange(n_pulse, dtype=torch.float64, device=device) - (n_pulse - 1) / 2 - later) / half
     return torch.cos(math.pi / 2 * at.clamp(-1, 1)).square()
 
 
@@ -76,10 +63,13 @@ class ClutterModel:
     power: Tensor
 
     @staticmethod
-    def of(radar: BistaticRadar, prior: Prior, n_pulse: int, bands: int, device: torch.device) -> ClutterModel:
+    def of(
+        radar: BistaticRadar, prior: Prior, n_pulse: int, bands: int, device: torch.device, points: int = 8
+    ) -> ClutterModel:
         """Return the model of clutter in Hann-weighted pulses, on the scale of a prior.
 
-        The taper spreads the power over neighbouring bins, also beyond the edges of the bands.
+        The taper spreads the power over neighbouring bins, also beyond the edges of the bands. It
+        is followed over eight bins to either side, beyond which its side lobes lie below -70 dB.
 
         Args:
             radar: Radar parameters.
@@ -87,29 +77,25 @@ class ClutterModel:
             n_pulse: Number of pulses.
             bands: Number of Doppler bands that hold the clutter.
             device: Device of the result.
+            points: Points per Doppler bin at which the prior is smoothed by the taper.
 
         Returns:
             The model.
         """
         motion = PointMotion.of(radar, torch.zeros((), dtype=torch.float64, device=device))
-        wide = bands + 2
-        fine = (torch.arange(_POINTS, dtype=torch.float64, device=device) + 0.5) / _POINTS - 0.5
+        wide, reach = bands + 2, 8 * points
+        fine = (torch.arange(points, dtype=torch.float64, device=device) + 0.5) / points - 0.5
         offset = doppler_offsets(n_pulse, wide, radar.prf_hz, device)[:, None] + fine * (radar.prf_hz / n_pulse)
         power = prior.power(offset, radar, motion) * (offset.abs() <= bands * radar.prf_hz / 2)
-        x = (torch.arange(-_REACH * _POINTS, _REACH * _POINTS, dtype=torch.float64, device=device) + 0.5) / _POINTS
+        x = (torch.arange(-reach, reach, dtype=torch.float64, device=device) + 0.5) / points
         kernel = (torch.sinc(x) / (1 - x.square())).square()
-        smooth = torch.nn.functional.conv1d(
-            torch.nn.functional.pad(power.reshape(1, 1, -1), (_REACH * _POINTS - _POINTS // 2,) * 2),
-            (kernel / kernel.sum())[None, None],
-            stride=_POINTS,
-        ).view(wide, n_pulse)
-        response = shared_response(radar, motion, n_pulse, wide, torch.complex128).T[..., None] * band_matrix(
-            radar, motion, wide
-        )
-        first = first_bin(n_pulse, wide)
-        return ClutterModel(torch.roll(response, first, 0), torch.roll(smooth.T, first, 0))
+        padded = torch.nn.functional.pad(power.reshape(1, 1, -1), (reach - points // 2,) * 2)
+        smooth = torch.nn.functional.conv1d(padded, (kernel / kernel.sum())[None, None], stride=points)
+        response = shared_response(radar, motion, n_pulse, wide, torch.complex128).T[..., None]
+        response, first = response * band_matrix(radar, motion, wide), first_bin(n_pulse, wide)
+        return ClutterModel(torch.roll(response, first, 0), torch.roll(smooth.view(wide, n_pulse).T, first, 0))
 
-    def adapted(self, products: Tensor, weights: Tensor, snr_db: Tensor) -> ClutterModel:
+    def adapted(self, products: Tensor, weights: Tensor, snr_db: Tensor, rounds: int = 30) -> ClutterModel:
         """Return the model with the power over Doppler of the data, per trial.
 
         It is the likeliest power of each band but the outermost two, averaged over neighbouring
@@ -119,31 +105,31 @@ class ClutterModel:
             products: Measured covariances, complex128 (..., bin, channel, channel).
             weights: Weights that balance the channels, (..., channel).
             snr_db: SNR of the model that fits the weights, (...,).
+            rounds: Rounds in which the power is found.
         """
         weights = weights[..., None, :]
         balanced = self._smoothed(weights[..., :, None] * products * weights[..., None, :].conj())
-        inside, model, power = slice(1, -1), self, self.power
-        for _ in range(_POWER_ROUNDS):
-            seen = matrix_inverse(model.noisy(snr_db)) @ self.response[..., inside]
-            found = (seen.conj() * (balanced @ seen)).sum(-2).real
-            expected = (seen.conj() * self.response[..., inside]).sum(-2).real
+        response, model, power = self.response[..., 1:-1], self, self.power
+        for _ in range(rounds):
+            seen = matrix_inverse(model.noisy(snr_db)) @ response
+            found, expected = ((seen.conj() * x).sum(-2).real for x in (balanced @ seen, response))
             ratio = found / expected.clamp_min(torch.finfo(torch.float64).tiny)
             power = model.power.expand(*ratio.shape[:-1], -1).clone()
-            power[..., inside] = power[..., inside] * ratio
+            power[..., 1:-1] *= ratio
             model = ClutterModel(self.response, power)
         return ClutterModel(self.response, power / power.amax((-2, -1), True).clamp_min(1e-300))
 
-    def _smoothed(self, products: Tensor) -> Tensor:
+    def _smoothed(self, products: Tensor, near: int = 4) -> Tensor:
         """Average covariances (..., bin, channel, channel) over neighbouring Doppler bins.
 
-        The delays between the channels are removed meanwhile.
+        The delays between the channels are removed meanwhile. Nine bins of 80 range cells give the
+        power to 5 %.
         """
         bins, first = products.shape[-3], first_bin(products.shape[-3], self.response.shape[-1])
-        steering = self.response[..., 0]
-        steering = steering[..., :, None] * steering[..., None, :].conj()
+        steering = self.response[..., :1] @ self.response[..., :1].mH
         rising = torch.view_as_real(torch.roll(products * steering.conj(), -first, -3)).flatten(-3).mT
-        padded = torch.nn.functional.pad(rising.reshape(-1, 1, bins), (_NEAR, _NEAR), mode="replicate")
-        found = torch.nn.functional.avg_pool1d(padded, 2 * _NEAR + 1, stride=1).view(rising.shape).mT
+        padded = torch.nn.functional.pad(rising.reshape(-1, 1, bins), (near, near), mode="replicate")
+        found = torch.nn.functional.avg_pool1d(padded, 2 * near + 1, stride=1).view(rising.shape).mT
         found = torch.view_as_complex(found.unflatten(-1, (*products.shape[-2:], 2)).contiguous())
         return torch.roll(found, first, -3) * steering
 
@@ -161,6 +147,8 @@ class ClutterModel:
     def weights(self, products: Tensor, snr_db: Tensor | float) -> tuple[Tensor, Tensor]:
         """Fit the channel weights for a given SNR.
 
+        The fit starts from the weights of channels of equal power for which w^H Q w is least.
+
         Args:
             products: Measured covariances, complex128 (..., bin, channel, channel).
             snr_db: SNR in dB, (...,).
@@ -172,7 +160,10 @@ class ClutterModel:
         model = self.noisy(snr_db)
         matrix = (matrix_inverse(model) * products.mT).mean(-3)
         power = products.diagonal(dim1=-2, dim2=-1).real.mean(-2)
-        found = solve(matrix[..., None, :, :], _start(matrix, power))
+        level = power.clamp_min(torch.finfo(torch.float64).tiny).rsqrt().to(matrix.dtype)
+        least = torch.linalg.eigh(level[..., :, None] * matrix * level[..., None, :])[1][..., 0]
+        # no channel starts without weight, by choice
+        found = solve(matrix[..., None, :, :], level * torch.polar(least.abs().clamp_min(0.1), least.angle()))
         return found.weights, 2 * found.cost + torch.linalg.slogdet(model)[1].mean(-1)
 
     def fit(self, products: Tensor, snr_db: Tensor | float, position: Tensor | None) -> Fit:
@@ -215,15 +206,13 @@ class ClutterModel:
 
     def snr_db(self, products: Tensor) -> Tensor:
         """Estimate the SNR in dB (...,) by maximum likelihood, with the weights."""
-        levels = torch.tensor(_LEVELS_DB, dtype=torch.float64, device=products.device)
-        cost = torch.stack([self.weights(products, level)[1] for level in levels], -1)
-        best = cost.argmin(-1).clamp(1, len(levels) - 2)
-        sides = [take(cost, best + i, -1) for i in (-1, 0, 1)]
-        found = levels[best] + _lowest(*sides) * (levels[1] - levels[0])
-        for step in _FINER_DB:
-            sides = [self.weights(products, found + i * step)[1] for i in (-1, 0, 1)]
-            found = found + _lowest(*sides) * step
-        return found
+
+        def cost(snr_db: Tensor) -> Tensor:
+            return self.weights(products, snr_db)[1]
+
+        centre = torch.full(products.shape[:-3], 39.0, dtype=torch.float64, device=products.device)
+        levels, _ = grid_minimum(cost, centre, 57.0, 20)
+        return parabola_minimum(cost, levels, 6.0, 0.4, rounds=3)[0]
 
     def chance(self, snr_db: Tensor, reference: int, looks: float) -> Tensor:
         """Return by how much the powers of balanced channels differ from the reference by chance.
@@ -241,25 +230,6 @@ class ClutterModel:
         shared = model[..., reference].abs().square()
         variance = (power.square() + power[..., reference, None].square() - 2 * shared).clamp_min(0).mean(-2)
         return (variance / looks).sqrt() / power.mean(-2)
-
-
-def _start(matrix: Tensor, power: Tensor) -> Tensor:
-    """Return weights of channels of equal power for which w^H Q w is least, (..., channel).
-
-    Args:
-        matrix: Q, complex128 (..., channel, channel).
-        power: Measured power of each channel, (..., channel).
-    """
-    level = power.clamp_min(torch.finfo(torch.float64).tiny).rsqrt().to(matrix.dtype)
-    least = torch.linalg.eigh(level[..., :, None] * matrix * level[..., None, :])[1][..., 0]
-    # no channel starts without weight, by choice
-    return level * torch.polar(least.abs().clamp_min(0.1), least.angle())
-
-
-def _lowest(before: Tensor, here: Tensor, after: Tensor) -> Tensor:
-    """Return where a parabola through three equidistant values is least, at most 1.5 steps away."""
-    bend = before - 2 * here + after
-    return torch.where(bend > 0, (before - after) / 2 / torch.where(bend > 0, bend, 1), 0).clamp(-1.5, 1.5)
 
 
 @dataclass(frozen=True)
@@ -281,7 +251,7 @@ class Fit:
     cost: Tensor
 
 
-def solve(matrix: Tensor, start: Tensor, position: Tensor | None = None) -> Fit:
+def solve(matrix: Tensor, start: Tensor, position: Tensor | None = None, rounds: int = 25) -> Fit:
     """Minimise the mean over blocks of half of w^H Q w - 2 sum(a), by damped Newton steps.
 
     The weights w are exp(a + j p), in block b exp(a + j (p + position[b] d)). The common phase and
@@ -292,6 +262,8 @@ def solve(matrix: Tensor, start: Tensor, position: Tensor | None = None) -> Fit:
         start: First weights, complex128 (..., channel).
         position: Places of the blocks in the range band, -1 to 1, shape (block,); None to leave out
             the turns d, which start at zero.
+        rounds: Number of steps. After 25 they have converged; after 12, phases still err by 3e-5
+            rad with a flat band and by 8e-3 rad with the element pattern.
 
     Returns:
         The minimum.
@@ -299,50 +271,40 @@ def solve(matrix: Tensor, start: Tensor, position: Tensor | None = None) -> Fit:
     form = (start.conj()[..., None, :] * (matrix @ start[..., None, :, None])[..., 0]).sum(-1).real.mean(-1)
     start = start * (matrix.shape[-1] / form.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()[..., None]
     logs = torch.cat([start.abs().log(), start.angle()] + [torch.zeros_like(start.real)] * (position is not None), -1)
-    damping = torch.full_like(form, 1e-6)
-    cost, gradient, hessian = _expanded(matrix, logs, position)
+    damping, here = torch.full_like(form, 1e-6), _expanded(matrix, logs, position)
     identity = torch.eye(logs.shape[-1], dtype=logs.dtype, device=logs.device)
-    for _ in range(_ROUNDS):
-        curved = (
-            hessian
-            + (damping * hessian.diagonal(dim1=-2, dim2=-1).abs().amax(-1)).clamp_min(1e-12)[..., None, None] * identity
-        )
-        new = logs - linear_solve(curved, gradient).clamp(-1, 1)
-        after = _expanded(matrix, new, position)
-        better = after[0] < cost
+    for _ in range(rounds):
+        _, gradient, hessian = here
+        level = (damping * hessian.diagonal(dim1=-2, dim2=-1).abs().amax(-1)).clamp_min(1e-12)[..., None, None]
+        new = logs - linear_solve(hessian + level * identity, gradient).clamp(-1, 1)
+        there = _expanded(matrix, new, position)
+        better = there[0] < here[0]
         logs = torch.where(better[..., None], new, logs)
-        cost, gradient, hessian = (
-            torch.where(better[(...,) + (None,) * (a.ndim - better.ndim)], a, b)
-            for a, b in zip(after, (cost, gradient, hessian))
-        )
+        here = tuple(torch.where(better.view(better.shape + (1,) * i), there[i], here[i]) for i in range(3))
         damping = torch.where(better, damping / 10, damping * 30).clamp(1e-9, 1e6)
     a, p, *d = logs.unflatten(-1, (-1, start.shape[-1])).unbind(-2)
-    return Fit(torch.polar(a.exp(), p), d[0] if d else torch.zeros_like(p), hessian, cost)
+    return Fit(torch.polar(a.exp(), p), d[0] if d else torch.zeros_like(p), here[2], here[0])
 
 
 def _expanded(matrix: Tensor, logs: Tensor, position: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the value that `solve` minimises, with its gradient and Hessian over (a, p[, d])."""
+    """Return the value that `solve` minimises, with its gradient and Hessian over (a, p[, d]).
+
+    In each block the derivatives are first taken by the logarithms and phases of its own weights.
+    These are linear in the unknowns: the phases are p + position[b] d.
+    """
     a, p, *d = logs.unflatten(-1, (-1, matrix.shape[-1])).unbind(-2)
     phase = p[..., None, :] if position is None else p[..., None, :] + position[:, None] * d[0][..., None, :]
     weights = torch.polar(a.exp()[..., None, :].expand_as(phase), phase)
     t = weights.conj()[..., :, None] * matrix * weights[..., None, :]
     rows = t.sum(-1)
-    over_p = t.real - torch.diag_embed(rows.real)
-    over_a = (t.real + torch.diag_embed(rows.real)).mean(-3)
-    mixed = torch.diag_embed(rows.imag) - t.imag
-    gradient, turns = [rows.real.mean(-2) - 1, rows.imag.mean(-2)], mixed.mean(-3)
-    if position is None:
-        hessian = torch.cat([torch.cat([over_a, turns], -1), torch.cat([turns.mT, over_p.mean(-3)], -1)], -2)
-    else:
-        at = position[:, None, None]
-        gradient.append((position[:, None] * rows.imag).mean(-2))
-        twist, shared, own = (at * mixed).mean(-3), (at * over_p).mean(-3), (at.square() * over_p).mean(-3)
-        hessian = torch.cat(
-            [
-                torch.cat([over_a, turns, twist], -1),
-                torch.cat([turns.mT, over_p.mean(-3), shared], -1),
-                torch.cat([twist.mT, shared.mT, own], -1),
-            ],
-            -2,
-        )
-    return t.real.sum((-2, -1)).mean(-1) / 2 - a.sum(-1), torch.cat(gradient, -1), hessian
+    gradient = torch.cat([rows.real, rows.imag], -1)
+    turns = torch.diag_embed(rows.imag) - t.imag
+    above = torch.cat([t.real + torch.diag_embed(rows.real), turns], -1)
+    hessian = torch.cat([above, torch.cat([turns.mT, t.real - torch.diag_embed(rows.real)], -1)], -2)
+    if position is not None:
+        channels, at = p.shape[-1], position[:, None]
+        gradient = torch.cat([gradient, at * gradient[..., channels:]], -1)
+        hessian = torch.cat([hessian, at[..., None] * hessian[..., channels:, :]], -2)
+        hessian = torch.cat([hessian, at[..., None] * hessian[..., channels : 2 * channels]], -1)
+    gradient = gradient.mean(-2) - torch.cat([torch.ones_like(a), torch.zeros_like(logs[..., a.shape[-1] :])], -1)
+    return t.real.sum((-2, -1)).mean(-1) / 2 - a.sum(-1), gradient, hessian.mean(-3)

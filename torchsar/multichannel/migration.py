@@ -25,8 +25,8 @@ from torch.nn.functional import pad
 from torchsar.core import Signal, Stage, block_bytes_of, checked_samples, linear_phasor, per_trial, unit_phasor
 from torchsar.focus import keystone
 from torchsar.focus.nufft import nufft_type2
+from torchsar.multichannel.channels import refuse_shifted
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.reconstruct import refuse_shifted
 from torchsar.radar import BistaticRadar, receive_range
 
 # Relative error of the non-uniform FFT: -100 dB, well below the -60 dB asked of complex64 images;
@@ -158,7 +158,7 @@ class Keystone:
             frame: Radar, slow time and ranges of the data.
             reference: Motion of the reference point, whose range history is removed, shape (...,).
             ambiguity: PRF ambiguity number of the targets relative to the reference, shape (...,),
-                see `ambiguity_number`.
+                the nearest whole number to (F - F_ref) / PRF, see `Keystone`.
 
         Returns:
             Corrected data, same shape.
@@ -171,26 +171,6 @@ class Keystone:
 
 
 Migration = NoMigration | StaticBulk | Keystone
-
-
-def ambiguity_number(radar: BistaticRadar, motion: PointMotion, reference: PointMotion) -> Tensor:
-    """Return the PRF ambiguity number of a point after the range history of a reference is removed.
-
-    A point then is a tone of frequency F - F_ref, with F = (u_r + v y0 / R0) / lambda of the point
-    and F_ref that of the reference; the number is round((F - F_ref) / PRF). Here u_r is the
-    slant-range speed, v the along-track speed of the receiver relative to the point, y0 the
-    along-track position and R0 the closest range.
-
-    Args:
-        radar: Radar parameters.
-        motion: Motion of the point, shape (...,).
-        reference: Motion of the reference point, shape (...,).
-
-    Returns:
-        Whole numbers, float64 (...,).
-    """
-    tone = [m.u_r_m_s + m.along_m_s * m.y0_m / m.range_m for m in (motion, reference)]
-    return torch.round((tone[0] - tone[1]) / radar.ambiguous_velocity_m_s)
 
 
 def envelope_phasor(path_m: Tensor, radar: BistaticRadar, data: Tensor) -> Tensor:
@@ -259,7 +239,7 @@ def correct_migration(
         reference: Motion of the reference point, whose range history is removed, shape (...,).
         migration: Method, `Keystone()` by default.
         ambiguity: PRF ambiguity number of the targets relative to the reference, shape (...,) or a
-            number, see `ambiguity_number`.
+            number, the nearest whole number to (F - F_ref) / PRF, see `Keystone`.
 
     Returns:
         Corrected data, same shape.
@@ -313,7 +293,7 @@ class CorrectMigration(Stage):
             u_a_m_s: Along-track speed of the reference in m/s, same shape.
             y0_m: Along-track position of the reference at t = 0 in metres, same shape.
             ambiguity: PRF ambiguity number of the targets relative to the reference, same shape,
-                see `ambiguity_number`.
+                the nearest whole number to (F - F_ref) / PRF, see `Keystone`.
 
         Returns:
             Corrected channels on the same axes; azimuth-only data are returned unchanged.

@@ -1,4 +1,4 @@
-"""Uniform motion of a point in front of an airborne receiver, and the check of its channels."""
+"""Uniform motion of a point in front of an airborne receiver."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import check_value, checked_samples, per_trial
+from torchsar.core import check_value, per_trial
 from torchsar.radar import BistaticRadar
 
 Number = Tensor | float
@@ -201,34 +201,3 @@ def _refuse(motion: PointMotion) -> None:
         )
     if not nearest > 0:
         raise ValueError(f"the closest range of a point must be positive, got range_m={nearest:g}")
-
-
-def checked_channels(
-    data: Tensor, radar: BistaticRadar, what: str, dims: str = "channel, pulse", *, finite: bool = True
-) -> Tensor:
-    """Check the samples of several channels, and resolve lazy conjugation and negation.
-
-    Args:
-        data: Samples, shape (..., *dims), complex64 or complex128.
-        radar: Radar parameters.
-        what: Name of the function for the message.
-        dims: Names of the trailing dimensions, of which one is "channel".
-        finite: Whether NaN and Inf are refused.
-
-    Returns:
-        The samples.
-
-    Raises:
-        TypeError: If the data are not a tensor of these dtypes.
-        ValueError: If the data have no samples or too few dimensions, do not have one channel for
-            each position of the radar, or a sample is not finite.
-    """
-    data = checked_samples(data, what, dims, finite=finite)
-    names = dims.split(", ")
-    channels = data.shape[names.index("channel") - len(names)]
-    if channels != radar.channels:
-        raise ValueError(
-            f"{what} works on samples (..., {dims}) with one channel for each of the {radar.channels} positions in "
-            f"the radar's channel_m, got the shape {tuple(data.shape)}"
-        )
-    return data

@@ -27,8 +27,6 @@ from torch import Tensor
 from torchsar.core import (
     Axis,
     Signal,
-    Stage,
-    checked_samples,
     fft_lines,
     host_largest,
     host_value,
@@ -36,13 +34,12 @@ from torchsar.core import (
     linear_solve,
     unit_phasor,
 )
+from torchsar.multichannel.channels import ChannelStage, checked_channels, refuse_shifted
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.radar import BistaticRadar
 
-# Largest condition numbers of an inverse. Convention: an inverse in float64 may lose six of its
-# sixteen digits, one in complex64 four of its seven.
-SINGULAR, SINGULAR_SINGLE = 1e6, 1e4
-# Above this a warning is given: the noise gain of three bands of three channels is then 6.5 dB.
+# Condition number above which a warning is given, by choice: the noise gain of three bands of
+# three channels is then 6.5 dB.
 POOR = 5.0
 
 
@@ -250,18 +247,9 @@ class LeastSquares:
         """
         matrix = band_matrix(radar, motion, self.bands)
         normal = matrix.mH @ matrix
-        # it acts on singular values below 1 / SINGULAR of the largest
-        floor = SINGULAR**-2 * self.bands * radar.channels
+        # it acts on singular values below 1e-6 of the largest
+        floor = 1e-12 * self.bands * radar.channels
         return linear_solve(normal + floor * torch.eye(self.bands, dtype=normal.dtype, device=normal.device), matrix.mH)
-
-    def refusal(self, channels: int) -> str | None:
-        """Return why the method cannot work with this number of channels, or None if it can."""
-        few = (
-            f"{self.bands} Doppler bands cannot be separated by {channels} "
-            f"channel{'s' if channels > 1 else ''}; rebuild at most {channels}, or give a prior "
-            "(MinimumMeanSquare)"
-        )
-        return few if self.bands > channels else None
 
 
 @dataclass(frozen=True)
@@ -304,37 +292,9 @@ class MinimumMeanSquare:
         noise = 10 ** (-self.snr_db / 10) * torch.eye(radar.channels, dtype=matrix.dtype, device=matrix.device)
         return linear_solve(weighted @ matrix.mH + noise, weighted).mH
 
-    def refusal(self, channels: int) -> str | None:
-        """Return None, since a prior lets any number of channels separate the bands."""
-        return None
-
 
 # Reconstruction method: the number of Doppler bands and the weights that separate them.
 Rebuild = LeastSquares | MinimumMeanSquare
-
-
-def clutter_covariance(
-    radar: BistaticRadar, prior: Prior, n_pulse: int, bands: int, device: torch.device | str | None = None
-) -> Tensor:
-    """Return the covariance across channels of stationary clutter, per Doppler bin.
-
-    Args:
-        radar: Radar parameters.
-        prior: Expected power over Doppler, such as `ElementPattern()`.
-        n_pulse: Number of pulses.
-        bands: Number of Doppler bands that hold the clutter.
-        device: Device of the result.
-
-    Returns:
-        Covariance per bin of the unitary FFT over the pulses, FFT order, complex128 (n_pulse,
-        channel, channel), on the scale of the expected power.
-    """
-    motion = PointMotion.of(radar, torch.zeros((), dtype=torch.float64, device=device))
-    offset = doppler_offsets(n_pulse, bands, radar.prf_hz, device).view(bands, n_pulse).T
-    power = prior.power(offset, radar, motion)[:, None, :].to(torch.complex128)
-    shared = shared_response(radar, motion, n_pulse, bands, torch.complex128).T[..., None]
-    response = shared * band_matrix(radar, motion, bands)
-    return torch.roll((response * power) @ response.mH, first_bin(n_pulse, bands), 0)
 
 
 def noise_and_clutter(radar: BistaticRadar, lit_s: float | None, n_pulse: int, power_db: Tensor | float) -> Tensor:
@@ -348,20 +308,46 @@ def noise_and_clutter(radar: BistaticRadar, lit_s: float | None, n_pulse: int, p
         power_db: Power of the clutter over the noise in dB, a number or shape (...,).
 
     Returns:
-        Covariance per Doppler bin, complex128 (..., n_pulse, channel, channel).
+        Covariance per bin of the unitary FFT over the pulses, FFT order, complex128 (..., n_pulse,
+        channel, channel).
     """
     band = None if lit_s is None else radar.speed_m_s**2 * lit_s / (radar.wavelength_m * radar.reference_range_m)
-    prior = ElementPattern() if band is None else FlatBand(band)
-    clutter = clutter_covariance(radar, prior, n_pulse, bands=5)  # which the clutter of a pattern fills
+    prior, bands = ElementPattern() if band is None else FlatBand(band), 5  # which the clutter of a pattern fills
+    motion = PointMotion.of(radar, torch.zeros((), dtype=torch.float64))
+    power = prior.power(doppler_offsets(n_pulse, bands, radar.prf_hz).view(bands, n_pulse).T, radar, motion)
+    shared = shared_response(radar, motion, n_pulse, bands, torch.complex128).T[..., None]
+    response = shared * band_matrix(radar, motion, bands)
+    clutter = torch.roll((response * power[:, None, :]) @ response.mH, first_bin(n_pulse, bands), 0)
     level = 10 ** (torch.as_tensor(power_db, dtype=torch.float64) / 10)
     mean = clutter.diagonal(dim1=-2, dim2=-1).real.mean()
     return clutter * (level[..., None, None, None] / mean) + torch.eye(radar.channels, dtype=clutter.dtype)
 
 
+def largest_condition(dtype: torch.dtype) -> float:
+    """Return the largest condition number of an inverse, by convention.
+
+    An inverse in float64 may lose six of its sixteen digits, one in complex64 four of its seven.
+
+    Args:
+        dtype: Complex dtype of the data.
+
+    Returns:
+        1e6 or 1e4.
+    """
+    return 1e6 if dtype == torch.complex128 else 1e4
+
+
 def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
     """Return the condition number of the matrix of channel responses to the Doppler bands.
 
-    It is the ratio of the largest to the least singular value of `band_matrix`, infinite where the
+    >>> import torch
+    >>> from torchsar.multichannel import PointMotion, condition_number
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> round(condition_number(radar, PointMotion.of(radar, torch.zeros(())), 3).item(), 1)
+    10.2
+
+    It is the ratio of the largest to the least singular value of the responses, infinite where the
     matrix is singular or has more bands than channels. Not differentiable.
 
     Args:
@@ -373,12 +359,8 @@ def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> T
         Condition number, float64 (...,).
     """
     values = torch.linalg.svdvals(band_matrix(radar, motion, bands).detach())
-    if bands > radar.channels:
-        return torch.full_like(values[..., 0], math.inf)
-    least = values[..., -1]
-    return torch.where(
-        least > 1e-13 * values[..., 0], values[..., 0] / least.clamp_min(torch.finfo(least.dtype).tiny), math.inf
-    )
+    least, most = values[..., -1] if bands <= radar.channels else 0 * values[..., 0], values[..., 0]
+    return torch.where(least > 1e-13 * most, most / least.clamp_min(torch.finfo(least.dtype).tiny), math.inf)
 
 
 def noise_gain_db(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, n_pulse: int = 64) -> Tensor:
@@ -403,72 +385,57 @@ def noise_gain_db(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, n
     gain = 10 * torch.log10(power.mean(-1) if power.ndim > motion.trial_dims else power)
     if not isinstance(rebuild, LeastSquares):
         return gain
-    return torch.where(condition_number(radar, motion, rebuild.bands) > SINGULAR, torch.inf, gain)
+    limit = largest_condition(torch.complex128)
+    return torch.where(condition_number(radar, motion, rebuild.bands) > limit, torch.inf, gain)
 
 
 def reconstruct(
-    data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, left_k1_m_s: float = 0.0
+    data: Tensor,
+    radar: BistaticRadar,
+    motion: PointMotion,
+    rebuild: Rebuild,
+    left_k1_m_s: float = 0.0,
+    *,
+    with_range: bool = False,
 ) -> Tensor:
     """Reconstruct the full-band Doppler spectrum of points with a given motion.
+
+    >>> import torch
+    >>> from torchsar.multichannel import LeastSquares, PointMotion, reconstruct
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> data = torch.ones(3, 90, dtype=torch.complex64)
+    >>> reconstruct(data, radar, PointMotion.of(radar, data.real), LeastSquares(2)).shape
+    torch.Size([180])
 
     Differentiable in data and motion.
 
     Args:
-        data: Channels with slow time zero at pulse n // 2, shape (..., channel, pulse), complex.
-            The transmit range has been removed from the phase, except for a linear term where
-            `left_k1_m_s` is given.
+        data: Channels with slow time zero at pulse n // 2, shape (..., channel, pulse), or (...,
+            channel, pulse, range) if `with_range`, complex. The transmit range has been removed
+            from the phase, except for a linear term where `left_k1_m_s` is given.
         radar: Radar parameters.
-        motion: Motion of the points, shape (...,).
+        motion: Motion of the points, shape (...,), which all range lines share.
         rebuild: Reconstruction method.
         left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
             still in the phase; 0 if it was removed.
+        with_range: Whether the data have a range axis.
 
     Returns:
-        Spectrum about the Doppler centre of the motion, shape (..., bands * pulse), complex. Bins
-        rise in Doppler from `first_bin(pulse, bands)`, phases refer to slow time zero, and the
-        scale is that of the FFT of bands * pulse samples of a single channel.
+        Spectrum about the Doppler centre of the motion, shape (..., bands * pulse[, range]),
+        complex. Bins rise in Doppler from `first_bin(pulse, bands)`, phases refer to slow time
+        zero, and the scale is that of the FFT of bands * pulse samples of a single channel.
 
     Raises:
         TypeError: If the samples are not complex64 or complex128.
         ValueError: If there are no samples, or if the data do not have the channels of the radar,
             or there are too few channels for the bands.
     """
-    data = checked_samples(data, "reconstruct", "channel, pulse", finite=False)
-    return reconstruct_lines(data[..., None], radar, motion, rebuild, left_k1_m_s)[..., 0]
-
-
-def reconstruct_lines(
-    data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, left_k1_m_s: float = 0.0
-) -> Tensor:
-    """Reconstruct the full-band Doppler spectra of range lines that share one motion.
-
-    This is `reconstruct` for data with a range axis.
-
-    Args:
-        data: Channels with slow time zero at pulse n // 2, shape (..., channel, pulse, range),
-            complex. The transmit range has been removed from the phase, except for a linear term
-            where `left_k1_m_s` is given.
-        radar: Radar parameters.
-        motion: Motion of the points, shape (...,).
-        rebuild: Reconstruction method.
-        left_k1_m_s: Rate k1 in m/s of the linear term k1 t of the transmit range, if this term is
-            still in the phase; 0 if it was removed.
-
-    Returns:
-        Spectra about the Doppler centre of the motion, shape (..., bands * pulse, range), complex.
-
-    Raises:
-        TypeError: If the samples are not complex64 or complex128.
-        ValueError: If there are no samples, or if the data do not have the channels of the radar,
-            or there are too few channels for the bands.
-    """
-    data = checked_samples(data, "reconstruct_lines", "channel, pulse, range", finite=False)
-    if data.shape[-3] != radar.channels:
-        raise ValueError(
-            f"reconstruction expects {radar.channels} channels as in the radar's channel_m, got data "
-            f"with {data.shape[-3]}; select the same channels in radar and data"
-        )
+    dims = "channel, pulse, range" if with_range else "channel, pulse"
+    data = checked_channels(data, radar, "reconstruct", dims, finite=False)
     refuse_channels(radar, rebuild)
+    if not with_range:
+        data = data[..., None]
     n, dtype = data.shape[-2], data.dtype
     # the FFT of the demodulated data begins with the lowest bin of the lowest band
     turns = -doppler_centre_hz(radar, motion, left_k1_m_s) / radar.prf_hz - first_bin(n, rebuild.bands) % n / n
@@ -480,8 +447,25 @@ def reconstruct_lines(
     )
     weights = rebuild.weights(radar, motion, n).to(dtype) * rebuild.bands
     if weights.ndim == motion.trial_dims + 2:
-        return (weights @ spectrum.flatten(-2)).unflatten(-1, spectrum.shape[-2:]).flatten(-3, -2)
-    return (weights @ spectrum.transpose(-3, -2)).transpose(-3, -2).flatten(-3, -2)
+        made = (weights @ spectrum.flatten(-2)).unflatten(-1, spectrum.shape[-2:]).flatten(-3, -2)
+    else:
+        made = (weights @ spectrum.transpose(-3, -2)).transpose(-3, -2).flatten(-3, -2)
+    return made if with_range else made[..., 0]
+
+
+def separates(rebuild: Rebuild, channels: int) -> bool:
+    """Test whether a reconstruction works with this number of channels.
+
+    A prior lets any number of channels separate the bands.
+
+    Args:
+        rebuild: Reconstruction method.
+        channels: Number of channels.
+
+    Returns:
+        False for more bands than channels without a prior.
+    """
+    return not isinstance(rebuild, LeastSquares) or rebuild.bands <= channels
 
 
 def refuse_channels(radar: BistaticRadar, rebuild: Rebuild) -> None:
@@ -491,12 +475,15 @@ def refuse_channels(radar: BistaticRadar, rebuild: Rebuild) -> None:
         radar: Radar parameters.
         rebuild: Reconstruction method.
     """
-    why = rebuild.refusal(radar.channels)
-    if why is not None:
-        raise ValueError(why)
+    if not separates(rebuild, radar.channels):
+        raise ValueError(
+            f"{rebuild.bands} Doppler bands cannot be separated by {radar.channels} "
+            f"channel{'s' if radar.channels > 1 else ''}; rebuild at most {radar.channels}, or give a prior "
+            "(MinimumMeanSquare)"
+        )
 
 
-class Reconstruct(Stage):
+class Reconstruct(ChannelStage):
     """Stage that reconstructs the full Doppler band of points with given velocities.
 
     The input has the axes (channel, pulse[, range]), the output the axes (doppler[, range]) with
@@ -512,23 +499,20 @@ class Reconstruct(Stage):
         ValueError: If there are too few channels for the bands.
     """
 
-    works_on = ("channel", "pulse")
-    also_on = (("channel", "pulse", "range"),)
     takes_empty = False
 
     def __init__(self, radar: BistaticRadar, rebuild: Rebuild | None = None, range_m: float | None = None) -> None:
-        super().__init__()
-        if rebuild is not None and not hasattr(rebuild, "refusal"):
+        super().__init__(radar)
+        if rebuild is not None and not hasattr(rebuild, "weights"):
             raise TypeError(f"rebuild must be LeastSquares(bands) or MinimumMeanSquare(...), got {rebuild!r}")
-        self.radar, self.rebuild, self.range_m = radar, rebuild or LeastSquares(), range_m
+        self.rebuild, self.range_m = rebuild or LeastSquares(), range_m
         refuse_channels(radar, self.rebuild)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Signal:
         """Reconstruct the full Doppler band with the velocities of each trial.
 
-        Velocities of zero suit a stationary scene.
-
-        A warning is given where the reconstruction is ill-conditioned.
+        Velocities of zero suit a stationary scene. A warning is given where the reconstruction is
+        ill-conditioned.
 
         Args:
             signal: Channels with the axes (channel, pulse[, range]) and the transmit range removed
@@ -549,30 +533,8 @@ class Reconstruct(Stage):
         check_condition(self.radar, motion, self.rebuild, signal.data.dtype)
         refuse_shifted(self.radar, signal.axis("pulse"))
         doppler = doppler_axis(self.radar, signal.axis("pulse").n, self.rebuild.bands)
-        made = reconstruct_lines if "range" in signal.names else reconstruct
-        return Signal(made(signal.data, self.radar, motion, self.rebuild), (doppler, *signal.axes[2:]))
-
-
-def refuse_shifted(radar: BistaticRadar, pulse: Axis) -> None:
-    """Raise ValueError unless slow time is zero at pulse n // 2 and pulses come at the radar's PRF.
-
-    Reconstruction and focusing count phases from slow time zero.
-
-    Args:
-        radar: Radar parameters.
-        pulse: Slow-time axis of the data.
-    """
-    expected = radar.pulse_axis(pulse.n)
-    if (
-        abs(pulse.start - expected.start) > 1e-6 * expected.step
-        or abs(pulse.step - expected.step) > 1e-9 * expected.step
-    ):
-        raise ValueError(
-            f"slow time must be zero at pulse {pulse.n // 2} of {pulse.n}, in steps of 1 / "
-            f"{radar.prf_hz:g} s, got a first pulse at {pulse.start:g} s in steps of "
-            f"{pulse.step:g} s; "
-            "if pulses were cropped, crop as many from the other end; otherwise check prf_hz of the radar"
-        )
+        made = reconstruct(signal.data, self.radar, motion, self.rebuild, with_range="range" in signal.names)
+        return Signal(made, (doppler, *signal.axes[2:]))
 
 
 def doppler_axis(radar: BistaticRadar, n_pulse: int, bands: int) -> Axis:
@@ -615,7 +577,7 @@ def check_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild,
     if not isinstance(rebuild, LeastSquares):
         return
     found = condition_number(radar, motion, rebuild.bands)
-    limit = SINGULAR if dtype == torch.complex128 else SINGULAR_SINGLE
+    limit = largest_condition(dtype)
     singular, worst = host_value((found > limit).all(), False), host_largest(found, 0.0)
     if not singular and not worst > POOR:
         return

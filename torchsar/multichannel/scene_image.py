@@ -25,7 +25,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, fft_lines, linear_phasor, unit_level
-from torchsar.multichannel.body import Body, Extraction, body_echo, body_image, find_body, known_body
+from torchsar.multichannel.body import Body, body_echo, body_image, find_body, known_body
+from torchsar.multichannel.chip import Extraction
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import LeastSquares, Rebuild, band_matrix, first_bin, shared_response

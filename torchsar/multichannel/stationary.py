@@ -29,7 +29,7 @@ from torchsar.multichannel.reconstruct import (
     LeastSquares,
     Rebuild,
     check_condition,
-    reconstruct_lines,
+    reconstruct,
     refuse_channels,
     refuse_shifted,
 )
@@ -102,7 +102,7 @@ def stationary_image(
     """
     data = checked_samples(data, "stationary_image", "channel, pulse, range", finite=False)
     rebuild = LeastSquares() if rebuild is None else rebuild
-    spectrum = reconstruct_lines(data, radar, PointMotion.of(radar, data.real), rebuild)
+    spectrum = reconstruct(data, radar, PointMotion.of(radar, data.real), rebuild, with_range=True)
     return focus_stationary(spectrum, radar, near_range_m, rebuild.bands, form, band_hz)
 
 
@@ -180,7 +180,7 @@ class StationaryImage(Stage):
         refuse_shifted(self.radar, signal.axis("pulse"))
         still = PointMotion.of(self.radar, signal.data.real)
         check_condition(self.radar, still, self.rebuild, signal.data.dtype)
-        return self.focused(reconstruct_lines(signal.data, self.radar, still, self.rebuild), signal)
+        return self.focused(reconstruct(signal.data, self.radar, still, self.rebuild, with_range=True), signal)
 
     def focused(self, spectrum: Tensor, signal: Signal) -> Signal:
         """Focus a Doppler spectrum that was reconstructed from `signal` by any method.

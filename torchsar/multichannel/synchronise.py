@@ -17,13 +17,10 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, unit_phasor, worst
+from torchsar.core import Estimate, Outcome, Signal, unit_phasor, worst
 from torchsar.multichannel.balance import without_errors
+from torchsar.multichannel.channels import ChannelStage, refuse_other_count
 from torchsar.radar import BistaticRadar
-
-# The maximum of samples interpolated four times lies within an eighth of a sample of the peak. Four
-# Newton steps from there err by 1e-5 of a sample at 12 dB, by less at a higher SNR.
-_OVERSAMPLING, _NEWTON = 4, 4
 
 
 def estimate_synchronisation(direct: Tensor, radar: BistaticRadar, *, assess: bool = True) -> Estimate:
@@ -75,20 +72,24 @@ def estimate_synchronisation(direct: Tensor, radar: BistaticRadar, *, assess: bo
     return Estimate(value, std, quality, outcome, info)
 
 
-def _coarse_delay(direct: Tensor, radar: BistaticRadar) -> Tensor:
-    """Return the delay in seconds of the strongest interpolated sample, (..., pulse)."""
+def _coarse_delay(direct: Tensor, radar: BistaticRadar, finer: int = 4) -> Tensor:
+    """Return the delay in seconds of the strongest interpolated sample, (..., pulse).
+
+    The maximum of samples interpolated four times lies within an eighth of a sample of the peak.
+    """
     n = direct.shape[-1]
     spectrum = torch.fft.fftshift(torch.fft.fft(direct), dim=-1)
-    fine = torch.fft.ifft(torch.nn.functional.pad(spectrum, (0, (_OVERSAMPLING - 1) * n))).abs()
-    return (fine.argmax(-1).to(torch.float64) / _OVERSAMPLING - n // 2) / radar.sampling_hz
+    fine = torch.fft.ifft(torch.nn.functional.pad(spectrum, (0, (finer - 1) * n))).abs()
+    return (fine.argmax(-1).to(torch.float64) / finer - n // 2) / radar.sampling_hz
 
 
-def _refined_delay(band: Tensor, frequency: Tensor, delay: Tensor) -> Tensor:
-    """Maximise |sum_f X(f) exp(j 2 pi f delay)|^2 by Newton steps near the coarse delay."""
-    rate = 2j * math.pi * frequency
-    reach = 0.5 / (frequency.max() - frequency.min())
-    start = delay
-    for _ in range(_NEWTON):
+def _refined_delay(band: Tensor, frequency: Tensor, start: Tensor, steps: int = 4) -> Tensor:
+    """Maximise |sum_f X(f) exp(j 2 pi f delay)|^2 by Newton steps near the coarse delay.
+
+    Four steps err by 1e-5 of a sample at 12 dB, by less at a higher SNR.
+    """
+    rate, reach, delay = 2j * math.pi * frequency, 0.5 / (frequency.max() - frequency.min()), start
+    for _ in range(steps):
         turned = band * unit_phasor(delay[..., None] * frequency, band.dtype)
         p, slope, bend = turned.sum(-1), (turned * rate).sum(-1), (turned * rate.square()).sum(-1)
         first, second = (p.conj() * slope).real, (p.conj() * bend).real + slope.abs().square()
@@ -120,17 +121,12 @@ def remove_synchronisation(
         ValueError: If there is not one value per pulse, or data without a range axis have a delay.
     """
     pulses = data.shape[-2] if with_range else data.shape[-1]
-    for name, value in (("phase_rad", phase_rad), ("delay_s", delay_s)):
-        if value is not None and value.shape[-1:] != (pulses,):
-            raise ValueError(
-                f"remove_synchronisation needs {name} of shape (..., {pulses}), one value per pulse, got shape "
-                f"{tuple(value.shape)}"
-            )
+    refuse_other_count("remove_synchronisation", pulses, "pulse", phase_rad=phase_rad, delay_s=delay_s)
     turn = unit_phasor(-phase_rad.to(torch.float64) / (2 * math.pi), data.dtype)[..., None, :]
     return without_errors(data, radar, turn, None if delay_s is None else delay_s[..., None, :], with_range)
 
 
-class EstimateSynchronisation(Stage):
+class EstimateSynchronisation(ChannelStage):
     """Stage that estimates the clock phase and delay of each pulse from a recorded direct path.
 
     See `estimate_synchronisation`. Where the direct path is side data of the recording, connect it
@@ -142,15 +138,13 @@ class EstimateSynchronisation(Stage):
         assess: Whether quality and outcome are assessed.
     """
 
-    works_on = ("channel", "pulse")
-    also_on = (("channel", "pulse", "range"),)
     provides = ("phase_rad", "delay_s")
     neutral = {"phase_rad": 0.0, "delay_s": 0.0}
     takes_empty = False
 
     def __init__(self, radar: BistaticRadar, *, assess: bool = True) -> None:
-        super().__init__()
-        self.radar, self.assess = radar, assess
+        super().__init__(radar)
+        self.assess = assess
 
     def forward(self, signal: Signal, direct_path: Tensor) -> Estimate:
         """Estimate the clock phase and delay of each pulse from the direct path.
@@ -174,7 +168,7 @@ class EstimateSynchronisation(Stage):
         return estimate_synchronisation(direct_path, self.radar, assess=self.assess)
 
 
-class RemoveSynchronisation(Stage):
+class RemoveSynchronisation(ChannelStage):
     """Stage that removes estimated or known clock phases and delays from every pulse.
 
     See `remove_synchronisation`.
@@ -182,13 +176,6 @@ class RemoveSynchronisation(Stage):
     Args:
         radar: Radar parameters.
     """
-
-    works_on = ("channel", "pulse")
-    also_on = (("channel", "pulse", "range"),)
-
-    def __init__(self, radar: BistaticRadar) -> None:
-        super().__init__()
-        self.radar = radar
 
     def forward(self, signal: Signal, phase_rad: Tensor, delay_s: Tensor | None = None) -> Signal:
         """Remove clock phases and delays (..., pulse) from channels (channel, pulse[, range])."""

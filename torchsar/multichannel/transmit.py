@@ -3,7 +3,7 @@
 Reference:
     Remote Sens. 2020, 12, 1703, Eqs. (8)-(14), (31). The transmit range is the same for all
     channels, so that its removal with the ephemeris is exact (`remove_transmit_range`). Eq. (31)
-    leaves its linear term in the data (`scale_azimuth`).
+    leaves its linear term in the data (`AzimuthScaling`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from torch import Tensor
 from torchsar.core import Signal, Stage, checked_samples, per_trial, unit_phasor
 from torchsar.focus import range_compress
 from torchsar.focus.reference import REFERENCES
-from torchsar.multichannel.motion import Number, PointMotion, checked_channels
+from torchsar.multichannel.channels import ChannelStage, checked_channels
+from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.radar import BistaticRadar, polynomial_range
 
 
@@ -60,48 +61,6 @@ def remove_transmit_range(
     return data * (phasor[..., None] if with_range else phasor)
 
 
-def scale_azimuth(
-    data: Tensor, radar: BistaticRadar, time_s: Tensor, motion: PointMotion, order: int = 4, with_range: bool = True
-) -> Tensor:
-    """Remove all but the linear term of the transmit range by azimuth nonlinear chirp scaling.
-
-    Prefer `remove_transmit_range`, which is exact and removes the linear term as well.
-
-    With the transmit range k1 t + k2 t^2 + ... over slow time t, data of channel m at the
-    along-track position dx_m are multiplied by exp(j pi (q2 t'^2 + q3 t'^3 + q4 t'^4)), where t' =
-    t - dx_m / v_e, v_e is the relative sensor velocity of Eq. (25), and q_i = 2 k_i / lambda. The
-    shift dx_m / v_e leaves a phase error 4 pi k2 t dx_m / (lambda v_e), at most 0.006 rad at the
-    ends of an aperture of 4.5 s in the geometry of the reference.
-
-    The term k1 t remains in the data and moves the Doppler centre to (u_r - k1) / lambda for the
-    slant-range speed u_r. `reconstruct(..., left_k1_m_s=k1)` takes it into account. Differentiable.
-
-    Args:
-        data: Channels as in `remove_transmit_range`.
-        radar: Radar parameters.
-        time_s: Slow time in seconds, float64 (pulse,).
-        motion: Motion of the points, shape (...,).
-        order: Highest power of slow time in the transmit range that is removed.
-        with_range: Whether the data have a range axis.
-
-    Returns:
-        Data of the same shape.
-
-    Raises:
-        TypeError: If the samples are not complex64 or complex128.
-        ValueError: If there are no samples, or the channels are not those of the radar.
-
-    Reference:
-        Remote Sens. 2020, 12, 1703, Eqs. (25), (31), (34).
-    """
-    dims = "channel, pulse, range" if with_range else "channel, pulse"
-    data = checked_channels(data, radar, "scale_azimuth", dims, finite=False)
-    delay = radar.channels_at(data.device) / motion.effective_m_s[..., None]
-    path_m = polynomial_range((0.0, *radar.transmit_range[1:order]), time_s - delay[..., None])
-    phasor = unit_phasor(path_m / radar.wavelength_m, data.dtype)
-    return data * (phasor[..., None] if with_range else phasor)
-
-
 def neglected_transmit_phase_rad(radar: BistaticRadar, order: int, integration_s: float) -> float:
     """Bound the phase due to the powers of slow time above `order` in the transmit range.
 
@@ -124,7 +83,7 @@ def neglected_transmit_phase_rad(radar: BistaticRadar, order: int, integration_s
     )
 
 
-class RemoveTransmitRange(Stage):
+class RemoveTransmitRange(ChannelStage):
     """Stage that removes the transmit range with the ephemeris coefficients of the radar.
 
     See `remove_transmit_range`. A warning is given where the coefficients from k2 on that `order`
@@ -140,16 +99,13 @@ class RemoveTransmitRange(Stage):
         ValueError: If `order` is negative.
     """
 
-    works_on = ("channel", "pulse")
-    also_on = (("channel", "pulse", "range"),)
-
     def __init__(self, radar: BistaticRadar, order: int | None = None) -> None:
-        super().__init__()
+        super().__init__(radar)
         if order is not None and order < 0:
             raise ValueError(
                 f"order must be 0 or more, the number of transmit-range coefficients to remove, got {order}"
             )
-        self.radar, self.order = radar, len(radar.transmit_range) if order is None else order
+        self.order = len(radar.transmit_range) if order is None else order
 
     def forward(self, signal: Signal) -> Signal:
         """Remove the transmit range from the phase of channels (channel, pulse[, range])."""
@@ -172,11 +128,28 @@ class RemoveTransmitRange(Stage):
         )
 
 
-class AzimuthScaling(Stage):
-    """Stage that removes the transmit range, except its linear term, by azimuth chirp scaling.
+class AzimuthScaling(ChannelStage):
+    """Stage that removes all but the linear term of the transmit range by azimuth chirp scaling.
 
-    See `scale_azimuth`. Prefer `RemoveTransmitRange`, which is exact and removes the linear term
-    k1 t as well.
+    Prefer `RemoveTransmitRange`, which is exact and removes the linear term k1 t as well.
+
+    >>> import torch
+    >>> from torchsar.core import Signal
+    >>> from torchsar.multichannel import AzimuthScaling
+    >>> from torchsar.radar import BistaticRadar, LinearFM
+    >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
+    >>> signal = Signal(torch.ones(3, 90, dtype=torch.complex64), radar.axes(90))
+    >>> AzimuthScaling(radar)(signal).names
+    ('channel', 'pulse')
+
+    With the transmit range k1 t + k2 t^2 + ... over slow time t, data of channel m at the
+    along-track position dx_m are multiplied by exp(j pi (q2 t'^2 + q3 t'^3 + q4 t'^4)), where t' =
+    t - dx_m / v_e, v_e is the relative sensor velocity of Eq. (25), and q_i = 2 k_i / lambda. The
+    shift dx_m / v_e leaves a phase error 4 pi k2 t dx_m / (lambda v_e), at most 0.006 rad at the
+    ends of an aperture of 4.5 s in the geometry of the reference.
+
+    The term k1 t remains in the data and moves the Doppler centre to (u_r - k1) / lambda for the
+    slant-range speed u_r. `reconstruct(..., left_k1_m_s=k1)` takes it into account. Differentiable.
 
     Args:
         radar: Radar parameters.
@@ -186,20 +159,17 @@ class AzimuthScaling(Stage):
         ValueError: If `order` lies outside 2 to 4.
 
     Reference:
-        Remote Sens. 2020, 12, 1703, Eq. (31).
+        Remote Sens. 2020, 12, 1703, Eqs. (25), (31), (34).
     """
 
-    works_on = ("channel", "pulse")
-    also_on = (("channel", "pulse", "range"),)
-
     def __init__(self, radar: BistaticRadar, order: int = 4) -> None:
-        super().__init__()
+        super().__init__(radar)
         if not 2 <= order <= 4:
             raise ValueError(
                 "order must be 2, 3 or 4, since azimuth scaling removes orders 2 to 4 of the transmit range, "
                 f"got {order}"
             )
-        self.radar, self.order = radar, order
+        self.order = order
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0) -> Signal:
         """Remove the transmit range, except its linear term, for the motion of each trial.
@@ -212,12 +182,17 @@ class AzimuthScaling(Stage):
 
         Returns:
             Channels on the same axes.
+
+        Raises:
+            ValueError: If the channels are not those of the radar.
         """
-        motion = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s)
-        time = signal.axis("pulse").values(signal.data.device)
-        return signal.with_data(
-            scale_azimuth(signal.data, self.radar, time, motion, self.order, "range" in signal.names)
-        )
+        data = checked_channels(signal.data, self.radar, "AzimuthScaling", ", ".join(signal.names), finite=False)
+        motion = PointMotion.of(self.radar, data, u_r_m_s, u_a_m_s)
+        delay = self.radar.channels_at(data.device) / motion.effective_m_s[..., None]
+        time_s = signal.axis("pulse").values(data.device) - delay[..., None]
+        path_m = polynomial_range((0.0, *self.radar.transmit_range[1 : self.order]), time_s)
+        phasor = unit_phasor(path_m / self.radar.wavelength_m, data.dtype)
+        return signal.with_data(data * (phasor[..., None] if "range" in signal.names else phasor))
 
 
 class CompressChannels(Stage):

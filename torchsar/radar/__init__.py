@@ -2,23 +2,21 @@
 
 from torchsar.radar.antenna_path import AntennaPath
 from torchsar.radar.bistatic import BistaticRadar, polynomial_range, receive_range
-from torchsar.radar.ephemeris import Ephemeris
+from torchsar.radar.instrument import LIGHT_M_S
 from torchsar.radar.inverse import InverseRadar
 from torchsar.radar.ladar import TriangularLadar, sweep_middles
 from torchsar.radar.local_frame import LocalFrame, geocentric
 from torchsar.radar.navigation import resample_path
-from torchsar.radar.orbit import Orbit, orbit_range, range_coefficients, seen_point
+from torchsar.radar.orbit import Ephemeris, Orbit, orbit_range, range_coefficients, seen_point
 from torchsar.radar.spotlight import (
     FarField,
-    PlaneWaveLoss,
     Spotlight,
     frequency_samples,
     geometry_of,
-    plane_wave_loss,
     range_profiles,
 )
 from torchsar.radar.straight_track import StraightTrack
-from torchsar.radar.stripmap import LIGHT_M_S, StripmapRadar
+from torchsar.radar.stripmap import StripmapRadar
 from torchsar.radar.timing import TimingDiagram, timing_diagram
 from torchsar.radar.waveform import LinearFM
 
@@ -32,7 +30,6 @@ __all__ = [
     "LinearFM",
     "LocalFrame",
     "Orbit",
-    "PlaneWaveLoss",
     "Spotlight",
     "StraightTrack",
     "StripmapRadar",
@@ -42,7 +39,6 @@ __all__ = [
     "geocentric",
     "geometry_of",
     "orbit_range",
-    "plane_wave_loss",
     "polynomial_range",
     "range_coefficients",
     "range_profiles",

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, numbers_on
-from torchsar.radar.stripmap import LIGHT_M_S
+from torchsar.radar.instrument import LIGHT_M_S, Instrument
 from torchsar.radar.waveform import LinearFM
 
 
 @dataclass(frozen=True)
-class BistaticRadar:
+class BistaticRadar(Instrument):
     """Bistatic radar: a far transmitter with a low pulse rate, and an airborne receiver.
 
     The receiver has several channels along its track. The phase of an echo is -2 pi (R_T + R_m) /
@@ -59,44 +59,22 @@ class BistaticRadar:
     wave_speed_m_s: float = LIGHT_M_S
 
     def __post_init__(self) -> None:
-        for name in (
-            "carrier_hz",
-            "sampling_hz",
-            "prf_hz",
-            "speed_m_s",
-            "reference_range_m",
-            "element_m",
-            "wave_speed_m_s",
-        ):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"radar.{name} must be a positive number, got {getattr(self, name)}")
+        self.refuse_not_positive("sampling_hz", "prf_hz", "speed_m_s", "reference_range_m", "element_m")
         if not 0 <= self.height_m < self.reference_range_m:
             raise ValueError(
                 f"radar.height_m must lie in 0..reference_range_m ({self.reference_range_m:g} m), got {self.height_m}"
             )
-        if self.pulse.bandwidth_hz > self.sampling_hz:
-            raise ValueError(
-                f"pulse bandwidth {self.pulse.bandwidth_hz:g} Hz exceeds the complex sampling rate "
-                f"{self.sampling_hz:g} Hz; sample at least as fast as the bandwidth"
-            )
+        self.pulse.refuse_aliased(self.sampling_hz)
         object.__setattr__(self, "channel_m", tuple(self.channel_m))
         object.__setattr__(self, "transmit_range", tuple(self.transmit_range))
-        if not self.channel_m or not all(math.isfinite(x) for x in self.channel_m):
+        finite = all(math.isfinite(x) for x in self.channel_m)
+        if not (self.channel_m and finite and len(set(self.channel_m)) == len(self.channel_m)):
             raise ValueError(
-                "radar.channel_m must hold the finite along-track position (m) of at least one channel, "
-                f"got {self.channel_m}"
-            )
-        if len(set(self.channel_m)) != len(self.channel_m):
-            raise ValueError(
-                f"radar.channel_m must be distinct, since a repeated position adds no samples, got {self.channel_m}"
+                "radar.channel_m must hold the finite along-track position (m) of at least one channel, and must be "
+                f"distinct, since a repeated position adds no samples, got {self.channel_m}"
             )
         if not all(math.isfinite(k) for k in self.transmit_range):
             raise ValueError(f"radar.transmit_range must be finite coefficients k1, k2, ..., got {self.transmit_range}")
-
-    @property
-    def wavelength_m(self) -> float:
-        """Carrier wavelength in metres."""
-        return self.wave_speed_m_s / self.carrier_hz
 
     @property
     def channels(self) -> int:

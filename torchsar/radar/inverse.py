@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass
 
 from torchsar.core import Axis
-from torchsar.radar.stripmap import LIGHT_M_S
+from torchsar.radar.instrument import LIGHT_M_S, Instrument
 
 
 @dataclass(frozen=True)
-class InverseRadar:
+class InverseRadar(Instrument):
     """Inverse synthetic aperture radar or ladar whose range window follows the target.
 
     Args:
@@ -39,20 +39,9 @@ class InverseRadar:
     wave_speed_m_s: float = LIGHT_M_S
 
     def __post_init__(self) -> None:
-        for name in ("carrier_hz", "bandwidth_hz", "prf_hz", "wave_speed_m_s"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"radar.{name} must be a positive number, got {getattr(self, name)}")
-        for name in ("rotation_rad_s", "pulse_s"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise ValueError(f"radar.{name} must be a positive number or None, got {value}")
-        if not (math.isfinite(self.reference_range_m) and self.reference_range_m >= 0):
+        self.refuse_not_positive("bandwidth_hz", "prf_hz", "rotation_rad_s", "pulse_s")
+        if not 0 <= self.reference_range_m < math.inf:
             raise ValueError(f"radar.reference_range_m must be a range of 0 m or more, got {self.reference_range_m}")
-
-    @property
-    def wavelength_m(self) -> float:
-        """Carrier wavelength in metres."""
-        return self.wave_speed_m_s / self.carrier_hz
 
     @property
     def range_step_m(self) -> float:
@@ -69,23 +58,6 @@ class InverseRadar:
         if self.pulse_s is None:
             raise ValueError("radar.pulse_s is not set; give the length of the dechirped pulse in seconds")
         return self.bandwidth_hz / self.pulse_s
-
-    def cross_range_step_m(self, n_pulse: int) -> float:
-        """Return the cross-range cell lambda / (2 omega T) of an image, in metres.
-
-        Args:
-            n_pulse: Number of pulses, which last T = n_pulse / PRF; the target rotates with omega,
-                `rotation_rad_s`.
-
-        Raises:
-            ValueError: If `rotation_rad_s` is None.
-        """
-        if self.rotation_rad_s is None:
-            raise ValueError(
-                "radar.rotation_rad_s is not set; give the rotation rate of the target in rad/s, without which "
-                "cross range has no scale in metres"
-            )
-        return self.wavelength_m * self.prf_hz / (2 * self.rotation_rad_s * n_pulse)
 
     def raw_axes(self, n_pulse: int, n_range: int, start_s: float = 0.0) -> tuple[Axis, Axis]:
         """Return the axes (pulse, range) of range-compressed pulses.
@@ -111,11 +83,9 @@ class InverseRadar:
 
         Returns:
             Cross range in metres (Doppler in Hz where the rotation is unknown) with zero at line n
-            // 2, and the range axis.
+            // 2, and the range axis. The cross-range cell is lambda / (2 omega T) for pulses that
+            last T seconds and the rotation rate omega.
         """
-        pulse, range_ = raw[-2:]
-        if self.rotation_rad_s is None:
-            step, unit = 1 / (pulse.n * pulse.step), "Hz"
-        else:
-            step, unit = self.wavelength_m / (2 * self.rotation_rad_s * pulse.n * pulse.step), "m"
-        return Axis("azimuth", pulse.n, -(pulse.n // 2) * step, step, unit), range_
+        (pulse, range_), omega = raw[-2:], self.rotation_rad_s
+        step = (1 if omega is None else self.wavelength_m / (2 * omega)) / (pulse.n * pulse.step)
+        return Axis("azimuth", pulse.n, -(pulse.n // 2) * step, step, "Hz" if omega is None else "m"), range_

@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis
-from torchsar.radar.stripmap import LIGHT_M_S
+from torchsar.radar.instrument import LIGHT_M_S, Instrument
 
 DechirpSign = Literal["lo_conj_echo", "echo_conj_lo"]
 Detection = Literal["complex", "real"]
 
 
 @dataclass(frozen=True)
-class TriangularLadar:
+class TriangularLadar(Instrument):
     """Symmetric triangular FMCW ladar that is dechirped on receive (STLFMCW).
 
     In a period that starts at t the middle of the up sweep is at t + period / 4, the turning point
@@ -62,9 +62,7 @@ class TriangularLadar:
     wave_speed_m_s: float = LIGHT_M_S
 
     def __post_init__(self) -> None:
-        for name in ("carrier_hz", "bandwidth_hz", "period_s", "sample_rate_hz", "reference_range_m", "wave_speed_m_s"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"radar.{name} must be a positive number, got {getattr(self, name)}")
+        self.refuse_not_positive("bandwidth_hz", "period_s", "sample_rate_hz", "reference_range_m")
         if not (math.isfinite(self.speed_m_s) and self.speed_m_s >= 0):
             raise ValueError(f"radar.speed_m_s must be a number of 0 or more, got {self.speed_m_s}")
         if self.beam_rad is not None and not 0 < self.beam_rad < math.pi:
@@ -88,11 +86,6 @@ class TriangularLadar:
                 "radar.sample_rate_hz must give a whole number of samples, 16 or more, in a sweep of "
                 f"{self.sweep_s:g} s, got {samples:g} samples at {self.sample_rate_hz:g} Hz"
             )
-
-    @property
-    def wavelength_m(self) -> float:
-        """Carrier wavelength in metres."""
-        return self.wave_speed_m_s / self.carrier_hz
 
     @property
     def sweep_s(self) -> float:
@@ -217,12 +210,10 @@ def sweep_middles(radar: TriangularLadar, pulse: Axis, device: torch.device | st
     return torch.stack([start + 0.25 * radar.period_s, start + 0.75 * radar.period_s])
 
 
-# scatterers more than 10 dB below the strongest do not lead an estimator
-_LEADING = 10 ** (-10 / 20)
-
-
 def leading(level: Tensor) -> Tensor:
     """Mark the scatterers whose amplitude is within 10 dB of the strongest and above zero.
+
+    Scatterers more than 10 dB below the strongest do not lead an estimator.
 
     Args:
         level: Amplitudes, shape (..., target).
@@ -230,4 +221,4 @@ def leading(level: Tensor) -> Tensor:
     Returns:
         True for these scatterers, bool, shape (..., target).
     """
-    return (level >= _LEADING * level.amax(-1, keepdim=True)) & (level > 0)
+    return (level >= 10 ** (-10 / 20) * level.amax(-1, keepdim=True)) & (level > 0)

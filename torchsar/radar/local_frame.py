@@ -90,7 +90,7 @@ class LocalFrame:
             TypeError: If the tensor is not float64.
             ValueError: If its last dimension is not 3, or a value is not finite.
         """
-        origin, axes = self._axes(_three("geocentric_m", geocentric_m))
+        origin, axes = self._axes("geocentric_m", geocentric_m)
         return (geocentric_m - origin) @ axes.mT
 
     def geocentric_m(self, local_m: Tensor) -> Tensor:
@@ -106,20 +106,18 @@ class LocalFrame:
             TypeError: If the tensor is not float64.
             ValueError: If its last dimension is not 3, or a value is not finite.
         """
-        origin, axes = self._axes(_three("local_m", local_m))
+        origin, axes = self._axes("local_m", local_m)
         return local_m @ axes + origin
 
-    def _axes(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Geocentric position of the origin, and unit vectors east, north and up, (3, 3)."""
+    def _axes(self, name: str, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Geocentric position of the origin, and unit vectors east, north and up, (3, 3).
+
+        Raises an error unless the positions are finite float64 of shape (..., 3).
+        """
+        refuse_unusable(**{name: like})
+        if like.shape[-1:] != (3,):
+            raise ValueError(f"{name} must have the shape (..., 3), got {tuple(like.shape)}")
         origin = geocentric(*(like.new_tensor(v) for v in (self.latitude_deg, self.longitude_deg, self.height_m)))
         latitude, longitude = math.radians(self.latitude_deg), math.radians(self.longitude_deg)
         (s, c), (sl, cl) = ((math.sin(angle), math.cos(angle)) for angle in (latitude, longitude))
         return origin, like.new_tensor([[-sl, cl, 0.0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
-
-
-def _three(name: str, value: Tensor) -> Tensor:
-    """The positions; raise an error unless they are finite float64 of shape (..., 3)."""
-    refuse_unusable(**{name: value})
-    if value.shape[-1:] != (3,):
-        raise ValueError(f"{name} must have the shape (..., 3), got {tuple(value.shape)}")
-    return value

@@ -10,20 +10,6 @@ from torch import Tensor
 from torchsar.core import UnevenSpline
 from torchsar.radar.antenna_path import broadcast, refuse_unusable
 
-# a gap is longer than ten median intervals, and than five times what 95 % of them do not exceed, by
-# choice: the longest of 1000 random intervals is about ten times the median
-_GAP, _USUAL, _SHARE = 10.0, 5.0, 0.95
-# a jump exceeds the median of the residuals by this factor, by choice; normal noise has up to 4
-_ABOVE_MEDIAN = 10.0
-# acceleration that may set in between two records, in m/s^2, by choice: about that of gravity
-_GUST_M_S2 = 10.0
-# normalised fourth difference at equal steps of a jump of 1 in the middle, 3 / sqrt(70), and of an
-# acceleration that sets in, per h^2
-_OF_JUMP = 0.36
-_OF_GUST = 1 / 12
-# share of the median interval by which pulses may lie beyond the record, for rounding errors
-_ROUNDING = 1e-6
-
 
 def resample_path(
     time_s: Tensor,
@@ -76,33 +62,28 @@ def resample_path(
     if not jump_m > 0 or not (longest_gap_s is None or longest_gap_s > 0):
         raise ValueError(f"longest_gap_s and jump_m must be positive, got {longest_gap_s} and {jump_m}")
     time, first, last = (x.detach() for x in (time_s, pulse_time_s.amin(-1), pulse_time_s.amax(-1)))
-    _refuse_order(time)
-    _refuse_outside(time, first, last)
+    _refuse_times(time, first, last)
     _refuse_gaps(time, first, last, longest_gap_s)
     _refuse_jumps(time, position_m.detach(), first, last, jump_m)
     return UnevenSpline(time_s[..., None, :], position_m.mT).at(pulse_time_s[..., None, :]).mT
 
 
-def _refuse_order(time: Tensor) -> None:
-    """Raise ValueError unless times rise."""
+def _refuse_times(time: Tensor, first: Tensor, last: Tensor) -> None:
+    """Raise ValueError unless times rise, and pulses lie within the record.
+
+    Pulses may lie beyond the record by a millionth of the median interval, for rounding errors.
+    """
     bad = time.diff() <= 0
     if bool(bad.any()):
         at, where = _first(bad)
         before, after = float(time[(*at[:-1], at[-1])]), float(time[(*at[:-1], at[-1] + 1)])
-        if before == after:
-            raise ValueError(
-                f"times of a navigation record must rise, but {after:.9g} s stands twice, at record {at[-1] + 1}"
-                f"{where}; remove doubled records"
-            )
-        raise ValueError(
-            f"times of a navigation record must rise, but {after:.9g} s follows {before:.9g} s at record "
-            f"{at[-1] + 1}{where}; sort the records"
+        fault, remedy = (
+            (f"{after:.9g} s stands twice,", "remove doubled records")
+            if before == after
+            else (f"{after:.9g} s follows {before:.9g} s", "sort the records")
         )
-
-
-def _refuse_outside(time: Tensor, first: Tensor, last: Tensor) -> None:
-    """Raise ValueError if pulses lie beyond the record."""
-    slack = _ROUNDING * time.diff().median(-1).values
+        raise ValueError(f"times of a navigation record must rise, but {fault} at record {at[-1] + 1}{where}; {remedy}")
+    slack = 1e-6 * time.diff().median(-1).values
     for beyond, end, edge in (
         (time[..., 0] - first, "before the first", 0),
         (last - time[..., -1], "after the last", -1),
@@ -110,23 +91,26 @@ def _refuse_outside(time: Tensor, first: Tensor, last: Tensor) -> None:
         bad = beyond > slack
         if bool(bad.any()):
             at, where = _first(bad[..., None])
-            edges = time[..., edge].expand(bad.shape)
             raise ValueError(
                 f"pulses must lie within the navigation record, but one is {float(beyond[at[:-1]]):.3g} s {end} record "
-                f"at {float(edges[at[:-1]]):.9g} s{where}; use a longer record or fewer pulses"
+                f"at {float(time[..., edge].expand(bad.shape)[at[:-1]]):.9g} s{where}; use a longer record or fewer "
+                "pulses"
             )
 
 
 def _refuse_gaps(time: Tensor, first: Tensor, last: Tensor, longest_gap_s: float | None) -> None:
-    """Raise ValueError if an interval among the pulses is too long."""
+    """Raise ValueError if an interval among the pulses is too long.
+
+    By choice, that is ten median intervals, and five times what 95 % do not exceed: the longest of
+    1000 random intervals is about ten times the median.
+    """
     step = time.diff()
     if longest_gap_s is None:
-        usual = step.kthvalue(math.ceil(_SHARE * step.shape[-1]), -1, keepdim=True).values
-        longest = torch.maximum(_GAP * step.median(-1, keepdim=True).values, _USUAL * usual)
+        usual = step.kthvalue(math.ceil(0.95 * step.shape[-1]), -1, keepdim=True).values
+        longest = torch.maximum(10 * step.median(-1, keepdim=True).values, 5 * usual)
     else:
         longest = torch.as_tensor(longest_gap_s, dtype=torch.float64)
-    among = (time[..., 1:] > first[..., None]) & (time[..., :-1] < last[..., None])
-    bad = (step > longest) & among
+    bad = (step > longest) & (time[..., 1:] > first[..., None]) & (time[..., :-1] < last[..., None])
     if bool(bad.any()):
         at, where = _first(bad)
         gap, limit, start = (float(x.expand(bad.shape)[at]) for x in (step, longest, time[..., :-1]))
@@ -146,18 +130,22 @@ def _refuse_jumps(time: Tensor, position: Tensor, first: Tensor, last: Tensor, j
     # the weights have a sum of zero; without the common offset nothing is rounded
     offset = position.unfold(-2, 5, 1) - position[..., 2:-2, :, None]  # (..., window, 3, 5)
     residual = torch.linalg.vector_norm((offset * weight[..., None, :]).sum(-1), dim=-1)
-    limit = torch.maximum(_OF_GUST * _GUST_M_S2 * mean_step.square(), mean_step.new_tensor(_OF_JUMP * jump_m))
-    # what is left of smooth motion grows with the fourth power of the interval
+    # Normalised fourth differences at equal steps: 3 / sqrt(70) of a jump of 1 in the middle, and
+    # h^2 / 12 of an acceleration that sets in between two records, by choice about that of gravity.
+    of_jump = 0.36
+    limit = torch.maximum(10.0 / 12 * mean_step.square(), mean_step.new_tensor(of_jump * jump_m))
+    # What is left of smooth motion grows with the fourth power of the interval. By choice a jump
+    # exceeds the median of the residuals ten times; normal noise has up to 4.
     longer = (mean_step / mean_step.median(-1, keepdim=True).values).clamp_min(1) ** 4
-    limit = torch.maximum(limit, _ABOVE_MEDIAN * longer * residual.median(-1, keepdim=True).values)
+    limit = torch.maximum(limit, 10 * longer * residual.median(-1, keepdim=True).values)
     bad = (residual > limit) & (t[..., -1] > first[..., None]) & (t[..., 0] < last[..., None])
     if bool(bad.any()):
         # the middle of the window that it disturbs most
         at, where = _first(bad & (residual == torch.where(bad, residual, 0).amax(-1, keepdim=True)))
         size, most, when = (float(x.expand(bad.shape)[at]) for x in (residual, limit, t[..., 2]))
         raise ValueError(
-            f"the navigation record has a jump of about {size / _OF_JUMP:.3g} m near {when:.9g} s{where}, where up to "
-            f"{most / _OF_JUMP:.3g} m are accepted; correct the record, or give jump_m"
+            f"the navigation record has a jump of about {size / of_jump:.3g} m near {when:.9g} s{where}, where up to "
+            f"{most / of_jump:.3g} m are accepted; correct the record, or give jump_m"
         )
 
 

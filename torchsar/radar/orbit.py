@@ -1,10 +1,14 @@
-"""Two-body orbits of a transmitter, points on the rotating Earth, and the range between them."""
+"""Two-body orbits of a transmitter, points on the rotating Earth, and the range between them.
+
+`Ephemeris` describes an orbit and a line of sight as a config gives them.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,8 +19,6 @@ from torchsar.core import per_trial
 EARTH_RADIUS_M = 6_378_137.0  # equatorial radius of WGS 84
 EARTH_GRAVITY_M3_S2 = 3.986004418e14  # GM of WGS 84
 EARTH_RATE_RAD_S = 7.2921159e-5  # one rotation in a sidereal day of 86164.09 s
-# Seven steps reach 1e-15 rad at eccentricity 0.9; a fixed count serves all trials alike.
-_NEWTON_STEPS = 30
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def _radians(degrees: Tensor | float, like: Tensor) -> Tensor:
     return per_trial(degrees, 1, like) * (math.pi / 180)
 
 
-def eccentric_anomaly(mean_rad: Tensor, eccentricity: Tensor) -> Tensor:
+def eccentric_anomaly(mean_rad: Tensor, eccentricity: Tensor, steps: int = 30) -> Tensor:
     """Solve Kepler's equation E - e sin E = M by Newton's method.
 
     Autograd differentiates only the last Newton step, whose gradient at the solution is that of E.
@@ -117,32 +119,21 @@ def eccentric_anomaly(mean_rad: Tensor, eccentricity: Tensor) -> Tensor:
     Args:
         mean_rad: Mean anomaly M in radians.
         eccentricity: Eccentricity e; broadcasts with `mean_rad`.
+        steps: Number of steps, a fixed one for all trials. Seven reach 1e-15 rad at eccentricity
+            0.9.
 
     Returns:
         Eccentric anomaly E in radians.
     """
+
+    def stepped(e: Tensor) -> Tensor:
+        return e - (e - eccentricity * torch.sin(e) - mean_rad) / (1 - eccentricity * torch.cos(e))
+
     with torch.no_grad():
         solution = mean_rad + eccentricity * torch.sin(mean_rad)
-        for _ in range(_NEWTON_STEPS):
-            solution = _newton(solution, mean_rad, eccentricity)
-    return _newton(solution, mean_rad, eccentricity)
-
-
-def _newton(anomaly: Tensor, mean_rad: Tensor, eccentricity: Tensor) -> Tensor:
-    """Take one Newton step on Kepler's equation."""
-    return anomaly - (anomaly - eccentricity * torch.sin(anomaly) - mean_rad) / (1 - eccentricity * torch.cos(anomaly))
-
-
-def gravity_m_s2(position_m: Tensor) -> Tensor:
-    """Return the gravitational acceleration in m/s^2 at positions (..., 3) in metres.
-
-    Args:
-        position_m: Positions in metres from the centre of the Earth, shape (..., 3).
-
-    Returns:
-        Acceleration in m/s^2, shape (..., 3).
-    """
-    return -EARTH_GRAVITY_M3_S2 * position_m / torch.linalg.vector_norm(position_m, dim=-1, keepdim=True) ** 3
+        for _ in range(steps):
+            solution = stepped(solution)
+    return stepped(solution)
 
 
 def turned_with_earth(point_m: Tensor, time_s: Tensor) -> Tensor:
@@ -209,17 +200,13 @@ def seen_point(
     height = torch.linalg.vector_norm(position_m, dim=-1, keepdim=True)
     inside = EARTH_RADIUS_M**2 - (height * torch.sin(tilt)).square()
     if not bool((inside.detach() > 0).all()):
+        highest = float(height.detach().max())
         raise ValueError(
             f"a line of sight {off_nadir_deg} degrees off nadir misses the Earth; stay below "
-            f"{_horizon_deg(height):.4g} degrees for a satellite {float(height.detach().max()) / 1e3:g} km from the "
-            "centre of the Earth"
+            f"{math.degrees(math.asin(EARTH_RADIUS_M / highest)):.4g} degrees for a satellite {highest / 1e3:g} km "
+            "from the centre of the Earth"
         )
     return position_m + (height * torch.cos(tilt) - torch.sqrt(inside)) * look
-
-
-def _horizon_deg(height_m: Tensor) -> float:
-    """Return the off-nadir angle of the horizon in degrees."""
-    return math.degrees(math.asin(EARTH_RADIUS_M / float(height_m.detach().max())))
 
 
 def power_series(series: Sequence[Tensor], power: float) -> list[Tensor]:
@@ -335,3 +322,60 @@ def orbit_range(orbit: Orbit, point_m: Tensor, epoch_s: Tensor | float, time_s: 
     now = orbit.state(epoch + time_s)[0] - turned_with_earth(point_m, time_s)
     lengths = torch.linalg.vector_norm(now, dim=-1) + torch.linalg.vector_norm(start, dim=-1)
     return ((now - start) * (now + start)).sum(-1) / lengths
+
+
+@dataclass(frozen=True)
+class Ephemeris:
+    """Orbit of a transmitter over a rotating spherical Earth, and its line of sight to the scene.
+
+    Args:
+        height_m: Semi-major axis minus the radius of the Earth, in metres; the height of the orbit
+            where the eccentricity is 0.
+        eccentricity: Eccentricity of the orbit, 0 to 0.9.
+        inclination_deg: Inclination in degrees.
+        raan_deg: Right ascension of the ascending node in degrees.
+        argument_of_perigee_deg: Argument of perigee in degrees.
+        mean_anomaly_deg: Mean anomaly at the epoch of the orbit, in degrees.
+        off_nadir_deg: Angle between the line of sight and the nadir in degrees.
+        squint_deg: Rotation of the line of sight about the nadir in degrees; 0 is across the track,
+            90 is ahead.
+        side: Side of the track to which the transmitter looks.
+        time_s: Time in seconds from the epoch of the orbit to slow time zero.
+        order: Number of coefficients k1, k2, ... of the range polynomial from the transmitter to
+            the scene, 1 to 6.
+
+    Raises:
+        ValueError: If the height is not positive, or the eccentricity or the order is out of range.
+    """
+
+    height_m: float = 36_500e3
+    eccentricity: float = 0.0
+    inclination_deg: float = 60.0
+    raan_deg: float = 195.5
+    argument_of_perigee_deg: float = 270.0
+    mean_anomaly_deg: float = 0.0
+    off_nadir_deg: float = 7.0
+    squint_deg: float = 0.0
+    side: Literal["right", "left"] = "right"
+    time_s: float = 0.0
+    order: int = 4
+
+    def __post_init__(self) -> None:
+        if not self.height_m > 0 or not 0 <= self.eccentricity <= 0.9 or not 1 <= self.order <= 6:
+            raise ValueError(
+                "an orbit needs a positive height_m, an eccentricity of 0 to 0.9 and an order of 1 to 6, got "
+                f"height_m={self.height_m}, eccentricity={self.eccentricity} and order={self.order}"
+            )
+
+    def transmit_coefficients(self) -> tuple[float, ...]:
+        """Compute the coefficients of the range from the satellite to the point that it looks at.
+
+        Returns:
+            Coefficients k1, k2, ... in m/s, m/s^2, ... of the change of range k1 t + k2 t^2 + ...
+            with the slow time t.
+        """
+        names = ("eccentricity", "inclination_deg", "raan_deg", "argument_of_perigee_deg", "mean_anomaly_deg")
+        orbit = Orbit.at_height(self.height_m, **{name: getattr(self, name) for name in names})
+        time_s, side = torch.tensor([self.time_s], dtype=torch.float64), 1.0 if self.side == "right" else -1.0
+        point = seen_point(*orbit.state(time_s), self.off_nadir_deg, self.squint_deg, side)
+        return tuple(range_coefficients(orbit, point, time_s, self.order)[0].tolist())

@@ -1,4 +1,4 @@
-"""Geometry of spotlight and turntable recordings, and the error of the plane-wave approximation.
+"""Geometry of spotlight and turntable recordings, exact and for plane waves.
 
 Ground points have coordinates x, y, z in metres about the scene centre. A scatterer at the range r
 relative to that centre (r grows away from the radar) has the phase -4 pi f r / c at the frequency
@@ -9,16 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from torchsar.core import centred_fft, centred_ifft, checked_samples
-from torchsar.radar.stripmap import LIGHT_M_S
-
-# Largest relative error of a frequency step: stored frequencies are rounded, by 6e-4 of a step in
-# the GOTCHA recording; 1 % of a step still rejects a missing or repeated frequency.
-_STEP_TOLERANCE = 0.01
+from torchsar.radar.instrument import LIGHT_M_S
 
 
 def range_profiles(samples: Tensor) -> Tensor:
@@ -75,9 +72,10 @@ def frequency_step_hz(frequency_hz: Tensor) -> float:
         raise ValueError(
             f"frequency_hz must be two or more positive numbers (n,), got {f.dtype} of shape {tuple(f.shape)}"
         )
-    step = float(f[-1] - f[0]) / (f.shape[0] - 1)
-    steps = f.diff()
-    if not (step > 0 and float((steps - step).abs().max()) <= _STEP_TOLERANCE * step):
+    step, steps = float(f[-1] - f[0]) / (f.shape[0] - 1), f.diff()
+    # stored frequencies are rounded, by 6e-4 of a step in the GOTCHA recording; 1 % of a step still
+    # rejects a missing or repeated frequency
+    if not (step > 0 and float((steps - step).abs().max()) <= 0.01 * step):
         raise ValueError(
             f"frequency_hz must rise in equal steps, got steps of {float(steps.min()):g} to "
             f"{float(steps.max()):g} Hz; sort or resample the frequencies"
@@ -86,11 +84,53 @@ def frequency_step_hz(frequency_hz: Tensor) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class FarField:
+class _Geometry:
+    """Base class of geometries: frequencies, and a vector and a range for each pulse.
+
+    Subclasses name the fields of the vectors (pulse, 2 or 3) and of the ranges (pulse,) in
+    `_names`, and give the length of a vector.
+    """
+
+    frequency_hz: Tensor
+    _names: ClassVar[tuple[str, str]]
+    _dims: ClassVar[int]
+
+    def __post_init__(self) -> None:
+        frequency_step_hz(self.frequency_hz)
+        vectors, ranges = (tuple(getattr(self, name).shape) for name in self._names)
+        if vectors != (*ranges, self._dims) or len(ranges) != 1:
+            raise ValueError(
+                f"{self._names[0]} must have the shape (pulse, {self._dims}) and {self._names[1]} the shape (pulse,), "
+                f"got {vectors} and {ranges}"
+            )
+
+    @property
+    def pulses(self) -> int:
+        """Number of pulses."""
+        return getattr(self, self._names[0]).shape[0]
+
+    def turned(self, angle_rad: float) -> Self:
+        """Return the same geometry in ground coordinates that are turned about the scene centre.
+
+        Args:
+            angle_rad: Angle in radians by which the new x axis is turned towards the old y axis.
+        """
+        vectors, (cos, sin) = getattr(self, self._names[0]), (math.cos(angle_rad), math.sin(angle_rad))
+        turn = vectors.new_tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])[: self._dims, : self._dims]
+        return replace(self, **{self._names[0]: vectors @ turn})
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the same geometry with its tensors on another device."""
+        names = ("frequency_hz", *self._names)
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+
+
+@dataclass(frozen=True, eq=False)
+class FarField(_Geometry):
     """Plane-wave geometry: the range of a ground point (x, y) is direction . (x, y) + offset.
 
     The curvature of the wavefront is neglected. `Spotlight.neglected_range_m` gives the resulting
-    range error, `plane_wave_loss` bounds its effect on the image.
+    range error.
 
     Args:
         frequency_hz: Frequencies in Hz, float64 (n,), rising in equal steps.
@@ -104,18 +144,10 @@ class FarField:
         ValueError: If the frequencies are not rising in equal steps, or the shapes do not match.
     """
 
-    frequency_hz: Tensor
     direction: Tensor
     offset_m: Tensor
     wave_speed_m_s: float = LIGHT_M_S
-
-    def __post_init__(self) -> None:
-        frequency_step_hz(self.frequency_hz)
-        if self.direction.ndim != 2 or self.direction.shape[-1] != 2 or self.offset_m.shape != self.direction.shape[:1]:
-            raise ValueError(
-                "direction must have the shape (pulse, 2) and offset_m the shape (pulse,), got "
-                f"{tuple(self.direction.shape)} and {tuple(self.offset_m.shape)}"
-            )
+    _names, _dims = ("direction", "offset_m"), 2
 
     @classmethod
     def turntable(cls, frequency_hz: Tensor, angle_rad: Tensor, wave_speed_m_s: float = LIGHT_M_S) -> FarField:
@@ -137,30 +169,6 @@ class FarField:
             wave_speed_m_s,
         )
 
-    def turned(self, angle_rad: float) -> FarField:
-        """Return the same geometry in ground coordinates that are turned about the scene centre.
-
-        Args:
-            angle_rad: Angle in radians by which the new x axis is turned towards the old y axis.
-        """
-        cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-        turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64, device=self.direction.device)
-        return replace(self, direction=self.direction @ turn)
-
-    def to(self, device: torch.device | str) -> FarField:
-        """Return the same plane-wave geometry with its tensors on another device."""
-        return replace(
-            self,
-            frequency_hz=self.frequency_hz.to(device),
-            direction=self.direction.to(device),
-            offset_m=self.offset_m.to(device),
-        )
-
-    @property
-    def pulses(self) -> int:
-        """Number of pulses."""
-        return self.direction.shape[0]
-
     def range_m(self, pulses: slice, x: Tensor, y: Tensor) -> Tensor:
         """Return the range of ground points in given pulses.
 
@@ -179,7 +187,7 @@ class FarField:
 
 
 @dataclass(frozen=True, eq=False)
-class Spotlight:
+class Spotlight(_Geometry):
     """Spotlight geometry: antenna positions about the scene centre, and reference ranges.
 
     In a range profile the point p lies at the range |position - p| - reference.
@@ -196,49 +204,11 @@ class Spotlight:
         ValueError: If the frequencies are not rising in equal steps, or the shapes do not match.
     """
 
-    frequency_hz: Tensor
     position_m: Tensor
     reference_m: Tensor
     height_m: float = 0.0
     wave_speed_m_s: float = LIGHT_M_S
-
-    def __post_init__(self) -> None:
-        frequency_step_hz(self.frequency_hz)
-        if (
-            self.position_m.ndim != 2
-            or self.position_m.shape[-1] != 3
-            or self.reference_m.shape != self.position_m.shape[:1]
-        ):
-            raise ValueError(
-                "position_m must have the shape (pulse, 3) and reference_m the shape (pulse,), got "
-                f"{tuple(self.position_m.shape)} and {tuple(self.reference_m.shape)}"
-            )
-
-    def turned(self, angle_rad: float) -> Spotlight:
-        """Return the same geometry in ground coordinates that are turned about the scene centre.
-
-        Args:
-            angle_rad: Angle in radians by which the new x axis is turned towards the old y axis.
-        """
-        cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-        turn = torch.tensor(
-            [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=torch.float64, device=self.position_m.device
-        )
-        return replace(self, position_m=self.position_m @ turn)
-
-    def to(self, device: torch.device | str) -> Spotlight:
-        """Return the same spotlight geometry with its tensors on another device."""
-        return replace(
-            self,
-            frequency_hz=self.frequency_hz.to(device),
-            position_m=self.position_m.to(device),
-            reference_m=self.reference_m.to(device),
-        )
-
-    @property
-    def pulses(self) -> int:
-        """Number of pulses."""
-        return self.position_m.shape[0]
+    _names, _dims = ("position_m", "reference_m"), 3
 
     def range_m(self, pulses: slice, x: Tensor, y: Tensor) -> Tensor:
         """Return the range of ground points in given pulses.
@@ -304,70 +274,6 @@ class Spotlight:
         waves = self.far_field()
         fit = torch.linalg.lstsq(waves.direction, self.neglected_range_m(x, y)).solution
         return x + fit[0], y + fit[1]
-
-
-@dataclass(frozen=True)
-class PlaneWaveLoss:
-    """Displacement and defocus of a point that the plane-wave approximation causes.
-
-    Args:
-        total_rad: Phase in radians of the range that the approximation neglects. All of it except
-            `defocus_rad` only displaces the point.
-        displacement_m: Largest displacement on the ground in metres, in range or in cross range.
-        defocus_rad: Phase error at the ends of the aperture, in radians, that remains after the
-            displacement.
-    """
-
-    total_rad: float
-    displacement_m: float
-    defocus_rad: float
-
-
-def plane_wave_loss(
-    radius_m: float, range_m: float, aperture_rad: float, wavelength_m: float, elevation_rad: float = 0.0
-) -> PlaneWaveLoss:
-    """Bound the displacement and defocus of a ground point by the plane-wave approximation.
-
-    With the elevation el of the line of sight and the azimuth a of the point relative to the line
-    of sight, the neglected range is d(a) = (rho^2 - (rho cos(el) cos(a))^2) / (2 R). Its mean over
-    the aperture displaces the point in range, its slope in cross range.
-
-    A displacement changes the range by terms in cos(a) and sin(a), for which the second derivative
-    plus the function is zero. The defocus therefore follows from d'' + d, which is at most
-    rho^2 (1 + cos(el)^2) / (2 R). At the ends of an aperture A it leaves the range error
-    (d'' + d) (A / 2)^2 / 2, whose phase is `defocus_rad`.
-
-    The bounds hold for apertures below about 1 rad, and leave out terms of order rho^3 / R^2.
-
-    Args:
-        radius_m: Distance rho of the point from the scene centre in metres.
-        range_m: Range R of the scene centre in metres.
-        aperture_rad: Azimuth aperture in radians.
-        wavelength_m: Wavelength in metres.
-        elevation_rad: Elevation of the line of sight in radians.
-
-    Returns:
-        Upper bounds of the phase of the neglected range, of the displacement and of the defocus.
-
-    Raises:
-        ValueError: If an argument is out of range.
-    """
-    if not (
-        0 <= radius_m < range_m
-        and 0 <= aperture_rad <= 2 * math.pi
-        and wavelength_m > 0
-        and abs(elevation_rad) < math.pi / 2
-    ):
-        got = f"{radius_m=}, {range_m=}, {aperture_rad=}, {wavelength_m=}, {elevation_rad=}"
-        raise ValueError(
-            "plane_wave_loss needs 0 <= radius_m < range_m, 0 <= aperture_rad <= 2 pi, wavelength_m > 0 and "
-            f"|elevation_rad| < pi / 2, got {got}"
-        )
-    per_metre = 4 * math.pi / wavelength_m
-    shift = radius_m**2 / (2 * range_m)
-    cos = math.cos(elevation_rad)
-    bend = (1 + cos**2) / 2 * (aperture_rad / 2) ** 2
-    return PlaneWaveLoss(per_metre * shift, shift / cos, per_metre * shift * bend)
 
 
 def geometry_of(

@@ -9,13 +9,12 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, per_trial
+from torchsar.radar.instrument import LIGHT_M_S, Instrument
 from torchsar.radar.waveform import LinearFM
-
-LIGHT_M_S = 299_792_458.0  # speed of light in vacuum, by definition of the metre
 
 
 @dataclass(frozen=True)
-class StripmapRadar:
+class StripmapRadar(Instrument):
     """Stripmap radar on a straight path, described in the slant plane.
 
     The nominal effective velocity also gives images their azimuth axis, x = velocity * slow time.
@@ -50,25 +49,12 @@ class StripmapRadar:
     wave_speed_m_s: float = LIGHT_M_S
 
     def __post_init__(self) -> None:
-        for name in ("carrier_hz", "sampling_hz", "prf_hz", "velocity_m_s", "near_range_m", "wave_speed_m_s"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"radar.{name} must be a positive number, got {getattr(self, name)}")
+        self.refuse_not_positive("sampling_hz", "prf_hz", "velocity_m_s", "near_range_m", "integration_s")
         if self.pointing_doppler_hz is not None and not math.isfinite(self.pointing_doppler_hz):
             raise ValueError(
                 f"radar.pointing_doppler_hz must be a finite number or None, got {self.pointing_doppler_hz}"
             )
-        if self.integration_s is not None and not self.integration_s > 0:
-            raise ValueError(f"radar.integration_s must be a positive number or None, got {self.integration_s}")
-        if self.pulse.bandwidth_hz > self.sampling_hz:
-            raise ValueError(
-                f"pulse bandwidth {self.pulse.bandwidth_hz:g} Hz exceeds the complex sampling rate "
-                f"{self.sampling_hz:g} Hz; sample at least as fast as the bandwidth"
-            )
-
-    @property
-    def wavelength_m(self) -> float:
-        """Carrier wavelength in metres."""
-        return self.wave_speed_m_s / self.carrier_hz
+        self.pulse.refuse_aliased(self.sampling_hz)
 
     @property
     def range_step_m(self) -> float:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsar.radar.instrument import LIGHT_M_S
 from torchsar.radar.orbit import EARTH_RADIUS_M
-from torchsar.radar.stripmap import LIGHT_M_S
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,27 @@ def timing_diagram(
     Reference:
         Remote Sens. 2020, 12, 1703, Fig. 2.
     """
-    _check_arguments(height_m, prf_hz, ground_m, pulse_s, guard_s, nadir_s)
+    if not (height_m > 0 and pulse_s > 0 and guard_s >= 0 and nadir_s >= 0):
+        raise ValueError(
+            "a timing diagram needs height_m and pulse_s above 0, and guard_s and nadir_s of 0 s or more, got "
+            f"height_m={height_m}, pulse_s={pulse_s}, guard_s={guard_s}, nadir_s={nadir_s}"
+        )
+    if prf_hz.numel() == 0:
+        raise ValueError("prf_hz of a timing diagram needs at least one pulse rate, got none")
+    if not bool((prf_hz > 0).all()) or float(prf_hz.max()) * 2 * (pulse_s + guard_s) >= 1:
+        raise ValueError(
+            f"pulses of {pulse_s:g} s with guards of {guard_s:g} s leave nothing of the pulse period for reception at "
+            f"prf_hz of {float(prf_hz.min()):g}..{float(prf_hz.max()):g} Hz; choose lower rates above 0 or a "
+            "shorter pulse"
+        )
+    horizon = EARTH_RADIUS_M * math.acos(EARTH_RADIUS_M / (EARTH_RADIUS_M + height_m))
+    if ground_m.numel() < 2:
+        raise ValueError(f"ground_m of a timing diagram needs at least two positions, got {ground_m.numel()}")
+    if not (float(ground_m.min()) >= 0 and float(ground_m.max()) <= horizon):
+        raise ValueError(
+            f"ground_m must lie from 0 m to the horizon at {horizon:.6g} m, got positions from "
+            f"{float(ground_m.min()):g} to {float(ground_m.max()):g} m"
+        )
     delay, below = 2 / LIGHT_M_S * ground_slant_m(height_m, ground_m), 2 / LIGHT_M_S * height_m
     period = 1 / prf_hz[:, None]
     transmit = _overlaps(delay, period, pulse_s + guard_s, pulse_s + guard_s)
@@ -136,30 +156,3 @@ def off_nadir_ground_m(height_m: float, off_nadir_deg: float) -> float:
             f"height of {height_m / 1e3:g} km to the Earth, got {off_nadir_deg}"
         )
     return EARTH_RADIUS_M * (math.asin(sine) - math.radians(off_nadir_deg))
-
-
-def _check_arguments(
-    height_m: float, prf_hz: Tensor, ground_m: Tensor, pulse_s: float, guard_s: float, nadir_s: float
-) -> None:
-    """Raise ValueError for arguments of `timing_diagram` that are out of range."""
-    if not (height_m > 0 and pulse_s > 0 and guard_s >= 0 and nadir_s >= 0):
-        raise ValueError(
-            "a timing diagram needs height_m and pulse_s above 0, and guard_s and nadir_s of 0 s or more, got "
-            f"height_m={height_m}, pulse_s={pulse_s}, guard_s={guard_s}, nadir_s={nadir_s}"
-        )
-    if prf_hz.numel() == 0:
-        raise ValueError("prf_hz of a timing diagram needs at least one pulse rate, got none")
-    if not bool((prf_hz > 0).all()) or float(prf_hz.max()) * 2 * (pulse_s + guard_s) >= 1:
-        raise ValueError(
-            f"pulses of {pulse_s:g} s with guards of {guard_s:g} s leave nothing of the pulse period for reception at "
-            f"prf_hz of {float(prf_hz.min()):g}..{float(prf_hz.max()):g} Hz; choose lower rates above 0 or a "
-            "shorter pulse"
-        )
-    horizon = EARTH_RADIUS_M * math.acos(EARTH_RADIUS_M / (EARTH_RADIUS_M + height_m))
-    if ground_m.numel() < 2:
-        raise ValueError(f"ground_m of a timing diagram needs at least two positions, got {ground_m.numel()}")
-    if not (float(ground_m.min()) >= 0 and float(ground_m.max()) <= horizon):
-        raise ValueError(
-            f"ground_m must lie from 0 m to the horizon at {horizon:.6g} m, got positions from "
-            f"{float(ground_m.min()):g} to {float(ground_m.max()):g} m"
-        )

@@ -10,11 +10,6 @@ from torch import Tensor
 
 from torchsar.core import unit_phasor
 
-# relative error of the product of duration and sampling rate, below which it is a whole number
-_ROUNDING = 1e-12
-# chosen: fine samples per sample, from which the spectrum of the pulse before sampling is computed
-_FINER = 16
-
 
 @dataclass(frozen=True)
 class LinearFM:
@@ -66,7 +61,8 @@ class LinearFM:
         """
         if not 0 < sampling_hz < math.inf:
             raise ValueError(f"sampling_hz must be positive and finite, got {sampling_hz}")
-        return max(1, math.ceil(self.duration_s * sampling_hz * (1 - _ROUNDING)))
+        # a product that is above a whole number by rounding is that number
+        return max(1, math.ceil(self.duration_s * sampling_hz * (1 - 1e-12)))
 
     def samples(
         self, sampling_hz: float, dtype: torch.dtype = torch.complex128, device: torch.device | str | None = None
@@ -84,6 +80,14 @@ class LinearFM:
         n = self.n_samples(sampling_hz)
         t = torch.arange(n, dtype=torch.float64, device=device) / sampling_hz - self.duration_s / 2
         return unit_phasor(0.5 * self.rate_hz_s * t.square(), dtype)
+
+    def refuse_aliased(self, sampling_hz: float) -> None:
+        """Raise ValueError if the bandwidth exceeds a complex sampling rate in Hz."""
+        if self.bandwidth_hz > sampling_hz:
+            raise ValueError(
+                f"pulse bandwidth {self.bandwidth_hz:g} Hz exceeds the complex sampling rate "
+                f"{sampling_hz:g} Hz; sample at least as fast as the bandwidth"
+            )
 
     def _refuse_short(self, n: int, sampling_hz: float) -> None:
         """Raise ValueError for range lines that are shorter than the pulse."""
@@ -131,12 +135,13 @@ class LinearFM:
             ValueError: If a range line of n samples is shorter than the pulse.
         """
         self._refuse_short(n, sampling_hz)
-        rate, duration = _FINER * sampling_hz, self.duration_s
-        t = torch.arange(math.ceil(duration * rate * (1 - _ROUNDING)) + 1, dtype=torch.float64, device=device) / rate
+        finer, duration = 16, self.duration_s  # chosen: fine samples per sample, from which the spectrum is computed
+        rate = finer * sampling_hz
+        t = torch.arange(math.ceil(duration * rate * (1 - 1e-12)) + 1, dtype=torch.float64, device=device) / rate
         # each fine sample stands for the part of the pulse within half a step of it
         inside = (t + 0.5 / rate).clamp(max=duration) - (t - 0.5 / rate).clamp(min=0)
         fine = unit_phasor(0.5 * self.rate_hz_s * (t - duration / 2).square(), torch.complex128) * inside.clamp(min=0)
-        whole = torch.fft.fft(fine, _FINER * n) * sampling_hz
+        whole = torch.fft.fft(fine, finer * n) * sampling_hz
         band = torch.cat([whole[: n - n // 2], whole[whole.numel() - n // 2 :]])
         # the averaging over a step attenuates the edges of the band
-        return band / torch.sinc(torch.fft.fftfreq(n, dtype=torch.float64, device=device) / _FINER)
+        return band / torch.sinc(torch.fft.fftfreq(n, dtype=torch.float64, device=device) / finer)

@@ -26,7 +26,8 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, unit_phasor
 from torchsar.focus.nufft import smooth_length
-from torchsar.multichannel.motion import PointMotion, checked_channels
+from torchsar.multichannel.channels import checked_channels
+from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture, Kept, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.model import (
@@ -57,7 +58,8 @@ def along_track_velocity(
     """Estimate the along-track speed u_a of a point of known slant-range speed and position.
 
     >>> import torch
-    >>> from torchsar.multichannel import Dwell, PointMotion, along_track_velocity
+    >>> from torchsar.multichannel import Dwell, PointMotion
+    >>> from torchsar.multichannel.velocity.along_track import along_track_velocity
     >>> from torchsar.radar import BistaticRadar, LinearFM
     >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
     >>> data = torch.zeros(3, 90, dtype=torch.complex64)

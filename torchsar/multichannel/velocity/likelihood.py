@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import take
-from torchsar.multichannel.motion import PointMotion, checked_channels
+from torchsar.multichannel.channels import checked_channels
+from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.model import (
     TINY,

@@ -19,14 +19,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Outcome, Signal, Stage, take
+from torchsar.core import Estimate, Outcome, Signal, take
+from torchsar.multichannel.channels import ChannelStage
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import (
     LeastSquares,
     Rebuild,
     check_condition,
     doppler_offsets,
-    reconstruct_lines,
+    reconstruct,
     refuse_channels,
 )
 from torchsar.multichannel.velocity.along_track import interfered
@@ -35,13 +36,6 @@ from torchsar.multichannel.velocity.assess import outcome_of_point
 from torchsar.multichannel.velocity.model import TINY
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
-
-_TOLERANCE_M_S = 1e-4  # of the maximum, well below the 0.06 m/s of error without noise
-# Half steps of the derivatives for the standard deviation: the first, and the limits of the second.
-# Found by trial: with a fixed half step of 0.5 m/s, errors are 0.6, 0.75 and 1.0 of the prediction
-# at 10, 13 and 17 dB per sample; with 1 m/s they are 1.0, 1.2 and 1.8.
-_FIRST_M_S, _CURVE_M_S = 0.75, (0.4, 1.5)
-_GROUPS = 16  # of the jackknife: 8 and 32 groups give the same standard deviation within 6 %
 
 
 @dataclass(frozen=True)
@@ -57,13 +51,6 @@ class Intensity:
     energy: Tensor
     amplitude: Tensor
     bins: tuple[int, int]
-
-    def summed(self, weight: Tensor) -> Intensity:
-        """Return weighted sums over the last dimension, with weights (last, group).
-
-        The energies and amplitudes of the result have the shape (2, ..., group).
-        """
-        return Intensity(self.energy @ weight, self.amplitude @ weight, self.bins)
 
     @property
     def power_ratio(self) -> Tensor:
@@ -85,7 +72,12 @@ class Intensity:
 
 
 def signal_intensity(
-    data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float
+    data: Tensor,
+    radar: BistaticRadar,
+    motion: PointMotion,
+    rebuild: Rebuild,
+    bandwidth_hz: float,
+    groups: int | None = None,
 ) -> Intensity:
     """Return energies and amplitudes inside and outside the Doppler band of a motion.
 
@@ -99,30 +91,27 @@ def signal_intensity(
         motion: Motion assumed, shape (...,).
         rebuild: Reconstruction method.
         bandwidth_hz: Processed Doppler bandwidth in Hz.
+        groups: Number of interleaved groups of alias frequencies, each of which is left out once
+            for a jackknife; None for the sums over all frequencies.
 
     Returns:
-        Energies and summed amplitudes of shape (2, ...).
+        Energies and summed amplitudes of shape (2, ...), or (2, ..., group) without each group.
 
     Raises:
         ValueError: If the reconstructed band does not exceed `bandwidth_hz`, or there are fewer
             channels than the reconstruction needs.
     """
-    bins = _intensity_of_bins(data, radar, motion, rebuild, bandwidth_hz)
-    return Intensity(bins.energy.sum(-1), bins.amplitude.sum(-1), bins.bins)
-
-
-def _intensity_of_bins(
-    data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float
-) -> Intensity:
-    """Return the intensities of each alias frequency, (2, ..., pulse); see `signal_intensity`."""
     refuse_full_band(radar, rebuild, bandwidth_hz)
     n = data.shape[-2]
-    spectrum = reconstruct_lines(data, radar, motion, rebuild)
+    amplitude = reconstruct(data, radar, motion, rebuild, with_range=True).abs().to(torch.float64)
     inside = doppler_offsets(n, rebuild.bands, radar.prf_hz, data.device).abs() <= bandwidth_hz / 2
-    amplitude = spectrum.abs().to(torch.float64)
     lines = [line.sum(-1).unflatten(-1, (rebuild.bands, n)) for line in (amplitude.square(), amplitude)]
     masks = [mask.view(rebuild.bands, n) for mask in (inside, ~inside)]
-    energy, total = (torch.stack([(line * mask).sum(-2) for mask in masks]) for line in lines)
+    sums = [torch.stack([(line * mask).sum(-2) for mask in masks]) for line in lines]
+    if groups is not None:
+        group = torch.arange(n, device=data.device)[:, None] % groups
+        kept = (group != torch.arange(groups, device=data.device)).to(torch.float64)
+    energy, total = (x.sum(-1) if groups is None else x @ kept for x in sums)
     samples = int(inside.sum()) * data.shape[-1]
     return Intensity(energy, total, (samples, inside.numel() * data.shape[-1] - samples))
 
@@ -144,7 +133,7 @@ def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float
         )
 
 
-class SignalIntensityRatio(Stage):
+class SignalIntensityRatio(ChannelStage):
     """Stage that estimates the slant-range speed u_r by the signal intensity ratio Gamma.
 
     A spectrum that is reconstructed with the right speed concentrates in the processed Doppler
@@ -179,8 +168,6 @@ class SignalIntensityRatio(Stage):
         Remote Sens. 2020, 12, 1703, Eqs. (37)-(39).
     """
 
-    works_on = ("channel", "pulse")
-    also_on = (("channel", "pulse", "range"),)
     provides = ("u_r_m_s",)
     neutral = {"u_r_m_s": 0.0}
     takes_empty = False
@@ -197,14 +184,9 @@ class SignalIntensityRatio(Stage):
         *,
         assess: bool = True,
     ) -> None:
-        super().__init__()
+        super().__init__(radar)
         half = radar.ambiguous_velocity_m_s / 2
-        self.radar, self.bandwidth_hz, self.rebuild, self.range_m = (
-            radar,
-            bandwidth_hz,
-            rebuild or LeastSquares(3),
-            range_m,
-        )
+        self.bandwidth_hz, self.rebuild, self.range_m = bandwidth_hz, rebuild or LeastSquares(3), range_m
         self.search_m_s, self.step_m_s, self.least_quality = search_m_s or (-half, half), step_m_s, least_quality
         self.bounded, self.assess = search_m_s is not None, assess
         low, high = self.search_m_s
@@ -242,32 +224,32 @@ class SignalIntensityRatio(Stage):
             ValueError: If the reconstruction is singular.
         """
         lines = signal.data if "range" in signal.names else signal.data[..., None]
-        middle = sum(self.search_m_s) / 2
+        (low, high), middle = self.search_m_s, sum(self.search_m_s) / 2
         start = torch.full(signal.trials, middle, dtype=torch.float64, device=lines.device)
-        check_condition(self.radar, self._motion(lines, start, u_a_m_s, y0_m), self.rebuild, lines.dtype)
 
-        def intensity(u_r_m_s: Tensor, of_bins=_intensity_of_bins) -> Intensity:
-            motion = self._motion(lines, u_r_m_s, u_a_m_s, y0_m)
-            return of_bins(lines, self.radar, motion, self.rebuild, self.bandwidth_hz)
+        def motion(u_r_m_s: Tensor) -> PointMotion:
+            return PointMotion.of(self.radar, lines, u_r_m_s, u_a_m_s, y0_m, self.range_m)
 
-        def cost(u_r_m_s: Tensor) -> Tensor:
-            return -torch.log(intensity(u_r_m_s, signal_intensity).ratio.clamp_min(TINY))
+        def log_ratio(u_r_m_s: Tensor, groups: int | None = None) -> Tensor:
+            found = signal_intensity(lines, self.radar, motion(u_r_m_s), self.rebuild, self.bandwidth_hz, groups)
+            return torch.log(found.ratio.clamp_min(TINY))
 
-        reach = (self.search_m_s[1] - self.search_m_s[0]) / 2
-        coarse, costs = grid_minimum(cost, start, reach, 2 * round(reach / self.step_m_s) + 1)
-        fine, _ = parabola_minimum(cost, coarse, self.step_m_s / 2, _TOLERANCE_M_S)
-        low, high = self.search_m_s
+        check_condition(self.radar, motion(start), self.rebuild, lines.dtype)
+        reach = (high - low) / 2
+        coarse, costs = grid_minimum(lambda u: -log_ratio(u), start, reach, 2 * round(reach / self.step_m_s) + 1)
+        # the tolerance is well below the 0.06 m/s of error without noise
+        fine, _ = parabola_minimum(lambda u: -log_ratio(u), coarse, self.step_m_s / 2, 1e-4)
         has_data = lines.detach().abs().amax((-3, -2, -1)) > 0
         value = torch.where(has_data, fine.clamp(low, high), middle)
         if not self.assess:
             return Estimate({"u_r_m_s": value}, info={"log_ratio": -costs})
         # Systematic error without noise, from echoes beyond the reconstructed bands: 0.035 m/s rms
         # over velocities and positions, up to 0.06 m/s, of lambda PRF = 43 m/s.
-        std = _standard_deviation(intensity, fine, 8e-4 * self.radar.ambiguous_velocity_m_s)
+        std = _standard_deviation(log_ratio, fine, 8e-4 * self.radar.ambiguous_velocity_m_s)
         quality = torch.where(has_data, 1 - torch.exp(costs.amin(-1) - costs.median(-1).values), 0.0).clamp(0, 1)
         ended = (coarse - low).abs().minimum((coarse - high).abs()) <= self.step_m_s / 2
         reasons = [(Outcome.NOISE, ~(quality >= self.least_quality)), (Outcome.OUTSIDE_SEARCH, ended)]
-        std, outcome, info = self._beside_tone(lines, self._motion(lines, value, u_a_m_s, y0_m), std, reasons)
+        std, outcome, info = self._beside_tone(lines, motion(value), std, reasons)
         return Estimate({"u_r_m_s": value}, {"u_r_m_s": std}, quality, outcome, {"log_ratio": -costs, **info})
 
     def _beside_tone(
@@ -287,44 +269,37 @@ class SignalIntensityRatio(Stage):
         # by chance they differ by up to two predicted deviations, by convention
         return torch.where(apart > 2.0 * std, apart, std), outcome, info
 
-    def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
-        """Return the motion with a candidate of u_r."""
-        return PointMotion.of(self.radar, lines, u_r_m_s, u_a_m_s, y0_m, self.range_m)
 
-
-def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor, rest_m_s: float) -> Tensor:
+def _standard_deviation(log_ratio: Callable[[Tensor, int], Tensor], value: Tensor, rest_m_s: float) -> Tensor:
     """Return the jackknife standard deviation (...,) of the maximum of log Gamma.
 
     The noise of log Gamma changes over less than 0.25 m/s, so that its slope depends on the step.
     Slope and curvature are taken over the interval about the maximum in which noise may displace
     it. The systematic error `rest_m_s` is included.
+
+    The half steps were found by trial: with a fixed one of 0.5 m/s, errors are 0.6, 0.75 and 1.0 of
+    the prediction at 10, 13 and 17 dB per sample; with 1 m/s they are 1.0, 1.2 and 1.8. The second
+    is that at which the maximum has fallen by 1.8 standard deviations of the noise of ln Gamma:
+    predictions then hold within 10 % from 10 to 25 dB.
     """
-    step = torch.full_like(value, _FIRST_M_S)
-    spread, bend = _slope_and_bend(intensity, value, step)
+    step = torch.full_like(value, 0.75)
+    spread, bend = _slope_and_bend(log_ratio, value, step)
     noise = math.sqrt(2) * step * spread  # of log Gamma at one speed
-    # The second half step is that at which the maximum has fallen by 1.8 standard deviations of the
-    # noise of ln Gamma. Found by trial: predictions then hold within 10 % from 10 to 25 dB.
     step = torch.where(bend > 0, (2 * 1.8 * noise / torch.where(bend > 0, bend, 1)).sqrt(), math.inf)
-    spread, bend = _slope_and_bend(intensity, value, step.clamp(*_CURVE_M_S))
+    spread, bend = _slope_and_bend(log_ratio, value, step.clamp(0.4, 1.5))
     std = torch.where(bend > 0, spread / torch.where(bend > 0, bend, 1), math.inf)
     return torch.hypot(std, torch.full_like(std, rest_m_s))
 
 
-def _slope_and_bend(intensity: Callable[[Tensor], Intensity], value: Tensor, step_m_s: Tensor) -> tuple[Tensor, Tensor]:
+def _slope_and_bend(
+    log_ratio: Callable[[Tensor, int], Tensor], value: Tensor, step_m_s: Tensor, groups: int = 16
+) -> tuple[Tensor, Tensor]:
     """Return the standard deviation of the slope of log Gamma and its downward curvature, (...,).
 
-    Each of _GROUPS interleaved groups of alias frequencies, whose noise is independent, is left out
-    in turn.
+    Each of the interleaved groups of alias frequencies, whose noise is independent, is left out in
+    turn; 8 and 32 groups give the same standard deviation within 6 %.
     """
-    low, middle, high = (_left_out(intensity(value + sign * step_m_s)) for sign in (-1, 0, 1))
+    low, middle, high = (log_ratio(value + sign * step_m_s, groups) for sign in (-1, 0, 1))
     slope = (high - low) / (2 * step_m_s[..., None])
-    spread = (slope - slope.mean(-1, keepdim=True)).square().sum(-1) * (_GROUPS - 1) / _GROUPS
+    spread = (slope - slope.mean(-1, keepdim=True)).square().sum(-1) * (groups - 1) / groups
     return spread.sqrt(), (2 * middle - low - high).mean(-1) / step_m_s.square()
-
-
-def _left_out(bins: Intensity) -> Tensor:
-    """Return log Gamma (..., group) of all alias frequencies but those of one group."""
-    n = bins.energy.shape[-1]
-    group = torch.arange(n, device=bins.energy.device) % _GROUPS
-    kept = (group[:, None] != torch.arange(_GROUPS, device=group.device)).to(torch.float64)
-    return torch.log(bins.summed(kept).ratio.clamp_min(TINY))

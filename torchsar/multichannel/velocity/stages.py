@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, take, unit_level
-from torchsar.multichannel.motion import Number, PointMotion, checked_channels
-from torchsar.multichannel.reconstruct import refuse_shifted
+from torchsar.multichannel.channels import checked_channels, refuse_shifted
+from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.along_track import along_track_velocity, interferometry
 from torchsar.multichannel.velocity.aperture import Aperture, seen_aperture
 from torchsar.multichannel.velocity.assess import outcome_of_point
@@ -59,7 +59,8 @@ def gradient_likelihood(
     """Estimate the motion of highest likelihood by limited-memory BFGS with autograd gradients.
 
     >>> import torch
-    >>> from torchsar.multichannel import Dwell, PointMotion, gradient_likelihood
+    >>> from torchsar.multichannel import Dwell, PointMotion
+    >>> from torchsar.multichannel.velocity.stages import gradient_likelihood
     >>> from torchsar.radar import BistaticRadar, LinearFM
     >>> radar = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0)
     >>> data = torch.zeros(3, 90, dtype=torch.complex64)

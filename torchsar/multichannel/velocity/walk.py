@@ -10,60 +10,21 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, Signal, Stage, best_of
-from torchsar.multichannel.migration import CorrectMigration, Frame, Keystone, Migration, correct_migration
+from torchsar.multichannel.migration import CorrectMigration, Frame, Keystone, correct_migration
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.model import TINY
 from torchsar.multichannel.velocity.stages import strongest_line
 from torchsar.radar import BistaticRadar
 
-_CONTRAST = 5.0  # least contrast of a line that is not one of noise, by choice
-
-
-def walk_ambiguity(
-    data: Tensor, frame: Frame, reference: PointMotion, most: int = 2, migration: Migration | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the PRF ambiguity number for which the strongest point stays in one range line.
-
-    The range migration is corrected with each number in turn. The criterion is the energy of the
-    strongest range line, which depends neither on phases nor on aliasing in azimuth.
-
-    Args:
-        data: Range-compressed channels with the transmit range removed, shape (..., channel, pulse,
-            range), complex.
-        frame: Radar, slow time and range axis of the data.
-        reference: Motion of the reference point, whose range history is removed, shape (...,).
-        most: Largest magnitude of the ambiguity numbers that are tried.
-        migration: Method of migration correction, `Keystone(whole_swath=False)` by default.
-
-    Returns:
-        Three tensors (...,). First, the ambiguity number, float64. Second, the energy of the
-        strongest range line with this number minus that with the next best number, in standard
-        deviations of the energy of a line of noise. Third, the index of the strongest line.
-    """
-    numbers = torch.arange(-most, most + 1, dtype=torch.float64, device=data.device)
-    migration = migration or Keystone(whole_swath=False)
-    energies = torch.stack(
-        [
-            correct_migration(data, frame, reference, migration, number).abs().to(torch.float64).square().sum((-3, -2))
-            for number in numbers
-        ]
-    )
-    strongest, line = energies.max(-1)
-    best, margin = best_of(-strongest, numbers[(...,) + (None,) * (strongest.ndim - 1)].expand(strongest.shape))
-    # the energies of lines with noise alone, by their median absolute deviation
-    middle = energies[most].median(-1, keepdim=True).values
-    spread = 1.4826 * (energies[most] - middle).abs().median(-1).values
-    noise_std = spread.clamp_min(1e-12 * middle[..., 0]).clamp_min(TINY)
-    return best, margin / noise_std, line.gather(0, (best + most).long()[None])[0]
-
 
 class WalkAmbiguity(Stage):
     """Stage that estimates the PRF ambiguity number of the strongest point from its range walk.
 
-    See `walk_ambiguity`. `CorrectMigration` accepts the estimate as its input `ambiguity`.
+    The range migration is corrected with each number in turn. The criterion is the energy of the
+    strongest range line, which depends neither on phases nor on aliasing in azimuth.
+    `CorrectMigration` accepts the estimate as its input `ambiguity`.
 
     Args:
         radar: Radar parameters.
@@ -105,12 +66,22 @@ class WalkAmbiguity(Stage):
             phases.
         """
         reference = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
-        number, contrast, line = walk_ambiguity(signal.data, Frame.of(self.radar, signal), reference, self.most)
+        frame, migration = Frame.of(self.radar, signal), Keystone(whole_swath=False)
+        numbers = torch.arange(-self.most, self.most + 1, dtype=torch.float64, device=signal.data.device)
+        corrected = (correct_migration(signal.data, frame, reference, migration, number) for number in numbers)
+        energies = torch.stack([x.abs().to(torch.float64).square().sum((-3, -2)) for x in corrected])
+        strongest, line = energies.max(-1)
+        number, margin = best_of(-strongest, numbers[(...,) + (None,) * (strongest.ndim - 1)].expand(strongest.shape))
+        line = line.gather(0, (number + self.most).long()[None])[0]
+        # the energies of lines with noise alone, by their median absolute deviation
+        middle = energies[self.most].median(-1, keepdim=True).values
+        spread = 1.4826 * (energies[self.most] - middle).abs().median(-1).values
+        contrast = margin / spread.clamp_min(1e-12 * middle[..., 0]).clamp_min(TINY)
         info = {"line": line.to(torch.float64), "contrast": contrast}
         if not self.assess:
             return Estimate({"ambiguity": number}, info=info)
-        outcome = Outcome.of(contrast > _CONTRAST, Outcome.NOISE)
-        return Estimate({"ambiguity": number}, {}, contrast / (_CONTRAST + contrast), outcome, info)
+        outcome = Outcome.of(contrast > 5.0, Outcome.NOISE)  # least contrast, by choice
+        return Estimate({"ambiguity": number}, {}, contrast / (5.0 + contrast), outcome, info)
 
 
 class MigratingLines(Stage):

@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import cholesky_factor, matrix_inverse
-from torchsar.multichannel.motion import PointMotion, checked_channels
+from torchsar.multichannel.channels import checked_channels
+from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import shared_response
 from torchsar.radar import BistaticRadar
 

@@ -19,7 +19,8 @@ import torch
 from torchsar import plot
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_bistatic
-from torchsar.multichannel import Body, Detector, Extraction, ImageMovers, PointMotion, RemoveTransmitRange, SceneImage
+from torchsar.multichannel import Detector, Extraction, ImageMovers, PointMotion, RemoveTransmitRange, SceneImage
+from torchsar.multichannel.body import Body
 from torchsar.reproduce.geo.sensor import RADAR as SENSOR
 from torchsar.reproduce.geo.sensor import TRANSMIT_RANGE
 from torchsar.reproduce.item import Check, Item, number, statement

@@ -23,7 +23,6 @@ from torchsar.multichannel import (
     LikelihoodVelocity,
     MigratingLines,
     MinimumMeanSquare,
-    MoversImage,
     MovingPointVelocity,
     NoMigration,
     Reconstruct,
@@ -32,6 +31,7 @@ from torchsar.multichannel import (
     StaticBulk,
     StationaryImage,
 )
+from torchsar.multichannel.scene_image import MoversImage
 from torchsar.radar import BistaticRadar
 
 Unknown = Literal["u_r_m_s", "u_a_m_s", "y0_m"]

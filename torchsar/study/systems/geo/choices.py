@@ -18,31 +18,29 @@ from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_db
 from torchsar.metrics.replicas import azimuth_response
 from torchsar.multichannel import (
+    AlongTrackAutofocus,
     CorrectMigration,
     FlatBand,
     FocusAzimuth,
+    GradientVelocity,
+    Interferometry,
     Keystone,
     LeastSquares,
+    LikelihoodVelocity,
     MinimumMeanSquare,
+    MovingPointVelocity,
     MultichannelUse,
     NoMigration,
     Reconstruct,
     RemoveTransmitRange,
+    SignalIntensityRatio,
     StaticBulk,
     StationaryImage,
-    known_motion_chain,
     multichannel_limits,
     multichannel_requirements,
 )
+from torchsar.multichannel.azimuth import known_motion_chain
 from torchsar.multichannel.requirements import Estimator
-from torchsar.multichannel.velocity import (
-    AlongTrackAutofocus,
-    GradientVelocity,
-    Interferometry,
-    LikelihoodVelocity,
-    MovingPointVelocity,
-    SignalIntensityRatio,
-)
 from torchsar.multichannel.velocity.walk import MigratingLines
 from torchsar.scene import BandLimited, ExactRange, LitPoints, MovingPoints, TaylorRange
 from torchsar.study.systems.geo.judge import FocusedPoint, PeakCuts, point_responses, worst_image_error_db

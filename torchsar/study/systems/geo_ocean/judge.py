@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from torchsar.core import Signal, Trace
-from torchsar.multichannel.body import Extraction, centred_motion, chip_about
+from torchsar.multichannel.body import centred_motion
+from torchsar.multichannel.chip import Extraction, chip_about
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.stationary import StationaryImage

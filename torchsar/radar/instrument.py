@@ -1,0 +1,30 @@
+"""What all instruments share: a carrier, the speed of light, and the check of their parameters."""
+
+from __future__ import annotations
+
+import math
+
+LIGHT_M_S = 299_792_458.0  # speed of light in vacuum, by definition of the metre
+
+
+class Instrument:
+    """Base class of radars and ladars with the fields `carrier_hz` and `wave_speed_m_s`."""
+
+    carrier_hz: float
+    wave_speed_m_s: float
+
+    @property
+    def wavelength_m(self) -> float:
+        """Carrier wavelength in metres."""
+        return self.wave_speed_m_s / self.carrier_hz
+
+    def refuse_not_positive(self, *names: str) -> None:
+        """Raise ValueError unless the carrier, the wave speed and further fields are positive.
+
+        Args:
+            *names: Names of fields that hold numbers, or None where they have no value.
+        """
+        for name in ("carrier_hz", "wave_speed_m_s", *names):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"radar.{name} must be a positive number, got {value}")
