@@ -28,7 +28,6 @@ if TYPE_CHECKING:
         Trace,
         Truth,
         use,
-        validate,
     )
     from torchsar.study.memory import keep_freed_memory
 
@@ -59,7 +58,6 @@ __all__ = [
     "repair",
     "scene",
     "use",
-    "validate",
 ]
 
 

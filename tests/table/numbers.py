@@ -39,8 +39,6 @@ REASONS: dict[str, str] = {
     "core.host_value": "reads one number",
     "core.host_values": "reads numbers",
     "core.true_positions": "index arithmetic that callers inside the package have checked",
-    "core.validate": "takes the name of a mode; tests/core/test_validate.py",
-    "core.validation": "takes no arguments",
     "core.check_value": "reads numbers; tests/core/test_host.py",
     "core.gathered_checks": "takes no arguments; tests/core/test_host.py",
     "core.is_traced": "whether a tensor has values, whatever they are; tests/core/test_host.py",

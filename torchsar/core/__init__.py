@@ -27,7 +27,6 @@ from torchsar.core.fft import (
     transform_in_blocks,
 )
 from torchsar.core.host import (
-    Validation,
     check_value,
     device_fault,
     gathered_checks,
@@ -37,8 +36,6 @@ from torchsar.core.host import (
     is_out_of_memory,
     is_traced,
     untraced,
-    validate,
-    validation,
 )
 from torchsar.core.linear import cholesky_factor, linear_solve, matrix_inverse
 from torchsar.core.outcome import Outcome, counts, worst
@@ -79,7 +76,6 @@ __all__ = [
     "UnevenSpline",
     "UniformSpline",
     "Use",
-    "Validation",
     "best_of",
     "block_bytes_of",
     "centred_fft",
@@ -124,8 +120,6 @@ __all__ = [
     "unit_phasor",
     "untraced",
     "use",
-    "validate",
-    "validation",
     "worst",
     "wrapped",
 ]

@@ -401,7 +401,6 @@ class Chain(Shown, nn.Module):
             )
         return part, known
 
-    @gathered_checks()
     def _run(self, names: list[str], signal: Signal, known: _Known, log: _Log | None = None) -> Signal:
         timed = log is not None and not torch.compiler.is_dynamo_compiling()
         for name in names:
@@ -411,7 +410,7 @@ class Chain(Shown, nn.Module):
             entered, began = signal, time.perf_counter() if timed else 0.0
             arguments, origins = self._arguments(name, known, required=not held)
             if not held:
-                with gathered_checks(f"stage {name!r}"):
+                with gathered_checks():
                     signal = self._step(name, stage, signal, arguments, known, origins)
             if log is not None:
                 if timed:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core.host import check_value, flat_index, validation
+from torchsar.core.host import check_value
 
 _COMPLEX = (torch.complex64, torch.complex128)
 _REAL = (torch.float32, torch.float64)
@@ -34,29 +34,17 @@ def refuse_non_finite(
     """
     # a lazily conjugated tensor has no real view; signs do not matter here
     x = x.detach().resolve_conj()
-    shape = x.shape
 
-    def refuse(count: float, first: float) -> None:
-        if count:
+    def refuse(finite: bool) -> None:
+        # the sum of finite samples may overflow
+        bad = [] if finite else (~torch.isfinite(x)).nonzero().tolist()
+        if bad:
             raise ValueError(
-                f"{what}: {count:.0f} of {shape.numel()} {noun} are NaN or Inf, the first at index "
-                f"{flat_index(first, shape)}; {advice}"
+                f"{what}: {len(bad)} of {x.numel()} {noun} are NaN or Inf, the first at index {tuple(bad[0])}; {advice}"
             )
 
-    if validation() == "off" or not shape.numel():
-        return
-    if validation() == "deferred":
-        # the samples themselves are not kept until the end of a chain
-        check_value(_non_finite(x), refuse)
-        return
     total = torch.view_as_real(x).sum() if x.is_complex() else x.sum()
-    check_value(torch.isfinite(total), lambda finite: None if finite else refuse(*_non_finite(x).tolist()))
-
-
-def _non_finite(x: Tensor) -> Tensor:
-    """Number of samples that are NaN or infinite, and flat index of the first; (2,), int64."""
-    bad = ~torch.isfinite(x).flatten()
-    return torch.stack([bad.sum(), bad.to(torch.uint8).argmax()])
+    check_value(torch.isfinite(total), refuse)
 
 
 def refuse_non_finite_values(what: str, **values: Tensor | float | None) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchsar.core.host import check_value, flat_index
+from torchsar.core.host import check_value
 
 _LARGEST_IN_BATCH = 128  # rows of matrices that are factorised in a batch
 
@@ -97,7 +97,7 @@ def _check(info: Tensor, what: str) -> None:
 
     def check(failed: float) -> None:
         if failed:
-            trial = f" at index {flat_index(int((info != 0).int().argmax()), info.shape)}" if info.ndim else ""
+            trial = f" at index {tuple((info != 0).nonzero()[0].tolist())}" if info.ndim else ""
             text = f"{what}{trial}, or not finite; add a small multiple of the identity"
             raise torch.linalg.LinAlgError(text)  # pyright: ignore[reportPrivateImportUsage]
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import torch
 from torch import Tensor
 
-from torchsar.core.host import check_value, flat_index, is_out_of_memory, is_traced, validation
+from torchsar.core.host import check_value, is_out_of_memory, is_traced
 
 # the distance of float64 numbers of this size is 6e-5 turn
 MAX_TURNS = 4e11
@@ -120,23 +119,16 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
 
 def _check_resolution(turns: Tensor) -> None:
     """Raise ValueError for phases beyond the precision of float64."""
-    if not turns.numel() or validation() == "off":
-        return
-    size = turns.detach().abs()
-    if validation() == "deferred":
-        worst, at = size.flatten().max(0)
-        check_value(torch.stack([worst, at.to(worst)]), partial(_check_worst, turns.shape))
-    else:
-        check_value(size.max(), partial(_check_worst, turns.shape))
 
+    def check(worst: float) -> None:
+        if not worst <= MAX_TURNS:
+            raise ValueError(
+                f"the phase must be at most {MAX_TURNS:.0e} turns, beyond which float64 resolves only 1e-4 turn, "
+                f"got {worst:.3g} turns; subtract the reference range from the range before computing the phase"
+            )
 
-def _check_worst(shape: torch.Size, worst: float, at: float | None = None) -> None:
-    if not worst <= MAX_TURNS:
-        index = "" if at is None else f" at index {flat_index(at, shape)}"
-        raise ValueError(
-            f"the phase must be at most {MAX_TURNS:.0e} turns, beyond which float64 resolves only 1e-4 turn, "
-            f"got {worst:.3g} turns{index}; subtract the reference range from the range before computing the phase"
-        )
+    if turns.numel():
+        check_value(turns.detach().abs().max(), check)
 
 
 def linear_phasor(turns_per_step: Tensor, start: float, n: int, dtype: torch.dtype) -> Tensor:

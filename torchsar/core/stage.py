@@ -71,7 +71,7 @@ class Stage(nn.Module):
             from torchsar.core.compiled import call_as_one
 
             return call_as_one(self, (signal, *args), values)
-        with gathered_checks(type(self).__name__):
+        with gathered_checks():
             return self._called(signal, *args, **values)
 
     def _called(self, signal: Signal, *args: Any, **values: Any) -> Any:
