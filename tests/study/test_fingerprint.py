@@ -20,6 +20,7 @@ import torch
 
 from torchsar.core import Chain, Stage
 from torchsar.study.montecarlo.fingerprint import fingerprint, own_code
+from torchsar.study.settings.errors import ConfigError
 
 PROGRAM = """
 import argparse, math, torch
@@ -139,9 +140,34 @@ def test_values_of_many_kinds_are_told_apart(one: Any, other: Any) -> None:
     assert fingerprint(closing_over(one)) == first
 
 
-@pytest.mark.parametrize("value", [threading.Lock(), (i for i in range(3)), sys.stdout, ModuleType("m")])
-def test_what_has_no_state_counts_by_its_kind(value: Any) -> None:
-    assert fingerprint(closing_over(value))["uses"]
+@pytest.mark.parametrize("value", [threading.Lock(), (i for i in range(3)), sys.stdout])
+def test_what_cannot_be_compared_is_refused(value: Any) -> None:
+    with pytest.raises(ConfigError, match=r"closing_over.* uses value, .* give a version"):
+        fingerprint(closing_over(value))
+
+
+def test_a_module_counts_by_its_name() -> None:
+    assert fingerprint(closing_over(ModuleType("m"))) != fingerprint(closing_over(ModuleType("n")))
+
+
+class Cached:
+    """A class whose members Python cannot pickle."""
+
+    def __init__(self, gain: float) -> None:
+        self.gain = gain
+
+    @functools.cached_property
+    def square(self) -> float:
+        return self.gain**2
+
+    @staticmethod
+    def half(x: float) -> float:
+        return x / 2
+
+
+def test_objects_of_classes_with_properties_are_told_apart() -> None:
+    assert fingerprint(closing_over(Cached(2.0))) == fingerprint(closing_over(Cached(2.0)))
+    assert fingerprint(closing_over(Cached(2.0)))["uses"] != fingerprint(closing_over(Cached(3.0)))["uses"]
 
 
 def test_wrapped_functions_are_seen() -> None:

@@ -1,36 +1,27 @@
-"""Fingerprints of functions and modules: digests of their code and of all values that it uses."""
+"""Fingerprints of functions: digests of their code and of all values that it uses."""
 
 from __future__ import annotations
 
 import argparse
-import dis
-import functools
 import hashlib
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from operator import itemgetter
+from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
 from pathlib import Path
-from types import CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
+from types import CodeType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-# packages whose functions are known by name, beside the standard library and installed packages
-_LIBRARIES = ("torchsar", "torch", "numpy")
-_INSTALLED = ("site-packages", "dist-packages")
+from torchsar.study.settings.errors import ConfigError
+
 # longer descriptions of values are replaced by a digest
 _SHOWN = 40
-_PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), range, slice)
+_PLAIN = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis))
 # of these objects only those members count that the code names
 _NAMESPACES = (ModuleType, argparse.Namespace, SimpleNamespace)
-# entries of a class that change no result
-_UNSEEN = (
-    *("__doc__", "__dict__", "__weakref__", "__module__", "__qualname__", "__slotnames__"),
-    *("__firstlineno__", "__static_attributes__", "__annotations__", "__annotate_func__", "__annotations_cache__"),
-)
-_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")
 
 
 def fingerprint(function: Callable[..., Any]) -> dict[str, Any]:
@@ -49,16 +40,26 @@ def fingerprint(function: Callable[..., Any]) -> dict[str, Any]:
         `name`, the qualified name; `code`, a digest of code and defaults; and `uses`, a description
         of each value that the function closes over, reads from a global name, or holds as an
         attribute: a short text, or a digest of a longer one.
+
+    Raises:
+        ConfigError: If a value that the function uses has no description, such as an open file.
     """
-    reader = _Reader()
-    if isinstance(function, FunctionType):
-        code, used = reader.own(function), reader.used(function)
-    else:
-        code, used = "", dict(_state_of(function))
-    name = getattr(function, "__qualname__", type(function).__qualname__)
-    kind = reader.text(function if isinstance(function, (FunctionType, type)) else type(function))
-    uses = {name: _short(reader.text(value)) for name, value in sorted(used.items())}
-    return {"name": name, "code": _digest(code or kind), "uses": uses}
+    reader, plain, uses = _Reader(), isinstance(function, FunctionType), {}
+    for key, value in sorted((_used(function) if plain else {"object": function}).items()):
+        try:
+            text = reader.text(value)
+        except Exception as error:  # locks, files and generators refuse with errors of many kinds
+            raise ConfigError(
+                f"sweep: {name_of(function)} uses {key}, whose value cannot be compared with that of a later run "
+                f"({error}); give a version, which counts instead"
+            ) from None
+        uses[key] = text if len(text) <= _SHOWN else f"{text.partition('(')[0]} {_digest(text)}"
+    return {"name": name_of(function), "code": _digest(reader.text(_own(function)) if plain else ""), "uses": uses}
+
+
+def name_of(function: Callable[..., Any]) -> str:
+    """The qualified name of a function, or that of the class of another callable object."""
+    return getattr(function, "__qualname__", type(function).__qualname__)
 
 
 def own_code(modules: Iterable[nn.Module]) -> dict[str, str]:
@@ -92,134 +93,109 @@ class _Reader:
 
     def text(self, value: Any) -> str:
         """The text of any value; values that contain themselves end in a reference."""
-        if isinstance(value, _PLAIN) and type(value) in _PLAIN:
+        if type(value) in _PLAIN:
             return f"{type(value).__name__} {value!r}"
         if id(value) in self._open:
             return f"outer {len(self._open) - self._open.index(id(value))}"
         if id(value) not in self._known:
             self._open.append(id(value))
-            text = self._of(value)
+            kind = value.__qualname__ if isinstance(value, type) else self.text(type(value)).partition("(")[0]
+            text = f"{kind}({', '.join(map(self.text, self._parts(value)))})"
             self._open.pop()
             self._known[id(value)] = value, text  # the value is kept, and with it its id
         return self._known[id(value)][1]
 
-    def _of(self, value: Any) -> str:
+    def _parts(self, value: Any) -> Iterable[Any]:
+        """All that a value consists of."""
         if isinstance(value, FunctionType):
-            return f"function {self.own(value)} {self.text(self.used(value))}"
+            return (_own(value), _used(value))
         if isinstance(value, CodeType):
-            return self._code(value)
-        if isinstance(value, type):
-            return self._class(value)
-        if isinstance(value, ModuleType):
-            return f"module {value.__name__}"
-        if isinstance(value, Tensor):
-            return _of_tensor(value)
-        if isinstance(value, np.ndarray) and not value.dtype.hasobject:
-            return f"array {value.dtype} {value.shape} {_digest(value.tobytes())}"
-        if isinstance(value, (staticmethod, classmethod)):
-            return f"{type(value).__name__} {self.text(value.__func__)}"
-        if isinstance(value, property):
-            return f"property {self.text([value.fget, value.fset])}"
-        if type(value) in (list, tuple):
-            return f"{type(value).__name__}({', '.join(map(self.text, value))})"
-        if type(value) in (set, frozenset):
-            return f"{type(value).__name__}({', '.join(sorted(map(self.text, value)))})"
+            return _parts_of_code(value)
+        if isinstance(value, (type, ModuleType)):
+            return _parts_of_name(value)
+        if isinstance(value, (Tensor, np.ndarray)):
+            return (str(value.dtype), tuple(value.shape), _digest(_content(value)))
+        if isinstance(value, (list, tuple)):
+            return value
+        if isinstance(value, (set, frozenset)):
+            return sorted(value, key=self.text)
         if type(value) is dict:
-            items = sorted(((self.text(key), one) for key, one in value.items()), key=itemgetter(0))
-            return f"dict({', '.join(f'{key}: {self.text(one)}' for key, one in items)})"
-        return f"{self.text(type(value))} {self.text(dict(_state_of(value)))}"
-
-    def own(self, function: FunctionType) -> str:
-        """The text of the code of a function and of its defaults; of a library, its name."""
-        module = str(function.__globals__.get("__name__"))
-        code = f"{module}.{function.__code__.co_qualname}" if _is_library(module) else self._code(function.__code__)
-        return f"{code} {self.text([function.__defaults__, function.__kwdefaults__])}"
-
-    def used(self, function: FunctionType) -> dict[str, Any]:
-        """The values that a function closes over and those of the global names that it reads."""
-        found: dict[str, Any] = {}
-        for name, cell in zip(function.__code__.co_freevars, function.__closure__ or ()):
-            try:
-                found[name] = cell.cell_contents
-            except ValueError:  # a name without a value yet
-                found[name] = None
-        scope = function.__globals__
-        if _is_library(str(scope.get("__name__"))):
-            return found
-        read, mentioned = _names(function.__code__)
-        for name in sorted(read & set(scope)):
-            value = scope[name]
-            if not isinstance(value, _NAMESPACES):
-                found[name] = value
-            elif not (isinstance(value, ModuleType) and _is_library(value.__name__)):
-                found.update({f"{name}.{key}": vars(value)[key] for key in sorted(mentioned & set(vars(value)))})
-        return found
-
-    def _code(self, code: CodeType) -> str:
-        constants = code.co_consts
-        # the docstring of a function is its first constant, which is None without one
-        if constants and isinstance(constants[0], str) and code.co_name not in ("<lambda>", "<module>"):
-            constants = (None, *constants[1:])
-        counts = (code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags)
-        names = (code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
-        return _digest(self.text([code.co_code, code.co_exceptiontable, list(constants), counts, names]))
-
-    def _class(self, kind: type) -> str:
-        name = f"class {kind.__module__}.{kind.__qualname__}"
-        if _is_library(kind.__module__):
-            return name
-        members = {key: value for key, value in vars(kind).items() if key not in _UNSEEN and not key.startswith("_abc")}
-        return f"{name} {self.text([*kind.__bases__])} {self.text(members)}"
+            return sorted(value.items(), key=self.text)
+        if isinstance(value, (staticmethod, classmethod, property, cached_property)):
+            return [getattr(value, name, None) for name in ("__func__", "fget", "fset", "func")]
+        reduced = value.__reduce_ex__(4)
+        pickled = [reduced] if isinstance(reduced, str) else reduced
+        parts = [list(part) if isinstance(part, Iterator) else part for part in pickled]
+        return [type(value), *parts, getattr(value, "__wrapped__", None)]
 
 
-def _names(code: CodeType) -> tuple[set[str], set[str]]:
-    """The global names that code reads, and all names that it mentions, also in inner functions."""
-    read = {str(step.argval) for step in dis.get_instructions(code) if step.opname in _GLOBAL}
-    mentioned = set(code.co_names)
-    for inner in (one for one in code.co_consts if isinstance(one, CodeType)):
-        more = _names(inner)
-        read, mentioned = read | more[0], mentioned | more[1]
-    return read, mentioned
+def _own(function: FunctionType) -> list[Any]:
+    """The code of a function, or its name if it is that of a library, and its defaults."""
+    module = str(function.__globals__.get("__name__"))
+    code = f"{module}.{function.__code__.co_qualname}" if _is_library(module) else function.__code__
+    return [code, function.__defaults__, function.__kwdefaults__]
 
 
-def _state_of(value: Any) -> Iterator[tuple[str, Any]]:
-    """Name and value of each part of an object, as it would be pickled; none if it cannot be."""
-    if isinstance(value, MethodType):
-        yield from (("function", value.__func__), ("self", value.__self__))
-        return
-    if isinstance(value, functools.partial):
-        yield from (("function", value.func), ("args", list(value.args)), *value.keywords.items())
-        return
-    if hasattr(value, "__wrapped__"):
-        yield "wrapped", value.__wrapped__
-    try:
-        reduced = value.__reduce_ex__(2)
-    except Exception:  # locks, files and generators refuse with errors of many kinds
-        return
-    made, state = (reduced, None) if isinstance(reduced, str) else (reduced[:2], (*reduced, None)[2])
-    pairs = reduced[3:5] if not isinstance(reduced, str) else ()
-    items = [list(one) for one in pairs if one is not None]
-    yield from (("made by", made), *([("items", items)] if items else []))
-    yield from state.items() if isinstance(state, Mapping) else [("state", state)]
+def _used(function: FunctionType) -> dict[str, Any]:
+    """The values that a function closes over and those of the global names that it mentions."""
+    cells = zip(function.__code__.co_freevars, function.__closure__ or ())
+    found = {name: cell.cell_contents for name, cell in cells}
+    scope, mentioned = function.__globals__, _names(function.__code__)
+    for name in () if _is_library(str(scope.get("__name__"))) else sorted(mentioned & set(scope)):
+        value = scope[name]
+        if not isinstance(value, _NAMESPACES):
+            found[name] = value
+        elif not (isinstance(value, ModuleType) and _is_library(value.__name__)):
+            found |= {f"{name}.{key}": vars(value)[key] for key in mentioned & set(vars(value))}
+    return found
+
+
+def _names(code: CodeType) -> set[str]:
+    """All names that code mentions, also in inner functions."""
+    inner = [_names(one) for one in code.co_consts if isinstance(one, CodeType)]
+    return set(code.co_names).union(*inner)
+
+
+def _parts_of_code(code: CodeType) -> tuple[Any, ...]:
+    constants = code.co_consts
+    # the docstring of a function is its first constant, which is None without one
+    if constants and isinstance(constants[0], str) and code.co_name not in ("<lambda>", "<module>"):
+        constants = (None, *constants[1:])
+    counts = (code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags)
+    names = (code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
+    return code.co_code, code.co_exceptiontable, constants, counts, names
+
+
+def _parts_of_name(value: type | ModuleType) -> tuple[Any, ...]:
+    """The name of a class or a module, and of a class of the user its bases and its members without
+    those that Python adds.
+    """
+    if isinstance(value, ModuleType) or _is_library(value.__module__):
+        return (getattr(value, "__module__", ""), value.__name__)
+    members = {
+        key: one
+        for key, one in vars(value).items()
+        if isinstance(one, FunctionType) or not key.startswith(("__", "_abc"))
+    }
+    return (value.__module__, value.__name__, value.__bases__, members)
 
 
 def _is_library(module: str) -> bool:
     """Whether a module belongs to the standard library or to an installed package."""
     top = module.partition(".")[0]
-    if top in sys.stdlib_module_names or top in _LIBRARIES:
-        return True
     file = getattr(sys.modules.get(module), "__file__", None) or ""
-    return any(folder in file for folder in _INSTALLED)
+    installed = "site-packages" in file or "dist-packages" in file
+    return top in sys.stdlib_module_names or top in ("torchsar", "torch", "numpy") or installed
 
 
-def _of_tensor(x: Tensor) -> str:
-    plain = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
-    content = plain.view(torch.uint8).numpy().tobytes() if plain.numel() else b""
-    return f"tensor {x.dtype} {tuple(x.shape)} {_digest(content)}"
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= _SHOWN else f"{text.partition(' ')[0]} {_digest(text)}"
+def _content(x: Tensor | np.ndarray) -> bytes:
+    """The bytes of all numbers."""
+    if isinstance(x, Tensor):
+        plain = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
+        return plain.view(torch.uint8).numpy().tobytes() if plain.numel() else b""
+    if x.dtype.hasobject:
+        raise TypeError("an array of objects")
+    return x.tobytes()
 
 
 def _digest(content: str | bytes) -> str:

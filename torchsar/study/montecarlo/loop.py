@@ -18,7 +18,7 @@ import torch
 from torchsar.core import Draws, Source, device_fault
 from torchsar.metrics.intervals import half_width_ratio
 from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
-from torchsar.study.montecarlo.fingerprint import fingerprint
+from torchsar.study.montecarlo.fingerprint import fingerprint, name_of
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.record import OK, OUTCOME, Record
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
@@ -235,11 +235,12 @@ def sweep(
     needs = () if stop is None else (("stop.metric", stop.metric),)
     plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device, needs, random)
     plan.refuse_missing(trial)
-    made = fingerprint(trial)
-    about = made if version is None else {"name": made["name"], "version": version}
-    identity = {**identity_of_draws(seed, random), "trial": about, "config": dict(config or {})}
     with nullcontext() if out is None else opened(Path(out), "sweep", SWEEP_FILES) as folder:
-        store = None if folder is None else open_store(folder, plan, identity, resume)
+        store = None
+        if folder is not None:
+            about = fingerprint(trial) if version is None else {"name": name_of(trial), "version": version}
+            identity = {**identity_of_draws(seed, random), "trial": about, "config": dict(config or {})}
+            store = open_store(folder, plan, identity, resume)
         return run_plan(plan, trial, store, engine(workers, cluster, threads)).select(plan.grid.labels)
 
 
