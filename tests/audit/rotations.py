@@ -26,9 +26,9 @@ from torchsar.compensate import (
     UnevenRotation,
 )
 from torchsar.core import Alternate, Draws, Signal, Turn
-from torchsar.core.warp import warp
 from torchsar.echo import simulate_turntable
 from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar.warp import warp
 from torchsar.scene import Aircraft, PolynomialRotation, Satellite, TurntableWorld, UniformStartPhase
 
 F64 = torch.float64

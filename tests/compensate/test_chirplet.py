@@ -10,10 +10,10 @@ from torch import Tensor
 
 from torchsar.compensate import ChirpletClean, chirplet_clean
 from torchsar.core import Signal
-from torchsar.core.warp import warp
 from torchsar.focus import matched_fourier
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar.warp import warp
 
 F64 = torch.float64
 PULSES, PRF = 600, 30e3

@@ -25,9 +25,9 @@ from torchsar.compensate import (
 )
 from torchsar.compensate.rotation import Unknowns, entropy_search
 from torchsar.core import Chain, Draws, Estimate, Outcome, Signal, use
-from torchsar.core.warp import shape_of, warp
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar.warp import shape_of, warp
 
 F64 = torch.float64
 WAVELENGTH, PRF, PULSES, BINS, CELL = 1.55e-6, 20e3, 400, 16, 0.48

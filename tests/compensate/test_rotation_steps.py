@@ -36,7 +36,7 @@ from torchsar.compensate.rotation.histories import (
 )
 from torchsar.compensate.rotation.motion import Motion, Sampling, image_of, warped_time, without_range_term
 from torchsar.compensate.rotation.scatterers import Fit, Scatterers, Step, _solver, solved
-from torchsar.core.warp import warp
+from torchsar.radar.warp import warp
 
 SAMPLING = Sampling(WAVELENGTH, PRF, PULSES, len(RANGE_M), float(RANGE_M[0]), CELL)
 TIME = torch.arange(PULSES, dtype=F64) / PRF

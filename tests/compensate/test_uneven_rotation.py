@@ -41,11 +41,11 @@ from torchsar.compensate import (
 from torchsar.compensate.rotation import recommended
 from torchsar.compensate.rotation.coarse import coarse_warp
 from torchsar.core import Alternate, Chain, Draws, Estimate, Outcome, Signal, Turn, use
-from torchsar.core.warp import least_rate, warp
 from torchsar.echo import simulate_turntable
 from torchsar.focus import RangePhase
 from torchsar.metrics import rotation_bounds
 from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar.warp import least_rate, warp
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
 ESTIMATORS = {"coarse": coarse_rotation, "phase_fit": phase_fit_rotation, "uneven": uneven_rotation}

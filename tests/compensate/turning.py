@@ -10,8 +10,8 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core.warp import warp
 from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar.warp import warp
 
 F64 = torch.float64
 WAVELENGTH, PRF, PULSES, BINS, CELL, OMEGA = 1.55e-6, 40e3, 800, 24, 0.3, 0.02

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.core.warp import coefficients_of
 from torchsar.echo import dechirped_echo, simulate_turntable, turntable_echo
 from torchsar.focus import compress_dechirped
 from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar.warp import coefficients_of
 from torchsar.scene import Dechirped, PhaseOnly, Points, PolynomialRotation, RandomPoints, Scatterers, TurntableWorld
 
 DOUBLE = torch.complex128

@@ -13,7 +13,6 @@ import torch
 
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.core import Signal
-from torchsar.core.warp import warp, warp_rate
 from torchsar.focus import (
     CompiledNufft,
     CrossRangeLines,
@@ -33,6 +32,7 @@ from torchsar.focus import (
 from torchsar.focus.warped_sums import times_of_even_angle
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar.warp import warp, warp_rate
 
 PRF, N, LAMBDA = 20e3, 400, 1.55e-6
 DURATION = N / PRF

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.core.warp import warp
 from torchsar.metrics import rotation_bounds
+from torchsar.radar.warp import warp
 from torchsar.scene import Satellite
 
 F64 = torch.float64

@@ -52,10 +52,9 @@ from torchsar.core.phase import (
 from torchsar.core.polynomials import legendre
 from torchsar.core.select import best_of, numbers_on, per_trial, take, true_positions
 from torchsar.core.signal import Recording, Signal, Truth
-from torchsar.core.spline import UniformSpline
+from torchsar.core.spline import Spline
 from torchsar.core.stage import Stage
 from torchsar.core.stored import ArrayFile, StoredArray
-from torchsar.core.uneven_spline import UnevenSpline
 
 __all__ = [
     "Alternate",
@@ -68,13 +67,12 @@ __all__ = [
     "Recording",
     "Signal",
     "Source",
+    "Spline",
     "Stage",
     "StoredArray",
     "Trace",
     "Truth",
     "Turn",
-    "UnevenSpline",
-    "UniformSpline",
     "Use",
     "best_of",
     "block_bytes_of",

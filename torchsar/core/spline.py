@@ -1,8 +1,9 @@
-"""Cubic splines on a uniform grid, with their derivative and their integral."""
+"""Cubic splines through values at even or uneven knots, with their integral."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,80 +17,75 @@ _DECAY = math.sqrt(3.0) - 2.0
 _REACH = 32
 
 
-@dataclass(frozen=True)
-class UniformSpline:
-    """Cubic spline through values at `start + i * step`, with not-a-knot conditions at both ends.
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """Cubic spline through values at knots, with not-a-knot conditions at both ends.
+
+    >>> import torch
+    >>> from torchsar.core import Spline
+    >>> t = torch.arange(5, dtype=torch.float64)
+    >>> Spline(t**3, (0.0, 1.0)).at(torch.tensor([1.5], dtype=torch.float64))
+    tensor([3.3750], dtype=torch.float64)
 
     The result is that of scipy.interpolate.CubicSpline with default settings. Two values give a
-    straight line, three a parabola. Outside the grid the polynomials of the first and last interval
-    continue. Differentiable in the values and in the times of evaluation.
+    straight line, three a parabola. Outside the knots the polynomials of the first and last
+    interval continue. Differentiable in the values, the times of evaluation and uneven knots.
 
     Args:
         values: Values at the knots, shape (..., n) with n >= 2, float64; leading dimensions are
             trials.
-        start: Time of the first knot.
-        step: Distance between knots, positive.
+        knots: Time of the first knot and positive distance of neighbours (start, step), which is
+            faster; or the times of all knots, rising, shape (..., n), float64.
 
     Raises:
-        TypeError: If the values are not float64.
-        ValueError: If there are fewer than two values, the step is not positive, or start or step
-            are not finite.
+        TypeError: If values or knots are not float64.
+        ValueError: If there are fewer than two values, the numbers of knots and values differ, the
+            knots do not rise, or start or step are not finite.
     """
 
     values: Tensor
-    start: float
-    step: float
+    knots: Tensor | tuple[float, float]
 
     def __post_init__(self) -> None:
-        if not isinstance(self.values, Tensor) or self.values.dtype != torch.float64:
-            raise TypeError(
-                "a spline needs float64 values, got "
-                f"{getattr(self.values, 'dtype', type(self.values).__name__)}; convert them with "
-                ".double()"
-            )
-        if self.values.ndim < 1 or self.values.shape[-1] < 2:
-            raise ValueError(f"a spline needs at least two values (..., n), got shape {tuple(self.values.shape)}")
-        if not (math.isfinite(self.start) and math.isfinite(self.step) and self.step > 0):
-            raise ValueError(
-                f"a spline needs a finite start and a positive step, got start={self.start}, step={self.step}"
-            )
+        even = not isinstance(self.knots, Tensor)
+        for name, x in {"values": self.values, "knots": self.values if even else self.knots}.items():
+            if not isinstance(x, Tensor) or x.dtype != torch.float64:
+                kind = getattr(x, "dtype", type(x).__name__)
+                raise TypeError(f"a spline needs float64 {name}, got {kind}; convert them with .double()")
+            shapes = tuple(self.values.shape), tuple(x.shape)
+            if not all(shapes) or shapes[0][-1] != shapes[1][-1] or shapes[0][-1] < 2:
+                raise ValueError(f"a spline needs at least two values (..., n) and as many {name}, got shapes {shapes}")
+        if isinstance(self.knots, Tensor):
+            if not bool((self.knots.detach().diff() > 0).all()):
+                raise ValueError("the knots of a spline must rise; sort them and remove doubled ones")
+        elif not all(map(math.isfinite, self.knots)) or not self.knots[1] > 0:
+            raise ValueError(f"a spline needs a finite start and a positive step, got (start, step)={self.knots}")
 
     def at(self, t: Tensor) -> Tensor:
         """Evaluate the spline at given times.
 
         Args:
-            t: Times, any shape, float64, the same for all trials.
+            t: Times, float64: of even knots any shape, the same for all trials; of uneven knots
+                (..., m), whose leading dimensions broadcast with those of the trials.
 
         Returns:
-            Values, shape (..., *t.shape).
+            Values, shape (..., *t.shape) or (..., m).
         """
-        return self._polynomial(self._unit, t)
-
-    def slope(self, t: Tensor) -> Tensor:
-        """Evaluate the derivative of the spline at given times.
-
-        Args:
-            t: Times, any shape, float64, the same for all trials.
-
-        Returns:
-            Derivative in units of the values per unit of time, shape (..., *t.shape).
-        """
-        c0 = self._unit
-        return self._polynomial([c0[1], 2 * c0[2], 3 * c0[3]], t) / self.step
+        return self._sum(self._unit, t)
 
     def integral(self, t: Tensor) -> Tensor:
         """Evaluate the integral of the spline from its first knot to given times.
 
         Args:
-            t: Upper limits of the integral, any shape, float64, the same for all trials.
+            t: Upper limits of the integral, as for `at`.
 
         Returns:
-            Integral in units of the values times the unit of time, shape (..., *t.shape).
+            Integral in units of the values times the unit of time, of the shape that `at` gives.
         """
-        c = self._unit
-        whole = c[0] + c[1] / 2 + c[2] / 3 + c[3] / 4
+        c = [self._steps * c / (power + 1) for power, c in enumerate(self._unit)]
+        whole = c[0] + c[1] + c[2] + c[3]
         before = torch.cat([torch.zeros_like(whole[..., :1]), whole.cumsum(-1)[..., :-1]], -1)
-        return self._polynomial([before, c[0], c[1] / 2, c[2] / 3, c[3] / 4], t) * self.step
+        return self._sum([before, *c], t)
 
     def pieces(self) -> Tensor:
         """Return the polynomial coefficients of the spline in every interval between its n knots.
@@ -98,23 +94,45 @@ class UniformSpline:
             Coefficients of the powers 0 to 3 of the time since the first knot of the interval,
             shape (..., n - 1, 4).
         """
-        return torch.stack([c / self.step**power for power, c in enumerate(self._unit)], -1)
+        return torch.stack([c / self._steps**power for power, c in enumerate(self._unit)], -1)
+
+    @property
+    def _steps(self) -> Tensor | float:
+        """Lengths of the intervals between the knots, or that of all of them."""
+        return self.knots.diff() if isinstance(self.knots, Tensor) else self.knots[1]
 
     @cached_property
     def _unit(self) -> list[Tensor]:
-        """Coefficients (..., n - 1) of the powers 0..3 of the time in steps."""
-        y, bend = self.values, second_differences(self.values)
-        first, last = bend[..., :-1], bend[..., 1:]
+        """Coefficients (..., n - 1) of the powers 0..3 of the time in intervals."""
+        if isinstance(self.knots, Tensor):
+            bend, square = _uneven_bend(self.values, self.knots), self.knots.diff().square()
+            first, last = bend[..., :-1] * square, bend[..., 1:] * square
+        else:
+            bend = second_differences(self.values)
+            first, last = bend[..., :-1], bend[..., 1:]
+        y = self.values
         return [y[..., :-1], y[..., 1:] - y[..., :-1] - (2 * first + last) / 6, first / 2, (last - first) / 6]
 
-    def _polynomial(self, powers: list[Tensor], t: Tensor) -> Tensor:
+    def _sum(self, powers: Sequence[Tensor], t: Tensor) -> Tensor:
         """Evaluate polynomials by Horner's rule, each time in its interval."""
-        position = (t.to(torch.float64) - self.start) / self.step
-        piece = torch.floor(position.detach()).clamp(0, self.values.shape[-1] - 2)
-        offset, index = position - piece, piece.to(torch.int64).flatten()
+        if isinstance(self.knots, Tensor):
+            # knots and times alone have fewer trials than the values, often none
+            few = torch.broadcast_shapes(self.knots.shape[:-1], t.shape[:-1])
+            knots, times = (x.expand(*few, -1).contiguous() for x in (self.knots, t))
+            piece = torch.searchsorted(knots[..., 1:-1].detach().contiguous(), times.detach(), right=True)
+            offset = (t - knots.gather(-1, piece)) / knots.diff().gather(-1, piece)
+        else:
+            position = (t.to(torch.float64) - self.knots[0]) / self.knots[1]
+            piece = torch.floor(position.detach()).clamp(0, self.values.shape[-1] - 2).to(torch.int64)
+            offset, few = position - piece, ()
+        lead = torch.broadcast_shapes(powers[-1].shape[:-1], few)
         total = torch.zeros_like(offset)
         for c in reversed(powers):
-            total = total * offset + c.index_select(-1, index).reshape((*c.shape[:-1], *t.shape))
+            if isinstance(self.knots, Tensor):
+                taken = c.expand(*lead, -1).gather(-1, piece.expand(*lead, -1))
+            else:
+                taken = c.index_select(-1, piece.flatten()).reshape((*lead, *t.shape))
+            total = total * offset + taken
         return total
 
 
@@ -160,3 +178,49 @@ def _dirichlet(known: Tensor) -> Tensor:
 def _power(k: Tensor) -> Tensor:
     """Power z^k of whole numbers k >= 0; z is negative."""
     return torch.where(k.remainder(2) == 0, 1.0, -1.0).to(k) * abs(_DECAY) ** k
+
+
+def _uneven_bend(values: Tensor, knots: Tensor) -> Tensor:
+    """Second derivatives at the knots, shape (..., n)."""
+    h = knots.diff()
+    slope = values.diff() / h
+    n = values.shape[-1]
+    if n == 2:
+        return torch.zeros_like(slope).expand(*slope.shape[:-1], 2)
+    known = 6 * slope.diff()
+    if n == 3:
+        return (known / (3 * (h[..., :1] + h[..., 1:]))).expand(*known.shape[:-1], 3)
+    # not-a-knot: the second derivative is linear over the first and over the last three knots
+    (h0, h1), (g1, g0) = h[..., :2].split(1, -1), h[..., -2:].split(1, -1)
+    below = torch.cat([torch.zeros_like(h0), h[..., 1:-2], g1 - g0 * g0 / g1], -1)
+    above = torch.cat([h1 - h0 * h0 / h1, h[..., 2:-1], torch.zeros_like(g0)], -1)
+    more = torch.cat([h0 * (1 + h0 / h1), torch.zeros_like(h[..., 1:-2]), g0 * (1 + g0 / g1)], -1)
+    inner = _tridiagonal(below, 2 * (h[..., :-1] + h[..., 1:]) + more, above, known)
+    first = inner[..., :1] + (inner[..., :1] - inner[..., 1:2]) * h0 / h1
+    last = inner[..., -1:] + (inner[..., -1:] - inner[..., -2:-1]) * g0 / g1
+    return torch.cat([first, inner, last], -1)
+
+
+def _tridiagonal(below: Tensor, main: Tensor, above: Tensor, known: Tensor) -> Tensor:
+    """Solve below[i] x[i-1] + main[i] x[i] + above[i] x[i+1] = known[i] by cyclic reduction.
+
+    Each step eliminates the neighbours of all unknowns at once, which doubles the distance of those
+    that are left. Rows are diagonally dominant, so that no pivots are needed.
+    """
+    below, above, x = below / main, above / main, known / main
+    step = 1
+    while step < known.shape[-1]:
+        below0, above0, x0 = (_moved(v, step) for v in (below, above, x))
+        below1, above1, x1 = (_moved(v, -step) for v in (below, above, x))
+        main = 1 - below * above0 - above * below1
+        x = (x - below * x0 - above * x1) / main
+        below, above = -below * below0 / main, -above * above1 / main
+        step *= 2
+    return x
+
+
+def _moved(x: Tensor, step: int) -> Tensor:
+    """x[i - step] at each i of the last dimension, zero where there is none."""
+    pad = (step, 0) if step > 0 else (0, -step)
+    kept = x[..., : x.shape[-1] - step] if step > 0 else x[..., -step:]
+    return torch.nn.functional.pad(kept, pad)

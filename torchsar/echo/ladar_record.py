@@ -13,8 +13,8 @@ from torch import Tensor
 from torchsar.core import (
     Draws,
     Recording,
+    Spline,
     Truth,
-    UniformSpline,
     cis,
     gathered_checks,
     per_trial,
@@ -256,7 +256,7 @@ class BlockPaths:
         Returns:
             Displacement in metres, shape (..., pulse, n).
         """
-        return UniformSpline(self.knots, 0.0, self.step_s).at(self.offsets_s)
+        return Spline(self.knots, (0.0, self.step_s)).at(self.offsets_s)
 
     def delay_s(self, target: int, motion_m: Tensor) -> Tensor:
         """Return the delay of one scatterer at all samples, relative to the reference range.

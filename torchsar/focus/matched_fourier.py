@@ -19,7 +19,7 @@ wavelength c_q / (2 Om phi(T)). The data do not show the sign of Om, so that ima
 in x.
 
 Reference:
-    Remote Sens. 2025, 17, 3447, Eqs. (7)-(10), with the warp of `core.warp`; Greengard and Lee 2004
+    Remote Sens. 2025, 17, 3447, Eqs. (7)-(10), with `radar.warp`; Greengard and Lee 2004
     (non-uniform FFT).
 """
 
@@ -43,11 +43,11 @@ from torchsar.core import (
     real_dtype,
     unit_phasor,
 )
-from torchsar.core.warp import least_rate, warp, warp_rate
 from torchsar.focus.image_lines import CrossRangeLines, DopplerLines
 from torchsar.focus.transforms import Gridding, PulsesToLines, Transform
 from torchsar.focus.warped_sums import Sum, normalised_warp, slow_times
 from torchsar.radar import InverseRadar
+from torchsar.radar.warp import least_rate, warp, warp_rate
 
 # chosen limit: shorter records are rejected as invalid input
 MIN_PULSES = 8

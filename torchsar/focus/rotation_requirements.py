@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core.warp import least_rate, warp, warp_rate
 from torchsar.focus.ladar_requirements import Limit, Verdict
 from torchsar.focus.matched_fourier import MIN_PULSES
 from torchsar.focus.requirements import Requirement, phase_error_db
 from torchsar.radar import InverseRadar
+from torchsar.radar.warp import least_rate, warp, warp_rate
 
 # chosen limits of estimating the rotation rate: phase of the range term (rad), Cramer-Rao bound
 # (%), and rms share of the ranges that no line through the centre explains

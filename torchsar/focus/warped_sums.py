@@ -26,10 +26,10 @@ from torch import Tensor
 
 from torchsar.core import block_bytes_of, linear_phasor, numbers_on
 from torchsar.core.spline import second_differences
-from torchsar.core.warp import warp, warp_rate
 from torchsar.focus.chirp_z import chirp_z
 from torchsar.focus.gridding import PulseNufft
 from torchsar.focus.nufft import Kernel
+from torchsar.radar.warp import warp, warp_rate
 
 
 def slow_times(n_pulse: int, prf_hz: float, device: torch.device | str | None = None) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import per_trial, refuse_non_finite
-from torchsar.core.warp import warp
+from torchsar.radar.warp import warp
 
 # float64 rounding: eigenvalues of a correlation matrix below this count as zero
 _SINGULAR = 1e-13
@@ -61,7 +61,7 @@ def rotation_bounds(
         noise_std: Square root of the variance of the complex noise per sample, shape (...,).
         omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,).
         warp_k: Derivatives k1, k2, ... of the rotation rate divided by the rate, in 1/s, 1/s^2,
-            ..., shape (..., order - 1), of any order; see `core.warp`.
+            ..., shape (..., order - 1), of any order; see `radar.warp`.
         yc_m: Range centre deviation in metres, shape (...,).
         wavelength_m: Carrier wavelength in metres.
         prf_hz: Pulse rate in Hz.

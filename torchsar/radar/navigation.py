@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import UnevenSpline
+from torchsar.core import Spline
 from torchsar.radar.antenna_path import broadcast, refuse_unusable
 
 
@@ -65,7 +65,7 @@ def resample_path(
     _refuse_times(time, first, last)
     _refuse_gaps(time, first, last, longest_gap_s)
     _refuse_jumps(time, position_m.detach(), first, last, jump_m)
-    return UnevenSpline(time_s[..., None, :], position_m.mT).at(pulse_time_s[..., None, :]).mT
+    return Spline(position_m.mT, time_s[..., None, :]).at(pulse_time_s[..., None, :]).mT
 
 
 def _refuse_times(time: Tensor, first: Tensor, last: Tensor) -> None:

@@ -17,7 +17,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, UnevenSpline, per_trial
+from torchsar.core import Draws, Spline, per_trial
 from torchsar.radar.navigation import resample_path
 from torchsar.scene.fluctuation import MeasuredTrack, RandomMotion, drawn_motion
 from torchsar.scene.trials import refuse_other_trials, refuse_unless, refuse_unless_finite
@@ -393,7 +393,7 @@ class Navigation:
         before, after = (math.ceil(s / step_s) for s in (_LONGEST_S, float(time_s[-1] - time_s[0]) + _LONGEST_S))
         at = time_s[0] + step_s * torch.arange(-before, after + 1, dtype=torch.float64, device=time_s.device)
         asked = time_s - latency[..., None]
-        return UnevenSpline(at, path.position_m(at).mT).at(asked[..., None, :]).mT
+        return Spline(path.position_m(at).mT, at).at(asked[..., None, :]).mT
 
 
 def _steps(span_s: float, step_s: float) -> Tensor:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsar.core import ArrayFile, Draws, UniformSpline
+from torchsar.core import ArrayFile, Draws, Spline
 from torchsar.scene.trials import finite, positive, refuse_unless, refuse_unless_finite, with_dims
 from torchsar.scene.vibration import Motion
 
@@ -363,7 +363,7 @@ class MeasuredTrack:
                 f"times of a measured track must lie within {first:g} to {last:g} s, one step beyond its ends, got "
                 f"{float(asked.min()):g} to {float(asked.max()):g} s; record fewer periods or measure a longer track"
             )
-        return UniformSpline(self.displacement.to(time_s.device), float(self.time_s[0]), self.step_s).at(time_s)
+        return Spline(self.displacement.to(time_s.device), (float(self.time_s[0]), self.step_s)).at(time_s)
 
 
 def _columns_of(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import per_trial
-from torchsar.core.warp import least_rate, warp, warp_rate
+from torchsar.radar.warp import least_rate, warp, warp_rate
 from torchsar.scene.trials import refuse_unless_finite
 
 

@@ -30,7 +30,7 @@ from torchsar.core import (
     cis,
     power_of,
 )
-from torchsar.core.spline import UniformSpline
+from torchsar.core.spline import Spline
 from torchsar.metrics.phase import phase_rmse
 from torchsar.optim import adam
 
@@ -262,7 +262,7 @@ def linked_walk(cells: Tensor, polished_rad: Tensor, step_rad: Tensor) -> Walk:
     spread = (std[best, trial].square() + (within + apart.square() / 2)[:, None]).sqrt()
     at = torch.arange(n, dtype=torch.float64, device=cells.device)
     block = ((at - first) / size).floor().clamp(0, count - 1).long()
-    walk = UniformSpline(_without_line(chosen), first + (size - 1) / 2, size).at(at)
+    walk = Spline(_without_line(chosen), (first + (size - 1) / 2, size)).at(at)
     return Walk(walk, spread[:, block], apart)
 
 

@@ -32,7 +32,7 @@ from torchsar.core import (
     host_value,
     true_positions,
 )
-from torchsar.core.spline import UniformSpline
+from torchsar.core.spline import Spline
 from torchsar.focus.triangular import deramp_azimuth, profile_axes
 from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
 from torchsar.radar import TriangularLadar, sweep_middles
@@ -241,7 +241,7 @@ def range_error(estimate: Estimate, radar: TriangularLadar, pulse: Axis, at_s: T
         fine = estimate["phase_rad"].to(torch.float64) * (radar.wavelength_m / (4 * math.pi))
         start = float(sweep_middles(radar, pulse)[0, 0])
         total = total + (
-            UniformSpline(fine, start, pulse.step).at(at_s)
+            Spline(fine, (start, pulse.step)).at(at_s)
             if pulse.n > 1
             else fine.reshape(*fine.shape[:-1], *(1,) * at_s.ndim).expand(*fine.shape[:-1], *at_s.shape)
         )

@@ -23,7 +23,7 @@ from torchsar.core import (
     refuse_non_finite_values,
     unit_phasor,
 )
-from torchsar.core.spline import UniformSpline
+from torchsar.core.spline import Spline
 from torchsar.radar import TriangularLadar, sweep_middles
 
 
@@ -92,7 +92,7 @@ def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, 
     v = velocity_m_s.to(torch.float64)
     if pulse.n == 1:
         return v.reshape(*v.shape[:-1], *(1,) * at_s.ndim) * (at_s - grid.start)
-    return UniformSpline(v, grid.start, grid.step).integral(at_s)
+    return Spline(v, (grid.start, grid.step)).integral(at_s)
 
 
 def sweep_motion(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> Tensor:
@@ -117,7 +117,7 @@ def sweep_motion(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> T
     if pulse.n == 1:
         constant = v[..., None, :] * (middles - grid.start)
         return torch.nn.functional.pad(torch.stack([constant, v[..., None, :].expand_as(constant)], -1), (0, 3))
-    spline = UniformSpline(v, grid.start, grid.step)
+    spline = Spline(v, (grid.start, grid.step))
     pieces = spline.pieces()
     before = torch.cat([pieces[..., :1, :], pieces], -2)
     after = torch.cat([pieces, pieces[..., -1:, :]], -2)

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from torchsar.compensate.rotation.motion import SEARCH_EPS
 from torchsar.core import numbers_on
-from torchsar.core.warp import warp, warp_rate
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.focus.transforms import Gridding
 from torchsar.metrics import entropy
+from torchsar.radar.warp import warp, warp_rate
 
 _OCTAVES = 3.5  # Doppler below the edge of the band that is used, found by trial
 _STEPS_PER_UNIT = 200  # steps per unit of the logarithm of Doppler: half a percent each

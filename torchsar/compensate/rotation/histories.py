@@ -30,8 +30,8 @@ from torch.nn.functional import pad
 
 from torchsar.compensate.rotation.motion import Motion, Sampling, chosen, image_of, warped_time
 from torchsar.core import cis
-from torchsar.core.warp import warp, warp_rate
 from torchsar.focus.warped_sums import slow_times
+from torchsar.radar.warp import warp, warp_rate
 
 OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
 HALF_CELLS = 24  # half width of a window in Doppler cells

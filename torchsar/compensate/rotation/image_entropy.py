@@ -17,11 +17,11 @@ from torch import Tensor
 
 from torchsar.compensate.rotation.motion import Sampling
 from torchsar.core import Signal, block_bytes_of, checked_samples, power_of, unit_level
-from torchsar.core.warp import k_of_shape, least_rate, shape_of, warp
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier, range_phase
 from torchsar.focus.transforms import Gridding
 from torchsar.radar import InverseRadar
+from torchsar.radar.warp import k_of_shape, least_rate, shape_of, warp
 
 Variables = Literal["raw", "shape"]
 
@@ -52,7 +52,7 @@ class Unknowns:
     relative derivatives k1, k2, ... (1/s, 1/s^2, ...), and the range centre deviation yc (m): a
     cell at range y lies at y + yc from the rotation centre. With the variables "shape" it holds the
     total rotation angle A over the aperture (rad), the Legendre coefficients q2, q3, ... of the
-    rotation angle over time (`torchsar.core.warp.shape_of`), and yc. Estimation errors of k1 and k2
+    rotation angle over time (`radar.warp.shape_of`), and yc. Estimation errors of k1 and k2
     are correlated: the error of k1 is about -T/2 times that of k2, with the length T of the
     aperture. Those of q2 and q3 are not.
 

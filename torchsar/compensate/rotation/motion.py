@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from torchsar.core import host_values, numbers_on, outer_phasor, phasor_tables, refuse_non_finite, unit_phasor
-from torchsar.core.warp import warp
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.focus.transforms import Gridding
 from torchsar.focus.warped_sums import slow_times
+from torchsar.radar.warp import warp
 
 SEARCH_EPS = 1e-3  # accuracy of the transform in estimates; images use a better one
 

@@ -43,11 +43,11 @@ from torchsar.core import (
     refuse_non_finite,
     settle,
 )
-from torchsar.core.warp import k_of_shape, shape_of
 from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import MatchedFourierOperator, range_phase
 from torchsar.focus.transforms import Gridding
 from torchsar.radar import InverseRadar
+from torchsar.radar.warp import k_of_shape, shape_of
 
 
 def uneven_rotation(

@@ -27,8 +27,8 @@ from torchsar.compensate.rotation.couplings import Neighbours, envelopes, inner_
 from torchsar.compensate.rotation.histories import OVERSAMPLING, find_peaks, inverted, noise_power, threshold
 from torchsar.compensate.rotation.motion import Motion, Sampling, chosen, each, image_of, warped_time
 from torchsar.core import power_of, real_dtype, reduced_turns, settle
-from torchsar.core.warp import least_rate
 from torchsar.focus.warped_sums import slow_times
+from torchsar.radar.warp import least_rate
 
 MOST, ROUNDS = 800, 12  # largest number of scatterers, number of steps; accuracy against time
 # rounds that search for further scatterers, and the share of their number up to which they do: the

@@ -14,7 +14,6 @@ from torch import Tensor
 from torchsar.compensate.rotation import coarse_rotation, phase_fit_rotation, uneven_rotation
 from torchsar.compensate.rotation.entropy_search import descent_near_truth, genetic_near_truth
 from torchsar.core import Draws, Estimate
-from torchsar.core.warp import cut_warp, warp
 from torchsar.focus import DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
@@ -25,6 +24,7 @@ from torchsar.focus.rotation_requirements import (
     rotation_requirements,
 )
 from torchsar.metrics import error_db, rotation_bounds
+from torchsar.radar.warp import cut_warp, warp
 from torchsar.scene import PhaseOnly, Points
 from torchsar.study.systems.isal import echo_choices
 from torchsar.study.systems.isal_rotation.world import Rotating, first_values, k_of

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.core.warp import coefficients_of, k_of_coefficients, k_of_shape, least_rate, shape_of, warp, warp_rate
+from torchsar.radar.warp import coefficients_of, k_of_coefficients, k_of_shape, least_rate, shape_of, warp, warp_rate
 
 F64 = torch.float64
 DURATION = 0.02
