@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import pytest
 import torch
 from torch import Tensor
 
 from torchsar.compensate import autofocus, entropy_fixed_point, link_phases
-from torchsar.compensate.pulse_phase.alignment import Displacement, coherent_jitter
+from torchsar.compensate.pulse_phase.alignment import coherent_jitter
 from torchsar.compensate.pulse_phase.alignment import displacement as displacement_of
 from torchsar.metrics.phase import phase_rmse
 
@@ -24,9 +25,14 @@ COURSES = {
 }
 
 
+class Displacement(NamedTuple):
+    jitter: Tensor
+    migration: Tensor
+
+
 def displacement(rows: Tensor, present: Tensor) -> Displacement:
     """Displacement of pulses (trial, range, pulse)."""
-    return displacement_of(torch.fft.fft(rows, dim=-2), present)
+    return Displacement(*displacement_of(torch.fft.fft(rows, dim=-2), present))
 
 
 def displaced(course: Tensor, points: int, snr_db: float, trials: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -207,8 +207,8 @@ def test_the_gain_of_a_sparse_scene_is_that_of_its_best_number_of_cells() -> Non
             own = (p[:strong].log() + 1).sum() + strong * (1 + math.log(30 / strong))
             gains.append(float(30 - own - (30 - strong) * (1 + rest.log())))
         assert float(sparse_gain_nats(power)[trial]) == pytest.approx(max(gains), rel=0.02, abs=0.05)
-    none = describe(torch.zeros(1, 4, 8, dtype=torch.complex128), torch.zeros(1, 8), torch.ones(1))
-    assert not bool(none.homogeneous) and float(none.sparse) == 0
+    sparse, ratio = describe(torch.zeros(1, 4, 8, dtype=torch.complex128), torch.zeros(1, 8), torch.ones(1))
+    assert float(ratio) == 0 and float(sparse) == 0
 
 
 def test_added_phases_have_a_derivative_of_one() -> None:

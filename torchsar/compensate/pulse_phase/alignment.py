@@ -8,8 +8,6 @@ scene of six scatterers at 15 dB.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -20,28 +18,12 @@ from torchsar.core import fft_lines, power_of
 # ones. Found by trial on 2 to 300 scatterers: the phases may be wrong from 0.2 and 0.45 on, and
 # interference of scatterers that are not resolved displaces aligned profiles by 0.25 at most.
 LARGEST_JITTER, LARGEST_MIGRATION = 0.25, 0.4
-# standard deviations by which a displacement must differ from zero, in halves of the band and in
-# halves of the range cells
-_SIGNIFICANT = 3.0
-# fewest range cells and pulses whose displacement is estimated; number of groups of pulses
-_LEAST_CELLS, _LEAST_PULSES, _GROUPS = 8, 8, 16
-
-
-@dataclass(frozen=True)
-class Displacement:
-    """Displacements in range of the profiles of pulses, in range cells rms, shape (trial,) each.
-
-    Args:
-        jitter: Displacement from pulse to pulse; 0 where not significant.
-        migration: Displacement of the mean of neighbouring pulses; 0 where not significant.
-    """
-
-    jitter: Tensor
-    migration: Tensor
+# fewest range cells and pulses whose displacement is estimated
+_LEAST = 8
 
 
 @torch.no_grad()
-def displacement(spectrum: Tensor, present: Tensor) -> Displacement:
+def displacement(spectrum: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     """Estimate the rms displacement in range of the profiles of pulses from their mean.
 
     The displacement of a pulse is the projection of its profile |s| on the derivative of the mean
@@ -59,15 +41,17 @@ def displacement(spectrum: Tensor, present: Tensor) -> Displacement:
         present: False where a pulse holds only zeros, shape (trial, pulse).
 
     Returns:
-        The displacements; 0 where they do not differ from none by 3 standard deviations, and where
-        there are fewer than 8 range cells or 8 pulses.
+        The displacement from pulse to pulse (jitter), and that of the mean of neighbouring pulses
+        (migration), in range cells rms, shape (trial,) each; 0 where they do not differ from none
+        by 3 standard deviations, and where there are fewer than 8 range cells or 8 pulses.
     """
     cells, n = spectrum.shape[-2:]
-    if cells < _LEAST_CELLS or n < _LEAST_PULSES:
-        return Displacement(*torch.zeros(2, len(spectrum), dtype=torch.float64, device=spectrum.device))
+    if cells < _LEAST or n < _LEAST:
+        none = torch.zeros(len(spectrum), dtype=torch.float64, device=spectrum.device)
+        return none, none
     one, other = _halves(spectrum)
     whole = one + other
-    length = -(-n // _GROUPS)
+    length = -(-n // 16)
 
     def grouped(x: Tensor, dim: int = -1) -> Tensor:
         more = [0] * (-2 * dim - 1) + [-n % length]
@@ -83,7 +67,7 @@ def displacement(spectrum: Tensor, present: Tensor) -> Displacement:
         return torch.where(grouped(present), parts - _mean(parts, grouped(present))[..., None], 0).flatten(-2)
 
     free = present.sum(-1) - (count > 0).sum(-1), (count > 0).sum(-1)
-    return Displacement(_shared([within(x) for x in fast], free[0]), _shared(slow, free[1]))
+    return _shared([within(x) for x in fast], free[0]), _shared(slow, free[1])
 
 
 def _four_displacements(
@@ -106,7 +90,7 @@ def _four_displacements(
 
 def _shared(parts: list[Tensor], count: Tensor) -> Tensor:
     """Displacement in cells rms that the halves of the band share, if those of the cells agree."""
-    return torch.where(_agreement(parts[2:], count) > _SIGNIFICANT, _common(parts[:2], count), 0)
+    return torch.where(_agreement(parts[2:], count) > 3, _common(parts[:2], count), 0)
 
 
 @torch.no_grad()
@@ -128,7 +112,7 @@ def coherent_jitter(rows: Tensor, present: Tensor) -> Tensor:
         deviations, and where there are fewer than 8 range cells or 8 pulses.
     """
     cells, n = rows.shape[-2:]
-    if cells < _LEAST_CELLS or n < _LEAST_PULSES:
+    if cells < _LEAST or n < _LEAST:
         return torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
     spectrum = fft_lines(rows)
     offset = _about_centroid(spectrum)
@@ -166,8 +150,7 @@ def _about_centroid(spectrum: Tensor) -> Tensor:
 def _common(halves: list[Tensor], count: Tensor) -> Tensor:
     """Displacement in cells rms that both halves share, (trial,), of a number of free values."""
     shared = (halves[0] * halves[1]).sum(-1)
-    significant = _agreement(halves, count) > _SIGNIFICANT
-    return torch.where(significant, (shared / count.clamp_min(1)).sqrt(), 0)
+    return torch.where(_agreement(halves, count) > 3, (shared / count.clamp_min(1)).sqrt(), 0)
 
 
 def _agreement(halves: list[Tensor], count: Tensor) -> Tensor:

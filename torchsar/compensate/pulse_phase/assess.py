@@ -40,30 +40,6 @@ Again = Callable[[Tensor, Tensor | slice, Tensor], Tensor]
 
 UNKNOWN_RAD = math.pi / math.sqrt(3)  # standard deviation of a random phase
 LEAST_STREHL = 0.8  # Strehl ratio of a well-focused image, a convention (Marechal)
-# factor by which the sharpness must exceed that of noise: `sharpness_of_noise` errs by up to 15 %
-_MARGIN = 1.5
-# Blocks of neighbouring range cells, the cells of each that are judged (the strongest), iterations
-# of their own phases, and the largest gain in sharpness in units of that of noise. In 99 % of the
-# right trials with 3 to 25 points it was up to 2.2, and in 90 % of those in which a vehicle as
-# strong as 30 points moves on its own beyond 2.4. More or fewer blocks separate both less.
-_BLOCKS, _JUDGED, _ITERATIONS, _LARGEST_GAIN = 3, 48, 12, 2.2
-# Phases from which the halves start are apart by a walk of so many rad rms; they go on for so many
-# rounds at most, until a round moves them by less than this. Found by trial: what the scene does
-# not hold stays apart, and weak targets are found again.
-_DISTURBED_RAD, _RETURNED_RAD, _ROUNDS = 0.4, 0.04, 2
-# difference of halves from which on a phase counts as unknown: half of the difference of uniformly
-# distributed phases is half of their error
-_APART_RAD = 2.0
-# A single scatterer: the sharpness is that of so many rows, or the rows are side lobes of one
-# range. Its own motion cannot be separated from a phase error, and some phases exist that make one
-# point of several. But no phase changes its modulus: noise and weaker scatterers change it as much
-# as the phase. It is steady if it scatters by less than this, far below the 0.52 of noise, over at
-# least so many pulses.
-_ONE_ROW, _ONE_RANGE, _STEADY, _LEAST_PULSES = 1.5, 1.2, 0.25, 32
-# Longest gap as a share of the pulses from the first to the last, up to which scenes of many points
-# tell how the phases before and after it go together.
-_LONGEST_GAP = 0.36
-_STRIP = 4  # lines of an image in a strip, by choice: more than the response of a point is wide
 
 
 def conclude(
@@ -120,11 +96,15 @@ def conclude(
     strehl = torch.exp(-std.square())
     outcome = worst(
         (Outcome.INEXACT, strehl <= LEAST_STREHL),
-        (Outcome.PARTS_DISAGREE, gain > _LARGEST_GAIN),
+        # in 99 % of the right trials with 3 to 25 points the gain was up to 2.2, and in 90 % of
+        # those in which a vehicle as strong as 30 points moves on its own beyond 2.4
+        (Outcome.PARTS_DISAGREE, gain > 2.2),
         (Outcome.HOMOGENEOUS, homogeneous > 0),
-        (Outcome.TOO_FEW, (unsteady > 0) | (gap > _LONGEST_GAP)),
+        # beyond a gap of this share, scenes of many points do not tell how the phases go together
+        (Outcome.TOO_FEW, (unsteady > 0) | (gap > 0.36)),
         (Outcome.DISPLACED, (jitter >= LARGEST_JITTER) | (migration >= LARGEST_MIGRATION)),
-        (Outcome.NOISE, (sharp <= _MARGIN * noise) & (homogeneous == 0)),
+        # the sharpness of noise is predicted within 15 %
+        (Outcome.NOISE, (sharp <= 1.5 * noise) & (homogeneous == 0)),
         (Outcome.EMPTY, ~present.any(-1).reshape(trials)),
         (Outcome.SINGULAR, ~enough.reshape(trials)),
     )
@@ -173,19 +153,23 @@ def _seen(
     spectrum = fft_lines(rows)
     band = occupied_band(spectrum)
     apart = half_difference(halves_of_rows(rows), present, phase, partial(_disturbed, again, which, present))
-    moved = displacement(spectrum, present)
+    jitter, migration = displacement(spectrum, present)
     scatter, rest = scatter_of_point(focused, present)
-    single = ((sharp_rows < _ONE_ROW) & (sharp > noise)) | (different_rows(rows, power_of(rows).sum(-1)) < _ONE_RANGE)
-    steady = (scatter < _STEADY) & (present.sum(-1) >= _LEAST_PULSES) & (rows.shape[-2] > 1)
+    # A single scatterer: the sharpness is that of one row, or the rows are side lobes of one range.
+    # Its own motion cannot be separated from a phase error, and some phases exist that make one
+    # point of several. But no phase changes its modulus: noise and weaker scatterers change it as
+    # much as the phase. It is steady if it scatters far less than the 0.52 of noise.
+    single = ((sharp_rows < 1.5) & (sharp > noise)) | (different_rows(rows, power_of(rows).sum(-1)) < 1.2)
+    steady = (scatter < 0.25) & (present.sum(-1) >= 32) & (rows.shape[-2] > 1)
     return (
         sharp,
         noise,
         torch.where(single & steady, torch.hypot(scatter, rest), apart / band.sqrt()),
         gain_of_parts(rows, present, phase),
         (single & ~steady).double(),
-        (describe(rows, phase, band).homogeneous & ~single).double(),
-        moved.jitter,
-        moved.migration,
+        ((describe(rows, phase, band)[1] > 1) & ~single).double(),
+        jitter,
+        migration,
     )
 
 
@@ -220,15 +204,14 @@ def gain_of_parts(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
         as many range cells, shape (trial,), float64.
     """
     gains = [torch.zeros(len(rows), dtype=torch.float64, device=rows.device)]
-    for block in rows.tensor_split(_BLOCKS, -2):
+    # more or fewer blocks separate right trials from a second motion less
+    for block in rows.tensor_split(3, -2):
         if not block.shape[-2]:
             continue
         energy = power_of(block).sum(-1)
-        strongest = energy.topk(min(_JUDGED, block.shape[-2]), -1).indices
+        strongest = energy.topk(min(48, block.shape[-2]), -1).indices
         block = block.gather(-2, strongest[..., None].expand(-1, -1, rows.shape[-1]))
-        own = fixed_point(block, pair_phase(block, present), Run(LogAbove(2.5), AlongPulses(), _ITERATIONS, 1.8, 0.0))[
-            0
-        ]
+        own = fixed_point(block, pair_phase(block, present), Run(LogAbove(2.5), AlongPulses(), 12, 1.8, 0.0))[0]
         images = (torch.fft.fft(rotate(block, at), norm="ortho") for at in (own, phase))
         (alone, count, _), (common, _, _) = (sharpness_beyond_speckle(image) for image in images)
         gains.append((alone - common) / sharpness_of_noise(count.clamp_min(1)))
@@ -267,7 +250,7 @@ def halves_of_image(through: Through, rows: Tensor, phase: Tensor) -> tuple[Tens
     """
     image = through.image(rotate(rows, phase))
     lines = image.shape[-1]
-    strip = torch.arange(lines, device=image.device) // max(1, min(_STRIP, lines // 2))
+    strip = torch.arange(lines, device=image.device) // max(1, min(4, lines // 2))
     energy = power_of(image).sum(-2)
     strips = energy.new_zeros(len(energy), int(strip[-1]) + 1).index_add_(1, strip, energy)
     place = strips.argsort(-1, descending=True).argsort(-1)[:, strip]
@@ -300,7 +283,7 @@ def half_difference(
     one, other = continued(halves, phase)
     apart = residual_phase(one, other, present)
     moved = phase_rmse(one - apart / 2, phase, present)
-    apart = torch.where(apart.abs() > _APART_RAD, apart, apart / 2)
+    apart = torch.where(apart.abs() > 2, apart, apart / 2)
     apart = (apart.square().sum(-1) / present.sum(-1).clamp_min(1)).sqrt()
     return torch.where(filled, torch.maximum(apart, moved), UNKNOWN_RAD).double()
 
@@ -313,16 +296,19 @@ def _from(again: Again, which: Tensor, halves: Sequence[Tensor], phase: Tensor) 
 def _disturbed(
     again: Again, which: Tensor, present: Tensor, halves: Sequence[Tensor], phase: Tensor
 ) -> Sequence[Tensor]:
-    """Phases of halves that continue from either side of the phase until they return or settle."""
+    """Phases of halves that continue from either side of the phase, two rounds at most.
+
+    What the scene does not hold stays apart, and weak targets are found again.
+    """
     walk = _walk(phase)
     ends: Sequence[Tensor] = (phase + walk, phase - walk)
     active = torch.ones_like(phase[:, 0], dtype=torch.bool)
-    for number in range(1, _ROUNDS + 1):
+    for number in (1, 2):
         reached = [again(half, which, at) for half, at in zip(halves, ends, strict=True)]
-        far = torch.stack([_moved(*pair, present) for pair in zip(reached, ends, strict=True)]) >= _RETURNED_RAD
+        far = torch.stack([_moved(*pair, present) for pair in zip(reached, ends, strict=True)]) >= 0.04
         ends = [torch.where(active[:, None], new, old) for new, old in zip(reached, ends, strict=True)]
         active = active & far.any(0)
-        if number < _ROUNDS and not host_value(active.any(), True):
+        if number < 2 and not host_value(active.any(), True):
             break
     return ends
 
@@ -334,9 +320,9 @@ def _moved(new: Tensor, old: Tensor, present: Tensor) -> Tensor:
 
 
 def _walk(phase: Tensor) -> Tensor:
-    """Walk of phases in rad without a straight line, (pulse,): the same in every trial."""
+    """Walk of phases without a straight line, 0.4 rad rms, (pulse,): the same in every trial."""
     pulse = torch.arange(phase.shape[-1], dtype=torch.float64, device=phase.device)
     # steps that repeat nowhere: the angles are irrational parts of a turn times squares
     walk = torch.cos(math.pi * (math.sqrt(5) - 1) * pulse.square()).cumsum(-1)
     walk = without_line(walk, torch.ones_like(walk, dtype=torch.bool))
-    return (_DISTURBED_RAD / walk.square().mean().sqrt() * walk).to(phase.dtype)
+    return (0.4 / walk.square().mean().sqrt() * walk).to(phase.dtype)

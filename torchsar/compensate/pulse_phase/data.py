@@ -6,7 +6,6 @@ over range.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -144,32 +143,39 @@ def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | 
 
 
 def by_blocks(
-    pulses: Pulses, work: Callable[[slice], tuple[Tensor, ...]], whole: bool, gradients: bool = False
+    pulses: Pulses,
+    work: Callable[[slice], tuple[Tensor, ...]],
+    whole: bool = False,
+    gradients: bool = False,
+    size: int | None = None,
 ) -> tuple[Tensor, ...]:
-    """Process blocks of trials that fit into the cache, and join their results.
+    """Process blocks of trials, and join their results.
 
     Args:
         pulses: The pulses.
         work: Function of a slice of the trials that returns tensors (trial, ...).
         whole: Whether to process all trials at once.
-        gradients: Whether gradients are required; then all trials are processed at once.
+        gradients: Whether gradients are required; blocks are then processed one after another.
+        size: Trials in a block, by default as many as fit into the cache.
 
     Returns:
         The tensors of all trials.
     """
-    rows = pulses.rows
-    if whole or gradients or len(rows) <= 1:
-        with contextlib.nullcontext() if gradients else torch.no_grad():
-            return work(slice(None))
-    height = max(1, block_bytes_of(rows.device) // (rows[0].numel() * rows.element_size()))
-    parts = [slice(first, first + height) for first in range(0, len(rows), height)]
-    done: dict[int, tuple[Tensor, ...]] = {}
+    rows, done = pulses.rows, {}
+    if size is None:
+        size = max(1, block_bytes_of(rows.device) // max(1, rows[:1].numel() * rows.element_size()))
+    size = max(1, len(rows)) if whole else size
+    parts = [slice(first, first + size) for first in range(0, max(1, len(rows)), size)]
 
     def into(part: slice) -> None:
         done[part.start] = work(part)
 
-    with torch.no_grad():
-        over_blocks(into, parts, rows)
+    if gradients:
+        for part in parts:
+            into(part)
+    else:
+        with torch.no_grad():
+            over_blocks(into, parts, rows)
     return tuple(torch.cat(pieces) for pieces in zip(*(done[part.start] for part in parts), strict=True))
 
 
@@ -203,7 +209,8 @@ def find_phases(
         return find(rows[part], pulses.present[part], None if start is None else start[part])
 
     of_gradients = any(isinstance(x, Tensor) and x.requires_grad for x in (rows, start, *tuned))
-    phase, taken = by_blocks(pulses, work, whole, of_gradients and torch.is_grad_enabled())
+    gradients = of_gradients and torch.is_grad_enabled()
+    phase, taken = by_blocks(pulses, work, whole or gradients, gradients)
     return phase, taken
 
 

@@ -8,7 +8,6 @@ sharpen the image end with wrong phases in a homogeneous scene; function `link_p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,40 +15,10 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import or_one, rotate
 from torchsar.core import power_of
 
-# Range cells are grouped by power, because each group has its own spectrum: largest ratio of the
-# powers in a group, and number of groups; the last one also takes all weaker cells.
-_GROUP_RATIO, _GROUPS = 4.0, 4
 # least spectral density relative to its mean: it keeps R invertible where noise is weak
 SPECTRAL_FLOOR = 1e-4
-_LAGS = 4  # distances of the pulses whose coherence is compared with that of noise
-_LEAST_REST = 1e-14  # power of the weak cells relative to the mean: below it sums are inexact
-# independent range cells below which a spectrum fits single scatterers as well as speckle: found by
-# trial on 4 to 20 cells of few points
+# independent range cells below which a spectrum fits single scatterers as well as speckle
 LEAST_LOOKS = 10.0
-# the strongest rows are described, and of each group those are compared by their products
-_DESCRIBED, _COMPARED = 256, 64
-_SURE = 4.0  # standard deviations by which coherence must exceed that of noise
-_BIN_NATS = 0.02  # width of the bins of logarithmic power in which strong cells are counted
-
-
-@dataclass(frozen=True)
-class Descriptions:
-    """Gains of the log likelihood of two descriptions of the scene over white noise, in nats.
-
-    Args:
-        sparse: Gain of the sparse description, shape (trial,).
-        ratio: Gain of the homogeneous description over that of the sparse one, without the part of
-            both that is due to the powers of the range cells, shape (trial,). It is zero where the
-            coherence of the pulses does not exceed that of noise.
-    """
-
-    sparse: Tensor
-    ratio: Tensor
-
-    @property
-    def homogeneous(self) -> Tensor:
-        """True where the homogeneous description is more likely, shape (trial,), bool."""
-        return self.ratio > 1
 
 
 def occupied_band(spectrum: Tensor) -> Tensor:
@@ -69,7 +38,7 @@ def occupied_band(spectrum: Tensor) -> Tensor:
 
 
 def power_groups(power: Tensor) -> Tensor:
-    """Assign range cells to groups of similar power.
+    """Assign range cells to four groups of similar power, because each has its own spectrum.
 
     Args:
         power: Power of the range cells, shape (trial, range).
@@ -79,11 +48,11 @@ def power_groups(power: Tensor) -> Tensor:
         holds the cells down to a quarter of the greatest power, and the last one all weaker cells.
     """
     ratio = power.amax(-1, keepdim=True) / power.clamp_min(torch.finfo(power.dtype).tiny)
-    member = (ratio.log() / math.log(_GROUP_RATIO)).clamp(0, _GROUPS - 1).long()
-    return torch.stack([member == group for group in range(_GROUPS)])
+    member = (ratio.log() / math.log(4)).clamp(0, 3).long()
+    return torch.stack([member == group for group in range(4)])
 
 
-def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> Descriptions:
+def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> tuple[Tensor, Tensor]:
     """Compare the likelihoods of the two descriptions of a scene for given phases.
 
     The homogeneous description is judged by the greater of two gains: that of the Doppler spectra
@@ -97,11 +66,14 @@ def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> Descriptio
             `occupied_band`.
 
     Returns:
-        The gains and the decision.
+        The gain of the log likelihood of the sparse description over white noise in nats; and the
+        ratio of the gain of the homogeneous description to it, both without the part that is due to
+        the powers of the range cells: above 1 if the homogeneous description is likelier, and 0
+        where the coherence of the pulses does not exceed that of noise. Shape (trial,) each.
     """
     n = rows.shape[-1]
-    if rows.shape[-2] > _DESCRIBED:
-        strongest = power_of(rows).sum(-1).topk(_DESCRIBED, -1).indices
+    if rows.shape[-2] > 256:  # the strongest rows are described
+        strongest = power_of(rows).sum(-1).topk(256, -1).indices
         rows = rows.gather(1, strongest[..., None].expand(-1, -1, n))
     energy = power_of(rows)
     mean = energy.mean((-2, -1), dtype=torch.float64)
@@ -119,7 +91,7 @@ def describe(rows: Tensor, phase_rad: Tensor, independent: Tensor) -> Descriptio
 
     gain, deviation = _coherence(rows, groups, cells, independent)
     ratio = torch.maximum(by_spectra - by_power, gain) / or_one(sparse - by_power)
-    return Descriptions(sparse, torch.where(gain > _SURE * deviation, ratio, 0))
+    return sparse, torch.where(gain > 4 * deviation, ratio, 0)
 
 
 def sparse_gain_nats(power: Tensor) -> Tensor:
@@ -135,18 +107,19 @@ def sparse_gain_nats(power: Tensor) -> Tensor:
     Returns:
         The gain over N cells of one power in nats, shape (trial,), 0 or more, float64.
     """
-    total, least = power[0].numel() if len(power) else 1, math.log(_LEAST_REST)
-    bins = math.ceil((math.log(total) - least) / _BIN_NATS) + 1
-    level = ((power.flatten(1).clamp_min(_LEAST_REST).log() - least) / _BIN_NATS).long().clamp(0, bins - 1)
+    floor, width = 1e-14, 0.02  # below this power, relative to the mean, sums are inexact
+    total, least = power[0].numel() if len(power) else 1, math.log(floor)
+    bins = math.ceil((math.log(total) - least) / width) + 1
+    level = ((power.flatten(1).clamp_min(floor).log() - least) / width).long().clamp(0, bins - 1)
     cells = torch.zeros(len(power), bins, device=power.device)
     cells = cells.scatter_add(-1, level, torch.ones_like(power.flatten(1)).to(cells)).to(torch.float64)
-    nats = least + _BIN_NATS * (torch.arange(bins, dtype=torch.float64, device=power.device) + 0.5)
+    nats = least + width * (torch.arange(bins, dtype=torch.float64, device=power.device) + 0.5)
     # of the cells in a bin and above, and of those below
     count, own = (x.flip(-1).cumsum(-1).flip(-1) for x in (cells, cells * nats))
     rest = (cells * nats.exp()).cumsum(-1).roll(1, -1)[:, 1:] / (total - count[:, 1:]).clamp_min(1)
     count, own = count[:, 1:], own[:, 1:]
     cost = count * (2 + torch.log(total / or_one(count)))
-    gain = total - own - cost - (total - count) * (1 + rest.clamp_min(_LEAST_REST).log())
+    gain = total - own - cost - (total - count) * (1 + rest.clamp_min(floor).log())
     filled = (power > 0).flatten(1).any(-1)
     return torch.where(filled, gain.amax(-1).clamp_min(0), 0)
 
@@ -172,7 +145,7 @@ def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor)
     row = kinds * energy.sum(-1)
     looks = row.sum(-1).square() / or_one(row.square().sum(-1)) * independent
     excess = torch.zeros_like(cells)
-    lags = min(_LAGS, n - 1)
+    lags = min(4, n - 1)  # distances of the pulses
     for lag in range(1, lags + 1):
         product = torch.einsum("gtr,trp->gtp", kinds.to(rows.dtype), rows[..., lag:] * rows[..., :-lag].conj())
         square = power_of(product).sum(-1)
@@ -184,7 +157,7 @@ def _coherence(rows: Tensor, groups: Tensor, cells: Tensor, independent: Tensor)
 
 
 def different_rows(rows: Tensor, energy: Tensor) -> Tensor:
-    """Compute the effective number of different rows among the strongest.
+    """Compute the effective number of different rows among the 64 strongest.
 
     It is (tr G)^2 / (tr G^2 - (tr G)^2 / P) for the products G of the rows over P pulses: the
     number of rows in white noise, and that of the points whose side lobes the rows are.
@@ -196,7 +169,7 @@ def different_rows(rows: Tensor, energy: Tensor) -> Tensor:
     Returns:
         The number, shape (trial,), float64.
     """
-    power, strongest = energy.topk(min(_COMPARED, energy.shape[-1]), -1)
+    power, strongest = energy.topk(min(64, energy.shape[-1]), -1)
     some = rows.gather(1, strongest[..., None].expand(-1, -1, rows.shape[-1])) * (power > 0)[..., None]
     products = some @ some.mH
     total = products.diagonal(dim1=-2, dim2=-1).real.sum(-1).double().square()

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import Pulses, or_one, prepare, starting_phase
+from torchsar.compensate.pulse_phase.data import Pulses, by_blocks, or_one, prepare, starting_phase
 from torchsar.compensate.pulse_phase.homogeneous import smoothed_spectrum
 from torchsar.compensate.pulse_phase.likelihood import (
     Fit,
@@ -26,17 +26,8 @@ from torchsar.compensate.pulse_phase.likelihood import (
 )
 from torchsar.compensate.pulse_phase.linking_assess import Judged, judged, outcome_of
 from torchsar.compensate.pulse_phase.stages import _PhaseEstimatorFromStart
-from torchsar.core import Estimate, Outcome, cis, over_blocks
+from torchsar.core import Estimate, Outcome, cis
 
-# Longest block whose phases are found by themselves, in pulses; bands of their first guesses as
-# shares of the pulse rate.
-_BLOCK, _WIDTHS = 32, (0.1, 0.25, 0.45, 0.65, 0.8, 0.9)
-# Estimates of the spectrum of such a block, and of two blocks that were joined; those smoothed by a
-# window, because the first phases are far off.
-_ROUNDS, _JOINT_ROUNDS, _COARSE_ROUNDS = 8, 3, 2
-# Triples of rounds with adapted spectra; longest extrapolation; change, as a share of the predicted
-# standard deviation, that ends them.
-_REFINEMENTS, _LONGEST, _SMALL = 6, 8.0, 0.3
 _BLOCK_BYTES = 64 << 20  # limits the memory of a block of trials
 
 
@@ -121,20 +112,12 @@ def linked(pulses: Pulses, start: Tensor | None = None, still: bool = False, ass
         info = {"gain_nats": none.reshape(trials), "fit_nats": none.reshape(trials)}
         return Estimate({"phase_rad": zero}, outcome=Outcome.SINGULAR.like(info["gain_nats"]), info=info)
     size = max(1, _BLOCK_BYTES // (16 * n * (6 * n + 2 * rows.shape[1])))
-    parts = [slice(first, first + size) for first in range(0, len(rows), size)]
-    done: dict[int, tuple[Tensor, ...]] = {}
 
-    def work(part: slice) -> None:
-        begin = None if start is None else start[part]
-        done[part.start] = _linked(rows[part], pulses.present[part], begin, still, assess)
+    def work(part: slice) -> tuple[Tensor, ...]:
+        return _linked(rows[part], pulses.present[part], None if start is None else start[part], still, assess)
 
-    if rows.requires_grad and torch.is_grad_enabled():
-        for part in parts:
-            work(part)
-    else:
-        with torch.no_grad():
-            over_blocks(work, parts, rows)
-    phase, fit, gain, *rest = (torch.cat(x) for x in zip(*(done[part.start] for part in parts), strict=True))
+    gradients = rows.requires_grad and torch.is_grad_enabled()
+    phase, fit, gain, *rest = by_blocks(pulses, work, gradients=gradients, size=size)
     value = {"phase_rad": phase.reshape(*trials, n).to(rows.real.dtype)}
     info = {"gain_nats": gain.reshape(trials), "fit_nats": fit.reshape(trials)}
     if not assess:
@@ -174,10 +157,10 @@ def _grown(scene: Speckle) -> Tensor:
 
     A search over all pulses ends in local minima, in which parts of the pulses have slipped by a
     Doppler cell. Few pulses have few minima. The phases of short blocks are therefore found first,
-    and neighbouring blocks are joined until one is left.
+    of at most 32 pulses, and neighbouring blocks are joined until one is left.
     """
     trials, n = scene.present.shape
-    size = -(-n // 2 ** max(0, math.ceil(math.log2(n / _BLOCK))))
+    size = -(-n // 2 ** max(0, math.ceil(math.log2(n / 32))))
     u = _solved(scene.blocks(size))
     while size < n:
         blocks = u.reshape(trials, -1, size)
@@ -197,11 +180,12 @@ def _solved(blocks: Speckle) -> Tensor:
     which = torch.arange(count, device=blocks.samples.device)
     together = max(1, _BLOCK_BYTES // max(1, sum(16 * own.numel() for own, *_ in blocks.groups)))
     found, gains = [], []
-    for widths in torch.tensor(_WIDTHS, dtype=torch.float64, device=which.device).split(together):
+    bands = torch.tensor((0.1, 0.25, 0.45, 0.65, 0.8, 0.9), dtype=torch.float64, device=which.device)
+    for widths in bands.split(together):
         every = blocks.trials(which.repeat(len(widths)))
         u = every.start(widths.repeat_interleave(count))
-        for number in range(_ROUNDS):
-            smooth = windowed_spectrum if number < _COARSE_ROUNDS else smoothed_spectrum
+        for number in range(8):  # the first phases are far off
+            smooth = windowed_spectrum if number < 2 else smoothed_spectrum
             u = newton(every.fit(every.periodograms(u, smooth)).matrix, u)
         gain = every.gain(u, every.fit(every.periodograms(u, smoothed_spectrum)))
         found.append(u.unflatten(0, (-1, count)))
@@ -236,7 +220,7 @@ def _joined(pairs: Speckle, u: Tensor) -> Tensor:
     best = (own - 2 * mutual.abs()).argmin(-1, keepdim=True)
     line = 2 * math.pi / slopes * best * torch.arange(half, device=u.device)
     u = torch.cat([left, -right * cis(line - torch.angle(mutual.gather(-1, best)))], -1)
-    for _ in range(_JOINT_ROUNDS):
+    for _ in range(3):
         u = newton(matrix, u)
         matrix = pairs.fit(pairs.periodograms(u, smoothed_spectrum)).matrix
     return u
@@ -247,26 +231,26 @@ def _refined(scene: Speckle, u: Tensor) -> tuple[Tensor, Fit]:
 
     Phases and spectra are found in turn. A smooth error of the phase widens the spectrum, and the
     wider spectrum hardly opposes it; three rounds are therefore extrapolated (squared iteration)
-    where that makes the phases more likely.
+    where that makes the phases more likely, until they move by less than 0.3 standard deviations.
     """
     spectra = scene.periodograms(u, smoothed_spectrum)
     std = rms_of_pulses(deviation(scene.summed(scene.information_each(scene.fit(spectra)))), scene.present)
     active = torch.arange(len(u), device=u.device)
-    for _ in range(_REFINEMENTS):
+    for _ in range(6):
         some, first = scene.trials(active), u[active]
         own = [of_all[active] for of_all in spectra]
         second, own = some.round(first, own)
         third, own = some.round(second, own)
         step, next_ = torch.angle(second * first.conj()), torch.angle(third * second.conj())
         bend = (next_ - step).norm(dim=-1, keepdim=True)
-        reach = (step.norm(dim=-1, keepdim=True) / or_one(bend)).where(bend > 0, 1).clamp(1, _LONGEST)
+        reach = (step.norm(dim=-1, keepdim=True) / or_one(bend)).where(bend > 0, 1).clamp(1, 8)
         far, of_far = some.round(first * cis(2 * reach * step + reach.square() * (next_ - step)), own)
         better = some.gain(far, some.fit(of_far)) > some.gain(third, some.fit(own))
         new = torch.where(better[:, None], far, third)
         own = [torch.where(better[:, None], one, other) for one, other in zip(of_far, own, strict=True)]
         u = u.index_copy(0, active, new)
         spectra = [of_all.index_copy(0, active, of_some) for of_all, of_some in zip(spectra, own, strict=True)]
-        active = active[_distance(new, first) > _SMALL * std[active]]
+        active = active[_distance(new, first) > 0.3 * std[active]]
         if not len(active):
             break
     return u, scene.fit(spectra)

@@ -30,29 +30,6 @@ from torchsar.compensate.pulse_phase.likelihood import (
 )
 from torchsar.core import Outcome, fft_lines, power_of, worst
 
-# Gain of the log likelihood per pulse by which the phases fit circular noise: 1.1 to 2.3 nats were
-# measured for 4 to 192 range cells and 64 to 256 pulses. A scene must gain twice as much.
-_NOISE_NATS, _MARGIN = 2.0, 2.0
-# The errors of neighbouring pulses depend on each other, and where the spectrum has no edges a slow
-# phase error hardly changes it, so that the rms error of a scene may exceed its standard deviation
-# by this factor, and by more with fewer range cells than `_CELLS`. Found by trial.
-_SPREAD, _CELLS = 1.9, 24
-_PARTS = 4  # parts of the range cells; 2 to 8 predict about the same
-# Share of the energy that the cells must hold which share their spectrum with others: cells with
-# the side lobes of few points do so too. It is a quarter in clutter with five points of +15 dB.
-_LEAST_ENERGY = 0.2
-# Excess of the deviation (see `Crossed`) up to which range cells of similar power have the same
-# spectrum: it was 0.8 to 1.1 in 90 % of the scenes of clutter, 1.2 to 9 where each cell holds few
-# scatterers; number of cells from which on their scatter predicts the errors all the same; and
-# deviations by which such cells may move the phases of all.
-_UNLIKE, _MANY_ROWS, _MOVED = 1.2, 30.0, 1.5
-# Share of the coherence across a boundary between pulses that the fitted spectra must find: of
-# homogeneous scenes the least one was 0.6 to 0.9 over all boundaries, of scenes that change at a
-# pulse 0.1 to 0.5. Boundaries in the first and last sixteenth of the pulses are left out.
-_LEAST_SHARE, _OUTER = 0.55, 16
-# the phases that sharpen a sparse scene, as in `autofocus`
-_SHARPEN = Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)
-
 
 class Judged(NamedTuple):
     """What a block of trials tells of its linked phases.
@@ -124,7 +101,9 @@ def judged(scene: Speckle, u: Tensor, fit: Fit, still: bool) -> Judged:
     some = energy * sum(
         here[:, None] * (own != 0).any(-2) for (own, *_), here in zip(scene.groups, sharing, strict=True)
     )
-    known = (failed == 0) & (some.sum(-1) > _LEAST_ENERGY * energy.sum(-1))
+    # Cells with the side lobes of few points share their spectrum too. In clutter with five points
+    # of +15 dB the cells that share it hold a quarter of the energy.
+    known = (failed == 0) & (some.sum(-1) > 0.2 * energy.sum(-1))
     excess = torch.where(known, rms_of_pulses(scatter, scene.present) / or_one(alone), torch.inf)
     shift = torch.where(known, rms_of_pulses(steps.sum(-1), scene.present), torch.inf)
     std = deviation(independent[:, None, None] * scene.summed(each)) * excess.clamp_min(1)[:, None]
@@ -137,7 +116,7 @@ def _crossed(scene: Speckle, u: Tensor, fit: Fit, sharing: list[Tensor]) -> tupl
     """
     bend, slopes = torch.zeros_like(scene.groups[0][1].real), torch.zeros_like(scene.groups[0][0].real)
     cells = torch.arange(slopes.shape[-1], device=u.device)
-    for part in cells.tensor_split(_PARTS):
+    for part in cells.tensor_split(4):  # 2 to 8 parts predict about the same
         inside = torch.isin(cells, part).expand(len(u), -1)
         own_cells, others = scene.cells(inside), scene.cells(~inside)
         adapted = zip(others.adapted(u, fit), sharing, strict=True)
@@ -165,36 +144,46 @@ def outcome_of(
         Outcomes; standard deviations in rad, (trial, pulse); quality; and what is for reports;
         shape (trial,).
     """
-    noise = _NOISE_NATS * pulses.present.sum(-1)
+    # Phases fit circular noise: 1.1 to 2.3 nats per pulse were measured for 4 to 192 range cells
+    # and 64 to 256 pulses. A scene must gain twice as much.
+    noise = 2.0 * pulses.present.sum(-1)
     share = (1 - noise / or_one(gain)).clamp(0, 1)
     lost = torch.where(share > 0, or_one(share).rsqrt(), torch.inf)
     std = (found.std * lost[:, None]).clamp_max(PRIOR**-0.5)
     strehl = torch.exp(-rms_of_pulses(std, pulses.present).square())
     alone = found.alone * found.excess.clamp_min(1)
-    spread = _SPREAD**2 * (_CELLS / found.rows.clamp_min(1)).clamp_min(1)
+    # The errors of neighbouring pulses depend on each other, and where the spectrum has no edges a
+    # slow phase error hardly changes it, so that the rms error of a scene may exceed its standard
+    # deviation by this factor, and by more with fewer than 24 range cells.
+    spread = 1.9**2 * (24 / found.rows.clamp_min(1)).clamp_min(1)
     spectrum = fft_lines(pulses.rows)
-    moved = displacement(spectrum, pulses.present)
-    jitter = torch.maximum(moved.jitter, coherent_jitter(pulses.rows, pulses.present))
+    jitter, migration = displacement(spectrum, pulses.present)
+    jitter = torch.maximum(jitter, coherent_jitter(pulses.rows, pulses.present))
     outcome = worst(
         (Outcome.INEXACT, spread * (lost * alone).square() >= -math.log(LEAST_STREHL)),
-        (Outcome.PARTS_DISAGREE, found.shift >= _MOVED * alone),
-        (Outcome.PARTS_DISAGREE, (found.excess >= _UNLIKE) & (found.rows <= _MANY_ROWS)),
-        (Outcome.PARTS_DISAGREE, found.boundary <= _LEAST_SHARE),
+        (Outcome.PARTS_DISAGREE, found.shift >= 1.5 * alone),
+        # the excess was 0.8 to 1.1 in 90 % of the scenes of clutter, 1.2 to 9 where each cell holds
+        # few scatterers; the scatter of more than 30 cells predicts the errors all the same
+        (Outcome.PARTS_DISAGREE, (found.excess >= 1.2) & (found.rows <= 30)),
+        # the least coherence over all boundaries was 0.6 to 0.9 in homogeneous scenes, 0.1 to 0.5
+        # in scenes that change at a pulse
+        (Outcome.PARTS_DISAGREE, found.boundary <= 0.55),
         (Outcome.SPARSE, ~found.excess.isfinite()),
-        (Outcome.DISPLACED, (jitter >= LARGEST_JITTER) | (moved.migration >= LARGEST_MIGRATION)),
-        (Outcome.NOISE, gain <= _MARGIN * noise),
+        (Outcome.DISPLACED, (jitter >= LARGEST_JITTER) | (migration >= LARGEST_MIGRATION)),
+        (Outcome.NOISE, gain <= 2 * noise),
         (Outcome.EMPTY, ~pulses.present.any(-1)),
         (Outcome.SINGULAR, pulses.present.sum(-1) < 3),
     )
     if sparse:
-        sharp = fixed_point(pulses.rows, pair_phase(pulses.rows, pulses.present), _SHARPEN)[0]
-        scene = describe(pulses.rows, sharp, occupied_band(spectrum))
-        outcome = torch.maximum(outcome, worst((Outcome.SPARSE, (gain <= scene.sparse) | (scene.ratio <= 0))))
+        start, run = pair_phase(pulses.rows, pulses.present), Run(LogAbove(2.5), AlongPulses(), 60, 1.8, 0.01)
+        sharp = fixed_point(pulses.rows, start, run)[0]
+        sparse_gain, ratio = describe(pulses.rows, sharp, occupied_band(spectrum))
+        outcome = torch.maximum(outcome, worst((Outcome.SPARSE, (gain <= sparse_gain) | (ratio <= 0))))
     info = {
         "excess_deviation": found.excess,
         "weakest_boundary": found.boundary,
         "jitter_cells": jitter,
-        "migration_cells": moved.migration,
+        "migration_cells": migration,
     }
     return outcome, std, strehl * share, info
 
@@ -204,9 +193,10 @@ def _weakest_boundary(matrix: Tensor, u: Tensor, information: Tensor) -> Tensor:
 
     It is the part of the log likelihood that pairs of pulses across the boundary contribute: it
     would change its sign with the phases of all later pulses. Its expectation for a covariance R
-    is that of u^H (R^-T o C) u, which is half of the Fisher information.
+    is that of u^H (R^-T o C) u, which is half of the Fisher information. Boundaries in the first
+    and the last sixteenth of the pulses are left out.
     """
-    skipped = u.shape[-1] // _OUTER
+    skipped = u.shape[-1] // 16
 
     def across(pairs: Tensor) -> Tensor:
         sums = pairs.cumsum(-2).cumsum(-1)

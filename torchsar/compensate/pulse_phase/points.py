@@ -162,7 +162,7 @@ class _Fit:
             # quarter of the energy without noise: phases that make a line of one point out of ten
             # hide the others.
             if number == 3:
-                unknown = power_of(rows - model).sum((-2, -1)) - self.noise * self._degrees(lines.shape[-1])
+                unknown = power_of(rows - model).sum((-2, -1)) - self.noise * self.cells * (pulses - lines.shape[-1])
                 energy = power_of(self.rows).sum((-2, -1)) - self.cells * pulses * self.noise
                 free = free | (unknown < 0.25 * energy.detach())
                 active = active & free
@@ -190,14 +190,11 @@ class _Fit:
         """Return the rows without a bend."""
         return self.rows * cis(-bend[:, None, None] * self.curve)
 
-    def _degrees(self, lines: int) -> Tensor:
-        """Complex degrees of freedom that lines leave to the noise, (trial,)."""
-        return self.cells * (self.present.sum(-1) - lines)
-
     def rest(self) -> Tensor:
         """Power of what is not explained in powers of the noise, (trial,): 1 if it is all noise."""
         # a phase or a Doppler is half a complex parameter
-        degrees = self._degrees(self.lines.shape[-1]) - (self.present.sum(-1) + self.lines.shape[-1]) / 2
+        pulses, lines = self.present.sum(-1), self.lines.shape[-1]
+        degrees = self.cells * (pulses - lines) - (pulses + lines) / 2
         return power_of(self.left).sum((-2, -1)) / or_one(self.noise * degrees)
 
     def of_second_range(self) -> Tensor:

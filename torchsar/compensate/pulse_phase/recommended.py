@@ -374,12 +374,12 @@ def _with_linked(pulses: Pulses, sharpest: Estimate, assess: bool) -> Estimate:
     """
     rows, phase = pulses.rows.detach(), sharpest["phase_rad"].detach().reshape(-1, pulses.n)
     with torch.no_grad():
-        described = describe(rows, phase, occupied_band(fft_lines(rows)))
-    at = true_positions(described.homogeneous, host_value(described.homogeneous.sum(), 0))
+        sparse, ratio = describe(rows, phase, occupied_band(fft_lines(rows)))
+    at = true_positions(ratio > 1, host_value((ratio > 1).sum(), 0))
     if not len(at) or pulses.n < 3:
         return sharpest
     some = linked(Pulses(pulses.rows[at], pulses.present[at], at.shape), assess=assess)
-    likelier = some.info["gain_nats"] > described.sparse[at]
+    likelier = some.info["gain_nats"] > sparse[at]
 
     def mixed(of_all: Tensor, of_some: Tensor) -> Tensor:
         flat, width = of_all.reshape(len(rows), -1), likelier[:, None]
