@@ -25,7 +25,6 @@ from torchsar.compensate import envelope_assess
 from torchsar.compensate.envelope_fit import (
     Course,
     Envelopes,
-    refined_shifts,
     running_shifts,
     single_shifts,
     smooth_shifts,
@@ -159,7 +158,7 @@ def align_envelopes(
         shift = running_shifts(pulses, 0.1)
         if method != "running":
             shift = single_shifts(pulses, shift, "amplitude" if method == "amplitude" else "likelihood", 4)
-        return refined_shifts(pulses, shift) if method == "single" else shift, None
+        return single_shifts(pulses, shift, "refined", 2) if method == "single" else shift, None
 
     flat, present = checked(data, "align_envelopes")
     flat, shape = flat.detach(), data.shape[:-2]

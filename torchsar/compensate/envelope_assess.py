@@ -15,18 +15,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.envelope_fit import Course, Envelopes, refined_shifts, robust_std, single_shifts
+from torchsar.compensate.envelope_fit import Course, Envelopes, robust_std, single_shifts
 from torchsar.core import Estimate, Outcome, worst, wrapped
 
 # standard deviation of a shift in cells from which on an alignment is not ok: a convention
 GOOD_CELLS = 0.5
-# share of the deviation of random positions in the window from which on nothing was found, by
-# choice: polynomials in noise have 0.6 of it, single pulses by half of the band 0.28
-_RANDOM = 0.15
 _LEAST_RANGE_CELLS = 4
-# usual differences of the halves by which those of a pulse are far, and largest share of such
-# pulses
-_FAR, _MOST_FAR = 4.0, 0.05
 
 
 def deviation(
@@ -62,10 +56,10 @@ def deviation(
         agree = (apart.square().sum(-1) / count).sqrt() < GOOD_CELLS
         return std, agree & (std < GOOD_CELLS / 2)
     # a pulse whose halves differ by far is aligned at a wrong maximum by one of them
-    usual = _FAR * robust_std(apart.abs(), present)
-    agree = (apart.abs() > usual).sum(-1) <= _MOST_FAR * count
+    usual = 4.0 * robust_std(apart.abs(), present)
+    agree = (apart.abs() > usual).sum(-1) <= 0.05 * count
     envelopes = Envelopes.of(lines)
-    likeliest = refined_shifts(envelopes, single_shifts(envelopes, shift, "likelihood", 3))
+    likeliest = single_shifts(envelopes, single_shifts(envelopes, shift, "likelihood", 3), "refined", 2)
     terms = torch.minimum(apart.abs(), usual).square() + torch.where(present, wrapped(likeliest - shift, n), 0).square()
     # without noise, the parabola through samples a quarter of a cell apart errs by 1e-3 cells
     return (terms.sum(-1) / count + 1e-6).sqrt(), agree
@@ -89,7 +83,9 @@ def assessed(found: Estimate, std: Tensor, agree: Tensor, cells: int) -> Estimat
         (Outcome.INEXACT, std >= GOOD_CELLS),
         (Outcome.PARTS_DISAGREE, ~agree),
         (Outcome.TOO_FEW, (count < 2) | (cells < _LEAST_RANGE_CELLS)),
-        (Outcome.NOISE, (std > _RANDOM * random) & (count >= 2) & (cells >= _LEAST_RANGE_CELLS)),
+        # polynomials in noise have 0.6 of the deviation of random positions in the window, single
+        # pulses by half of the band 0.28
+        (Outcome.NOISE, (std > 0.15 * random) & (count >= 2) & (cells >= _LEAST_RANGE_CELLS)),
         (Outcome.EMPTY, count == 0),
     )
     wide = std[..., None].expand_as(found["shift_cells"])

@@ -18,10 +18,6 @@ _HALF = 2  # samples per cell: |s|^2 has twice the band of s
 _QUARTER = 4  # samples per cell in correlations, whose other factor is not band-limited
 # least power of a cell in the likelihood, over the mean power: empty cells must not dominate
 _FLOOR = 1e-2
-# Sidelobes of all cells, beyond this distance in cells and times this factor, are the least power
-# too: they repeat the speckle of the cells that they come from. Found by trial, on 1 to 200 points.
-_SIDELOBE_CELLS, _SIDELOBES = 1.5, 1.5
-_LEAST_TONE_CELLS = 0.05  # amplitude of a tone whose removal costs as much as it gains
 # power of a tone in the mean powers of a periodogram, beyond the log of its number of cells: one
 # false tone in 400 trials (exp(-6) = 1 / 403)
 _STANDS_OUT = 6.0
@@ -119,8 +115,9 @@ class Envelopes:
             at = torch.arange(samples, dtype=power.dtype, device=power.device) * (self.n / samples)
             # upper limit of the power of a sinc pulse in a circular window
             limit = (samples / self.n) * (self.n * torch.sin(math.pi * at / self.n)).square()
-            far = torch.minimum(at, self.n - at) >= _SIDELOBE_CELLS
-            kernel = torch.where(far, _SIDELOBES / torch.where(far, limit, 1), 0)
+            # beyond 1.5 cells and times 1.5, for 1 to 200 points
+            far = torch.minimum(at, self.n - at) >= 1.5
+            kernel = torch.where(far, 1.5 / torch.where(far, limit, 1), 0)
             level = torch.fft.irfft(torch.fft.rfft(power) * torch.fft.rfft(kernel), samples)
             power = torch.maximum(power, level)
         weight = -1 / power.clamp_min(_FLOOR)
@@ -183,47 +180,30 @@ def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
 def single_shifts(pulses: Envelopes, start: Tensor, match: str, iterations: int) -> Tensor:
     """Find the shift of each pulse separately against the mean envelope of all aligned pulses.
 
-    The shifts lie within half a window of those in `start`.
-
-    Args:
-        pulses: Envelopes.
-        start: Shifts to start from, in cells, shape (trial, pulse).
-        match: "likelihood" correlates the power |s|^2 of a pulse with -1 / T, where T is the mean
-            power envelope; "amplitude" correlates |s| with the mean amplitude envelope.
-        iterations: Number of times that the mean envelope is formed anew.
-
-    Returns:
-        The shifts in cells, shape (trial, pulse), float64, of mean zero.
-    """
-    used = pulses.amplitudes() if match == "amplitude" else pulses
-    shift = start
-    for _ in range(iterations):
-        mean = used.moved(shift).sum(-2, keepdim=True) / used.count
-        against = mean if match == "amplitude" else used.likelihood(mean)
-        found = used.peak(used.moved(start) * against.conj())
-        shift = centred(start + torch.where(used.present, found, 0), used.present)
-    return shift
-
-
-def refined_shifts(pulses: Envelopes, shift: Tensor, iterations: int = 2) -> Tensor:
-    """Refine the shifts of single pulses by the likelihood of the cells that exceed the sidelobes.
-
     Sidelobes help to tell the maxima of the likelihood apart, but they depend on each other over
     many cells, and without them the shift of a pulse errs less where noise is weak.
 
     Args:
         pulses: Envelopes.
-        shift: Shifts in cells, right within a cell, shape (trial, pulse).
+        start: Shifts to start from, in cells, shape (trial, pulse).
+        match: "likelihood" correlates the power |s|^2 of a pulse with -1 / T, where T is the mean
+            power envelope; "amplitude" correlates |s| with the mean amplitude envelope. Both find
+            shifts within half a window of those in `start`. "refined" is the likelihood of the
+            cells that exceed the sidelobes, for shifts that are right within a cell.
         iterations: Number of times that the mean envelope is formed anew.
 
     Returns:
         The shifts in cells, shape (trial, pulse), float64, of mean zero.
     """
+    used, refined = pulses.amplitudes() if match == "amplitude" else pulses, match == "refined"
+    shift = start
     for _ in range(iterations):
-        moved = pulses.moved(shift)
-        against = pulses.likelihood(moved.sum(-2, keepdim=True) / pulses.count, sidelobes=False)
-        found = pulses.peak(moved * against.conj(), within=1.0)
-        shift = centred(shift + torch.where(pulses.present, found, 0), pulses.present)
+        moved = used.moved(shift)
+        mean = moved.sum(-2, keepdim=True) / used.count
+        against = mean if match == "amplitude" else used.likelihood(mean, sidelobes=not refined)
+        about, moved = (shift, moved) if refined else (start, used.moved(start))
+        found = used.peak(moved * against.conj(), within=1.0 if refined else math.inf)
+        shift = centred(about + torch.where(used.present, found, 0), used.present)
     return shift
 
 
@@ -277,7 +257,7 @@ def mean_drift(pulses: Envelopes) -> Tensor:
     Returns:
         The drift in cells per pulse, modulo the window, shape (trial,), float64.
     """
-    # found by trial: finer features agree only close to the right drift, coarser ones measure it
+    # finer features agree only close to the right drift, coarser ones measure it
     # less well
     k, last = pulses.present.shape[-1], min(16, pulses.n - 1)
     if last < 1:
@@ -293,8 +273,9 @@ def mean_drift(pulses: Envelopes) -> Tensor:
 def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 12) -> Tensor:
     """Fit a linear model by reweighted least squares that withstands outliers.
 
-    The first half of the iterations minimises absolute residuals, the second uses Tukey's biweight
-    with the median absolute residual of each trial as its scale.
+    Directions that the data do not determine have coefficients of zero. The first half of the
+    iterations minimises absolute residuals, the second uses Tukey's biweight with the median
+    absolute residual of each trial as its scale.
 
     Args:
         values: Values, shape (trial, m).
@@ -306,8 +287,11 @@ def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 
         The coefficients, shape (trial, term).
     """
     now, coefficients = weight, torch.zeros_like(basis[:, 0])
+    ridge = 1e-9 * torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
     for iteration in range(iterations):
-        coefficients = weighted_fit(values, basis, now)
+        share = now / now.sum(-1, keepdim=True).clamp_min(torch.finfo(now.dtype).tiny)
+        across = basis.mT * share[:, None]
+        coefficients = linear_solve(across @ basis + ridge, across @ values[..., None]).squeeze(-1)
         residual = (values - (basis @ coefficients[..., None]).squeeze(-1)).abs()
         if iteration < iterations // 2:
             now = weight / residual.clamp_min(0.1)
@@ -329,23 +313,6 @@ def robust_std(magnitude: Tensor, used: Tensor) -> Tensor:
         The standard deviation, shape (trial, 1).
     """
     return 1.4826 * torch.where(used, magnitude, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num()
-
-
-def weighted_fit(values: Tensor, basis: Tensor, weight: Tensor) -> Tensor:
-    """Fit a linear model by weighted least squares.
-
-    Args:
-        values: Values, shape (trial, m).
-        basis: Basis, shape (trial, m, term).
-        weight: Weights, shape (trial, m).
-
-    Returns:
-        The coefficients, shape (trial, term); zero along directions that the data do not determine.
-    """
-    share = weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)
-    normal = (basis.mT * share[:, None]) @ basis
-    eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
-    return linear_solve(normal + 1e-9 * eye, (basis.mT * share[:, None]) @ values[..., None]).squeeze(-1)
 
 
 def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Tensor:
@@ -374,7 +341,7 @@ def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Te
         # fitted together with the polynomial
         frequency, stands_out = strongest_tone(rest(course), pulses.present)
         parts, base, now = torch.zeros_like(terms[:, 0, :1]).expand(-1, 2), course, course
-        for _ in range(5):  # found by trial: enough Gauss-Newton steps to converge
+        for _ in range(5):  # Gauss-Newton steps
             wave = _waves(frequency, time)
             turned = (parts[:, None, 1] * wave[..., 0] - parts[:, None, 0] * wave[..., 1]) * (
                 2 * math.pi * (time - time.mean())
@@ -384,7 +351,8 @@ def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Te
             base = base + (terms @ step[:, :-3, None]).squeeze(-1)
             now = base + (_waves(frequency, time) @ parts[..., None]).squeeze(-1)
         gain = log_likelihood(pulses, now) - log_likelihood(pulses, course)
-        kept = stands_out & (parts.square().sum(-1).sqrt() > _LEAST_TONE_CELLS) & (gain > math.log(k) + _STANDS_OUT)
+        # the removal of a tone of 0.05 cell costs as much as it gains
+        kept = stands_out & (parts.square().sum(-1).sqrt() > 0.05) & (gain > math.log(k) + _STANDS_OUT)
         course = centred(torch.where(kept[:, None], now, course), torch.ones_like(pulses.present))
     return course
 

@@ -11,9 +11,6 @@ from torchsar.core import Signal, host_value, level_of, power_of, unit_level
 
 # quantities that sharpness is defined for, with their power of the modulus |I|
 _OF = {"intensity": 2, "amplitude": 1}
-# chosen: range of the mean and of the total intensity of an image, in which fourth powers of single
-# precision neither underflow nor overflow
-_LEAST_MEAN, _LARGEST_TOTAL = 1e-12, 1e16
 # precision in which images of half precision are evaluated
 _WORKING = {torch.float16: torch.float32, torch.bfloat16: torch.float32, torch.complex32: torch.complex64}
 
@@ -65,8 +62,9 @@ def _power(image: Tensor) -> tuple[Tensor, Tensor]:
         power = _squares(image)
         total = _sum(power)
         least, largest = torch.aminmax(total.detach())
-        lowest = _LEAST_MEAN * image.shape[-2] * image.shape[-1]
-        if host_value(least, 0.0) > lowest and host_value(largest, math.inf) < _LARGEST_TOTAL:
+        # fourth powers of single precision then neither underflow nor overflow
+        lowest = 1e-12 * image.shape[-2] * image.shape[-1]
+        if host_value(least, 0.0) > lowest and host_value(largest, math.inf) < 1e16:
             return power, total
     power = _squares(unit_level(image))
     return power, _sum(power)

@@ -9,12 +9,6 @@ from torch import Tensor
 
 from torchsar.core import refuse_non_finite, unit_phasor
 
-# chosen: zero padding of the spectrum in which the linear term is searched; a Newton step is at
-# most one of its bins
-_OVERSAMPLING = 8
-# chosen: Newton steps that refine the peak of that spectrum
-_NEWTON = 4
-
 
 def residual_phase(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor | None = None) -> Tensor:
     """Compute the phase error per pulse after removal of its constant and linear terms.
@@ -43,7 +37,7 @@ def residual_phase(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor 
     n = z.shape[-1]
     cycles = _peak(z) / n
     k = torch.arange(n, dtype=torch.float64, device=z.device) - (n - 1) / 2
-    for _ in range(_NEWTON):
+    for _ in range(4):
         cycles = cycles + _newton_step(z, cycles, k)
     flat = z * unit_phasor(-cycles[..., None] * k, torch.complex128)
     total = flat.sum(-1, keepdim=True)
@@ -66,9 +60,9 @@ def _check(what: str, *phases: Tensor) -> None:
 
 def _peak(z: Tensor) -> Tensor:
     """Strongest frequency of exp(j difference), in cycles per record, on a grid of 1/8 cycle."""
-    n = _OVERSAMPLING * z.shape[-1]
+    n = 8 * z.shape[-1]
     at = torch.fft.fft(z.detach(), n).abs().argmax(-1).to(torch.float64)
-    return torch.where(at > n / 2, at - n, at) / _OVERSAMPLING
+    return torch.where(at > n / 2, at - n, at) / 8
 
 
 def _newton_step(z: Tensor, cycles: Tensor, k: Tensor) -> Tensor:
@@ -81,7 +75,7 @@ def _newton_step(z: Tensor, cycles: Tensor, k: Tensor) -> Tensor:
     slope = 2 * (s0.conj() * s1).real
     bend = 2 * (s1.abs().square() + (s0.conj() * s2).real)
     step = torch.where(bend < 0, -slope / torch.where(bend < 0, bend, -1), 0)
-    limit = 1 / (_OVERSAMPLING * z.shape[-1])
+    limit = 1 / (8 * z.shape[-1])
     return step.clamp(-limit, limit)
 
 
