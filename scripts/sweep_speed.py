@@ -21,10 +21,10 @@ import torch
 
 from torchsar import keep_freed_memory
 from torchsar.study.commands.sweep import SweepTrial, sweep_grid
-from torchsar.study.montecarlo.batches import rows_by_bytes
 from torchsar.study.montecarlo.engines import Engine, InProcess, engine
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.loop import Plan, run_plan
+from torchsar.study.montecarlo.work import rows_by_bytes
 from torchsar.study.table import load
 
 

@@ -16,7 +16,7 @@ from torchsar.compensate.pulse_phase.likelihood import Speckle
 from torchsar.compensate.pulse_phase.linking import _grown
 from torchsar.core import Axis, Outcome, Signal
 from torchsar.metrics.phase import phase_rmse
-from torchsar.study.montecarlo.batches import LargestTensor
+from torchsar.study.montecarlo.work import LargestTensor
 
 F64 = torch.float64
 N, ROWS = 128, 48

@@ -13,7 +13,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.contract.pretended import DEVICE, Pretended, pretended_device, to_host
 from torchsar.core import Draws, Source
-from torchsar.study.montecarlo.batches import LargestTensor
+from torchsar.study.montecarlo.work import LargestTensor
 
 
 @pytest.mark.parametrize("source", ["numpy", "torch"])

@@ -19,10 +19,18 @@ import zarr
 from tests.study import toy
 from torchsar.core import Draws, Outcome
 from torchsar.study.montecarlo import Record, Stop, differences, read_sweep, sweep
-from torchsar.study.montecarlo.batches import CACHE_BYTES, rows_by_bytes, rows_by_peak, rows_by_trial
 from torchsar.study.montecarlo.grid import address, make_grid
 from torchsar.study.montecarlo.loop import looks
-from torchsar.study.montecarlo.work import Work, cut, probed_bytes, rows_of
+from torchsar.study.montecarlo.work import (
+    CACHE_BYTES,
+    Work,
+    cut,
+    probed_bytes,
+    rows_by_bytes,
+    rows_by_peak,
+    rows_by_trial,
+    rows_of,
+)
 from torchsar.study.output import progress
 from torchsar.study.settings.errors import ConfigError
 
@@ -138,7 +146,7 @@ def pretend_gpus(monkeypatch: pytest.MonkeyPatch, count: int, peak: Callable[[],
         def __exit__(self, *_: object) -> None:
             self.bytes = peak()
 
-    monkeypatch.setattr("torchsar.study.montecarlo.batches.PeakMemory", Peak)
+    monkeypatch.setattr("torchsar.study.montecarlo.work.PeakMemory", Peak)
     for name, value in {"empty_cache": None, "mem_get_info": (10_000_000_000, 0), "device_count": count}.items():
         monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
 

@@ -125,11 +125,25 @@ def _text(name: str, tree: Mapping[str, Any]) -> str:
         parts += [*aligned([head, *_limit_rows(tree["limits"])], right=(1, 2)), ""]
     if tree["requirements"]:
         head = ("simplification", "neglected phase", "range cells", "verdict", "neglects")
-        parts += aligned([head, *_requirement_rows(tree["requirements"])], right=(1, 2))
+        cells = ["" if math.isnan(x := row["range_cells"]) else f"{x:.3g}" for row in tree["requirements"]]
+        rows = [
+            (row["effect"], f"{row['phase_rad']:.3g} rad", cell, row["verdict"], row["neglects"])
+            for row, cell in zip(tree["requirements"], cells, strict=True)
+        ]
+        parts += aligned([head, *rows], right=(1, 2))
     for choice in tree["choices"]:
         if choice["alternatives"]:
             parts += ["", f"{choice['name']} (auto at {choice['at']}): {choice['recommended']}"]
-            parts += aligned([_alternative_row(row) for row in choice["alternatives"]])
+            losses = [
+                ", ".join(f"{name} {value:.3g}" for name, value in row["loss"].items()) or "exact"
+                for row in choice["alternatives"]
+            ]
+            parts += aligned(
+                [
+                    (f"  {row['name']}", loss, "enough" if row["within_tolerance"] else "too much", row["neglects"])
+                    for row, loss in zip(choice["alternatives"], losses, strict=True)
+                ]
+            )
     return "\n".join([*parts, *(f"warning: {text}" for text in tree["warnings"])])
 
 
@@ -149,14 +163,3 @@ def _limit_rows(limits: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, ...]
             then = f"{row['consequence']}; {row['remedy']} {concerned}"
         least = f"{'>=' if row['at_least'] else '<'} {row['limit']:.4g}"
         yield row["name"], f"{row['value']:.4g}", least, row["unit"], row["verdict"], then
-
-
-def _requirement_rows(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, ...]]:
-    for row in rows:
-        cells = "" if math.isnan(row["range_cells"]) else f"{row['range_cells']:.3g}"
-        yield row["effect"], f"{row['phase_rad']:.3g} rad", cells, row["verdict"], row["neglects"]
-
-
-def _alternative_row(row: Mapping[str, Any]) -> tuple[str, ...]:
-    loss = ", ".join(f"{name} {value:.3g}" for name, value in row["loss"].items()) or "exact"
-    return f"  {row['name']}", loss, "enough" if row["within_tolerance"] else "too much", row["neglects"]

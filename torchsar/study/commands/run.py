@@ -57,7 +57,7 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = 
         progress = Steps([])
 
         def announce(method: str, stage: str) -> None:
-            progress.begin(_step(method, stage))
+            progress.begin(f"{method}, {stage}" if method else stage)
 
         benches = {name: Bench(case, device, announce) for name, case in cases.items()}
         for name, bench in benches.items():
@@ -72,8 +72,20 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = 
         write_json(folder / "metrics.json", tree)
         kept = {case: loaded.system.pictured(r) for case, r in results.items()}
         images = {key_of(case, name): image for case, of in kept.items() for name, image in of.items()}
-        truth = {key_of(case, name): value for case, r in results.items() for name, value in _first_truth(r).items()}
-        write_arrays(folder / "arrays.zarr", images, truth, _first_estimates(results))
+        truth = {
+            key_of(case, name): per_trial_first(torch.as_tensor(value), r.first.trials.count)[0]
+            for case, r in results.items()
+            for name, value in r.first.trials.truth.items()
+        }
+        estimates = {
+            method: {
+                key_of(case, name): value.value[0]
+                for case, r in results.items()
+                for name, value in r.estimates.get(method, {}).items()
+            }
+            for method in dict.fromkeys(method for r in results.values() for method in r.estimates)
+        }
+        write_arrays(folder / "arrays.zarr", images, truth, estimates)
         pictures = draw_all(loaded.system.pictures(results), folder / "figures")
         fields = run_fields(tree, loaded.system.columns, loaded.system.target_columns)
         notes = [*(("Chosen", text) for text in tree["chosen"]), *loaded.system.notes(tree)]
@@ -84,10 +96,6 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = 
     return out / "report.html"
 
 
-def _step(method: str, stage: str) -> str:
-    return f"{method}, {stage}" if method else stage
-
-
 def _chunks(bench: Bench) -> list[range]:
     """Numbers of the trials of each batch of a case."""
     count = 1 if bench.recording is not None else bench.world().trials
@@ -96,7 +104,7 @@ def _chunks(bench: Bench) -> list[range]:
 
 
 def _steps(bench: Bench) -> list[str]:
-    of_batch = [_step(name, stage) for name, chain in bench.chains.items() for stage in chain.stages]
+    of_batch = [f"{name}, {stage}" for name, chain in bench.chains.items() for stage in chain.stages]
     return ["simulation" if bench.recording is None else "recording", *of_batch] * len(_chunks(bench))
 
 
@@ -112,8 +120,10 @@ def _case(bench: Bench, name: str) -> Result:
     for chunk in _chunks(bench):
         keep = bench.chains if first is None else ()
         batch = bench.batch(bench.draws(system.address, chunk), keep=keep, detail=True)
-        first = first or batch
-        truth.append(_scalars(batch))
+        first, n = first or batch, batch.trials.count
+        whole = {name: per_trial_first(torch.as_tensor(x), n) for name, x in batch.trials.truth.items()}
+        # true values with one number per trial
+        truth.append({k: x.reshape(n).cpu() for k, x in whole.items() if x.numel() == n and not x.is_complex()})
         for method, outcome in batch.outcomes.items():
             metrics.setdefault(method, []).append(outcome.metrics)
             estimates.setdefault(method, []).append(system.found(bench, outcome, batch.trials))
@@ -121,54 +131,27 @@ def _case(bench: Bench, name: str) -> Result:
             for target, found in outcome.judged.targets.items():
                 targets.setdefault(method, {}).setdefault(target, []).append(found)
     assert first is not None
-    whole = {method: joined_metrics(parts) for method, parts in metrics.items()}
+    joined = {method: joined_metrics(parts) for method, parts in metrics.items()}
     of_targets = {method: {t: joined_metrics(parts) for t, parts in of.items()} for method, of in targets.items()}
     found = {method: joined_found(parts) for method, parts in estimates.items()}
     joined_marks = {
         method: {k: joined_metrics([part.get(k, {}) for part in parts]) for k in ("outcomes", "neutral", "doubtful")}
         for method, parts in marks.items()
     }
-    result = Result(bench, first, whole, of_targets, found, joined_metrics(truth), joined_marks)
-    _warn_if_unreliable(name, result)
-    log.info("%s: %.1f s", bench.loaded.name if name == ALL else name, time.perf_counter() - began)
-    return result
-
-
-def _warn_if_unreliable(case: str, result: Result) -> None:
-    """Warn of unreliable estimates of the recommended method."""
-    where = "" if case == ALL else f"{case}: "
+    result = Result(bench, first, joined, of_targets, found, joined_metrics(truth), joined_marks)
+    where = "" if name == ALL else f"{name}: "
     for stage, codes in result.marks["recommended"]["outcomes"].items():
         for code, count in _reasons(codes).items():
             if not code.is_ok:
                 text = "warning: %srecommended.%s, not ok in %d of %d trials: %s"
                 log.warning(text, where, stage, count, len(codes), code.message)
+    log.info("%s: %.1f s", bench.loaded.name if name == ALL else name, time.perf_counter() - began)
+    return result
 
 
 def _reasons(codes: Tensor) -> dict[Outcome, int]:
     """Number of trials of each outcome, from codes that are NaN in batches without them."""
     return counts(codes[codes.isfinite()].long())
-
-
-def _scalars(batch: Batch) -> dict[str, Tensor]:
-    """True values with one number per trial."""
-    n = batch.trials.count
-    values = {name: per_trial_first(torch.as_tensor(value), n) for name, value in batch.trials.truth.items()}
-    return {name: x.reshape(n).cpu() for name, x in values.items() if x.numel() == n and not x.is_complex()}
-
-
-def _first_truth(result: Result) -> dict[str, Tensor]:
-    """All true values of the first trial."""
-    n = result.first.trials.count
-    return {name: per_trial_first(torch.as_tensor(v), n)[0] for name, v in result.first.trials.truth.items()}
-
-
-def _first_estimates(results: Mapping[str, Result]) -> dict[str, dict[str, Tensor]]:
-    """Estimates of the first trial by method, then by case and name."""
-    found: dict[str, dict[str, Tensor]] = {}
-    for case, result in results.items():
-        for method, values in result.estimates.items():
-            found.setdefault(method, {}).update({key_of(case, name): value.value[0] for name, value in values.items()})
-    return found
 
 
 def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any]:

@@ -144,7 +144,12 @@ def sweep(
     plan.refuse_missing(trial)
     config_text = loaded.text()
     about = {"title": loaded.config.title, "config": config_text, "dtype": loaded.config.precision}
-    _announce(grid, settings.trials)
+    together, apart = (
+        ", ".join(f"{p.name} ({len(p.labels)})" for p in grid.parameters if p.batched is batched) or "none"
+        for batched in (True, False)
+    )
+    text = "%d points of %d trials; values that share batches: %s; cases of their own: %s"
+    log.info(text, len(grid.points()), settings.trials, together, apart)
     try:
         with opened(out, "sweep", SWEEP_FILES) as folder, _terminated_like_interrupted():
             store = open_store(
@@ -237,20 +242,6 @@ def report(record: Record, loaded: Loaded, out: Path, config_text: str, command:
     (out / "config.yaml").write_text(config_text, encoding="utf-8")
     write_json(out / "summary.json", tree)
     write_sweep_report(out / "report.html", tree, pictures, out / "figures", config_text, command)
-
-
-def _announce(grid: Grid, trials: int) -> None:
-    together, apart = (
-        ", ".join(f"{p.name} ({len(p.labels)})" for p in grid.parameters if p.batched is batched) or "none"
-        for batched in (True, False)
-    )
-    log.info(
-        "%d points of %d trials; values that share batches: %s; cases of their own: %s",
-        len(grid.points()),
-        trials,
-        together,
-        apart,
-    )
 
 
 @contextmanager

@@ -25,12 +25,6 @@ def label_text(label: float | str) -> str:
     return label if isinstance(label, str) else f"{label:g}"
 
 
-def _value_text(name: str, label: float | str) -> str:
-    """One value of a parameter, for reading: 'squint 3 deg', 'scene: point'."""
-    words, unit = name_and_unit(name)
-    return f"{words}: {label}" if isinstance(label, str) else f"{words} {label:g} {unit}".rstrip()
-
-
 @dataclass(frozen=True)
 class Quantity:
     """A statistic of a metric that is drawn, such as its RMSE.
@@ -217,7 +211,12 @@ class SweepPictures:
         return panels, "".join(thinned) + (f" Throughout: {self._texts(self.fixed)}." if self.fixed else "")
 
     def _texts(self, index: Mapping[str, int]) -> str:
-        return ", ".join(_value_text(name, self.labels[name][i]) for name, i in index.items())
+        """Values of parameters, for reading: 'squint 3 deg, scene: point'."""
+        known = [(*name_and_unit(name), self.labels[name][i]) for name, i in index.items()]
+        texts = (
+            f"{words}: {x}" if isinstance(x, str) else f"{words} {x:g} {unit}".rstrip() for words, unit, x in known
+        )
+        return ", ".join(texts)
 
     def caption(self, quantity: Quantity) -> str:
         """Return a caption with what is drawn, the confidence level and the number of trials."""

@@ -117,7 +117,10 @@ def summary_of(record: Record, success: Mapping[str, float]) -> Summary:
     trials = {"trials": np.broadcast_to(done.sum(-1), record.ok.shape[:-1]), **_shares(record.ok, assessed, "ok")}
     figures = {
         name: {
-            **_statistics(values, int(record.about["seed"])),
+            **{
+                "interval" if kind == "rmse_interval" else kind: array
+                for kind, array in trial_statistics(values, int(record.about["seed"])).items()
+            },
             **trials,
             **_success(record, values, success.get(name)),
         }
@@ -129,11 +132,6 @@ def summary_of(record: Record, success: Mapping[str, float]) -> Summary:
     }
     outcomes = {code: n for code in Outcome if (n := (record.outcome == code).sum(-1)).any()}
     return Summary(record.algorithms, record.labels, figures, bounds, outcomes)
-
-
-def _statistics(values: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-    found = trial_statistics(values, seed)
-    return {"interval" if name == "rmse_interval" else name: array for name, array in found.items()}
 
 
 def _shares(hits: np.ndarray, of: np.ndarray, name: str) -> dict[str, np.ndarray]:

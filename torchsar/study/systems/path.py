@@ -155,7 +155,7 @@ class Flown(World):
         records = (one or Recorded() for one in (self.navigation, self.receiver_navigation))
         known = [Navigation(Sway(one.x, one.y, one.z), one.latency_s, one.step_m, one.rate_hz) for one in records]
         effects = (self.ground, self.beam, self.window_range_m, self.noise.snr_db)
-        return PathWorld(Together(self.scene), *flown, *known, *effects)  # pyright: ignore[reportArgumentType]
+        return PathWorld(Together(self.scene), *flown, *known, *effects)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
     def trials_of(self, radar: InverseRadar, draws: Draws, dtype: torch.dtype, device: str) -> Trials:
         """Simulate recordings, and recordings without impairments whose positions are true."""

@@ -59,20 +59,20 @@ def impulse_cuts(image: Signal, at_m: tuple[float, float]) -> dict[str, tuple[Te
 
 
 def finer(line: Tensor, factor: int) -> Tensor:
-    """Interpolate a cut by zero padding of its spectrum, which must be centred on zero frequency.
+    """Interpolate cuts by zero padding of their spectra, which must be centred on zero frequency.
 
     Args:
-        line: Samples of the cut, shape (n,), continued periodically.
+        line: Samples of the cuts, shape (..., n), continued periodically.
         factor: Samples of the result per sample of `line`.
 
     Returns:
-        The finer cut, shape (factor n,), complex128, with the amplitude divided by `factor`.
+        The finer cuts, shape (..., factor n), complex128, with the amplitude divided by `factor`.
     """
-    n = len(line)
-    spectrum = torch.fft.fftshift(torch.fft.fft(line.to(torch.complex128)))
+    n = line.shape[-1]
+    spectrum = torch.fft.fftshift(torch.fft.fft(line.to(torch.complex128)), dim=-1)
     before = (factor * n) // 2 - n // 2
     wide = torch.nn.functional.pad(spectrum, (before, (factor - 1) * n - before))
-    return torch.fft.ifft(torch.fft.ifftshift(wide))
+    return torch.fft.ifft(torch.fft.ifftshift(wide, dim=-1))
 
 
 def about_peak(image: Signal, reach: tuple[float, float], samples: int) -> Signal:

@@ -16,7 +16,7 @@ from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
 from torchsar.study.names.registry import stages
 from torchsar.study.output.pictures import Drawn, comparisons
-from torchsar.study.settings.cases import titled, word_of
+from torchsar.study.settings.cases import ALL, titled, word_of
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Processed, Result, Trials
@@ -107,6 +107,7 @@ class System(ABC):
         settings: Settings of the metrics that metrics.json defines, by their names there.
         draw_first: Functions of the result of the first case that draw its scene.
         draw_case: Functions of a result that draw the pictures of a case.
+        plain_names: Whether these have no ending where a config has no cases.
         address: Case of the random draws of runs (see `Draws`).
         peak: Size of the largest tensor of a trial relative to that of its raw data, as measured.
     """
@@ -129,6 +130,7 @@ class System(ABC):
     settings: ClassVar[Mapping[str, str]] = {}
     draw_first: ClassVar[Sequence[Draw]] = ()
     draw_case: ClassVar[Sequence[Draw]] = ()
+    plain_names: ClassVar[bool] = False
     address: ClassVar[str | int] = "run"
     peak: ClassVar[float] = 8.0
 
@@ -256,5 +258,6 @@ def per_trial_first(x: Tensor, count: int) -> Tensor:
 
 
 def _of_case(draw: Draw, case: str, result: Result) -> Drawn:
+    end = "" if case == ALL and result.bench.system.plain_names else f"_{word_of(case)}"
     for name, title, caption, figure in draw(result):
-        yield f"{name}_{word_of(case)}", titled(title, case), caption, figure
+        yield name + end, titled(title, case), caption, figure

@@ -6,17 +6,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Chain, Draws, Signal, Trace, per_trial
+from torchsar.core import Chain, Signal, Trace, per_trial
 from torchsar.metrics import bistatic_bounds
 from torchsar.multichannel.reconstruct import noise_and_clutter
 from torchsar.radar import BistaticRadar
 from torchsar.study.names.registry import MULTICHANNEL_IMPAIRMENTS
-from torchsar.study.output.pictures import Drawn
+from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.geo import choices, figures
@@ -28,13 +29,10 @@ from torchsar.study.systems.geo.judge import (
     ideal_responses,
     point_responses,
 )
-from torchsar.study.systems.geo.radar import bistatic_radar
-from torchsar.study.systems.geo.world import TRUTHS, Points, compression_gain_db
-from torchsar.study.trials.batch import OK, Batch, Found, Judged, Processed, Result, Trials
+from torchsar.study.systems.geo.world import TRUTHS, Points, bistatic_radar, compression_gain_db
+from torchsar.study.trials.batch import IMAGE, OK, Batch, Found, Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Column, System
-
-_IMAGES = (("azimuth",), ("azimuth", "range"))
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,8 @@ class Geo(System):
     World = Points
     Judging = Judging
     impairments = MULTICHANNEL_IMPAIRMENTS
-    images = _IMAGES
+    images = (("azimuth",), IMAGE)
+    draw_case = figures.DRAW_CASE
     truths = TRUTHS
     peak = 12.0
     tolerance = {"image_error_db": -20.0, "echo_error_db": -20.0, "mfta_db": -50.0, "width_change_percent": 1.0}
@@ -154,9 +153,6 @@ class Geo(System):
         shapes = world["sea"] is not None and path.startswith(lights_sea)
         return not shapes and super().may_differ(path, world)
 
-    def simulate(self, bench: Bench, world: Points, draws: Draws) -> Trials:
-        return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
-
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
         chain, truth, world = bench.chains[name], trials.truth, bench.world()
         rows, view = trace.signal.trials, View(None, None, None)
@@ -164,7 +160,7 @@ class Geo(System):
         focused = FocusedPoint.of(chain, trace, bench.radar)
         if focused is not None:
             metrics |= {key: value.expand(rows) for key, value in focused.conditioning().items()}
-        if focused is not None and trace.signal.names in _IMAGES:
+        if focused is not None and trace.signal.names in self.images:
             clean = bench.config.processor[name].input == "clean" or trials.own.snr_db is None
             alone = trace if clean else chain.trace(trials.own.alone, _held(chain, trace))
             lit = trials.own.integration_s
@@ -236,7 +232,8 @@ class Geo(System):
         return {target: ideal_responses(radar, u_r, u_a, *known) for target, (u_r, u_a) in speeds.items()}
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
-        return figures.pictures(results, self.target_columns)
+        yield partial(comparisons, figures.by_target(results), self.target_columns)
+        yield from self.case_pictures(results)
 
     def pictured(self, result: Result) -> dict[str, Signal]:
         shots = figures.shots(result)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,18 +13,14 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Signal
-from torchsar.study.output.pictures import Drawn, comparisons
-from torchsar.study.settings.cases import key_of, titled, word_of
+from torchsar.study.output.pictures import Drawn
+from torchsar.study.settings.cases import key_of
 from torchsar.study.systems.geo.judge import PeakCuts
 from torchsar.study.trials.batch import Result
 from torchsar.study.trials.cuts import about_peak, finer
 
-# half extent of main lobes (m), and lowest levels of profiles and of spectra
-_NEAR_M, _LOW_DB, _SPECTRUM_DB = 12.0, -90.0, -70.0
-# half extents of contour plots in azimuth and range (m), and their samples
-_ALONG_M, _ACROSS_M, _SAMPLES = 6.0, 20.0, 161
-# samples of drawn main lobes per sample of an image
-_FINER = 8
+# lowest levels of profiles and of spectra
+_LOW_DB, _SPECTRUM_DB = -90.0, -70.0
 
 
 @dataclass(frozen=True)
@@ -74,14 +69,6 @@ def shots(result: Result) -> Shots:
     return found
 
 
-def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Yield functions that draw the pictures, in the order of the report."""
-    yield partial(comparisons, by_target(results), columns)
-    for case, result in results.items():
-        for make in (_profiles, _main_lobes, _contours, _spectra):
-            yield partial(make, case, result)
-
-
 def by_target(results: Mapping[str, Result]) -> dict[str, Any]:
     """Return the metrics of the methods, by case and target."""
     names = {(case, t): None for case, r in results.items() for of in r.targets.values() for t in of}
@@ -113,7 +100,7 @@ def _panels(found: Shots, curve: Callable[[Shot], tuple[Any, Any]], xlabel: str,
     ]
 
 
-def _profiles(case: str, result: Result) -> Drawn:
+def _profiles(result: Result) -> Drawn:
     def curve(shot: Shot) -> tuple[Any, Any]:
         return plot.array(shot.along_m), np.maximum(plot.decibel(shot.profile), _LOW_DB)
 
@@ -126,22 +113,22 @@ def _profiles(case: str, result: Result) -> Drawn:
         "lie outside of the rebuilt band."
     )
     figures = plot.panels(_panels(_pair(result), curve, "x = (V_R - u_a) t (m)", _LOW_DB))
-    yield f"profiles_{word_of(case)}", titled("False targets", case), caption, figures
+    yield "profiles", "False targets", caption, figures
 
 
-def _main_lobes(case: str, result: Result) -> Drawn:
+def _main_lobes(result: Result) -> Drawn:
     def curve(shot: Shot) -> tuple[Any, Any]:
-        fine, first = finer(shot.profile, _FINER), int(shot.profile.abs().argmax())
-        offset = float(shot.along_m[1] - shot.along_m[0]) * (np.arange(len(fine)) / _FINER - first)
-        near = np.abs(offset) <= _NEAR_M
+        fine, first = finer(shot.profile, 8), int(shot.profile.abs().argmax())
+        offset = float(shot.along_m[1] - shot.along_m[0]) * (np.arange(len(fine)) / 8 - first)
+        near = np.abs(offset) <= 12.0
         return offset[near], plot.decibel(fine)[near]
 
     figures = plot.panels(_panels(shots(result), curve, "x from the peak (m)", -40.0))
     caption = "The same profiles about their peaks, for every method."
-    yield f"main_lobes_{word_of(case)}", titled("Main lobes", case), caption, figures
+    yield "main_lobes", "Main lobes", caption, figures
 
 
-def _contours(case: str, result: Result) -> Drawn:
+def _contours(result: Result) -> Drawn:
     """Two-dimensional images about their peaks, if there are any."""
     found = _pair(result)
     images = {
@@ -153,17 +140,19 @@ def _contours(case: str, result: Result) -> Drawn:
             "Interpolated images without noise about their peaks, range on the axis c tau / 2. Conventional images of "
             "moving targets are defocused and displaced."
         )
-        yield f"contours_{word_of(case)}", titled("Contours", case), caption, plot.contours(cut)
+        yield "contours", "Contours", caption, plot.contours(cut)
 
 
 def _about_peak(image: Signal) -> Signal:
-    """The part about the peak, on a finer grid; offsets from the peak, range halved."""
-    part = about_peak(image, (_ALONG_M, 2 * _ACROSS_M), _SAMPLES)
+    """The part about the peak, +-6 m in azimuth and +-20 m in range on a grid of 161 samples;
+    offsets from the peak, range halved.
+    """
+    part = about_peak(image, (6.0, 40.0), 161)
     range_ = part.axes[1]
     return Signal(part.data, (part.axes[0], replace(range_, start=range_.start / 2, step=range_.step / 2)))
 
 
-def _spectra(case: str, result: Result) -> Drawn:
+def _spectra(result: Result) -> Drawn:
     def curve(shot: Shot) -> tuple[Any, Any]:
         return plot.array(shot.spectrum.axes[0].values()), np.maximum(plot.decibel(shot.spectrum.data), _SPECTRUM_DB)
 
@@ -171,4 +160,7 @@ def _spectra(case: str, result: Result) -> Drawn:
     caption = (
         "Rebuilt Doppler spectra of echoes without noise. Energy outside of the band of a target makes false ones."
     )
-    yield f"spectra_{word_of(case)}", titled("Rebuilt spectra", case), caption, figures
+    yield "spectra", "Rebuilt spectra", caption, figures
+
+
+DRAW_CASE = (_profiles, _main_lobes, _contours, _spectra)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,24 +10,12 @@ import torch
 
 from torchsar import plot
 from torchsar.core import Signal
-from torchsar.study.output.pictures import Drawn, comparisons
-from torchsar.study.settings.cases import titled, word_of
-from torchsar.study.systems.geo.figures import by_target
+from torchsar.study.output.pictures import Drawn
 from torchsar.study.systems.geo_ocean.judge import ImagePosition, MadeScene, ShownShip
 from torchsar.study.trials.batch import Result
 
-# half extents in azimuth and range (m) of pictures of ships, and of the boxes about them
-_SHIP_M, _BOX_M = (150.0, 60.0), (120.0, 60.0)
-# highest and lowest level of drawn scenes over the sea (dB), and their largest number of blocks
-_UP_DB, _DOWN_DB, _BLOCKS = 25.0, -10.0, 300
-
-
-def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Yield functions that draw the pictures, in the order of the report."""
-    for case, result in results.items():
-        for make in (_flow, _methods, _ships):
-            yield partial(make, case, result)
-    yield partial(comparisons, by_target(results), columns)
+# highest and lowest level of drawn scenes over the sea (dB)
+_UP_DB, _DOWN_DB = 25.0, -10.0
 
 
 def _made(result: Result) -> dict[str, MadeScene]:
@@ -46,15 +33,15 @@ def _true(shown: ShownShip) -> ImagePosition:
 
 def _over_sea(image: Signal) -> Signal:
     """Root mean square of blocks relative to the median block, limited to the drawn levels."""
-    view = plot.quicklook(image, _BLOCKS)
+    view = plot.quicklook(image, 300)
     level = view.data.abs().to(torch.float64)
     level = level / level.median().clamp_min(1e-300)
     return view.with_data(level.clamp(10 ** (_DOWN_DB / 20), 10 ** (_UP_DB / 20)).to(torch.complex64))
 
 
 def _boxes(positions: Sequence[ImagePosition]) -> tuple[np.ndarray, np.ndarray]:
-    """Outlines about positions as one broken line."""
-    return plot.boxes([(p.range_m, p.azimuth_m) for p in positions], _BOX_M[1], _BOX_M[0])
+    """Outlines +-60 m in range and +-120 m in azimuth about positions as one broken line."""
+    return plot.boxes([(p.range_m, p.azimuth_m) for p in positions], 60.0, 120.0)
 
 
 def _marked(result: Result, title: str, image: Signal, apparent: bool) -> dict[str, Any]:
@@ -70,7 +57,7 @@ def _marked(result: Result, title: str, image: Signal, apparent: bool) -> dict[s
     return {"title": title, "signal": _over_sea(image), "lines": lines}
 
 
-def _flow(case: str, result: Result) -> Drawn:
+def _flow(result: Result) -> Drawn:
     made = _made(result).get("recommended")
     if made is not None:
         steps = {"everything at rest": made.conventional, "without moving ships": made.rest, "fused": made.fused}
@@ -81,10 +68,10 @@ def _flow(case: str, result: Result) -> Drawn:
             "moving ships are subtracted. Third: every moving ship is focused and inserted at its position."
         )
         figures = plot.overlays(parts, _UP_DB - _DOWN_DB)
-        yield f"flow_{word_of(case)}", titled("Steps of the recommended method", case), caption, figures
+        yield "flow", "Steps of the recommended method", caption, figures
 
 
-def _methods(case: str, result: Result) -> Drawn:
+def _methods(result: Result) -> Drawn:
     parts = [_marked(result, name, made.fused, False) for name, made in _made(result).items()]
     if parts:
         caption = (
@@ -92,15 +79,15 @@ def _methods(case: str, result: Result) -> Drawn:
             "of moving ships to zero leaves holes in the sea."
         )
         figures = plot.overlays(parts, _UP_DB - _DOWN_DB)
-        yield f"methods_{word_of(case)}", titled("Final images", case), caption, figures
+        yield "methods", "Final images", caption, figures
 
 
-def _ships(case: str, result: Result) -> Drawn:
+def _ships(result: Result) -> Drawn:
     parts, made = [], _made(result)
     for name, shown in _shown(result).items():
         for method in (one for one in ("conventional", "recommended") if one in made):
             at = ImagePosition.of(shown.centre) if method == "conventional" else _true(shown)
-            reach = zip(("azimuth", "range"), (at.azimuth_m, at.range_m), _SHIP_M, strict=True)
+            reach = zip(("azimuth", "range"), (at.azimuth_m, at.range_m), (150.0, 60.0), strict=True)
             spans = {axis: (middle - half, middle + half) for axis, middle, half in reach}
             parts.append({"title": f"{name}, {method}", "signal": plot.within(made[method].fused, spans), "lines": {}})
     if parts:
@@ -108,4 +95,7 @@ def _ships(case: str, result: Result) -> Drawn:
             "Each ship at its position in the image focused for a stationary scene (conventional) and at its "
             "true position (recommended), in dB relative to its own peak."
         )
-        yield f"ships_{word_of(case)}", titled("Ships", case), caption, plot.overlays(parts)
+        yield "ships", "Ships", caption, plot.overlays(parts)
+
+
+DRAW_CASE = (_flow, _methods, _ships)

@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -16,18 +17,90 @@ from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.matched_fourier import MatchedFourier
 from torchsar.metrics import contrast, entropy, rotation_bounds
 from torchsar.radar import InverseRadar
+from torchsar.scene import Points, PolynomialRotation, Scatterers, Scene, Together, TurntableWorld
 from torchsar.study.names.factories import with_wavelength
 from torchsar.study.names.registry import TARGET_IMPAIRMENTS
-from torchsar.study.output.pictures import Drawn
+from torchsar.study.systems.isal import Target
+from torchsar.study.systems.isal import target as draw_target
 from torchsar.study.systems.isal_rotation import choices, figures
 from torchsar.study.systems.isal_rotation.judge import CrossRangeCut, FoundRotation, cross_range_cut, k_scales, true_k
-from torchsar.study.systems.isal_rotation.world import Rotating
-from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Result, Trials
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Column, System
 
-# reports warn of an image with so much less entropy than the ideal one at so large an error of k1
-_TRAP_NATS, _TRAP_PERCENT = 0.005, 1.0
+
+@dataclass(frozen=True)
+class OneScene:
+    """A random scene with a seed of its own, the same in every trial."""
+
+    scene: Scene
+    seed: int
+
+    def scatterers(self, draws: Draws) -> Scatterers:
+        return self.scene.scatterers(Draws(self.seed, source=draws.source))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rotating(Target):
+    """Section `world`: the simulated target and its true parameters.
+
+    Args:
+        rotation: Rotation rate at the first pulse, and its time derivatives relative to that rate.
+        centre_deviation_m: Range in metres from the centre of rotation to the zero of the range
+            axis, yc.
+        scene_seed: Seed of one scene for all trials, which then differ in noise alone; None for
+            another scene in every trial.
+    """
+
+    rotation: PolynomialRotation
+    centre_deviation_m: Tensor | float = 0.0
+    scene_seed: int | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.rotation_rad_s is not None:
+            raise ValueError(
+                "world.rotation_rad_s, the rate of a uniform rotation, is not accepted here; give world.rotation alone"
+            )
+        if not bool((torch.as_tensor(self.rotation.omega_rad_s) > 0).all()):
+            raise ValueError(
+                f"world.rotation.omega_rad_s must be positive, got {self.rotation.omega_rad_s}; a "
+                "negative rate would only mirror the image in cross range"
+            )
+
+    def of(self, radar: InverseRadar) -> TurntableWorld:
+        self.rotation.refuse_turning_back(self.pulses / radar.prf_hz)
+        scene: Scene = Together(self.scene)
+        scene = scene if self.scene_seed is None else OneScene(scene, self.scene_seed)
+        effects = (self.motion, self.start_phase, self.noise.snr_db, self.fidelity)
+        return TurntableWorld(scene, None, *effects, self.rotation, self.centre_deviation_m)
+
+    @property
+    def named_points(self) -> dict[str, int]:
+        """Names of the point targets, `part.number`, and their indices among all scatterers."""
+        names: dict[str, int] = {}
+        first = 0
+        for part, one in self.scene.items():
+            if isinstance(one, Points):
+                names.update({f"{part}.{i}": first + i for i in range(len(one.azimuth_m))})
+            first += one.scatterers(Draws(0)).range_m.shape[-1]
+        return names
+
+    def noise_std(self, amplitude: Tensor) -> float:
+        """Return the standard deviation of the noise in a sample; 0 without noise.
+
+        The SNR is the total power of the scatterers, divided by the number of range cells, over the
+        noise variance.
+
+        Args:
+            amplitude: Amplitudes of all scatterers.
+        """
+        snr_db = self.noise.snr_db
+        if snr_db is None:
+            return 0.0
+        return math.sqrt(float(amplitude.abs().square().sum()) / self.samples) * 10 ** (-float(snr_db) / 20)
+
+
 # limits that concern only methods which estimate the value
 _OF_ESTIMATORS = {"scatterers above the noise": "warp_k", "range term, pi lambda sigma_y / ra^2": "omega_rad_s"}
 
@@ -132,8 +205,9 @@ class IsalRotation(System):
         "pslr_azimuth_db": Column("PSLR in cross range", "dB"),
     }
 
-    def samples(self, world: Rotating, radar: InverseRadar) -> int:
-        return world.pulses * world.samples
+    settings = {"reference": "reference", "search_m": "search_m"}
+    draw_first = (draw_target,)
+    draw_case = figures.DRAW_CASE
 
     def simulate(self, bench: Bench, world: Rotating, draws: Draws) -> Trials:
         made = world.trials_of(bench.radar, draws, bench.dtype, bench.device)
@@ -202,9 +276,6 @@ class IsalRotation(System):
 
     choices = staticmethod(choices.choices)  # pyright: ignore[reportAssignmentType]
 
-    def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
-        return figures.pictures(results, self.columns)
-
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """Yield notes for the report, as (title, text), about cases in which a wrong rotation gives
         an image with less entropy than the true rotation.
@@ -215,15 +286,11 @@ class IsalRotation(System):
             trapped = [
                 f"{name} ({row['entropy_above_ideal_nats']:.3f} nats, k1 {row['k1_error_percent']:.2g} % off)"
                 for name, row in rows.items()
-                if row.get("entropy_above_ideal_nats", 0.0) < -_TRAP_NATS
-                and abs(row.get("k1_error_percent", 0.0)) > _TRAP_PERCENT
+                if row.get("entropy_above_ideal_nats", 0.0) < -0.005 and abs(row.get("k1_error_percent", 0.0)) > 1.0
             ]
             if trapped:
                 text = "On the grid of these images, wrong rotations give less entropy than the true one: "
                 yield f"Misleading entropy, case {case}", f"{text}{', '.join(trapped)}. A finer grid prevents this."
-
-    def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
-        return {"reference": bench.judging.reference, "search_m": bench.judging.search_m}
 
 
 def _expanded(metrics: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:

@@ -27,7 +27,6 @@ from torchsar.metrics import error_db, rotation_bounds
 from torchsar.radar.warp import cut_warp, warp
 from torchsar.scene import PhaseOnly, Points
 from torchsar.study.systems.isal import echo_choices
-from torchsar.study.systems.isal_rotation.world import Rotating, first_values, k_of
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
@@ -127,16 +126,16 @@ def _aliased(one: Gridding) -> dict[str, float]:
 def _scatterers(bench: Bench) -> list[Tensor]:
     """Cross range, range (m) and amplitude in the first trial of a run, (target,) each."""
     scene = bench.world().of(bench.radar).scene.scatterers(bench.draws("run", [0]))
-    values = {"x": scene.azimuth_m, "y": scene.range_m, "a": scene.amplitude}
-    return first_values(values, "x", "y", "a")
+    return [x.reshape(-1, x.shape[-1])[0].cpu() for x in (scene.azimuth_m, scene.range_m, scene.amplitude)]
 
 
-def _rotation(world: Rotating) -> tuple[float, Tensor, float]:
+def _rotation(world: Any) -> tuple[float, Tensor, float]:
     """Rate, k1, k2, ... and range centre deviation of the first trial."""
     omega, yc = (
         float(torch.as_tensor(v).reshape(-1)[0]) for v in (world.rotation.omega_rad_s, world.centre_deviation_m)
     )
-    return omega, k_of(world.rotation), yc
+    k = world.rotation.warp_k(torch.zeros(0, dtype=torch.float64))
+    return omega, k.reshape(-1, k.shape[-1])[0] if k.numel() else k.reshape(-1)[:0], yc
 
 
 def _levers(bench: Bench) -> tuple[float, float]:

@@ -5,17 +5,16 @@ every period (Remote Sens. 2024, 16, 793).
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.radial import SpectrumCorrelation
 from torchsar.core import Draws, Trace
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement
+from torchsar.echo import Impairment, simulate_ladar, simulate_ladar_record
 from torchsar.metrics import (
     contrast,
     entropy,
@@ -25,24 +24,128 @@ from torchsar.metrics import (
     velocity_segmented_bound_m_s,
 )
 from torchsar.radar import TriangularLadar
-from torchsar.scene import Points
+from torchsar.scene import (
+    CalibrationFibre,
+    Fidelity,
+    LadarWorld,
+    LinearInSweep,
+    LogAmplitude,
+    Motion,
+    Points,
+    RetroAndBrokenLine,
+    Scene,
+    Together,
+)
+from torchsar.scene.ladar import SweepError
 from torchsar.study.names.factories import with_wavelength
-from torchsar.study.names.registry import group_of
-from torchsar.study.output.pictures import Drawn
+from torchsar.study.names.registry import (
+    CALIBRATIONS,
+    LADAR_IMPAIRMENTS,
+    LOG_AMPLITUDES,
+    RADIAL_MOTIONS,
+    SCENES,
+    SWEEP_ERRORS,
+    SWEEP_FIDELITIES,
+    group_of,
+)
 from torchsar.study.settings.errors import ConfigError, did_you_mean
-from torchsar.study.systems.sal import figures, limits
+from torchsar.study.systems.sal import choices, figures
 from torchsar.study.systems.sal.judge import Course, course_of, target_responses
-from torchsar.study.systems.sal.world import Ground
-from torchsar.study.trials.batch import IMAGE, Batch, Judged, Result, Trials
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Choice
-from torchsar.study.trials.system import Column, System
+from torchsar.study.trials.system import Column, Noise, System, World
+
+
+@dataclass(frozen=True)
+class Record:
+    """A continuous record of the detector, cut into blocks, instead of separated sweeps.
+
+    Args:
+        trigger_s: Time from the start of a block to the start of an up sweep in seconds.
+        block_s: Length of a block in seconds; null for one period of the sweep if every period is
+            kept, and else for two periods.
+        trigger_known: Whether the recording contains the time of the trigger.
+    """
+
+    trigger_s: Tensor | float = 0.0
+    block_s: float | None = None
+    trigger_known: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ground(World):
+    """True scene, motion of the line of sight, atmosphere, laser and noise.
+
+    Args:
+        periods: Number of recorded periods of the sweep.
+        scene: Scenes by name; their echoes add up.
+        motion: Radial motions of the line of sight by name; they add up.
+        log_amplitude: Scintillation of the atmosphere; null for none.
+        fidelity: Model of how the range changes inside a sweep.
+        gate_m: Least and largest relative range in metres that is recorded; null for all ranges.
+        sweep_error: Phase error of the laser's sweeps; null for none.
+        calibration: Internal fibre by which the sweep error can be measured; null for none.
+        record: Continuous record of the detector; null for sweeps that are separated ideally.
+        noise: Receiver noise; its snr_db is the power of a scatterer of amplitude 1 over that of
+            the noise in a sample before any compression.
+        impairments: Impairments of the recording by name, applied in this order.
+    """
+
+    periods: int
+    scene: Mapping[str, Annotated[Scene, SCENES]]
+    motion: Sequence[Annotated[Motion, RADIAL_MOTIONS]] = ()
+    log_amplitude: Annotated[LogAmplitude, LOG_AMPLITUDES] | None = None
+    fidelity: Annotated[Fidelity, SWEEP_FIDELITIES] = field(default_factory=LinearInSweep)
+    gate_m: Sequence[float] | None = None
+    sweep_error: Annotated[SweepError, SWEEP_ERRORS] | None = None
+    calibration: Annotated[CalibrationFibre, CALIBRATIONS] | None = None
+    record: Record | None = None
+    noise: Noise = field(default_factory=Noise)
+    impairments: Mapping[str, Annotated[Impairment, LADAR_IMPAIRMENTS]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        snr_db = self.noise.snr_db
+        if self.periods < 1 or not self.scene:
+            raise ValueError(
+                f"world needs at least one scene and one period, got {len(self.scene)} scenes, {self.periods} periods"
+            )
+        if snr_db is not None and bool((torch.as_tensor(snr_db).abs() > 300).any()):
+            raise ValueError(
+                f"noise.snr_db is {snr_db}, outside the numerical range; give -300 to 300 dB, or null for no noise"
+            )
+        self.of()
+
+    def of(self) -> LadarWorld:
+        """The same world in the form of the echo simulation."""
+        gate = None if self.gate_m is None else tuple(self.gate_m)
+        scene, snr_db = Together(dict(self.scene)), self.noise.snr_db
+        effects = (self.log_amplitude, snr_db, self.fidelity, gate, self.sweep_error, self.calibration)
+        return LadarWorld(scene, self.motion, *effects)  # pyright: ignore[reportArgumentType]
+
+    def trials_of(self, radar: TriangularLadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
+        """Simulate recordings with and without motion, and the true values."""
+        world, made = self.of(), (self.impairments, dtype, device)
+        if self.record is None:
+            return Trials.of(*simulate_ladar(radar, world, self.periods, draws, *made), draws, world)
+        how = (self.record.block_s, self.record.trigger_s, self.record.trigger_known)
+        return Trials.of(*simulate_ladar_record(radar, world, self.periods, draws, *how, *made), draws, world)
+
+    @property
+    def named_points(self) -> dict[str, int]:
+        """Names `part.number` of point targets and retro-reflectors, whose responses are measured,
+        and their indices among all scatterers.
+        """
+        names: dict[str, int] = {}
+        first = 0
+        for part, scene in self.scene.items():
+            shown = len(scene.azimuth_m) if isinstance(scene, Points) else int(isinstance(scene, RetroAndBrokenLine))
+            names.update({f"{part}.{i}": first + i for i in range(shown)})
+            first += scene.scatterers(Draws(0)).range_m.shape[-1]
+        return names
+
 
 log = logging.getLogger("torchsar")
-# stages that work on deramped profiles, but cannot check whether their input is deramped
-_OF_DERAMPED = ("azimuth_matched_filter", "phase_polish")
-# the report names images whose residual phase exceeds this, and whose entropy is lower by this
-_WRONG_RAD, _LOWER_NATS = 1.0, 0.02
 
 
 @dataclass(frozen=True)
@@ -119,16 +222,17 @@ class Sal(System):
         "seconds": Column("time of a trial", "s"),
     }
     target_columns = {
-        key: Column(label, unit)
-        for key, label, unit in (
-            ("irw_azimuth_m", "width in azimuth", "m"),
-            ("pslr_azimuth_db", "PSLR in azimuth", "dB"),
-            ("islr_azimuth_db", "ISLR in azimuth", "dB"),
-            ("irw_range_m", "width in range", "m"),
-            ("pslr_range_db", "PSLR in range", "dB"),
-            ("islr_range_db", "ISLR in range", "dB"),
-        )
+        "irw_azimuth_m": Column("width in azimuth", "m"),
+        "pslr_azimuth_db": Column("PSLR in azimuth", "dB"),
+        "islr_azimuth_db": Column("ISLR in azimuth", "dB"),
+        "irw_range_m": Column("width in range", "m"),
+        "pslr_range_db": Column("PSLR in range", "dB"),
+        "islr_range_db": Column("ISLR in range", "dB"),
     }
+
+    settings = {"islr_extent_nulls": "sidelobe_nulls", "reference": "reference", "target": "target"}
+    draw_first = (figures.target,)
+    draw_case = figures.DRAW_CASE
 
     def samples(self, world: Ground, radar: TriangularLadar) -> int:
         per_period = 2 * radar.sweep_samples
@@ -159,7 +263,12 @@ class Sal(System):
             before: list[str] = []
             for key, entry in (method.stages or {}).items():
                 stage, times = entry["stage"], before.count("deramp_azimuth")
-                if stage in _OF_DERAMPED and times != 1 and not any(group_of(other) == "own" for other in before):
+                # these work on deramped profiles, but cannot check whether their input is deramped
+                if (
+                    stage in ("azimuth_matched_filter", "phase_polish")
+                    and times != 1
+                    and not any(group_of(other) == "own" for other in before)
+                ):
                     raise ConfigError(
                         f"{file}: processor.{name}.stages.{key}: {stage} needs profiles that are deramped once, but "
                         f"{times} stages deramp_azimuth precede it; put one of them between compress_sweeps and {stage}"
@@ -171,9 +280,6 @@ class Sal(System):
                 "for what a real detector records",
                 file,
             )
-
-    def simulate(self, bench: Bench, world: Ground, draws: Draws) -> Trials:
-        return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
 
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
         clean, settings = bench.config.processor[name].input == "clean", bench.judging
@@ -218,20 +324,11 @@ class Sal(System):
             "range_error_detrended_rms_m": {"phase of one sweep": range_per_sweep_bound_m(*of_sweep)},
         }
 
-    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
-        return limits.limits(bench, self._moved(bench))
+    limits = staticmethod(choices.limits)  # pyright: ignore[reportAssignmentType]
 
-    def requirements(self, bench: Bench) -> Sequence[Requirement]:
-        return limits.requirements(bench, self._moved(bench))
+    requirements = staticmethod(choices.requirements)  # pyright: ignore[reportAssignmentType]
 
-    def choices(self, bench: Bench) -> Sequence[Choice]:
-        return limits.choices(bench, self._moved(bench))
-
-    def _moved(self, bench: Bench) -> limits.Moved:
-        return bench.memo("moved", lambda: limits.moved(bench))
-
-    def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
-        return figures.pictures(results, self.columns)
+    choices = staticmethod(choices.choices)  # pyright: ignore[reportAssignmentType]
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """Yield notes for the report, as (title, text), about images with a large residual phase
@@ -240,11 +337,11 @@ class Sal(System):
         methods, reference = metrics["methods"], metrics["definitions"]["reference"]
         for case, ideal in (methods[reference]["cases"] if reference else {}).items():
             rows = {name: method["cases"][case] for name, method in methods.items() if name != reference}
-            least = ideal.get("entropy_nats", 0.0) - _LOWER_NATS
+            least = ideal.get("entropy_nats", 0.0) - 0.02
             wrong = [
                 f"{name} {row['entropy_nats']:.2f} nats with {row['residual_phase_rms_rad']:.3g} rad of residual phase"
                 for name, row in rows.items()
-                if row.get("entropy_nats", least) < least and row["residual_phase_rms_rad"] > _WRONG_RAD
+                if row.get("entropy_nats", least) < least and row["residual_phase_rms_rad"] > 1.0
             ]
             if wrong:
                 text = (
@@ -252,10 +349,6 @@ class Sal(System):
                     f"{', '.join(wrong)}. Compare methods by the residual phase, not by entropy alone."
                 )
                 yield f"Misleading entropy, case {case}", text
-
-    def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
-        named = {"islr_extent_nulls": "sidelobe_nulls", "reference": "reference", "target": "target"}
-        return {shown: getattr(bench.judging, name) for shown, name in named.items()}
 
 
 def _expanded(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -12,35 +10,14 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Axis, Signal
-from torchsar.study.output.pictures import Drawn, comparisons, first_named
-from torchsar.study.settings.cases import titled, word_of
+from torchsar.study.output.pictures import Drawn, first_named
 from torchsar.study.systems.sal.judge import Course, finer_in_range
 from torchsar.study.trials.batch import Result, image_of
 from torchsar.study.trials.cuts import impulse_cuts
 
-# margins about the scatterers: samples in azimuth, cells in range, and a part of the extent of the
-# scene
-_SAMPLES, _CELLS, _PART = 24, 6, 0.1
 # dynamic range of images and profiles, so that images out of focus are visible beside sharp ones
 _RANGE_DB = 40.0
 Lines = Mapping[str, tuple[Axis, Tensor]]
-
-
-def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Yield functions that draw the pictures, in the order of the report."""
-    yield partial(_target, next(iter(results.values())))
-    yield partial(comparisons, results, columns)
-    for case, result in results.items():
-        for make in (_profiles, _images, _motion, _slices):
-            yield partial(make, case, result)
-
-
-def _scatterers(result: Result) -> tuple[Tensor, Tensor, Tensor]:
-    """Azimuth (m), relative range (m) and amplitude of the scatterers in the first trial."""
-    truth = result.first.trials.truth
-    values = (truth[name] for name in ("azimuth_m", "range_m", "amplitude"))
-    azimuth, range_m, amplitude = (x.reshape(-1, x.shape[-1])[0].cpu() for x in values)
-    return azimuth, range_m, amplitude
 
 
 def _courses(result: Result) -> dict[str, Course]:
@@ -49,8 +26,8 @@ def _courses(result: Result) -> dict[str, Course]:
     return {name: outcome.judged.view.first() for name, outcome in outcomes.items() if not outcome.failed}
 
 
-def _target(result: Result) -> Drawn:
-    along, range_, amplitude = (plot.array(x) for x in _scatterers(result))
+def target(result: Result) -> Drawn:
+    along, range_, amplitude = map(plot.array, result.first.trials.first("azimuth_m", "range_m", "amplitude"))
     caption = (
         "Scatterers of the first trial; the area of a point is proportional to its amplitude. The axes differ in scale."
     )
@@ -62,33 +39,33 @@ def _about_scene(signal: Signal, result: Result) -> Signal:
     """The part of an image or of profiles about the scatterers. It includes shifts by residual
     motion: in range by its velocity, in azimuth by its slope, if the image is in focus.
     """
-    azimuth, range_m, _ = _scatterers(result)
-    focused = [
-        c for c in _courses(result).values() if float(c.rms(c.detrended_m)) < result.bench.radar.wavelength_m / 8
-    ]
+    azimuth, range_m = result.first.trials.first("azimuth_m", "range_m")
+    radar = result.bench.radar
+    focused = [c for c in _courses(result).values() if float(c.rms(c.detrended_m)) < radar.wavelength_m / 8]
     slopes = torch.stack([c.slope_m_s.cpu().reshape(()) for c in focused]) if focused else torch.zeros(1).to(azimuth)
-    far = (result.bench.radar.reference_range_m + range_m) / max(result.bench.radar.speed_m_s, 1e-30)
+    far = (radar.reference_range_m + range_m) / max(radar.speed_m_s, 1e-30)
     azimuth = torch.cat([azimuth, (azimuth + slopes[:, None] * far).flatten()])
-    radar, velocity = result.bench.radar, result.first.trials.truth["velocity_m_s"]
+    velocity = result.first.trials.truth["velocity_m_s"]
     shift = velocity[:1].cpu() * radar.carrier_hz / radar.chirp_rate_hz_s
     shifted = torch.cat([range_m + shift.min().clamp(max=0.0), range_m + shift.max().clamp(min=0.0)])
+    # margins of 24 samples in azimuth, 6 cells in range, and a tenth of the extent of the scene
     return plot.within(
         signal,
         {
-            "azimuth": plot.span(azimuth, _SAMPLES * signal.axes[0].step + _PART * float(np.ptp(azimuth.numpy()))),
-            "range": plot.span(shifted, _CELLS * radar.range_step_m + _PART * float(np.ptp(range_m.numpy()))),
+            "azimuth": plot.span(azimuth, 24 * signal.axes[0].step + 0.1 * float(np.ptp(azimuth.numpy()))),
+            "range": plot.span(shifted, 6 * radar.range_step_m + 0.1 * float(np.ptp(range_m.numpy()))),
         },
     )
 
 
-def _profiles(case: str, result: Result) -> Drawn:
+def _profiles(result: Result) -> Drawn:
     found: dict[str, Signal] = {}
     for name, outcome in result.first.outcomes.items():
         outputs = {} if outcome.trace is None else outcome.trace.outputs
         signal = next((image_of(s) for s in outputs.values() if s.names == ("pulse", "range")), None)
         if signal is not None and not any(_look_alike(s.data, signal.data) for s in found.values()):
             found[name] = signal
-    shown = {name: _in_milliseconds(_about_scene(s, result)) for name, s in first_named(found).items()}
+    shown = {name: in_milliseconds(_about_scene(s, result)) for name, s in first_named(found).items()}
     if shown:
         caption = (
             "Range profiles of the up sweeps of the first trial, in dB relative to the peak of the first panel. Of "
@@ -96,7 +73,7 @@ def _profiles(case: str, result: Result) -> Drawn:
             "2 v / lambda, and thus the range."
         )
         figure = plot.images(shown, dynamic_range_db=_RANGE_DB, percentile=100)
-        yield f"profiles_{word_of(case)}", titled("Range profiles over slow time", case), caption, figure
+        yield "profiles", "Range profiles over slow time", caption, figure
 
 
 def _look_alike(one: Tensor, other: Tensor) -> bool:
@@ -104,12 +81,13 @@ def _look_alike(one: Tensor, other: Tensor) -> bool:
     return one.shape == other.shape and torch.allclose(one.abs(), other.abs(), rtol=0.0, atol=limit)
 
 
-def _in_milliseconds(signal: Signal) -> Signal:
+def in_milliseconds(signal: Signal) -> Signal:
+    """Return range profiles (pulse, range) with slow time in milliseconds."""
     pulse = signal.axes[0]
     return Signal(signal.data, (Axis("slow time", pulse.n, 1e3 * pulse.start, 1e3 * pulse.step, "ms"), signal.axes[1]))
 
 
-def _images(case: str, result: Result) -> Drawn:
+def _images(result: Result) -> Drawn:
     finer = {name: finer_in_range(finer_in_range(image)) for name, image in first_named(result.images).items()}
     cut = {name: _about_scene(image, result) for name, image in finer.items()}
     top = float(next(iter(cut.values())).data.abs().max())
@@ -120,10 +98,10 @@ def _images(case: str, result: Result) -> Drawn:
         "constant slope of the range error shifts an image along azimuth without loss of focus."
     )
     figure = plot.images(shown, dynamic_range_db=_RANGE_DB, percentile=100)
-    yield f"images_{word_of(case)}", titled("Images by every method", case), caption, figure
+    yield "images", "Images by every method", caption, figure
 
 
-def _motion(case: str, result: Result) -> Drawn:
+def _motion(result: Result) -> Drawn:
     """Velocity, its error, and the remaining range error; errors of similar size share a panel."""
     courses = {name: course for name, course in _courses(result).items() if name != "ideal"}
     estimating = {name: course for name, course in courses.items() if course.velocity_m_s is not None}
@@ -146,7 +124,7 @@ def _motion(case: str, result: Result) -> Drawn:
         "only the phase and the position of an image. A quarter of the wavelength is "
         f"{1e6 * result.bench.radar.wavelength_m / 4:.2g} um."
     )
-    yield f"motion_{word_of(case)}", titled("Radial motion and its errors", case), caption, plot.panels(parts)
+    yield "motion", "Radial motion and its errors", caption, plot.panels(parts)
 
 
 def _lit_only(course: Course, x: Tensor | None) -> Tensor:
@@ -170,7 +148,7 @@ def _by_size(title: str, unit: str, lines: Lines) -> list[dict[str, object]]:
     return [_panel(title if len(group) > 1 else f"{title}: {next(iter(group))}", unit, group) for group in groups]
 
 
-def _slices(case: str, result: Result) -> Drawn:
+def _slices(result: Result) -> Drawn:
     """Cuts through the response of metrics.target, four methods in a panel beside the ideal one."""
     target, images = result.bench.judging.target, result.images
     figures = {n: o.judged.targets[target] for n, o in result.first.outcomes.items() if target in o.judged.targets}
@@ -183,23 +161,23 @@ def _slices(case: str, result: Result) -> Drawn:
         for axis in ("azimuth", "range"):
             reach = float(cuts[names[0]][axis][0].abs().max())
             series = {n: _within(reach, *cuts[n][axis]) for n in names}
-            shown = {
-                "xlabel": f"{axis} from the response (m)",
-                "ylabel": "level (dB)",
-                "title": axis,
-                "ylim": (-40.0, 2.0),
-            }
-            parts.append({"series": series, **shown})
+            label = f"{axis} from the response (m)"
+            parts.append(
+                {"series": series, "xlabel": label, "ylabel": "level (dB)", "title": axis, "ylim": (-40.0, 2.0)}
+            )
     if parts:
         caption = (
             "Azimuth and range cuts through the strongest response near the predicted position, with ten side lobes on "
             "either side, in dB relative to the peak of each curve. Methods are sorted by the remaining motion, the "
             "best first; where much of it remains there is no distinct response."
         )
-        yield f"slices_{word_of(case)}", titled(f"Response of {target}", case), caption, plot.panels(parts)
+        yield "slices", f"Response of {target}", caption, plot.panels(parts)
 
 
 def _within(reach: float, offset_m: Tensor, response: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """The part of a cut that other cuts of the panel have, in dB."""
     near = offset_m.abs() <= reach
     return plot.array(offset_m[near]), plot.decibel(response[near])
+
+
+DRAW_CASE = (_profiles, _images, _motion, _slices)

@@ -2,33 +2,231 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Truth
-from torchsar.echo import target_energy
+from torchsar.core import Chain, Draws, Signal, Trace, Truth, wrapped
+from torchsar.echo import Impairment, apply_impairments, simulate, target_energy
+from torchsar.focus import ClosestRange
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
+from torchsar.focus.skew import common_lines
 from torchsar.focus.strip_limits import strip_limits
 from torchsar.io import read_stripmap
+from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
 from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.radar import StripmapRadar
-from torchsar.scene import Points, RandomPoints
+from torchsar.scene import AlwaysLit, Beam, Hyperbola, Path, Points, RandomPoints, Scene, StripmapWorld, Together
 from torchsar.study.names.factories import with_wavelength
-from torchsar.study.names.registry import IMPAIRMENTS
-from torchsar.study.output.pictures import Drawn
+from torchsar.study.names.registry import BEAMS, IMPAIRMENTS, PATHS, SCENES
+from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
-from torchsar.study.systems.stripmap import figures, judge
+from torchsar.study.systems.stripmap import figures
 from torchsar.study.systems.stripmap.choices import choices, probe_of
-from torchsar.study.systems.stripmap.world import Strip
-from torchsar.study.trials.batch import Batch, Result, Trials
+from torchsar.study.systems.stripmap.image import Margin, Used, window
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Processed, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Choice
-from torchsar.study.trials.system import Column, System
+from torchsar.study.trials.system import Column, Noise, System, World
+
+
+@dataclass(frozen=True, kw_only=True)
+class Strip(World):
+    """Section `world`: the simulated strip and its true parameters.
+
+    Args:
+        lines: Number of pulses of the record.
+        samples: Number of range samples of each pulse.
+        scene: Scenes by name, whose echoes add up.
+        beam: Illumination of the scene by the antenna.
+        path: Model of the range to a target over time.
+        velocity_m_s: True effective velocity in m/s; None for the nominal one of the radar.
+        doppler_hz: True Doppler centroid in Hz; None for the nominal pointing of the radar.
+        squint_deg: True squint of the beam in degrees, as an alternative to doppler_hz.
+        noise: Receiver noise; the SNR is that of raw samples that contain signal.
+        impairments: Impairments of the recording by name, in the order of their effect.
+    """
+
+    lines: int
+    samples: int
+    scene: Mapping[str, Annotated[Scene, SCENES]]
+    beam: Annotated[Beam, BEAMS] = field(default_factory=AlwaysLit)
+    path: Annotated[Path, PATHS] = field(default_factory=Hyperbola)
+    velocity_m_s: Tensor | float | None = None
+    doppler_hz: Tensor | float | None = None
+    squint_deg: Tensor | float | None = None
+    noise: Noise = field(default_factory=Noise)
+    impairments: Mapping[str, Annotated[Impairment, IMPAIRMENTS]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lines < 2 or self.samples < 2 or not self.scene:
+            raise ValueError(
+                f"world needs at least one scene, 2 lines and 2 samples, got {len(self.scene)} scenes, "
+                f"{self.lines} lines and {self.samples} samples"
+            )
+        if self.doppler_hz is not None and self.squint_deg is not None:
+            raise ValueError("doppler_hz and squint_deg both give the direction of the beam; give one of them")
+        if self.velocity_m_s is not None and bool((torch.as_tensor(self.velocity_m_s) <= 0).any()):
+            raise ValueError(f"velocity_m_s must be positive, got {self.velocity_m_s}")
+        if self.squint_deg is not None and bool((torch.as_tensor(self.squint_deg).abs() >= 90).any()):
+            raise ValueError(f"squint_deg must lie between -90 and 90 degrees, got {self.squint_deg}")
+
+    def doppler(self, radar: StripmapRadar) -> Tensor | float | None:
+        """True Doppler of the beam centre, 2 v sin(squint) / lambda where a squint is given."""
+        if self.squint_deg is None:
+            return self.doppler_hz
+        velocity = radar.velocity_m_s if self.velocity_m_s is None else self.velocity_m_s
+        squint = torch.deg2rad(torch.as_tensor(self.squint_deg, dtype=torch.float64))
+        return 2 * velocity * torch.sin(squint) / radar.wavelength_m
+
+    def of(self, radar: StripmapRadar) -> StripmapWorld:
+        """The parameters of the echo simulation."""
+        doppler, scene = self.doppler(radar), Together(self.scene)
+        return StripmapWorld(scene, self.beam, self.path, self.velocity_m_s, doppler, self.noise.snr_db)
+
+    def trials_of(self, radar: StripmapRadar, draws: Draws, dtype: torch.dtype, device: str) -> Trials:
+        """Simulate trials: recordings with and without impairments, and what is true of them."""
+        world, size = self.of(radar), (self.lines, self.samples)
+        made = Trials.of(*simulate(radar, world, *size, draws, self.impairments, dtype, device), draws, world)
+        return replace(made, clean=apply_impairments(made.clean, {}, draws)[0])
+
+    @property
+    def named_points(self) -> dict[str, int]:
+        """Names of the point targets and their indices among all scatterers.
+
+        A name is the key of the scene part in the config and the number of the target in this part,
+        such as `points.0`.
+        """
+        names: dict[str, int] = {}
+        first = 0
+        for part, scene in self.scene.items():
+            count = len(scene.azimuth_m) if isinstance(scene, Points) else getattr(scene, "count", 0)
+            if isinstance(scene, (Points, RandomPoints)):
+                names.update({f"{part}.{i}": first + i for i in range(count)})
+            first += count
+        return names
+
+
+_UNIT = re.compile(r"_(hz|m_s|m|s|rad|deg|db)$")
+_FIGURES = ("irw_azimuth_m", "irw_range_m", "pslr_azimuth_db", "pslr_range_db", "islr_azimuth_db", "islr_range_db")
+
+
+@dataclass(frozen=True)
+class Judging:
+    """Settings of the metrics.
+
+    Args:
+        margin: Edges of the image that the metrics leave out; None for lines without a full
+            aperture and samples without a full pulse.
+        reference: Name of the method with which images and peaks are compared.
+        sidelobe_nulls: Distance from the peak up to which side lobes are measured, in null spacings
+            of a rectangular band.
+        found_within_m: Largest distance in metres between the peak and the true position of a
+            target that counts as found.
+        found_above_db: Lowest peak of a target that counts as found, in dB relative to the
+            reference.
+        published: Published values by metric, case and method.
+    """
+
+    margin: Margin | None = None
+    reference: str | None = None
+    sidelobe_nulls: int = 10
+    found_within_m: float = 10.0
+    found_above_db: float = -6.0
+    published: Mapping[str, Mapping[str, Mapping[str, float | str]]] = field(default_factory=dict)
+
+
+def estimation_metrics(trace: Trace, trials: Trials, prf_hz: float) -> dict[str, Tensor]:
+    """Return the scalar estimates of a chain by name, and their errors.
+
+    If two stages estimate values of the same name, the value of the later stage is used.
+    """
+    n, truth = trials.count, trials.truth
+    found = {key: v for estimate in trace.estimates.values() for key, v in estimate.value.items()}
+    values = {key: v.double().expand(n) for key, v in found.items() if v.shape == trace.signal.trials}
+    metrics = dict(values)
+    for key, value in values.items():
+        if key in truth and truth[key].numel() in (1, n):
+            metrics[error_name(key)] = value - truth[key].to(value)
+    doppler = values.get("doppler_hz", values.get("doppler_baseband_hz"))
+    if doppler is not None and "doppler_hz" in truth:
+        metrics["doppler_baseband_error_hz"] = wrapped(doppler - truth["doppler_hz"].to(doppler), prf_hz)
+    return metrics
+
+
+def error_name(name: str) -> str:
+    """'doppler_hz' -> 'doppler_error_hz'."""
+    return _UNIT.sub(r"_error_\1", name) if _UNIT.search(name) else f"{name}_error"
+
+
+def positions(chain: Chain, used: Used, bench: Bench, trials: Trials) -> tuple[Tensor, Tensor]:
+    """Return the expected azimuth and range (m) of the point targets in an image, each of shape
+    (trial, target).
+    """
+    index = torch.tensor(list(bench.world().named_points.values()))
+    zero, closest, velocity = (trials.truth[key] for key in ("zero_doppler_s", "closest_range_m", "velocity_m_s"))
+    zero, closest = (x[..., index].expand(trials.count, -1) for x in (zero, closest))
+    azimuth, slant = bench.radar.image_position(
+        zero, closest, used.frame_hz[:, None], velocity.expand(trials.count)[:, None]
+    )
+    flat = any(isinstance(stage, ClosestRange) for stage in chain.stages.values())
+    return azimuth, closest if flat else slant
+
+
+def _targets(
+    bench: Bench, chain: Chain, image: Signal, used: Used, trials: Trials
+) -> tuple[dict[str, dict[str, Tensor]], list[str]]:
+    """Metrics of every point target inside the image, and the names of those outside."""
+    names = [] if bench.recording is not None else list(bench.world().named_points)
+    if not names:
+        return {}, []
+    expected = positions(chain, used, bench, trials)
+    inside = torch.stack([(x >= a.start) & (x <= a.stop) for x, a in zip(expected, image.axes)]).all(0).all(0)
+    kept = [name for name, within in zip(names, inside.tolist()) if within]
+    outside = [name for name in names if name not in kept]
+    if not kept:
+        return {}, outside
+    at = tuple(x[:, inside] if image.trials else x[0, inside] for x in expected)
+    figures = impulse_response(image, (at[0], at[1]), sidelobe_nulls=bench.judging.sidelobe_nulls)
+    figures = {key: value.reshape(trials.count, -1) for key, value in figures.items()}
+    table = {key: figures[key] for key in _FIGURES}
+    for axis, x in zip(("azimuth", "range"), expected):
+        table[f"position_error_{axis}_m"] = figures[f"position_{axis}_m"] - x[:, inside]
+    table["peak_db"] = 20 * torch.log10(figures["peak"].abs().clamp_min(1e-300))
+    return {name: {key: value[:, i] for key, value in table.items()} for i, name in enumerate(kept)}, outside
+
+
+def over_targets(bench: Bench, judged: Judged, ideal: Judged | None) -> Judged:
+    """Return the metrics of a method over its point targets: peaks relative to the reference
+    method, the number of targets found, and medians over those found.
+    """
+    settings, targets = bench.judging, {}
+    for name, row in judged.targets.items():
+        level = 0.0 if ideal is None or name not in ideal.targets else ideal.targets[name]["peak_db"]
+        peak = row["peak_db"] - level
+        away = torch.hypot(row["position_error_azimuth_m"], row["position_error_range_m"])
+        seen = (away <= settings.found_within_m) & ((peak >= settings.found_above_db) | (ideal is None))
+        targets[name] = {**row, "peak_db": peak, "found": seen.double()}
+    if not targets:
+        return judged
+    found = torch.stack([row["found"] for row in targets.values()])  # (target, trial)
+    metrics = {"targets": torch.full_like(found[0], len(targets)), "targets_found": found.sum(0)}
+    for key in (*_FIGURES, "position_error_azimuth_m", "position_error_range_m"):
+        values = torch.stack([row[key] for row in targets.values()])
+        kept = torch.where(found > 0, values, torch.nan)
+        if key in _FIGURES:
+            metrics[key] = kept.nanmedian(0).values
+        else:
+            metrics[key.replace("_m", "_rms_m")] = kept.square().nanmean(0).sqrt()
+    return Judged({**judged.metrics, **metrics}, targets, judged.outside, judged.view)
 
 
 class Stripmap(System):
@@ -38,7 +236,7 @@ class Stripmap(System):
     about = "side-looking radar on a straight path, simulated or recorded raw data"
     Radar = staticmethod(with_wavelength(StripmapRadar))
     World = Strip
-    Judging = judge.Judging
+    Judging = Judging
     impairments = IMPAIRMENTS
     reads = "raw stripmap"
     ending = "a focusing stage"
@@ -100,17 +298,51 @@ class Stripmap(System):
         "position_error_range_m": Column("position error in range", "m"),
     }
 
-    def read(self, path: str, dtype: torch.dtype) -> Recording:
-        return read_stripmap(path, dtype)
+    settings = {"islr_extent_nulls": "sidelobe_nulls", "reference": "reference"}
+    draw_case = figures.DRAW_CASE
+    plain_names = True
+    read = staticmethod(read_stripmap)  # pyright: ignore[reportAssignmentType]
 
     def samples(self, world: Strip, radar: StripmapRadar) -> int:
         return world.lines * world.samples
 
-    def simulate(self, bench: Bench, world: Strip, draws: Draws) -> Trials:
-        return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
+    def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+        """Return the metrics of one method, with those of point targets if `detail` is true."""
+        chain, n = bench.chains[name], trials.count
+        metrics = estimation_metrics(trace, trials, bench.radar.prf_hz)
+        if trace.signal.names != IMAGE:
+            return Judged(metrics)
+        used = Used.by(chain, trace, bench.radar, n)
+        if not trace.signal.data.is_complex():  # the metrics of images and responses are those before detection
+            return Judged({**metrics, **used.metrics(bench.radar)}, view=used)
+        image = trace.signal.isel(**window(trace.signal, bench.radar, bench.judging.margin))
+        metrics.update(
+            used.metrics(bench.radar), entropy_nats=entropy(image).expand(n), contrast=contrast(image).expand(n)
+        )
+        if not detail:
+            return Judged(metrics, view=used)
+        targets, outside = _targets(bench, chain, trace.signal, used, trials)
+        return Judged(metrics, targets, outside, used)
 
-    compare = staticmethod(judge.compare)  # pyright: ignore[reportAssignmentType]
-    judge = staticmethod(judge.judge)  # pyright: ignore[reportAssignmentType]
+    def compare(self, bench: Bench, outcome: Processed, ideal: Processed | None) -> Judged:
+        """Return the metrics of a method, with image error and correlation relative to the
+        reference method, and with statistics over its point targets.
+        """
+        judged = over_targets(bench, outcome.judged, None if ideal is None else ideal.judged)
+        one, other = outcome.signal, None if ideal is None else ideal.signal
+        if one is None or other is None or one is other or not one.names == other.names == IMAGE:
+            return judged
+        if not (one.data.is_complex() and other.data.is_complex()):
+            return judged
+        pair = [
+            image.isel(**window(image, bench.radar, bench.judging.margin)).to(torch.complex128)  # sums over many pixels
+            for image in common_lines(one, other)
+        ]
+        count = len(judged.metrics["seconds"])
+        found = {"image_error_db": error_db(*pair), "image_correlation": correlation(*pair)}
+        return replace(
+            judged, metrics={**judged.metrics, **{name: value.expand(count) for name, value in found.items()}}
+        )
 
     def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
         if "world.doppler_hz" in grid and "world.squint_deg" in grid:
@@ -160,15 +392,14 @@ class Stripmap(System):
     def position_of(self, result: Result, target: str) -> tuple[float, float]:
         """Return the expected azimuth and range (m) of a target in the recommended image."""
         trials, view = result.first.trials, result.first_of("recommended").judged.view
-        azimuth, range_ = judge.positions(result.bench.chains["recommended"], view, result.bench, trials)
+        azimuth, range_ = positions(result.bench.chains["recommended"], view, result.bench, trials)
         index = list(result.bench.world().named_points).index(target)
         return float(azimuth[0, index]), float(range_[0, index])
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
-        return figures.pictures(results, self.columns)
-
-    def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
-        return {"islr_extent_nulls": bench.judging.sidelobe_nulls, "reference": bench.judging.reference}
+        yield from self.case_pictures(results)
+        if len(results) > 1:
+            yield partial(comparisons, results, self.columns, "clean")
 
 
 SYSTEM = Stripmap

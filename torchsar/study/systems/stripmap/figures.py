@@ -3,25 +3,79 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchsar import plot
 from torchsar.compensate.velocity import EffectiveVelocity
 from torchsar.core import Signal
 from torchsar.repair.response import band_grid
 from torchsar.study.names.registry import group_of
-from torchsar.study.output.pictures import Drawn, comparisons
-from torchsar.study.settings.cases import titled, word_of
+from torchsar.study.output.pictures import Drawn
 from torchsar.study.systems.stripmap.image import focus_name, window
-from torchsar.study.systems.stripmap.spectra import azimuth_spectrum, phase_increments, range_spectrum
 from torchsar.study.trials.batch import IMAGE, Result, image_of
 from torchsar.study.trials.cuts import impulse_cuts
+
+
+def azimuth_spectrum(signal: Signal, bins: int = 256) -> tuple[Tensor, Tensor]:
+    """Estimate the azimuth power spectrum of a recording, averaged over range.
+
+    The spectrum is also averaged over segments of `bins` pulses, each weighted by a Hann window.
+
+    Args:
+        signal: Signal of one trial with the axes (pulse, range).
+        bins: Number of pulses of a segment, and of Doppler bins of the result.
+
+    Returns:
+        Baseband Doppler frequency in Hz and power relative to its maximum, (bins,) each, float64.
+    """
+    data, pulse = signal.data, signal.axes[-2]
+    bins = min(bins, pulse.n)
+    window = torch.hann_window(bins, dtype=data.real.dtype, device=data.device)[:, None]
+    power = torch.zeros(bins, dtype=torch.float64)
+    for segment in data[: pulse.n // bins * bins].unflatten(0, (-1, bins)):
+        power += torch.fft.fft(segment * window, dim=0).abs().square().sum(-1).double().cpu()
+    frequency = torch.fft.fftshift(torch.fft.fftfreq(bins, pulse.step, dtype=torch.float64))
+    return frequency, torch.fft.fftshift(power) / power.max().clamp_min(1e-300)
+
+
+def range_spectrum(signal: Signal) -> Tensor:
+    """Compute the range power spectrum of a recording, summed over all pulses.
+
+    Args:
+        signal: Signal of one trial with the axes (pulse, range).
+
+    Returns:
+        Power with zero frequency in the middle, (range,), float64.
+    """
+    power = torch.zeros(signal.axes[-1].n, dtype=torch.float64)
+    for block in signal.data.split(256):  # a few megabytes of complex samples
+        power += torch.fft.fft(block).abs().square().sum(0).double().cpu()
+    return torch.fft.fftshift(power)
+
+
+def phase_increments(signal: Signal, blocks: int = 64) -> tuple[Tensor, Tensor]:
+    """Compute the mean phase increment from pulse to pulse in successive blocks of a recording.
+
+    Args:
+        signal: Signal of one trial with the axes (pulse, range).
+        blocks: Number of blocks; increments are averaged over the pulses and range cells of each.
+
+    Returns:
+        Slow time of the blocks in seconds and phase increments in radians, (block,) each, float64.
+    """
+    pulse = signal.axes[-2]
+    blocks = min(blocks, max(1, (pulse.n - 1) // 2))
+    product = (signal.data[:-1].conj() * signal.data[1:]).sum(-1).to(torch.complex128).cpu()
+    index = torch.arange(pulse.n - 1, dtype=torch.float64).tensor_split(blocks)
+    centres = torch.stack([pulse.start + pulse.step * (part.mean() + 0.5) for part in index])
+    return centres, torch.stack([torch.angle(part.sum()) for part in product.tensor_split(blocks)])
+
 
 # the part of the velocity curve that is drawn finely: half its extent in steps of the grid, and its
 # number of points, of which the middle one is the estimate
@@ -34,7 +88,6 @@ _CUT_METHODS = ("clean", "none", "baseline", "recommended")
 class Strip:
     """The first trial of one case, from which its pictures are drawn."""
 
-    case: str
     result: Result
 
     @property
@@ -82,24 +135,8 @@ class Strip:
         return "the brightest point of the window", at[0], at[1]
 
 
-def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Yield functions that draw the pictures, in the order of the report."""
-    makers = (_images, _cuts, _squint, _doppler_spectrum, _increments, _corrections, _contaminated_line)
-    for case, result in results.items():
-        for make in (*makers, _response, _image_corrections, _velocity):
-            yield partial(_of_case, make, Strip(case, result))
-    if len(results) > 1:
-        yield partial(comparisons, results, columns, "clean")
-
-
-def _of_case(make: Callable[[Strip], Drawn], strip: Strip) -> Drawn:
-    """Draw pictures, with the case in their names and titles."""
-    word = "" if strip.case == "all" else f"_{word_of(strip.case)}"
-    for name, title, caption, figure in make(strip):
-        yield f"{name}{word}", titled(title, strip.case), caption, figure
-
-
-def _images(strip: Strip) -> Drawn:
+def _images(result: Result) -> Drawn:
+    strip = Strip(result)
     shown = strip.images()
     caption = (
         "The image of the recommended method in the window that the metrics use, in dB. The two axes have one scale "
@@ -112,7 +149,8 @@ def _images(strip: Strip) -> Drawn:
         yield "methods", "The same scene by every method", caption, plot.images(shown, **strip.scale)
 
 
-def _cuts(strip: Strip) -> Drawn:
+def _cuts(result: Result) -> Drawn:
+    strip = Strip(result)
     label, *at = strip.strongest()
     images = {n: image for n, image in strip.result.images.items() if n in _CUT_METHODS and image.data.is_complex()}
     found = {name: impulse_cuts(image, (at[0], at[1])) for name, image in images.items()}
@@ -131,8 +169,9 @@ def _cuts(strip: Strip) -> Drawn:
         yield "cuts", "Impulse-response cuts", caption, plot.panels(parts)
 
 
-def _squint(strip: Strip) -> Drawn:
+def _squint(result: Result) -> Drawn:
     """Draw the recommended image beside the rerun that ignores the Doppler centroid."""
+    strip = Strip(result)
     margin = strip.result.bench.judging.margin
     for name, method in strip.result.bench.config.processor.items():
         if method.rerun is not None and any(key.endswith("doppler_hz") for key in method.rerun.given):
@@ -159,7 +198,8 @@ def _focus_input(strip: Strip) -> Signal:
     return strip.step(focus_name(strip.result.bench.chains["recommended"]), output=False)
 
 
-def _doppler_spectrum(strip: Strip) -> Drawn:
+def _doppler_spectrum(result: Result) -> Drawn:
+    strip = Strip(result)
     centroid = _baseband(strip)
     if centroid is None:
         return
@@ -176,7 +216,8 @@ def _doppler_spectrum(strip: Strip) -> Drawn:
     yield "doppler_spectrum", "Doppler spectrum", caption, figure
 
 
-def _increments(strip: Strip) -> Drawn:
+def _increments(result: Result) -> Drawn:
+    strip = Strip(result)
     time_s, phase = phase_increments(_focus_input(strip))
     prf, centroid = strip.radar.prf_hz, _baseband(strip)
     doppler = plot.array(phase) * prf / (2 * math.pi)
@@ -202,7 +243,8 @@ def _changed(strip: Strip, names: tuple[str, ...], groups: tuple[str, ...]) -> I
             yield name, before, after
 
 
-def _corrections(strip: Strip) -> Drawn:
+def _corrections(result: Result) -> Drawn:
+    strip = Strip(result)
     for name, before, after in _changed(strip, ("pulse", "range"), ("repair", "own")):
         power = [x.data.abs().square().sum(-1).double().cpu().numpy() for x in (before, after)]
         median = np.median(power[0][power[0] > 0]) if (power[0] > 0).any() else 1.0
@@ -228,8 +270,9 @@ def _frequency_mhz(strip: Strip, n: int) -> np.ndarray:
     return plot.array(torch.fft.fftshift(strip.radar.range_frequency_hz(n))) / 1e6
 
 
-def _contaminated_line(strip: Strip) -> Drawn:
+def _contaminated_line(result: Result) -> Drawn:
     """Draw the range spectrum of the line that an interference correction changed most."""
+    strip = Strip(result)
     for name, before, after in _changed(strip, ("pulse", "range"), ("repair", "own")):
         if "interference" not in f"{strip.stages[name]['stage']} {name}":
             continue
@@ -251,8 +294,9 @@ def _contaminated_line(strip: Strip) -> Drawn:
         yield "contaminated_line", "Spectrum of a contaminated line", caption, figure
 
 
-def _response(strip: Strip) -> Drawn:
+def _response(result: Result) -> Drawn:
     """Draw the estimated response of the channel, with the true one where it is known."""
+    strip = Strip(result)
     band_mhz = plot.array(band_grid()) * strip.radar.pulse.bandwidth_hz / 2e6
     truth, parts = strip.result.first.trials.truth, []
     for estimate in strip.result.first_of("recommended").estimates.values():
@@ -269,8 +313,9 @@ def _response(strip: Strip) -> Drawn:
         yield "response", "Frequency response of the channel", caption, plot.panels(parts)
 
 
-def _image_corrections(strip: Strip) -> Drawn:
+def _image_corrections(result: Result) -> Drawn:
     """Draw a range cut through the strongest target before and after corrections of the image."""
+    strip = Strip(result)
     for name, before, after in _changed(strip, IMAGE, ("repair",)):
         label, *at = strip.strongest()
         cuts = {when: impulse_cuts(x, (at[0], at[1]))["range"] for when, x in (("before", before), ("after", after))}
@@ -280,8 +325,9 @@ def _image_corrections(strip: Strip) -> Drawn:
         yield f"correction_{name}", f"Correction: {name}", caption, figure
 
 
-def _velocity(strip: Strip) -> Drawn:
+def _velocity(result: Result) -> Drawn:
     """Draw the entropy that the velocity search minimises, finely about the estimate."""
+    strip = Strip(result)
     bench, first = strip.result.bench, strip.result.first_of("recommended")
     chain = bench.chains["recommended"]
     for name, stage in chain.stages.items():
@@ -300,3 +346,9 @@ def _velocity(strip: Strip) -> Drawn:
             "minimises this curve; the dashed line is the minimum that it found."
         )
         yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, figure
+
+
+DRAW_CASE = (
+    *(_images, _cuts, _squint, _doppler_spectrum, _increments, _corrections, _contaminated_line),
+    *(_response, _image_corrections, _velocity),
+)

@@ -23,7 +23,6 @@ from torchsar.scene import drawn_motion
 from torchsar.scene.moved_scene import Moved
 from torchsar.study.names.registry import SWEEP_FIDELITIES
 from torchsar.study.systems.sal.judge import lit_periods
-from torchsar.study.systems.sal.world import Ground
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured, beside_direct_sum
 from torchsar.study.trials.direct_images import DirectlySummed, ladar_strip
@@ -50,21 +49,26 @@ _MODELS = (
 )
 
 
-def moved(bench: Bench) -> Moved:
+def _moved(bench: Bench) -> Moved:
     """Return the strongest scatterers within the range gate, and the motion, of the first trial.
 
     Raises:
         ValueError: If no scatterer lies within the gate, or one within it lies behind the ladar or
             has a beat frequency that aliases.
     """
+    return bench.memo("moved", lambda: _first_moved(bench))
+
+
+def _first_moved(bench: Bench) -> Moved:
     world, radar, draws = bench.world(), bench.radar, bench.draws("run", [0])
     motion = drawn_motion(world.motion, draws, world.periods * radar.pulse_step_s)
     return Moved.of(radar, world.of().scene.scatterers(draws), motion, world.periods, world.gate_m)
 
 
-def limits(bench: Bench, seen: Moved) -> dict[Limit, list[str]]:
+def limits(bench: Bench) -> dict[Limit, list[str]]:
     """Return the limits of methods in this scene, with the methods that each concerns."""
-    world, radar, e = bench.world(), bench.radar, seen.extremes
+    world, radar, seen = bench.world(), bench.radar, _moved(bench)
+    e = seen.extremes
     apart = torch.diff(torch.unique(seen.range_m))
     snr_db = world.noise.snr_db
     snr_db = None if snr_db is None else float(snr_db) + 20 * math.log10(seen.peak)
@@ -92,14 +96,14 @@ def _concerns(limit: Limit, name: str, bench: Bench) -> bool:
     return any(e["stage"] == stage and e.get(key, value) == value for e in (method.stages or {}).values())
 
 
-def requirements(bench: Bench, seen: Moved) -> Sequence[Requirement]:
+def requirements(bench: Bench) -> Sequence[Requirement]:
     """Return what simplified echo models and motion compensation neglect in this scene."""
-    e, world = seen.extremes, bench.world()
+    e = _moved(bench).extremes
     motion = (e.velocity_m_s, e.acceleration_m_s2, e.displacement_m)
-    return ladar_requirements(bench.radar, world.periods, e.range_m, *motion)
+    return ladar_requirements(bench.radar, bench.world().periods, e.range_m, *motion)
 
 
-def choices(bench: Bench, seen: Moved) -> list[Choice]:
+def choices(bench: Bench) -> list[Choice]:
     """Return the choices between alternatives: echo model, and estimator of the velocity."""
     estimators = {
         "segmented interference": segmented_interference,
@@ -112,6 +116,7 @@ def choices(bench: Bench, seen: Moved) -> list[Choice]:
     found = [Alternative(name, {"estimator": work}) for name, work in estimators.items()]
     # a continuous record knows no single range of a sweep
     possible = [entry for entry in _MODELS if bench.world().record is None or not entry[0].startswith("one_per")]
+    seen = _moved(bench)
     models = [_model(bench, seen, *entry) for entry in possible]
     filters = [n for n, s in bench.chains["recommended"].stages.items() if isinstance(s, AzimuthMatchedFilter)]
     images = [beside_direct_sum(partial(_summed, bench, n), "migration while a point is seen") for n in filters[-1:]]
@@ -141,16 +146,16 @@ def _echoes(bench: Bench, seen: Moved) -> Measured:
     alone = replace(world, scene={"edge": seen.farthest}, noise=Noise(), **nothing)
     draws = bench.draws("run", [0])  # whose motion is predicted
 
-    def made(of: Ground, keys: Mapping[str, Any], dtype: torch.dtype) -> Tensor:
+    def made(of: Any, keys: Mapping[str, Any], dtype: torch.dtype) -> Tensor:
         trials = replace(of, fidelity=_fidelity(keys)).trials_of(bench.radar, draws, dtype)
         return trials.recording.signal.data.flatten(1, 2)
 
     exact = made(alone, bench.system.exact["world.fidelity"], torch.complex128)
 
-    def loss(one: Alternative, _: Tensor) -> dict[str, float]:
-        return {"echo_error_db": float(error_after_gain_db(made(alone, one.keys, torch.complex128), exact))}
-
-    return Measured(lambda one: made(world, one.keys, bench.dtype), loss)
+    return Measured(
+        lambda one: made(world, one.keys, bench.dtype),
+        lambda one, _: {"echo_error_db": float(error_after_gain_db(made(alone, one.keys, torch.complex128), exact))},
+    )
 
 
 def _estimates(bench: Bench) -> Measured:
@@ -167,14 +172,14 @@ def _estimates(bench: Bench) -> Measured:
     window, true = getattr(chain.stages[found[0]], "window_m", None), trials.truth["velocity_m_s"]
     pulse = sweeps.axis("pulse")
 
-    def run(one: Alternative) -> Estimate:
-        return one.keys["estimator"](sweeps.data, bench.radar, pulse, window_m=window)
-
     def error(estimate: Estimate) -> float:
         return float((estimate["velocity_m_s"] - true[..., : pulse.n]).square().mean().sqrt())
 
     best = error(radial_motion(sweeps.data, bench.radar, pulse, window_m=window))
-    return Measured(run, lambda one, estimate: {"velocity_rmse_m_s": error(estimate) - best})
+    return Measured(
+        lambda one: one.keys["estimator"](sweeps.data, bench.radar, pulse, window_m=window),
+        lambda one, estimate: {"velocity_rmse_m_s": error(estimate) - best},
+    )
 
 
 def _summed(bench: Bench, name: str) -> DirectlySummed:
