@@ -8,8 +8,8 @@ about 7.2.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -39,8 +39,7 @@ WITHIN = 0.3
 FOCUSED, DEFOCUSED = 0.3, 0.6
 
 
-@dataclass(frozen=True)
-class _Seen:
+class _Seen(NamedTuple):
     """Batches of trials by case."""
 
     batches: dict[str, Batch]

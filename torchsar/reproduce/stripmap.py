@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -56,8 +57,7 @@ def _response_rad(u: Tensor) -> Tensor:
     return 1.2 * u**3 + 0.5 * torch.sin(6 * math.pi * u)
 
 
-@dataclass(frozen=True)
-class _Strip:
+class _Strip(NamedTuple):
     """A recording without impairments, its image, and the place of the bright point in it."""
 
     recording: Recording
@@ -93,16 +93,10 @@ def _simulated(targets: Points, doppler_hz: float) -> Recording:
     return simulate(RADAR, world, LINES, SAMPLES, Draws(1))[0]
 
 
-def _strip(small: bool) -> _Strip:
+def _strip(small: bool, doppler_hz: float = DOPPLER_HZ) -> _Strip:
     """The reduced form is the full one."""
-    recording = _simulated(POINTS, DOPPLER_HZ)
-    return _Strip(recording, _focused(recording.signal, DOPPLER_HZ))
-
-
-def _wrapped(small: bool) -> _Strip:
-    """The reduced form is the full one."""
-    recording = _simulated(POINTS, WRAPPED_HZ)
-    return _Strip(recording, _focused(recording.signal, WRAPPED_HZ))
+    recording = _simulated(POINTS, doppler_hz)
+    return _Strip(recording, _focused(recording.signal, doppler_hz))
 
 
 def _uneven(small: bool) -> Recording:
@@ -275,7 +269,12 @@ PAPER = Paper(
         Item("Figure 3", "spectrum of a line with an external signal", of=_strip, make=_figure_3),
         Item("Figure 4", "image with and without jitter of the converter", of=_strip, make=_figure_4),
         Item("Figure 5", "phase increment along the strip", of=_uneven, make=_figure_5),
-        Item("Figure 6", "image without and with the Doppler centroid", of=_wrapped, make=_figure_6),
+        Item(
+            "Figure 6",
+            "image without and with the Doppler centroid",
+            of=partial(_strip, doppler_hz=WRAPPED_HZ),
+            make=_figure_6,
+        ),
         Item("Figure 7", "image with and without the squint", of=_strip, make=_figure_7),
         Item("Figure 8", "side lobe of the response in range", of=_strip, make=_figure_8),
         Item("Figure 9", "phase of the channel over the band", of=_strip, make=_figure_9),

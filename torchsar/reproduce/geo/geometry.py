@@ -9,6 +9,7 @@ depends on its slant-range speed.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -44,51 +45,6 @@ def _timing(small: bool) -> TimingDiagram:
     )
 
 
-def _nearest_swaths(diagram: TimingDiagram) -> dict[float, float]:
-    """By pulse rate (Hz) that has one, how far from 7 degrees off nadir the middle of the nearest
-    clear swath lies (m).
-    """
-    middles = diagram.ground_m + SWATH_M / 2 - off_nadir_ground_m(HEIGHT_M, OFF_NADIR_DEG)
-    fits = diagram.swath_fits(SWATH_M)
-    nearest = middles[torch.where(fits, middles.abs(), torch.inf).argmin(-1)]
-    return {
-        float(prf): float(near) for prf, near, fit in zip(diagram.prf_hz, nearest, fits.any(-1), strict=True) if fit
-    }
-
-
-def _draw_timing(diagram: TimingDiagram, path: Path) -> None:
-    """Figure 2: what is lost to nadir echoes (1) and to transmitted pulses (2); white lines: the
-    nearest clear swath at every second pulse rate.
-    """
-    lost = torch.maximum(diagram.nadir.double(), 2 * diagram.transmit.double())
-    title = f"clear swaths of {SWATH_M / 1e3:g} km nearest to {OFF_NADIR_DEG:g} degrees off nadir (white)"
-    part = {
-        "title": title,
-        "x": plot.array(diagram.prf_hz),
-        "y": plot.array(diagram.ground_m / 1e3),
-        "z": plot.array(lost.mT),
-    }
-    (figure,) = plot.heat_map(
-        [part],
-        "pulse rate (Hz)",
-        "ground from nadir (km)",
-        "0 clear, 1 nadir echo, 2 transmitted pulse",
-        limits=(0.0, 2.0),
-    )
-    first, step = (float(x) for x in (diagram.ground_m[0], diagram.ground_m[1] - diagram.ground_m[0]))
-    for prf, away in _nearest_swaths(diagram).items():
-        middle = off_nadir_ground_m(HEIGHT_M, OFF_NADIR_DEG) + away - first
-        if prf % 2 < 1e-9:
-            column = int((diagram.prf_hz == prf).nonzero())
-            figure.axes[0].plot(
-                [column, column],
-                [(middle - SWATH_M / 2) / step, (middle + SWATH_M / 2) / step],
-                color="white",
-                linewidth=1.0,
-            )
-    plot.save(figure, path)
-
-
 def _motion(u_r: Tensor | float, u_a: Tensor | float) -> PointMotion:
     return PointMotion.of(RADAR, torch.zeros(()), u_r, u_a)
 
@@ -109,25 +65,31 @@ def _delay_s(point: PointMotion) -> Tensor:
 
 def _draw_parameters(speed: Tensor, point: PointMotion, name: str, path: Path) -> None:
     """Figures 3 and 4: v_e, and delay and phase of channel 3."""
-    x, label = plot.array(speed), f"{name} (m/s)"
+    label = f"{name} (m/s)"
     shifts = {
         "transmit range removed": _phase_shift_rad(point)[:, 2],
         f"k1 = {LEFT_K1_M_S:g} m/s left in": _phase_shift_rad(point, LEFT_K1_M_S)[:, 2],
     }
     shifts = {key: value - value[speed.abs().argmin()] for key, value in shifts.items()}
-    values = [
-        ({"": point.effective_m_s}, "v_e (m/s)", "relative sensor velocity"),
-        ({"": 1e3 * _delay_s(point)[:, 2]}, "delay (ms)", "azimuth delay"),
-        (shifts, "phase (rad)", "phase shift against 0 m/s"),
-    ]
+    shown = {
+        "relative sensor velocity": (label, "v_e (m/s)", {"": point.effective_m_s}),
+        "azimuth delay": (label, "delay (ms)", {"": 1e3 * _delay_s(point)[:, 2]}),
+        "phase shift against 0 m/s": (label, "phase (rad)", shifts),
+    }
+    _draw(speed, shown, path)
+
+
+def _draw(speed: Tensor, shown: Mapping[str, tuple[str, str, Mapping[str, Tensor]]], path: Path) -> None:
+    """Panels by title: labels of the axes, and curves over the speed by name."""
+    x = plot.array(speed)
     parts = [
         {
-            "series": {key: (x, plot.array(y)) for key, y in series.items()},
-            "xlabel": label,
-            "ylabel": unit,
+            "series": {name: (x, plot.array(y)) for name, y in series.items()},
+            "xlabel": xlabel,
+            "ylabel": ylabel,
             "title": title,
         }
-        for series, unit, title in values
+        for title, (xlabel, ylabel, series) in shown.items()
     ]
     plot.save(plot.panels(parts), path, columns=3)
 
@@ -145,37 +107,31 @@ def _worst_phase_rad(u_r: Tensor | float, u_a: Tensor | float) -> Tensor:
     return 2 * math.pi / RADAR.wavelength_m * (moving + point.u_r_m_s * time - at_rest).abs().amax(-1)
 
 
-def _draw_errors(speed: Tensor, path: Path) -> None:
-    """Figure 8: phase errors within the integration time, and phases of the channels."""
-    x = plot.array(speed)
-    imbalance = _phase_shift_rad(_motion(speed, 0.0))
-    channels = {f"channel {m + 1}": (x, plot.array(imbalance[:, m])) for m in range(RADAR.channels)}
-    parts = [
-        {
-            "series": {"": (x, plot.array(_worst_phase_rad(0.0, speed)))},
-            "xlabel": "u_a (m/s)",
-            "ylabel": "phase (rad)",
-            "title": "largest error by u_a",
-        },
-        {
-            "series": {"": (x, plot.array(_worst_phase_rad(speed, 0.0)))},
-            "xlabel": "u_r (m/s)",
-            "ylabel": "phase (rad)",
-            "title": "largest error by u_r",
-        },
-        {"series": channels, "xlabel": "u_r (m/s)", "ylabel": "phase (rad)", "title": "imbalance of channels by u_r"},
-    ]
-    plot.save(plot.panels(parts), path, columns=3)
-
-
 def _speeds(small: bool) -> Tensor:
     """0 to 20 m/s; the reduced form is the full one."""
     return torch.linspace(0, 20, 41, dtype=torch.float64)
 
 
 def _figure_2(diagram: TimingDiagram, path: Path) -> list[Check]:
-    _draw_timing(diagram, path)
-    swaths = _nearest_swaths(diagram)
+    # what is lost to nadir echoes (1) and to transmitted pulses (2)
+    lost = torch.maximum(diagram.nadir.double(), 2 * diagram.transmit.double())
+    axes = {"x": plot.array(diagram.prf_hz), "y": plot.array(diagram.ground_m / 1e3), "z": plot.array(lost.mT)}
+    title = f"clear swaths of {SWATH_M / 1e3:g} km nearest to {OFF_NADIR_DEG:g} degrees off nadir (white)"
+    labels = ("pulse rate (Hz)", "ground from nadir (km)", "0 clear, 1 nadir echo, 2 transmitted pulse")
+    (figure,) = plot.heat_map([{"title": title, **axes}], *labels, limits=(0.0, 2.0))
+    # how far from 7 degrees off nadir the middle of the nearest clear swath lies (m), by pulse rate
+    aim, fits = off_nadir_ground_m(HEIGHT_M, OFF_NADIR_DEG), diagram.swath_fits(SWATH_M)
+    middles = diagram.ground_m + SWATH_M / 2 - aim
+    nearest = middles[torch.where(fits, middles.abs(), torch.inf).argmin(-1)]
+    rows = zip(diagram.prf_hz.tolist(), nearest.tolist(), fits.any(-1), strict=True)
+    swaths = {prf: near for prf, near, fit in rows if fit}
+    first, step = (float(x) for x in (diagram.ground_m[0], diagram.ground_m[1] - diagram.ground_m[0]))
+    for prf, away in swaths.items():
+        if prf % 2 < 1e-9:  # white lines at every second pulse rate
+            column = int((diagram.prf_hz == prf).nonzero())
+            ends = [(aim + away - first + side * SWATH_M / 2) / step for side in (-1, 1)]
+            figure.axes[0].plot([column, column], ends, color="white", linewidth=1.0)
+    plot.save(figure, path)
     ours = ", ".join(f"{prf:g} Hz: {swaths[prf] / 1e3:+.0f} km" for prf in RATES if prf in swaths)
     holds = all(prf in swaths for prf in RATES)
     claim = "pulse rates of 160 to 200 Hz, such as 180 Hz, leave 500 km clear"
@@ -204,7 +160,16 @@ def _figure_4(speed: Tensor, path: Path) -> list[Check]:
 
 
 def _figure_8(speed: Tensor, path: Path) -> list[Check]:
-    _draw_errors(speed, path)
+    phases = _phase_shift_rad(_motion(speed, 0.0))
+    shown = {
+        "largest error by u_a": ("u_a (m/s)", {"": _worst_phase_rad(0.0, speed)}),
+        "largest error by u_r": ("u_r (m/s)", {"": _worst_phase_rad(speed, 0.0)}),
+        "imbalance of channels by u_r": (
+            "u_r (m/s)",
+            {f"channel {m + 1}": phases[:, m] for m in range(RADAR.channels)},
+        ),
+    }
+    _draw(speed, {title: (label, "phase (rad)", series) for title, (label, series) in shown.items()}, path)
     along, across = (float(_worst_phase_rad(*u)) for u in ((0.0, 10.0), (10.0, 0.0)))
     imbalance = float(_phase_shift_rad(_motion(10.0, 0.0))[2].abs())
     ours = f"at 10 m/s {along:.1f} rad along track, {across:.2f} rad in slant range; imbalance {imbalance:.2f} rad"

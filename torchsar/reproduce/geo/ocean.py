@@ -10,10 +10,10 @@ source prints azimuth on x = (V_R - u_a) t of each target.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
-import numpy as np
 import torch
 
 from torchsar import plot
@@ -42,69 +42,31 @@ SMALL = {"ship 2": Ship(10.0, 0.0, 0.0, 0.0, length_m=40.0, range_cells=2, count
 SCR_DB, CNR_DB = 10.0, 30.0
 
 
-@dataclass(frozen=True)
-class _Setting:
-    """How large the scene is, and how the flow is set for it."""
+class _Seen(NamedTuple):
+    """True ships, and the image of the scene."""
 
     ships: Mapping[str, Ship]
-    pulses: int
-    lines: int
-    gate_s: float
-    scr_db: float
-    flow: ImageMovers
+    made: SceneImage
 
 
-def _whole() -> _Setting:
-    """As published."""
-    return _Setting(SHIPS, 2160, 512, 4.5, SCR_DB, ImageMovers(RADAR))
-
-
-def _small() -> _Setting:
-    """One ship, in seconds."""
-    return _Setting(
-        SMALL,
-        540,
-        120,
-        2.0,
-        2 * SCR_DB,
-        ImageMovers(RADAR, Extraction(60.0, 30.0, 2.0, 0.4), Detector(suppressed_m_s=()), u_a_half_m_s=12.0),
-    )
-
-
-def _received(setting: _Setting) -> Signal:
-    """Channels (channel, pulse, range) without the transmit range, the sea of unit power."""
-    ships = {
-        name: Ship(
-            ship.u_r_m_s,
-            ship.u_a_m_s,
-            ship.azimuth_m,
-            ship.range_m,
-            ship.length_m,
-            ship.range_cells,
-            ship.count,
-            level_db=setting.scr_db,
-        )
-        for name, ship in setting.ships.items()
-    }
-    world = BistaticWorld(Fleet(ships), BandLimited(setting.gate_s), KSea(shape=1.5), snr_db=CNR_DB)
-    recording, _ = simulate_bistatic(RADAR, world, setting.pulses, setting.lines, Draws(1))
-    return RemoveTransmitRange(RADAR)(recording.signal)
+def _sea(small: bool) -> _Seen:
+    """As published; one ship, in seconds, in the reduced form."""
+    pulses, lines, gate_s, scr_db, ships, flow = 2160, 512, 4.5, SCR_DB, SHIPS, ImageMovers(RADAR)
+    if small:
+        extraction, detector = Extraction(60.0, 30.0, 2.0, 0.4), Detector(suppressed_m_s=())
+        flow = ImageMovers(RADAR, extraction, detector, u_a_half_m_s=12.0)
+        pulses, lines, gate_s, scr_db, ships = 540, 120, 2.0, 2 * SCR_DB, SMALL
+    fleet = Fleet({name: replace(ship, level_db=scr_db) for name, ship in ships.items()})
+    world = BistaticWorld(fleet, BandLimited(gate_s), KSea(shape=1.5), snr_db=CNR_DB)
+    recording, _ = simulate_bistatic(RADAR, world, pulses, lines, Draws(1))
+    return _Seen(ships, flow(RemoveTransmitRange(RADAR)(recording.signal)))
 
 
 def _nearest(ship: Ship, bodies: list[Body]) -> Body | None:
     """What was found nearest to the middle of a ship, within 50 m."""
-    away = [
-        (
-            float(
-                torch.hypot(
-                    body.motion.y0_m - ship.azimuth_m, body.motion.range_m - RADAR.reference_range_m - ship.range_m
-                )
-            ),
-            i,
-        )
-        for i, body in enumerate(bodies)
-    ]
-    return bodies[min(away)[1]] if away and min(away)[0] < 50 else None
+    middle_m = RADAR.reference_range_m + ship.range_m
+    away = [float(torch.hypot(b.motion.y0_m - ship.azimuth_m, b.motion.range_m - middle_m)) for b in bodies]
+    return bodies[away.index(min(away))] if away and min(away) < 50 else None
 
 
 def _predicted(motion: PointMotion) -> tuple[float, float]:
@@ -122,56 +84,22 @@ def _levelled(image: Signal) -> Signal:
     return view.with_data(level.clamp(10**-0.5, 10**1.25).to(torch.complex64))
 
 
-def _draw(setting: _Setting, made: SceneImage, path: Path) -> None:
-    """Images focused for targets at rest, without the moving targets, and with these at their
-    positions; outlines about the true positions.
-    """
-    outlines = [
-        np.array(
-            [
-                [s.range_m + RADAR.reference_range_m + 60 * i, s.azimuth_m + 120 * j]
-                for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
-            ]
-        )
-        for s in setting.ships.values()
-    ]
-    joined = np.concatenate([np.append(outline, [[np.nan, np.nan]], 0) for outline in outlines]).T
-    named = {"everything at rest": made.conventional, "without movers": made.rest, "fused": made.fused}
-    figure = plot.overlays(
-        [
-            {"title": title, "signal": _levelled(image), "lines": {"true position": (joined[0], joined[1])}}
-            for title, image in named.items()
-        ],
-        35.0,
-    )
-    plot.save(figure, path, columns=3)
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """A scene and its image."""
-
-    setting: _Setting
-    made: SceneImage
-
-
-def _sea(small: bool) -> _Seen:
-    setting = _small() if small else _whole()
-    return _Seen(setting, setting.flow(_received(setting)))
-
-
 def _figure_18(seen: _Seen, path: Path) -> list[Check]:
     """What the motion that was found of each ship says; true and found velocities in words."""
-    _draw(seen.setting, seen.made, path)
+    middles = [(float(ship.range_m) + RADAR.reference_range_m, float(ship.azimuth_m)) for ship in seen.ships.values()]
+    lines = {"true position": plot.boxes(middles, 60, 120)}
+    named = {"everything at rest": seen.made.conventional, "without movers": seen.made.rest, "fused": seen.made.fused}
+    parts = [{"title": title, "signal": _levelled(image), "lines": lines} for title, image in named.items()]
+    plot.save(plot.overlays(parts, 35.0), path, columns=3)
     checks = []
-    for name, ship in seen.setting.ships.items():
+    for name, ship in seen.ships.items():
         body = _nearest(ship, seen.made.bodies)
         if not ship.u_r_m_s:
             continue
         found = "nothing" if body is None else f"{float(body.motion.u_r_m_s):.2f}, {float(body.motion.u_a_m_s):.2f} m/s"
         close = body is not None and abs(float(body.motion.u_r_m_s - ship.u_r_m_s)) < 0.5
         checks.append(statement(f"{name} at {ship.u_r_m_s:g}, {ship.u_a_m_s:g} m/s", "focused", close, found))
-        if body is not None and len(seen.setting.ships) > 1:
+        if body is not None and len(seen.ships) > 1:
             words = ("displacement (m)", "distance of the false target (m)")
             rows = zip(words, PUBLISHED[name], _predicted(body.motion), strict=True)
             checks += [number(f"{name}: {what}", theirs, [ours], 0.02 * theirs) for what, theirs, ours in rows]

@@ -10,8 +10,7 @@ reconstructed. Nothing here is random.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -39,29 +38,18 @@ RECORD_S = 20.0
 GATES: dict[str, Gate] = {"band-limited": BandLimited(INTEGRATION_S), "pattern": Pattern()}
 # velocities of figures 10 and 11
 TRUE_M_S, GUESSES_M_S = 10.0, (5.0, 8.0, 10.0)
+Closing = tuple[dict[str, Signal], Tensor]
 # level (dB) below which the text says that false targets are
 PUBLISHED_MFTA = {"band-limited": -60.0, "pattern": -25.0}
 
 
-@dataclass(frozen=True)
-class _Method:
-    """How bands are separated.
-
-    Args:
-        rebuild: Reconstruction of the bands.
-        moving: Whether the velocity of the target is used; otherwise it is assumed at rest.
-    """
-
-    rebuild: Rebuild
-    moving: bool
-
-
-METHODS = {
-    "conventional, N = 3": _Method(LeastSquares(3), False),
-    "conventional, N = 2": _Method(LeastSquares(2), False),
-    "proposed, N = 3": _Method(LeastSquares(3), True),
-    "proposed, N = 2": _Method(LeastSquares(2), True),
-    "proposed, MMSE, N = 5": _Method(MinimumMeanSquare(5), True),
+# reconstruction of the bands, and whether the velocity of the target is used, or zero in its place
+METHODS: dict[str, tuple[Rebuild, bool]] = {
+    "conventional, N = 3": (LeastSquares(3), False),
+    "conventional, N = 2": (LeastSquares(2), False),
+    "proposed, N = 3": (LeastSquares(3), True),
+    "proposed, N = 2": (LeastSquares(2), True),
+    "proposed, MMSE, N = 5": (MinimumMeanSquare(5), True),
 }
 
 
@@ -79,35 +67,15 @@ def _spectrum(data: Signal, rebuild: Rebuild, u_r_m_s: Tensor | float) -> Signal
         return Reconstruct(RADAR, rebuild)(data, u_r_m_s)
 
 
-def _replicas_db(data: Signal, u_r_m_s: Tensor, method: _Method, gate: Gate) -> Tensor:
+def _replicas_db(data: Signal, u_r_m_s: Tensor, rebuild: Rebuild, moving: bool, gate: Gate) -> Tensor:
     """MFTA within three pulse rates, (trial,)."""
-    assumed = u_r_m_s if method.moving else torch.zeros_like(u_r_m_s)
-    image = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(_spectrum(data, method.rebuild, assumed), assumed)
+    assumed = u_r_m_s if moving else torch.zeros_like(u_r_m_s)
+    image = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(_spectrum(data, rebuild, assumed), assumed)
     seen = INTEGRATION_S if isinstance(gate, BandLimited) else None
     zones = replica_zones(
-        RADAR, method.rebuild.bands, u_r_m_s, integration_s=seen, focused_at=(assumed, 0.0), orders=(1, 2, 3)
+        RADAR, rebuild.bands, u_r_m_s, integration_s=seen, focused_at=(assumed, 0.0), orders=(1, 2, 3)
     )
     return replica_level(image.data, image.axis("azimuth").step, zones)["mfta_db"]
-
-
-def _false_targets(speeds: Tensor) -> dict[str, dict[str, Tensor]]:
-    """MFTA (dB) by gate and method over u_r, (speed,)."""
-    found = {}
-    for name, gate in GATES.items():
-        data = _simulated(speeds, gate, RECORD_S)
-        found[name] = {label: _replicas_db(data, speeds, method, gate) for label, method in METHODS.items()}
-    return found
-
-
-def _draw_false_targets(speeds: Tensor, found: Mapping[str, Mapping[str, Tensor]], path: Path) -> None:
-    """Figure 17."""
-    parts = []
-    for gate, methods in found.items():
-        series = {label: (plot.array(speeds), plot.array(levels)) for label, levels in methods.items()}
-        parts.append(
-            {"series": series, "xlabel": "u_r (m/s)", "ylabel": "MFTA (dB)", "title": gate, "ylim": (-80.0, 45.0)}
-        )
-    plot.save(plot.panels(parts), path)
 
 
 def _draw_spectra(signal: Signal, path: Path) -> None:
@@ -145,43 +113,36 @@ def _ratios_db(found: Intensity) -> dict[str, Tensor]:
     }
 
 
-@dataclass(frozen=True)
-class _Closing:
+def _closing(small: bool) -> Closing:
     """Channels of the target of figures 10 to 12 by gate, and the velocities of figure 12."""
-
-    data: dict[str, Signal]
-    guesses: Tensor
-
-
-def _closing(small: bool) -> _Closing:
     moving = torch.tensor([TRUE_M_S], dtype=torch.float64)
     seconds = {"band-limited": 8.0, "pattern": RECORD_S}
     data = {name: _simulated(moving, gate, seconds[name]) for name, gate in GATES.items()}
-    return _Closing(data, torch.linspace(0, 20, 41 if small else 201, dtype=torch.float64))
+    return data, (torch.linspace(0, 20, 41 if small else 201, dtype=torch.float64))
 
 
-def _rebuilt(gate: str) -> Callable[[_Closing, Path], list[Check]]:
+def _rebuilt(gate: str) -> Callable[[Closing, Path], list[Check]]:
     """Figure 10 or 11: the share of the power about the centroid by the velocity."""
 
-    def make(seen: _Closing, path: Path) -> list[Check]:
-        _draw_spectra(seen.data[gate], path)
-        ratios = _ratios_db(_intensity(seen.data[gate], torch.tensor(GUESSES_M_S, dtype=torch.float64)))["Gamma1"]
+    def make(seen: Closing, path: Path) -> list[Check]:
+        _draw_spectra(seen[0][gate], path)
+        ratios = _ratios_db(_intensity(seen[0][gate], torch.tensor(GUESSES_M_S, dtype=torch.float64)))["Gamma1"]
         levels = {f"{guess:g} m/s": float(ratio) for guess, ratio in zip(GUESSES_M_S, ratios, strict=True)}
         return [falling("power inside over outside the processed band (dB)", levels, rising=True)]
 
     return make
 
 
-def _figure_12(seen: _Closing, path: Path) -> list[Check]:
+def _figure_12(seen: Closing, path: Path) -> list[Check]:
     parts, checks = [], []
-    for gate, signal in seen.data.items():
-        curves = _ratios_db(_intensity(signal, seen.guesses))
-        series = {name: (plot.array(seen.guesses), plot.array(curve)) for name, curve in curves.items()}
+    for gate, signal in seen[0].items():
+        curves = _ratios_db(_intensity(signal, seen[1]))
+        series = {name: (plot.array(seen[1]), plot.array(curve)) for name, curve in curves.items()}
         parts.append(
             {"series": series, "xlabel": "u_r of the reconstruction (m/s)", "ylabel": "ratio (dB)", "title": gate}
         )
-        step = float(seen.guesses[1] - seen.guesses[0])
-        peak = float(seen.guesses[curves["Gamma"].argmax()])
+        step = float(seen[1][1] - seen[1][0])
+        peak = float(seen[1][curves["Gamma"].argmax()])
         checks.append(number(f"{gate}: velocity of the largest ratio (m/s)", TRUE_M_S, peak, step))
         over = {name: float(curves[name].max() - curves[name][0]) for name in ("Gamma2", "Gamma1", "Gamma")}
         ours = ", ".join(f"{name} {value:.1f} dB" for name, value in over.items()) + " above 0 m/s"
@@ -191,22 +152,30 @@ def _figure_12(seen: _Closing, path: Path) -> list[Check]:
     return checks
 
 
-@dataclass(frozen=True)
-class _False:
-    """Largest false targets (dB) by gate and method over velocities (m/s)."""
-
-    speeds: Tensor
-    levels: dict[str, dict[str, Tensor]]
-
-
-def _over_velocity(small: bool) -> _False:
+def _over_velocity(small: bool) -> tuple[Tensor, dict[str, dict[str, Tensor]]]:
+    """Velocities (m/s), and largest false targets (dB) by gate and method, (speed,)."""
     few = [-20.0, -10.0, -2.0, 0.0, 2.0, 10.0, 20.0]
     speeds = torch.tensor(few, dtype=torch.float64) if small else torch.linspace(-20, 20, 41, dtype=torch.float64)
-    return _False(speeds, _false_targets(speeds))
+    found = {}
+    for name, gate in GATES.items():
+        data = _simulated(speeds, gate, RECORD_S)
+        found[name] = {label: _replicas_db(data, speeds, *method, gate) for label, method in METHODS.items()}
+    return speeds, found
 
 
-def _figure_17(seen: _False, path: Path) -> list[Check]:
-    _draw_false_targets(seen.speeds, seen.levels, path)
+def _figure_17(seen: tuple[Tensor, dict[str, dict[str, Tensor]]], path: Path) -> list[Check]:
+    speeds, found = seen
+    parts = [
+        {
+            "series": {label: (plot.array(speeds), plot.array(levels)) for label, levels in methods.items()},
+            "xlabel": "u_r (m/s)",
+            "ylabel": "MFTA (dB)",
+            "title": gate,
+            "ylim": (-80.0, 45.0),
+        }
+        for gate, methods in found.items()
+    ]
+    plot.save(plot.panels(parts), path)
     shown = {
         "band-limited": ("proposed, N = 3", "proposed, N = 2"),
         "pattern": ("proposed, N = 3", "proposed, MMSE, N = 5"),
@@ -214,7 +183,7 @@ def _figure_17(seen: _False, path: Path) -> list[Check]:
     checks = []
     for gate, methods in shown.items():
         for method in methods:
-            level, worst = PUBLISHED_MFTA[gate], float(seen.levels[gate][method].max())
+            level, worst = PUBLISHED_MFTA[gate], float(found[gate][method].max())
             ours = f"at most {worst:.1f} dB"
             checks.append(statement(f"{gate}, {method}", f"below {level:g} dB at all speeds", worst < level, ours))
     return checks

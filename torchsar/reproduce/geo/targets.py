@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,6 +38,7 @@ from torchsar.reproduce.geo.sensor import BANDWIDTH_HZ, INTEGRATION_S, TRANSMIT_
 from torchsar.reproduce.geo.sensor import RADAR as SENSOR
 from torchsar.reproduce.item import Check, Item, number, statement
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
+from torchsar.study.trials.cuts import finer
 
 # with the range to the satellite in the echo
 RADAR = replace(SENSOR, transmit_range=TRANSMIT_RANGE)
@@ -82,8 +84,7 @@ PUBLISHED = {
 }
 
 
-@dataclass(frozen=True)
-class _Batch:
+class _Batch(NamedTuple):
     """Targets, one a trial, and their channels. speeds: name -> (u_r, u_a)."""
 
     speeds: Mapping[str, tuple[float, float]]
@@ -96,8 +97,7 @@ class _Batch:
         return {"u_r_m_s": u_r, "u_a_m_s": u_a}
 
 
-@dataclass(frozen=True)
-class _Product:
+class _Product(NamedTuple):
     """Rebuilt spectrum (doppler, range) and image (azimuth, range) of every trial, and how they
     were made. moving: with the velocities of the targets.
     """
@@ -106,6 +106,9 @@ class _Product:
     image: Signal
     bands: int
     moving: bool
+
+
+Seen = tuple[_Batch, dict[str, list[_Product]]]
 
 
 def _received(world: BistaticWorld, n_pulse: int, n_range: int, trials: int | None = None) -> Signal:
@@ -207,14 +210,9 @@ def _near(image: Signal, along_m: float, range_m: float, trial: int) -> Signal:
 def _finer(image: Signal, factor: int = 8) -> Signal:
     """Interpolated by zeros around its spectrum, for contours."""
     data, axes = image.data, []
-    for dim, axis in zip((-2, -1), image.axes, strict=True):
-        n = data.shape[dim]
-        spectrum = torch.fft.fftshift(torch.fft.fft(data, dim=dim), dim=dim).movedim(dim, -1)
-        padded = torch.nn.functional.pad(
-            spectrum, ((factor * n) // 2 - n // 2, factor * n - n - ((factor * n) // 2 - n // 2))
-        )
-        data = factor * torch.fft.ifft(torch.fft.ifftshift(padded, dim=-1)).movedim(-1, dim)
-        axes.append(Axis(axis.name, factor * n, axis.start, axis.step / factor, axis.unit))
+    for dim, axis in enumerate(image.axes):
+        data = factor * finer(data.movedim(dim, -1), factor).movedim(-1, dim)
+        axes.append(replace(axis, n=factor * axis.n, step=axis.step / factor))
     return Signal(data, tuple(axes))
 
 
@@ -298,28 +296,21 @@ def _size(small: bool) -> tuple[int, int]:
     return (1080, 48) if small else (1800, 96)
 
 
-@dataclass(frozen=True)
-class _Seen:
+def _targets(small: bool) -> Seen:
     """Targets and their products by method, with two and with three bands."""
-
-    batch: _Batch
-    made: dict[str, list[_Product]]
-
-
-def _targets(small: bool) -> _Seen:
     batch = _simulated(SPEEDS, *_size(small))
-    return _Seen(batch, {method: _products(batch, method) for method in PUBLISHED})
+    return batch, {method: _products(batch, method) for method in PUBLISHED}
 
 
-def _figure(name: str, method: str) -> Callable[[_Seen, Path], list[Check]]:
+def _figure(name: str, method: str) -> Callable[[Seen, Path], list[Check]]:
     """The picture of one target by one method, and its width, PSLR and false targets in words."""
 
-    def make(seen: _Seen, path: Path) -> list[Check]:
+    def make(seen: Seen, path: Path) -> list[Check]:
         trial, (u_r, u_a) = list(SPEEDS).index(name), SPEEDS[name]
-        two = seen.made[method][0]
+        two = seen[1][method][0]
         blurred = method == "conventional" and u_a != 0
         _draw_target(two, trial, f"({u_r:g}, {u_a:g}) m/s, {method}", path, 60.0 if blurred else 15.0)
-        width, false = (float(_measured(seen.batch, two)[trial, which]) for which in (0, -1))
+        width, false = (float(_measured(seen[0], two)[trial, which]) for which in (0, -1))
         focused, clean = width < 1, false < -40
         claim = "focused, without false targets"
         if method == "conventional" and u_a:
@@ -333,11 +324,11 @@ def _figure(name: str, method: str) -> Callable[[_Seen, Path], list[Check]]:
     return make
 
 
-def _table_4(seen: _Seen, path: Path) -> list[Check]:
+def _table_4(seen: Seen, path: Path) -> list[Check]:
     """With two bands, which B_a < 2 PRF needs, and the false targets with three, as published."""
     checks = []
     for method, rows in PUBLISHED.items():
-        two, three = (_measured(seen.batch, made) for made in seen.made[method])
+        two, three = (_measured(seen[0], made) for made in seen[1][method])
         for name, published in rows.items():
             trial = list(SPEEDS).index(name)
             for what, theirs, ours, within in zip(FIGURES, published, two[trial], WITHIN[method], strict=True):

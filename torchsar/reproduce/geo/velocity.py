@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,8 +62,8 @@ TABLE_3 = {
 MEAN_OF_DEVIATION = math.sqrt(2 / math.pi)
 # standard deviation of the |error| of a Gaussian over its mean: how far that of one trial is off
 SPREAD = math.sqrt(math.pi / 2 - 1)
-# of noise at each point of the full form
-TRIALS = 24
+# |error| (trial,) by estimator for every column of a table, and what the columns differ in
+Columns = tuple[dict[str, list[dict[str, Tensor]]], list[float]]
 
 
 def _estimators(radar: BistaticRadar, along_m_s: float) -> dict[str, Stage]:
@@ -133,20 +133,12 @@ def _bounds_of(radar: BistaticRadar, points: Sequence[tuple[float, float]]) -> d
     }
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """|error| (trial,) by estimator for every column of a table."""
-
-    columns: dict[str, list[dict[str, Tensor]]]
-    at: list[float]
-
-
 def _search(small: bool) -> tuple[Draws, float]:
     """Draws, and how far (m/s) the recommended estimator searches along track."""
-    return Draws(1, trials=range(2 if small else TRIALS)), 2.0 if small else 20.0
+    return Draws(1, trials=range(2 if small else 24)), 2.0 if small else 20.0
 
 
-def _over_noise(small: bool) -> _Seen:
+def _over_noise(small: bool) -> Columns:
     """Table 2: u_r = 10 m/s; in the reduced form one pulse rate and one SCNR."""
     draws, along = _search(small)
     at = [-10.0] if small else list(SCNR_DB)
@@ -156,14 +148,14 @@ def _over_noise(small: bool) -> _Seen:
         columns[f"{prf:g} Hz"] = [
             _errors(radar, 10.0, scnr, draws.part(f"{prf:g} Hz, {scnr:g} dB"), along) for scnr in at
         ]
-    return _Seen(columns, at)
+    return columns, at
 
 
-def _over_velocity(small: bool) -> _Seen:
+def _over_velocity(small: bool) -> Columns:
     """Table 3: raw SCNR -10 dB; in the reduced form one velocity."""
     draws, along = _search(small)
     at = [1.0] if small else list(TABLE_3)
-    return _Seen({"": [_errors(RADAR, u_r, -10.0, draws.part(f"{u_r:g} m/s"), along) for u_r in at]}, at)
+    return {"": [_errors(RADAR, u_r, -10.0, draws.part(f"{u_r:g} m/s"), along) for u_r in at]}, at
 
 
 def _compared(what: str, published: float, column: Mapping[str, Tensor]) -> list[Check]:
@@ -174,24 +166,24 @@ def _compared(what: str, published: float, column: Mapping[str, Tensor]) -> list
     ]
 
 
-def _table_2(seen: _Seen, path: Path) -> list[Check]:
+def _table_2(seen: Columns, path: Path) -> list[Check]:
     parts, checks = [], []
-    for rate, columns in seen.columns.items():
+    for rate, columns in seen[0].items():
         prf = float(rate.split()[0])
-        published = [TABLE_2[prf][SCNR_DB.index(scnr)] for scnr in seen.at]
-        bounds = _bounds_of(replace(RADAR, prf_hz=prf), [(10.0, scnr) for scnr in seen.at])
-        parts.append(_part(rate, seen.at, columns, bounds, published))
-        for scnr, theirs, column in zip(seen.at, published, columns, strict=True):
+        published = [TABLE_2[prf][SCNR_DB.index(scnr)] for scnr in seen[1]]
+        bounds = _bounds_of(replace(RADAR, prf_hz=prf), [(10.0, scnr) for scnr in seen[1]])
+        parts.append(_part(rate, seen[1], columns, bounds, published))
+        for scnr, theirs, column in zip(seen[1], published, columns, strict=True):
             checks += _compared(f"{rate}, {scnr:g} dB", theirs, column)
     plot.save(plot.error_curves(parts, "raw SCNR (dB)", "mean |error| of u_r (m/s)", log_y=True), path)
     return checks
 
 
-def _table_3(seen: _Seen, path: Path) -> list[Check]:
-    (columns,), published = seen.columns.values(), [TABLE_3[u_r] for u_r in seen.at]
-    part = _part("", seen.at, columns, _bounds_of(RADAR, [(u_r, -10.0) for u_r in seen.at]), published)
+def _table_3(seen: Columns, path: Path) -> list[Check]:
+    (columns,), published = seen[0].values(), [TABLE_3[u_r] for u_r in seen[1]]
+    part = _part("", seen[1], columns, _bounds_of(RADAR, [(u_r, -10.0) for u_r in seen[1]]), published)
     plot.save(plot.error_curves([part], "u_r (m/s)", "mean |error| of u_r (m/s)", log_y=True), path)
-    rows = zip(seen.at, published, columns, strict=True)
+    rows = zip(seen[1], published, columns, strict=True)
     return [check for u_r, theirs, column in rows for check in _compared(f"{u_r:g} m/s", theirs, column)]
 
 

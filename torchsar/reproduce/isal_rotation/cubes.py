@@ -13,32 +13,30 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchsar import plot
 from torchsar.compensate import (
-    EntropyObjective,
     ImageEntropy,
     autofocus,
-    coarse_rotation,
     correct_pulse_phase,
-    descend_rotation,
     genetic_rotation,
     uneven_rotation,
 )
-from torchsar.core import Axis, Draws, Estimate, Signal, Truth
+from torchsar.core import Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus import MatchedFourier, RangePhase, mean_rate
+from torchsar.focus import mean_rate
 from torchsar.metrics import contrast, entropy
-from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar, second_order
 from torchsar.reproduce.item import Check, Item, falling, number, statement
 from torchsar.scene import Points, PolynomialRotation, TurntableWorld
 from torchsar.study.names.factories import rotation_and_phase
 
 # chosen, but for the wavelength
-RADAR = InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * 0.015), 50e3)
+RADAR = ladar(0.015, 50e3)
 CUBES = Points(azimuth_m=[-0.06, -0.03, 0.0, 0.03, 0.06], range_m=[0.09, -0.12, 0.0, 0.06, -0.06], random_phase=True)
 # the rate of the turntable as set, and shape parameters near the published estimates
 RATE_RAD_S = math.radians(10)
@@ -48,6 +46,7 @@ PULSES, CELLS, WALK_RAD, SNR_DB = 1000, 32, 0.15, 10.0
 # estimates of the genetic algorithm in the text (rad/s, 1/s, 1/s2), and the largest difference from
 # the truth of our simulation that is as good as theirs from the setting of the turntable
 PUBLISHED = {"omega_rad_s": (0.2040, 0.03), "k1_per_s": (6.1372, 0.3), "k2_per_s2": (1091.0, 30.0)}
+Rotation = Mapping[str, Tensor]
 # figures 19a to 19c; the last stands for the recommended alternation
 SHOWN = ("uniform autofocus", "autofocus + SM", "autofocus + third order")
 
@@ -62,28 +61,6 @@ class _PhaseWalk:
         return self.step_rad * draws.normal("phase walk", (n_pulse,)).cumsum(-1)
 
 
-def _known_of(signal: Signal) -> dict:
-    return {"wavelength_m": RADAR.wavelength_m, "prf_hz": RADAR.prf_hz, "range_m": signal.axis("range").values()}
-
-
-def _focused(signal: Signal, rotation: Mapping[str, Tensor] | None = None) -> Signal:
-    """Image on a Doppler axis, with what is known of the rotation taken out: all of it, its warp
-    alone, or nothing.
-    """
-    rotation = rotation or {}
-    if "omega_rad_s" in rotation:
-        signal = RangePhase(RADAR)(signal, **{name: rotation[name] for name in ("omega_rad_s", "warp_k", "yc_m")})
-    return MatchedFourier(RADAR)(signal, rotation.get("warp_k"))
-
-
-def _second_order(signal: Signal) -> Estimate:
-    """SM: one number, without a range term, by least entropy."""
-    figure = ImageEntropy.of(signal, RADAR, EntropyObjective(order=2, range_term=False))
-    return descend_rotation(
-        figure, figure.start(0.0, coarse_rotation(signal.data, order=2, **_known_of(signal))["warp_k"])
-    )
-
-
 def _published(signal: Signal, generations: int) -> Estimate:
     """The genetic algorithm in a box of +-20 % about what the turntable was set to."""
     figure = ImageEntropy.of(signal, RADAR)
@@ -91,78 +68,36 @@ def _published(signal: Signal, generations: int) -> Estimate:
     return genetic_rotation(figure, 0.8 * centre, 1.2 * centre, draws=Draws(1), generations=generations)
 
 
-@dataclass(frozen=True)
-class _Results:
+def _results(signal: Signal, truth: Truth, generations: int) -> tuple[dict[str, Signal], dict[str, Rotation]]:
     """Images on a Doppler axis, and estimates, by what was done."""
-
-    images: dict[str, Signal]
-    estimates: dict[str, Mapping[str, Tensor]]
-
-
-def _results(signal: Signal, truth: Truth, generations: int) -> _Results:
     uniform = signal.with_data(correct_pulse_phase(signal.data, autofocus(signal.data)["phase_rad"]))
-    second, genetic = _second_order(uniform), _published(uniform, generations)
-    third = uneven_rotation(uniform.data, yc_m=0.0, **_known_of(uniform))
+    second, genetic = second_order(uniform, RADAR), _published(uniform, generations)
+    third = uneven_rotation(uniform.data, yc_m=0.0, **known_of(uniform, RADAR))
     both = rotation_and_phase(RADAR)(signal)
     corrected = signal.with_data(correct_pulse_phase(signal.data, both["phase_rad"]))
     assert truth.clean is not None
     images = {
-        "no compensation": _focused(signal),
-        "uniform autofocus": _focused(uniform),
-        "autofocus + SM": _focused(uniform, {"warp_k": second["warp_k"]}),
-        "autofocus + genetic": _focused(uniform, genetic.value),
-        "autofocus + third order": _focused(uniform, third.value),
-        "alternation": _focused(corrected, both.value),
-        "clean reference": _focused(
-            truth.clean.signal, {name: truth.values[name] for name in ("omega_rad_s", "warp_k", "yc_m")}
-        ),
+        "no compensation": focused(signal, RADAR, {}),
+        "uniform autofocus": focused(uniform, RADAR, {}),
+        "autofocus + SM": focused(uniform, RADAR, {"warp_k": second["warp_k"]}),
+        "autofocus + genetic": focused(uniform, RADAR, genetic.value),
+        "autofocus + third order": focused(uniform, RADAR, third.value),
+        "alternation": focused(corrected, RADAR, both.value),
+        "clean reference": focused(truth.clean.signal, RADAR, truth.values),
     }
-    return _Results(
-        images,
-        {"autofocus + genetic": genetic.value, "autofocus + third order": third.value, "alternation": both.value},
-    )
+    return images, {"genetic": genetic.value, "autofocus + third order": third.value, "alternation": both.value}
 
 
-def _scale_m_hz(rotation: Mapping[str, Tensor]) -> float:
-    """Metres of cross range per Hz of Doppler."""
-    return RADAR.wavelength_m / (
-        2 * float(mean_rate(rotation["omega_rad_s"], rotation["warp_k"], PULSES / RADAR.prf_hz))
-    )
-
-
-def _scaled(image: Signal, rotation: Mapping[str, Tensor]) -> Signal:
-    doppler, range_ = image.axes
-    scale = _scale_m_hz(rotation)
-    return Signal(image.data, (Axis("azimuth", doppler.n, doppler.start * scale, doppler.step * scale, "m"), range_))
+def _scaled(image: Signal, rotation: Rotation) -> Signal:
+    """The image in metres by the mean rate of a rotation."""
+    rate = mean_rate(rotation["omega_rad_s"], rotation["warp_k"], PULSES / RADAR.prf_hz)
+    return in_metres(image, RADAR, rate)
 
 
 def _close(image: Signal) -> Signal:
     """The middle of an image, which holds the cubes, over the peak."""
     over_peak = image.with_data(image.data / image.data.abs().max())
     return plot.within(over_peak, {"azimuth": (-0.09, 0.09), "range": (-0.15, 0.15)})
-
-
-def _draw_profiles(found: _Results, truth: Truth, path: Path) -> None:
-    """Figure 20: a profile through each of the cubes, every method, on the true scale; a random
-    phase also shifts images, so that each is centred at its peak.
-    """
-    # the alternation last, since it lies on the reference
-    names = ("clean reference", "uniform autofocus", "autofocus + SM", "alternation")
-    shown = {name: _scaled(found.images[name], truth.values) for name in names}
-    parts = []
-    for cube, (x, y) in enumerate(zip(CUBES.azimuth_m, CUBES.range_m, strict=True), start=1):
-        profiles = {name: _profile(image, float(y)) for name, image in shown.items()}
-        series = {name: (1e3 * offset, level) for name, (offset, level) in profiles.items()}
-        parts.append(
-            {
-                "series": series,
-                "xlabel": "cross range from the peak (mm)",
-                "ylabel": "amplitude (dB)",
-                "title": f"cube {cube}, x = {1e3 * x:g} mm",
-                "ylim": (-40.0, 1.0),
-            }
-        )
-    plot.save(plot.panels(parts), path, columns=3)
 
 
 def _profile(image: Signal, y_m: float, reach_m: float = 0.006) -> tuple:
@@ -175,24 +110,23 @@ def _profile(image: Signal, y_m: float, reach_m: float = 0.006) -> tuple:
     return plot.array(offset), plot.decibel(part)
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """Results and truth."""
+class _Seen(NamedTuple):
+    """Images and estimates by method, and true values."""
 
-    found: _Results
-    truth: Truth
+    images: dict[str, Signal]
+    estimates: dict[str, Rotation]
+    true: Rotation
 
 
 def _turntable(small: bool) -> _Seen:
     """A genetic algorithm of two generations in the reduced form."""
     world = TurntableWorld(CUBES, rotation=ROTATION, start_phase=[_PhaseWalk(WALK_RAD)], snr_db=SNR_DB)
     recording, truth = simulate_turntable(RADAR, world, PULSES, CELLS, Draws(1))
-    return _Seen(_results(recording.signal, truth, 2 if small else 30), truth)
+    return _Seen(*_results(recording.signal, truth, 2 if small else 30), truth.values)
 
 
 def _figure_19(seen: _Seen, path: Path) -> list[Check]:
     """The image of the genetic algorithm has its own scale, in cross range, from its own rate."""
-    found, true = seen.found, seen.truth.values
     names = {
         "a: uniform autofocus": SHOWN[0],
         "b: second order (SM)": SHOWN[1],
@@ -200,14 +134,14 @@ def _figure_19(seen: _Seen, path: Path) -> list[Check]:
         "d: alternation": "alternation",
     }
     shown = {
-        title: _close(_scaled(found.images[name], found.estimates.get(name, true))) for title, name in names.items()
+        title: _close(_scaled(seen.images[name], seen.estimates.get(name, seen.true))) for title, name in names.items()
     }
     plot.save(plot.images(shown, 40, percentile=100), path)
-    best = found.estimates["alternation"]
+    best = seen.estimates["alternation"]
     rows = ("omega_rad_s", math.radians(10)), ("k1_per_s", 6.0), ("k2_per_s2", 1100.0)
     ours = ", ".join(f"{float(best[name]):.4g} for {value:.4g}" for name, value in rows)
     close = all(abs(float(best[name]) / value - 1) < 0.1 for name, value in rows)
-    genetic = found.estimates["autofocus + genetic"]
+    genetic = seen.estimates["genetic"]
     return [
         statement("rate, k1 and k2", "near the set values", close, ours),
         *(
@@ -219,14 +153,30 @@ def _figure_19(seen: _Seen, path: Path) -> list[Check]:
 
 def _figure_20(seen: _Seen, path: Path) -> list[Check]:
     """Width of the profile of every cube."""
-    _draw_profiles(seen.found, seen.truth, path)
+    # on the true scale; a random phase also shifts images, so that each profile is centred at its
+    # peak; the alternation last, since it lies on the reference
+    names = ("clean reference", "uniform autofocus", "autofocus + SM", "alternation")
+    shown = {name: _scaled(seen.images[name], seen.true) for name in names}
+    parts = []
+    for cube, (x, y) in enumerate(zip(CUBES.azimuth_m, CUBES.range_m, strict=True), start=1):
+        profiles = {name: _profile(image, float(y)) for name, image in shown.items()}
+        parts.append(
+            {
+                "series": {name: (1e3 * offset, level) for name, (offset, level) in profiles.items()},
+                "xlabel": "cross range from the peak (mm)",
+                "ylabel": "amplitude (dB)",
+                "title": f"cube {cube}, x = {1e3 * x:g} mm",
+                "ylim": (-40.0, 1.0),
+            }
+        )
+    plot.save(plot.panels(parts), path, columns=3)
     widths = {name: 1e3 * _width_m(seen, name) for name in (SHOWN[0], SHOWN[1], "alternation")}
     return [falling("mean width of the main lobes (mm)", widths)]
 
 
 def _width_m(seen: _Seen, name: str) -> float:
     """Mean over the cubes of the cross range in which a profile is above -3 dB."""
-    image, widths = _scaled(seen.found.images[name], seen.truth.values), []
+    image, widths = _scaled(seen.images[name], seen.true), []
     for y in CUBES.range_m:
         offset, level = _profile(image, float(y))
         widths.append(float(offset[1] - offset[0]) * int((level > -3).sum()))
@@ -239,7 +189,7 @@ def _table_5(seen: _Seen, path: Path) -> list[Check]:
 
 
 def _table_6(seen: _Seen, path: Path) -> list[Check]:
-    entropies, contrasts = ({name: float(of(seen.found.images[name])) for name in SHOWN} for of in (entropy, contrast))
+    entropies, contrasts = ({name: float(of(seen.images[name])) for name in SHOWN} for of in (entropy, contrast))
     return [falling("entropy (nats)", entropies), falling("contrast", contrasts, rising=True)]
 
 

@@ -21,7 +21,8 @@ from torchsar.compensate import uneven_rotation
 from torchsar.core import Axis, Draws, Signal
 from torchsar.echo import simulate_turntable
 from torchsar.focus import DopplerLines, cross_range_of, matched_fourier, range_phase
-from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar import InverseRadar
+from torchsar.reproduce.isal_rotation.common import known_of, ladar
 from torchsar.reproduce.item import Check, Item, statement
 from torchsar.scene import Points, PolynomialRotation, Satellite, TurntableWorld
 
@@ -44,11 +45,6 @@ NAMES = {
 }
 # of the satellite of figure 1
 SNR_DB = 20.0
-
-
-def _instrument(cell_m: float, prf_hz: float) -> InverseRadar:
-    """A ladar at 1.55 um with range cells of this size."""
-    return InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * cell_m), prf_hz)
 
 
 @dataclass(frozen=True)
@@ -141,14 +137,6 @@ def _draw_profiles(
     plot.save(plot.panels(parts), path, columns=3)
 
 
-def _one_cell(yc_m: Tensor, y_m: float) -> Tensor:
-    """Estimated over true rate (yc,) of one range cell whose centre deviation is ignored, Eq.
-
-    (6): the range term of y_m must stand for that of y_m + yc.
-    """
-    return torch.sqrt((1 + yc_m / y_m).clamp_min(0))
-
-
 def _whole_image(
     yc_m: Tensor, radar: InverseRadar, n_pulse: int, n_range: int, scatterers: int, snr_db: float
 ) -> dict[str, Tensor]:
@@ -160,34 +148,15 @@ def _whole_image(
         target, rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K), centre_deviation_m=yc_m, snr_db=snr_db
     )
     signal = simulate_turntable(radar, world, n_pulse, n_range, Draws(1, trials=[0] * len(yc_m)))[0].signal
-    given = {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
     return {
-        name: uneven_rotation(signal.data, **given, yc_m=known)["omega_rad_s"] / OMEGA_RAD_S
+        name: uneven_rotation(signal.data, **known_of(signal, radar), yc_m=known)["omega_rad_s"] / OMEGA_RAD_S
         for name, known in (("ignored", 0.0), ("estimated", None))
     }
 
 
-def _draw_centre(yc_m: Tensor, image: Mapping[str, Tensor], path: Path) -> None:
-    """Figure 1, and the same of an image. In one range cell the rate, the acceleration and the
-    jerk change by the same factor.
-    """
-    fine_m = torch.linspace(float(yc_m[0]), float(yc_m[-1]), 61, dtype=torch.float64)
-    cell = {f"y = {y:g} m": _one_cell(fine_m, y) for y in CELLS_M}
-    parts = [
-        {
-            "series": {name: (plot.array(at), plot.array(ratio)) for name, ratio in ratios.items()},
-            "xlabel": "range centre deviation yc (m)",
-            "ylabel": "estimated over true rate",
-            "title": title,
-        }
-        for title, at, ratios in (("one range cell, yc ignored", fine_m, cell), ("a whole image", yc_m, image))
-    ]
-    plot.save(plot.panels(parts), path)
-
-
 def _points(small: bool) -> dict[str, _Profile]:
     """The reduced form is the full one."""
-    radar = _instrument(4.0, 1e6)
+    radar = ladar(4.0, 1e6)
     points = Points(azimuth_m=PLACES_M, range_m=[RANGE_M] * 3)
     world = TurntableWorld(points, rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K))
     return _compensated(simulate_turntable(radar, world, 20000, 8, Draws(1))[0].signal, radar)
@@ -215,24 +184,32 @@ def _shown(names: Sequence[str], reach_m: Sequence[float]) -> Callable[[dict[str
     return make
 
 
-@dataclass(frozen=True)
-class _Deviations:
-    """Range centre deviations (m), and estimated over true rate of a whole image."""
-
-    yc_m: Tensor
-    image: dict[str, Tensor]
-
-
-def _deviations(small: bool) -> _Deviations:
-    """A tiny satellite and few deviations in the reduced form."""
+def _deviations(small: bool) -> tuple[Tensor, dict[str, Tensor]]:
+    """Range centre deviations (m), and estimated over true rate of a whole image. A tiny satellite
+    and few deviations in the reduced form.
+    """
     yc = torch.linspace(-3, 3, 2 if small else 7, dtype=torch.float64)
-    size = (_instrument(0.24, 50e3), 1000, 32, 60) if small else (_instrument(0.24, 500e3), 10000, 32, 300)
-    return _Deviations(yc, _whole_image(yc, *size, SNR_DB))
+    size = (ladar(0.24, 50e3), 1000, 32, 60) if small else (ladar(0.24, 500e3), 10000, 32, 300)
+    return yc, _whole_image(yc, *size, SNR_DB)
 
 
-def _figure_1(seen: _Deviations, path: Path) -> list[Check]:
-    _draw_centre(seen.yc_m, seen.image, path)
-    ignored, estimated = (float((seen.image[name] - 1).abs().max()) for name in ("ignored", "estimated"))
+def _figure_1(seen: tuple[Tensor, dict[str, Tensor]], path: Path) -> list[Check]:
+    yc_m, image = seen
+    # in one range cell whose centre deviation is ignored the range term of y must stand for that of
+    # y + yc, Eq. (6); the rate, the acceleration and the jerk change by the same factor
+    fine_m = torch.linspace(float(yc_m[0]), float(yc_m[-1]), 61, dtype=torch.float64)
+    cell = {f"y = {y:g} m": torch.sqrt((1 + fine_m / y).clamp_min(0)) for y in CELLS_M}
+    parts = [
+        {
+            "series": {name: (plot.array(at), plot.array(ratio)) for name, ratio in ratios.items()},
+            "xlabel": "range centre deviation yc (m)",
+            "ylabel": "estimated over true rate",
+            "title": title,
+        }
+        for title, at, ratios in (("one range cell, yc ignored", fine_m, cell), ("a whole image", yc_m, image))
+    ]
+    plot.save(plot.panels(parts), path)
+    ignored, estimated = (float((image[name] - 1).abs().max()) for name in ("ignored", "estimated"))
     ours = f"rate off by up to {100 * ignored:.0f} % if ignored, {100 * estimated:.1f} % if estimated"
     return [statement("deviation", "ignored, it biases the rotation", ignored > 0.1 > 5 * estimated, ours)]
 

@@ -1,34 +1,35 @@
-"""A satellite with non-uniform rotation: figures 4 to 9 and Table 1 of Remote Sens. 2025, 17, 3447,
-with a procedural satellite in place of the one that is not published.
+"""A satellite with non-uniform rotation: figures 4 to 12 and Tables 1 and 2 of Remote Sens. 2025,
+17, 3447, with a procedural satellite in place of the one that is not published.
 
 The image without compensation, as a sum of chirplets (ACL), with the acceleration alone taken out
-(SM), and with the recommended estimate of the whole rotation; and the positions of both panel tips
-in the image that is scaled to metres.
+(SM), and with the recommended estimate of the whole rotation; the positions of both panel tips in
+the image that is scaled to metres; and Newton's method, which the paper calls Gauss-Newton, from
+0.9, 1 and 1.1 times the truth.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchsar import plot
 from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
     chirplet_clean,
-    coarse_rotation,
-    descend_rotation,
+    newton_rotation,
     uneven_rotation,
 )
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus import MatchedFourier, RangePhase, mean_rate
+from torchsar.focus import MatchedFourier, mean_rate
 from torchsar.metrics import entropy, impulse_response
-from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar import InverseRadar
+from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar, second_order
 from torchsar.reproduce.isal_rotation.profiles import OMEGA_RAD_S, WARP_K
 from torchsar.reproduce.item import Check, Item, falling, number, statement
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
@@ -45,8 +46,6 @@ PUBLISHED = {
     "k1_per_s": (10.002, 0.02),
     "k2_per_s2": (999.6835, 2.0),
 }
-# half the size of an image over that of the target in cross range; range (m)
-WHOLE = 1.09, (-3.8, 3.8)
 # enlarged regions: middle in half widths of the target in cross range, range (m); half their height
 # (m), at which single scatterers can be seen
 TIP = "A, tip of a panel"
@@ -57,7 +56,7 @@ SHOWN = ("no compensation", "chirplets (ACL)", "SM, order 2", "order 3, two-dime
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Imaged:
     """Images in metres by method, the estimate, the truth and half the width of the target (m)."""
 
     shown: dict[str, Signal]
@@ -69,8 +68,8 @@ class _Seen:
         return {name: float(entropy(self.shown[name])) for name in names}
 
     def whole(self, name: str) -> Signal:
-        """The target in the image of a method."""
-        return _cut(self.shown[name], 0.0, WHOLE[0] * self.half_width_m, WHOLE[1])
+        """The target in the image of a method, 1.09 times its cross range."""
+        return _cut(self.shown[name], 0.0, 1.09 * self.half_width_m, (-3.8, 3.8))
 
     def region(self, name: str, which: str) -> Signal:
         """One of the enlarged regions."""
@@ -85,58 +84,30 @@ class _Seen:
         }
 
 
-def _satellite(small: bool) -> _Seen:
+def _satellite(small: bool) -> _Imaged:
     prf_hz, n_pulse, n_range, cell_m, count, atoms = SIZES[small]
-    radar = InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * cell_m), prf_hz)
+    radar = ladar(cell_m, prf_hz)
     half_width_m = TIP_M * prf_hz / 500e3
     world = TurntableWorld(Satellite(count, half_width_m), rotation=ROTATION, snr_db=SNR_DB)
     recording, truth = simulate_turntable(radar, world, n_pulse, n_range, Draws(1))
-    estimate = uneven_rotation(recording.signal.data, **_known_of(recording.signal, radar))
-    rate = mean_rate(estimate["omega_rad_s"], estimate["warp_k"], n_pulse / prf_hz)
-    made = _images(recording.signal, radar, estimate, atoms)
-    return _Seen({name: _scaled(x, radar, rate) for name, x in made.items()}, estimate, truth, half_width_m)
-
-
-def _second_order(signal: Signal, radar: InverseRadar) -> Estimate:
-    """The second-order method, azimuth only: its one number from short sections, then by least
-    entropy. It is not k1 of the target but about k1 + k2 T / 2.
-    """
-    figure = ImageEntropy.of(signal, radar, EntropyObjective(order=2, range_term=False))
-    start = coarse_rotation(signal.data, order=2, **_known_of(signal, radar))
-    return descend_rotation(figure, figure.start(0.0, start["warp_k"]))
-
-
-def _known_of(signal: Signal, radar: InverseRadar) -> dict:
-    return {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
-
-
-def _images(signal: Signal, radar: InverseRadar, estimate: Estimate, atoms: int) -> dict[str, Signal]:
-    """The image of every method, on one Doppler axis (Hz)."""
-    focus, flat = MatchedFourier(radar), RangePhase(radar)
-    rotation = {name: estimate[name] for name in ("omega_rad_s", "warp_k", "yc_m")}
-    chirplets = chirplet_clean(signal.data, radar.prf_hz, atoms=atoms).image
-    uncompensated = focus(signal)
-    return {
+    signal, focus = recording.signal, MatchedFourier(radar)
+    estimate, uncompensated = uneven_rotation(signal.data, **known_of(signal, radar)), focus(signal)
+    made = {
         "no compensation": uncompensated,
-        "chirplets (ACL)": uncompensated.with_data(chirplets),
-        "SM, order 2": focus(signal, _second_order(signal, radar)["warp_k"]),
-        "order 3, azimuth": focus(signal, rotation["warp_k"]),
-        "order 3, two-dimensional": focus(flat(signal, **rotation), rotation["warp_k"]),
+        "chirplets (ACL)": uncompensated.with_data(chirplet_clean(signal.data, prf_hz, atoms=atoms).image),
+        "SM, order 2": focus(signal, second_order(signal, radar)["warp_k"]),
+        "order 3, azimuth": focus(signal, estimate["warp_k"]),
+        "order 3, two-dimensional": focused(signal, radar, estimate.value),
     }
-
-
-def _scaled(image: Signal, radar: InverseRadar, rate_rad_s: Tensor) -> Signal:
-    """Doppler at the mean rate as cross range (m)."""
-    doppler, range_ = image.axes
-    scale = radar.wavelength_m / (2 * float(rate_rad_s))
-    return Signal(image.data, (Axis("azimuth", doppler.n, doppler.start * scale, doppler.step * scale, "m"), range_))
+    rate = mean_rate(estimate["omega_rad_s"], estimate["warp_k"], n_pulse / prf_hz)
+    return _Imaged({name: in_metres(x, radar, rate) for name, x in made.items()}, estimate, truth, half_width_m)
 
 
 def _cut(image: Signal, middle_m: float, half_m: float, range_m: tuple[float, float]) -> Signal:
     return plot.within(image, {"azimuth": (middle_m - half_m, middle_m + half_m), "range": range_m})
 
 
-def _figure_4(seen: _Seen, path: Path) -> list[Check]:
+def _figure_4(seen: _Imaged, path: Path) -> list[Check]:
     """Nothing is published to compare it with."""
     x, y, level = (plot.array(seen.truth.values[name]) for name in ("cross_range_m", "range_m", "amplitude"))
     title = f"{len(x)} scatterers, with areas as their amplitudes"
@@ -144,18 +115,18 @@ def _figure_4(seen: _Seen, path: Path) -> list[Check]:
     return []
 
 
-def _draw(seen: _Seen, name: str, path: Path) -> None:
+def _draw(seen: _Imaged, name: str, path: Path) -> None:
     """An image and two regions of it, in dB of its peak."""
     parts = {name: seen.whole(name)} | {which: seen.region(name, which) for which in REGIONS}
     plot.save(plot.images(parts, 40, percentile=100, lines={name: seen.outlines()}), path, columns=3)
 
 
-def _figure_5(seen: _Seen, path: Path) -> list[Check]:
+def _figure_5(seen: _Imaged, path: Path) -> list[Check]:
     _draw(seen, "no compensation", path)
     return [falling("entropy (nats)", seen.entropies("no compensation", "order 3, two-dimensional"))]
 
 
-def _figure_6(seen: _Seen, path: Path) -> list[Check]:
+def _figure_6(seen: _Imaged, path: Path) -> list[Check]:
     """Samples above -30 dB of the peak."""
     _draw(seen, "chirplets (ACL)", path)
     level = {name: seen.shown[name].data.abs() for name in ("chirplets (ACL)", "order 3, two-dimensional")}
@@ -165,12 +136,12 @@ def _figure_6(seen: _Seen, path: Path) -> list[Check]:
     return [statement("chirplets", "leave out weak parts of the target", few < all_, ours)]
 
 
-def _figure_7(seen: _Seen, path: Path) -> list[Check]:
+def _figure_7(seen: _Imaged, path: Path) -> list[Check]:
     _draw(seen, "SM, order 2", path)
     return [falling("entropy (nats)", seen.entropies("no compensation", "SM, order 2", "order 3, two-dimensional"))]
 
 
-def _figure_8(seen: _Seen, path: Path) -> list[Check]:
+def _figure_8(seen: _Imaged, path: Path) -> list[Check]:
     """The recommended estimator, which gets the data alone; and all methods in one picture."""
     _draw(seen, "order 3, two-dimensional", path)
     shown = {name: seen.whole(name) for name in SHOWN} | {f"{name}, A": seen.region(name, TIP) for name in SHOWN}
@@ -188,22 +159,27 @@ def _figure_8(seen: _Seen, path: Path) -> list[Check]:
     ]
 
 
-def _figure_9(seen: _Seen, path: Path) -> list[Check]:
+def _figure_9(seen: _Imaged, path: Path) -> list[Check]:
     """Both tips are enlarged, with the true position of the brightest scatterer of each."""
     best = seen.shown["order 3, two-dimensional"]
-    tips = _tips(best, seen.truth)
+    x, y, level = (seen.truth.values[name] for name in ("cross_range_m", "range_m", "amplitude"))
+    tips = []
+    for side in (-1, 1):
+        which = int(torch.where(side * x > 0.999 * x.abs().max(), level.abs(), 0).argmax())
+        at = float(x[which]), float(y[which])
+        tips.append((*at, float(impulse_response(best, at, search_m=0.1)["position_azimuth_m"])))
     shown, lines = {"scaled to metres": seen.whole("order 3, two-dimensional")}, {}
-    for tip in tips:
-        title = f"tip at {tip.true_m:.2f} m"
-        shown[title] = _cut(best, tip.true_m, REGION_M, (tip.range_m - 1.6, tip.range_m + 1.6))
-        lines[title] = {"true position": plot.boxes([(tip.range_m, tip.true_m)], 0.3, 0.1 * REGION_M)}
+    for true_m, range_m, _ in tips:
+        title = f"tip at {true_m:.2f} m"
+        shown[title] = _cut(best, true_m, REGION_M, (range_m - 1.6, range_m + 1.6))
+        lines[title] = {"true position": plot.boxes([(range_m, true_m)], 0.3, 0.1 * REGION_M)}
     plot.save(plot.images(shown, 40, percentile=100, lines=lines), path, columns=3)
-    ours = ", ".join(f"{tip.seen_m:.3f} m for {tip.true_m:.3f} m" for tip in tips)
-    close = all(abs(tip.seen_m / tip.true_m - 1) < 0.02 for tip in tips)
+    ours = ", ".join(f"{seen_m:.3f} m for {true_m:.3f} m" for true_m, _, seen_m in tips)
+    close = all(abs(seen_m / true_m - 1) < 0.02 for true_m, _, seen_m in tips)
     return [statement("tips of the panels", "scaled consistently with the simulation", close, ours)]
 
 
-def _table_1(seen: _Seen, path: Path) -> list[Check]:
+def _table_1(seen: _Imaged, path: Path) -> list[Check]:
     """What the text says of it."""
     return [
         number("rate (rad/s)", 0.002, OMEGA_RAD_S, 1e-6),
@@ -212,29 +188,112 @@ def _table_1(seen: _Seen, path: Path) -> list[Check]:
     ]
 
 
+# rate, k1 and k2 of the text (rad/s, 1/s, 1/s2)
+TRUTH = torch.tensor([0.02, 10.0, 1000.0], dtype=torch.float64)
+NAMES = ("omega_rad_s", "k1_per_s", "k2_per_s2")
+# starts over the truth, and largest relative error of an estimate that is close to it
+BEGINNINGS = {0.9: "from 0.9 times the truth", 1.0: "from the truth", 1.1: "from 1.1 times the truth"}
+FACTORS, CLOSE = tuple(BEGINNINGS), 0.05
+# enlarged part of a picture over its largest Doppler
+PART = (0.35, 0.45)
+
+
 @dataclass(frozen=True)
-class _Tip:
-    """True cross range and range of the brightest scatterer of a tip, and the cross range at which
-    it is seen (m).
-    """
+class _Seen:
+    """The data, and estimates by start; of None, the recommended one, which needs none."""
 
-    true_m: float
-    range_m: float
-    seen_m: float
+    signal: Signal
+    radar: InverseRadar
+    found: dict[float | None, Estimate]
 
-
-def _tips(image: Signal, truth: Truth) -> list[_Tip]:
-    """The tips of both panels."""
-    x, y, level = (truth.values[name] for name in ("cross_range_m", "range_m", "amplitude"))
-    found = []
-    for side in (-1, 1):
-        which = int(torch.where(side * x > 0.999 * x.abs().max(), level.abs(), 0).argmax())
-        at = float(x[which]), float(y[which])
-        found.append(_Tip(*at, float(impulse_response(image, at, search_m=0.1)["position_azimuth_m"])))
-    return found
+    def error(self, factor: float | None) -> torch.Tensor:
+        """Relative errors of the rate, k1 and k2."""
+        return torch.stack([self.found[factor][name] for name in NAMES]) / TRUTH - 1
 
 
+def _starts(small: bool) -> _Seen:
+    """A tiny satellite and one step in the reduced form."""
+    prf_hz, n_pulse, n_range, cell_m, count, _ = SIZES[small]
+    radar = ladar(cell_m, prf_hz)
+    world = TurntableWorld(Satellite(count, TIP_M * prf_hz / 500e3), rotation=ROTATION, snr_db=SNR_DB)
+    signal = simulate_turntable(radar, world, n_pulse, n_range, Draws(1))[0].signal
+    found: dict[float | None, Estimate] = {}
+    for factor in FACTORS:
+        figure = ImageEntropy.of(signal, radar, EntropyObjective(oversampling=2.0))
+        start = figure.start(factor * TRUTH[0], factor * TRUTH[1:])
+        found[factor] = newton_rotation(figure, start, damped=False, steps=1 if small else 20)
+    found[None] = uneven_rotation(signal.data, **known_of(signal, radar))
+    return _Seen(signal, radar, found)
+
+
+def _compensated(seen: _Seen, factor: float | None) -> Signal:
+    """Image in Doppler, since a wrong rate gives a wrong scale."""
+    image = focused(seen.signal, seen.radar, seen.found[factor].value)
+    doppler, range_ = image.axes
+    return Signal(image.data, (Axis("Doppler", doppler.n, 1e-3 * doppler.start, 1e-3 * doppler.step, "kHz"), range_))
+
+
+def _words(seen: _Seen, factor: float | None) -> str:
+    return ", ".join(
+        f"{name} {100 * float(error):+.2g} %"
+        for name, error in zip(("Om", "k1", "k2"), seen.error(factor), strict=True)
+    )
+
+
+def _picture(factor: float) -> Callable[[_Seen, Path], list[Check]]:
+    """Figure 10, 11 or 12: the middle of the image, a part of it, and the recommended one."""
+
+    def make(seen: _Seen, path: Path) -> list[Check]:
+        shown, lines = {}, {}
+        for title, one in ((BEGINNINGS[factor], factor), ("recommended", None)):
+            image = _compensated(seen, one)
+            half = -0.25 * image.axes[0].start  # a quarter of the band
+            shown[title] = plot.within(image, {"Doppler": (-half, half)})
+            shown[f"{title}, part"] = plot.within(image, {"Doppler": (PART[0] * half, PART[1] * half)})
+            range_m = image.axis("range")
+            middle_m, half_m = range_m.start + range_m.step * (range_m.n - 1) / 2, range_m.step * range_m.n / 2
+            middle, height = half * sum(PART) / 2, half * (PART[1] - PART[0]) / 2
+            lines[title] = {"part": plot.boxes([(middle_m, middle)], half_m, height)}
+        plot.save(plot.images(shown, 40, percentile=100, lines=lines), path)
+        return [_outcome(seen, factor)]
+
+    return make
+
+
+def _outcome(seen: _Seen, factor: float) -> Check:
+    close = bool((seen.error(factor).abs() < CLOSE).all())
+    claim = "close to the truth, focused" if factor == 1 else "far from the truth, defocused"
+    return statement(f"Newton's method {BEGINNINGS[factor]}", claim, close == (factor == 1), _words(seen, factor))
+
+
+def _table_2(seen: _Seen, path: Path) -> list[Check]:
+    best = bool((seen.error(None).abs() < CLOSE).all())
+    return [
+        *(_outcome(seen, factor) for factor in FACTORS),
+        statement("without a start", "a method that needs none is close to the truth", best, _words(seen, None)),
+    ]
+
+
+LOST = (
+    "the entropy is so flat in the rate that an undamped step from the truth itself is too long; with a line search "
+    "all three starts reach the same minimum"
+)
+# figures and tables, by their numbers
+STARTS = (
+    *(
+        Item(
+            f"Figure {label}",
+            f"image by Newton's method {BEGINNINGS[factor]}",
+            of=_starts,
+            make=_picture(factor),
+            why=LOST,
+        )
+        for label, factor in zip((10, 11, 12), FACTORS, strict=True)
+    ),
+    Item("Table 2", "estimates by Newton's method from three starts", "table", _starts, _table_2, LOST),
+)
 ITEMS = (
+    *STARTS,
     Item(
         "Figure 4",
         "model of the target",

@@ -25,17 +25,19 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchsar import plot
 from torchsar.compensate import EntropyObjective, ImageEntropy, genetic_rotation, uneven_rotation
-from torchsar.core import Axis, Draws, Estimate, Signal, Truth
+from torchsar.core import Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus import MatchedFourier, RangePhase, mean_rate
+from torchsar.focus import MatchedFourier, mean_rate
 from torchsar.metrics import entropy, impulse_response, rotation_bounds
-from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar import InverseRadar
+from torchsar.reproduce.isal_rotation.common import focused, in_metres, known_of, ladar
 from torchsar.reproduce.item import Check, Item, falling, number, statement
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
@@ -51,6 +53,7 @@ LOW, HIGH = [0.9 * value for value in TRUE.values()], [1.1 * value for value in 
 # scenes at once; of the recommended estimator, of the genetic algorithm and of the full target
 BATCH, TRIALS, GENETIC, SCENES = 25, 100, 4, 4
 
+Errors = tuple[dict[tuple[str, float], dict[str, Tensor]], dict[float, dict[str, Tensor]]]
 Finder = Callable[[Signal, InverseRadar], Estimate]
 
 
@@ -67,7 +70,7 @@ class _Target:
 
     @property
     def radar(self) -> InverseRadar:
-        return InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * self.cell_m), self.prf_hz)
+        return ladar(self.cell_m, self.prf_hz)
 
     def simulated(self, snr_db: float, seed: int, trials: Sequence[int]) -> tuple[Signal, Truth]:
         """Trials are scenes, with noise of their own; their numbers make them, so that every SNR
@@ -89,9 +92,7 @@ TINY = _Target(50e3, 1000, 32, 0.24, 60, TIP_M / 10)
 
 
 def _recommended(signal: Signal, radar: InverseRadar) -> Estimate:
-    return uneven_rotation(
-        signal.data, wavelength_m=radar.wavelength_m, prf_hz=radar.prf_hz, range_m=signal.axis("range").values()
-    )
+    return uneven_rotation(signal.data, **known_of(signal, radar))
 
 
 def _genetic(oversampling: float, generations: int, population: int = 30) -> Finder:
@@ -171,12 +172,9 @@ def _spread(error: Tensor) -> Tensor:
 
 def _focused(signal: Signal, radar: InverseRadar, found: Estimate, trial: int) -> Signal:
     """Image of one trial in metres."""
-    one = signal.with_data(signal.data[trial])
-    omega, k, yc = (found[name][trial] for name in ("omega_rad_s", "warp_k", "yc_m"))
-    image = MatchedFourier(radar)(RangePhase(radar)(one, omega, k, yc), k)
-    doppler, range_ = image.axes
-    scale = radar.wavelength_m / (2 * float(mean_rate(omega, k, one.axis("pulse").n / radar.prf_hz)))
-    return Signal(image.data, (Axis("azimuth", doppler.n, doppler.start * scale, doppler.step * scale, "m"), range_))
+    one, own = signal.with_data(signal.data[trial]), {name: found[name][trial] for name in found.value}
+    rate = mean_rate(own["omega_rad_s"], own["warp_k"], one.axis("pulse").n / radar.prf_hz)
+    return in_metres(focused(one, radar, own), radar, rate)
 
 
 def _tip(image: Signal, truth: Truth) -> float:
@@ -188,16 +186,10 @@ def _tip(image: Signal, truth: Truth) -> float:
     return float(impulse_response(image, (x[which], y[which]), search_m=0.1 * float(x[which]))["position_azimuth_m"])
 
 
-@dataclass(frozen=True)
-class _Errors:
-    """Errors (trial,) in % by method and SNR, and bounds by SNR."""
-
-    found: dict[tuple[str, float], dict[str, Tensor]]
-    least: dict[float, dict[str, Tensor]]
-
-
-def _small_target(small: bool) -> _Errors:
-    """Two scenes of a tiny target at two SNR in the reduced form, and a generation of six."""
+def _small_target(small: bool) -> Errors:
+    """Errors (trial,) in % by method and SNR, and bounds by SNR. Two scenes of a tiny target at two
+    SNR in the reduced form, and a generation of six.
+    """
     target, trials, few, search = (TINY, 2, 2, (1, 6)) if small else (SMALL, TRIALS, GENETIC, (30,))
     methods = {
         "recommended": (_recommended, trials),
@@ -206,32 +198,30 @@ def _small_target(small: bool) -> _Errors:
     }
     at = (SNR_DB[0], SNR_DB[-1]) if small else SNR_DB
     found = {(name, snr): _errors(find, target, snr, 1, n) for snr in at for name, (find, n) in methods.items()}
-    return _Errors(found, {snr: _bounds(target, snr, 1, trials) for snr in at})
+    return found, {snr: _bounds(target, snr, 1, trials) for snr in at}
 
 
-def _fall(seen: _Errors, method: str) -> list[Check]:
+def _fall(seen: Errors, method: str) -> list[Check]:
     """The rms errors at the lowest and at the highest SNR."""
     checks = []
     for name, title in NAMES.items():
         rms = {
-            f"{snr:g} dB": float(seen.found[method, snr][name].square().mean().sqrt())
-            for snr in (SNR_DB[0], SNR_DB[-1])
+            f"{snr:g} dB": float(seen[0][method, snr][name].square().mean().sqrt()) for snr in (SNR_DB[0], SNR_DB[-1])
         }
         checks.append(falling(f"{method}: rms error of {title} (%)", rms))
     return checks
 
 
-def _figure_13(seen: _Errors, path: Path) -> list[Check]:
-    _draw_errors(seen.found, seen.least, path)
+def _figure_13(seen: Errors, path: Path) -> list[Check]:
+    _draw_errors(*seen, path)
     return _fall(seen, "recommended") + _fall(seen, "GA, 4 lines per cell")
 
 
-def _table_3(seen: _Errors, path: Path) -> list[Check]:
+def _table_3(seen: Errors, path: Path) -> list[Check]:
     return _fall(seen, "GA, 1 line per cell") + _fall(seen, "recommended")
 
 
-@dataclass(frozen=True)
-class _Tips:
+class _Tips(NamedTuple):
     """Images of the first scene (m), whose tip is where, and rms errors of the rate (%)."""
 
     images: dict[float, Signal]

@@ -9,12 +9,11 @@ on; it cannot if each period is shifted circularly, as in figure 15b.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import torch
 from torch import nn
 
 from torchsar import plot
@@ -34,7 +33,6 @@ from torchsar.metrics import contrast, entropy, impulse_response
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.repair import BlankTurningPoints, CircularShift, SplitSweeps
 from torchsar.reproduce.item import Check, Item, falling, number, parameters, statement
-from torchsar.reproduce.sal.letter import in_milliseconds
 from torchsar.reproduce.sal.points import ISLR_DB, NAMES, NULLS, draw_over_time
 from torchsar.scene import (
     EverySample,
@@ -45,6 +43,7 @@ from torchsar.scene import (
     RetroAndBrokenLine,
     Sinusoid,
 )
+from torchsar.study.systems.sal.figures import in_milliseconds
 from torchsar.study.systems.sal.judge import Course, course_of, finer_in_range
 
 # of Table 4; the sampling is that of the text, the speed follows from azimuth cells of 0.1 mm
@@ -73,8 +72,7 @@ WITHIN = (0.0005, 1.0, ISLR_DB, 0.0005, 1.0, ISLR_DB)
 SHOWN = ("uncompensated", "cross-correlation", "segmented")
 
 
-@dataclass(frozen=True)
-class _Seen:
+class _Seen(NamedTuple):
     """The record of the first draw and what every method made of it, and numbers of all draws by
     method.
     """
@@ -85,11 +83,8 @@ class _Seen:
     courses: dict[str, Course]
     numbers: list[dict[str, dict[str, float]]]
 
-    def each(self, method: str, name: str) -> list[float]:
-        return [one[method][name] for one in self.numbers]
-
     def mean(self, method: str, name: str) -> float:
-        return sum(self.each(method, name)) / len(self.numbers)
+        return sum(one[method][name] for one in self.numbers) / len(self.numbers)
 
 
 def _ground(small: bool) -> _Seen:
@@ -100,9 +95,13 @@ def _ground(small: bool) -> _Seen:
 def _one(small: bool, seed: int) -> tuple[Recording, Truth, dict[str, Trace], dict[str, Course], dict[str, dict]]:
     """One draw; every 24th period in the reduced form."""
     radar = replace(RADAR, keep_every=24) if small else RADAR
-    recording, truth = _recorded(radar, 3840 // radar.keep_every, seed)
+    world = LadarWorld(RetroAndBrokenLine(), MOTION, LogAmplitude(0.1), snr_db=0.0, fidelity=EverySample())
+    # blocks that hold a period from the trigger on
+    how = {"block_s": BLOCK_S, "trigger_s": TRIGGER_S, "trigger_known": True}
+    recording, truth = simulate_ladar_record(radar, world, 3840 // radar.keep_every, Draws(seed), **how)
     assert truth.clean is not None
-    given = {"segmented, circular shift": _one_period(recording), "ideal": truth.clean}
+    period = recording.signal.isel(time=slice(0, 2 * RADAR.sweep_samples))  # which is what a ring needs
+    given = {"segmented, circular shift": replace(recording, signal=period), "ideal": truth.clean}
     chains = _methods(radar)
     traces = {name: chain.trace(given.get(name, recording)) for name, chain in chains.items()}
     courses = {
@@ -118,54 +117,31 @@ def _methods(radar: TriangularLadar) -> dict[str, Chain]:
     "segmented, circular shift" gets sweeps that the paper's circular shift separated, "ideal" the
     record without motion.
     """
-    split = {
-        "split": use(SplitSweeps(radar, "recorded"), trigger_s="aux.trigger_s"),
-        "blank": BlankTurningPoints(radar, farthest_m=11.5),
-    }
-    ring = {
-        "ring": CircularShift(radar, TRIGGER_S),
-        "split": SplitSweeps(radar),
-        "blank": BlankTurningPoints(radar, farthest_m=11.5),
-    }
+    blank = BlankTurningPoints(radar, farthest_m=11.5)
+    split = {"split": use(SplitSweeps(radar, "recorded"), trigger_s="aux.trigger_s"), "blank": blank}
+    ring = {"ring": CircularShift(radar, TRIGGER_S), "split": SplitSweeps(radar), "blank": blank}
     focus = {"compress": CompressSweeps(radar, window_m=SCENE_M), "deramp": DerampAzimuth(radar)}
-    image = {"image": AzimuthMatchedFilter(radar)}
+    image = {**focus, "image": AzimuthMatchedFilter(radar)}
     polish = {
+        **focus,
         "correct": use(CorrectPulsePhase(), phase_rad="motion"),
         "gain": PulseGain(),
         "equalise": use(EqualisePulses(), gain="gain"),
         "image": AzimuthMatchedFilter(radar, weighting=0.03),
     }
+    segmented = SegmentedInterference(radar, hann=True, window_m=RETRO)
 
     def compensated(estimator: Stage) -> dict[str, nn.Module]:
         return {"motion": estimator, "compensate": use(CompensateMotion(radar), velocity_m_s="motion")}
 
     return {
-        "uncompensated": Chain(**split, **focus, **image),
-        "cross-correlation": Chain(
-            **split, **compensated(SpectrumCorrelation(radar, window_m=RETRO)), **focus, **image
-        ),
-        "segmented": Chain(
-            **split, **compensated(SegmentedInterference(radar, hann=True, window_m=RETRO)), **focus, **image
-        ),
-        "recommended": Chain(**split, **compensated(RadialMotion(radar, window_m=RETRO)), **focus, **polish),
-        "segmented, circular shift": Chain(
-            **ring, **compensated(SegmentedInterference(radar, hann=True, window_m=RETRO)), **focus, **image
-        ),
-        "ideal": Chain(**split, **focus, **image),
+        "uncompensated": Chain(**split, **image),
+        "cross-correlation": Chain(**split, **compensated(SpectrumCorrelation(radar, window_m=RETRO)), **image),
+        "segmented": Chain(**split, **compensated(segmented), **image),
+        "recommended": Chain(**split, **compensated(RadialMotion(radar, window_m=RETRO)), **polish),
+        "segmented, circular shift": Chain(**ring, **compensated(segmented), **image),
+        "ideal": Chain(**split, **image),
     }
-
-
-def _recorded(radar: TriangularLadar, n_period: int, seed: int) -> tuple[Recording, Truth]:
-    """Some periods of a continuous record, in blocks that hold a period from the trigger on."""
-    world = LadarWorld(RetroAndBrokenLine(), MOTION, LogAmplitude(0.1), snr_db=0.0, fidelity=EverySample())
-    return simulate_ladar_record(
-        radar, world, n_period, Draws(seed), block_s=BLOCK_S, trigger_s=TRIGGER_S, trigger_known=True
-    )
-
-
-def _one_period(recording: Recording) -> Recording:
-    """Blocks cut to the length of one period, which is what a ring needs."""
-    return Recording(recording.signal.isel(time=slice(0, 2 * RADAR.sweep_samples)), recording.radar, recording.aux)
 
 
 def _judge(trace: Trace, course: Course) -> dict[str, float]:
@@ -181,87 +157,28 @@ def _judge(trace: Trace, course: Course) -> dict[str, float]:
     }
 
 
-def _draw_separation(recording: Recording, path: Path) -> None:
-    """One period as recorded and closed to a ring, and the sweeps that re-segmenting
-    gives.
-    """
-    period = recording.signal.data[0, : 2 * RADAR.sweep_samples]
-    sweeps = SplitSweeps(RADAR, TRIGGER_S)(recording.signal)
-    assert isinstance(sweeps, Signal)
-    ring = period.roll(-round(TRIGGER_S * RADAR.sample_rate_hz))
-    starts = 1e6 * TRIGGER_S, 1e6 * (TRIGGER_S + RADAR.sweep_s)
-    marked = {"up sweep begins": starts[0], "down sweep begins": starts[1]}
-    joint = {"samples one period apart meet": 1e6 * (RADAR.period_s - TRIGGER_S)}
-    parts = []
-    for title, samples, marks in (
-        ("one period as recorded", period, marked),
-        ("after a circular shift", ring, joint),
-        ("up sweep", sweeps.data[0, 0].real, {}),
-        ("down sweep", sweeps.data[1, 0].real, {}),
-    ):
-        lines = {name: (np.array([us, us]), np.array([0.0, 45.0])) for name, us in marks.items()}
-        parts.append(
-            {
-                "title": title,
-                "signal": plot.short_time_spectrum(samples, RADAR.sample_rate_hz, width=192, hop=24),
-                "lines": lines,
-                "ylim": (0.0, 60.0),
-            }
-        )
-    plot.save(plot.overlays(parts), path)
-
-
-def _draw_motion(courses: Mapping[str, Course], truth: Truth, path: Path) -> None:
-    """Velocity and motion, true and by both methods of the paper, and what they leave."""
-    pulse, names = courses["segmented"].pulse, ["cross-correlation", "segmented", "recommended"]
-    true = truth.values["range_error_up_m"]
-    velocity = {**{name: courses[name].velocity_m_s for name in names[:2]}, "true": truth.values["velocity_m_s"]}
-    motion = {
-        **{name: 1e3 * (true - true[0] + courses[name].error_m - courses[name].error_m[0]) for name in names[:2]},
-        "true": 1e3 * (true - true[0]),
-    }
-    left = {name: 1e6 * courses[name].detrended_m for name in names}
-    drawn = {
-        "radial velocity": ("m/s", velocity),
-        "motion": ("mm", motion),
-        "motion left, without constant and slope": ("um", left),
-    }
-    draw_over_time(pulse, drawn, path)
-
-
-def _draw_slices(traces: Mapping[str, Trace], path: Path) -> None:
-    """Cuts through the strongest sample, range on an eighth of the step."""
-    images = {
-        name: finer_in_range(finer_in_range(finer_in_range(traces[name].signal)))
-        for name in ("cross-correlation", "segmented", "recommended")
-    }
-    parts = []
-    for dim, reach_m in enumerate((0.05, 0.3)):
-        series = {name: _cut(image, dim, reach_m) for name, image in images.items()}
-        name = ("azimuth", "range")[dim]
-        parts.append(
-            {
-                "series": series,
-                "xlabel": f"{name} from the peak (m)",
-                "ylabel": "amplitude (dB)",
-                "title": name,
-                "ylim": (-50.0, 1.0),
-            }
-        )
-    plot.save(plot.panels(parts), path)
-
-
-def _cut(image: Signal, dim: int, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (m) from the strongest sample along one axis, and dB of it."""
-    amplitude = image.data.abs()
-    peak = np.unravel_index(int(amplitude.argmax()), amplitude.shape)
-    offset = image.axes[dim].step * (torch.arange(image.axes[dim].n) - int(peak[dim]))
-    near = offset.abs() <= reach_m
-    return plot.array(offset[near]), plot.decibel(amplitude.select(1 - dim, int(peak[1 - dim]))[near])
-
-
 def _figure_15(seen: _Seen, path: Path) -> list[Check]:
-    _draw_separation(seen.recording, path)
+    signal, rate_hz = seen.recording.signal, RADAR.sample_rate_hz
+    period, sweeps = signal.data[0, : 2 * RADAR.sweep_samples], SplitSweeps(RADAR, TRIGGER_S)(signal)
+    assert isinstance(sweeps, Signal)
+    begins = {"up sweep begins": 1e6 * TRIGGER_S, "down sweep begins": 1e6 * (TRIGGER_S + RADAR.sweep_s)}
+    joint = {"samples one period apart meet": 1e6 * (RADAR.period_s - TRIGGER_S)}
+    shown = {
+        "one period as recorded": (period, begins),
+        "after a circular shift": (period.roll(-round(TRIGGER_S * rate_hz)), joint),
+        "up sweep": (sweeps.data[0, 0].real, {}),
+        "down sweep": (sweeps.data[1, 0].real, {}),
+    }
+    parts = [
+        {
+            "title": title,
+            "signal": plot.short_time_spectrum(samples, rate_hz, width=192, hop=24),
+            "lines": {name: (np.array([us, us]), np.array([0.0, 45.0])) for name, us in marks.items()},
+            "ylim": (0.0, 60.0),
+        }
+        for title, (samples, marks) in shown.items()
+    ]
+    plot.save(plot.overlays(parts), path)
     by_trigger, by_shift = seen.mean("segmented", "residual"), seen.mean("segmented, circular shift", "residual")
     ours = f"residual phase {by_shift:.3g} rad after a circular shift, {by_trigger:.2g} rad with the trigger"
     return [statement("separation", "a circular shift separates the sweeps", by_shift < 1, ours)]
@@ -274,9 +191,21 @@ def _figure_16(seen: _Seen, path: Path) -> list[Check]:
 
 
 def _figure_17(seen: _Seen, path: Path) -> list[Check]:
-    _draw_motion(seen.courses, seen.truth, path)
-    errors = {name: seen.courses[name].metrics(RADAR) for name in SHOWN[1:]}
-    left = {name: 1e6 * float(error["range_error_max_m"]) for name, error in errors.items()}
+    courses, true = seen.courses, seen.truth.values["range_error_up_m"]
+    true = true - true[0]
+    found = {name: courses[name] for name in SHOWN[1:]}
+    velocity = {name: one.velocity_m_s for name, one in found.items()}
+    motion = {name: 1e3 * (true + one.error_m - one.error_m[0]) for name, one in found.items()}
+    drawn = {
+        "radial velocity": ("m/s", {**velocity, "true": seen.truth.values["velocity_m_s"]}),
+        "motion": ("mm", {**motion, "true": 1e3 * true}),
+        "motion left, without constant and slope": (
+            "um",
+            {name: 1e6 * courses[name].detrended_m for name in (*found, "recommended")},
+        ),
+    }
+    draw_over_time(courses["segmented"].pulse, drawn, path)
+    left = {name: 1e6 * float(one.metrics(RADAR)["range_error_max_m"]) for name, one in found.items()}
     return [falling("largest error of the motion (um)", left)]
 
 
@@ -287,21 +216,35 @@ def _figure_18(seen: _Seen, path: Path) -> list[Check]:
 
 
 def _figure_19(seen: _Seen, path: Path) -> list[Check]:
-    _draw_slices(seen.traces, path)
+    names = (*SHOWN[1:], "recommended")
+    images = {name: finer_in_range(finer_in_range(finer_in_range(seen.traces[name].signal))) for name in names}
+    parts = [
+        {
+            "series": {name: _cut(image, dim, reach_m) for name, image in images.items()},
+            "xlabel": f"{axis} from the peak (m)",
+            "ylabel": "amplitude (dB)",
+            "title": axis,
+            "ylim": (-50.0, 1.0),
+        }
+        for dim, (axis, reach_m) in enumerate({"azimuth": 0.05, "range": 0.3}.items())
+    ]
+    plot.save(plot.panels(parts), path)
     return [falling("PSLR in azimuth (dB)", {name: seen.mean(name, "pslr_azimuth_db") for name in SHOWN[1:]})]
 
 
 def _table_4(seen: _Seen, path: Path) -> list[Check]:
-    rows = {
-        "wavelength (um)": (1.55, 1e6 * RADAR.wave_speed_m_s / RADAR.carrier_hz),
-        "bandwidth (GHz)": (5.0, 1e-9 * RADAR.bandwidth_hz),
-        "period of the triangle (us)": (32.0, 1e6 * RADAR.period_s),
-        "range cell (m)": (0.03, RADAR.range_step_m),
-        "azimuth cell (m)": (0.0001, RADAR.speed_m_s * RADAR.period_s),
-        "reference range (m)": (4339.5, RADAR.reference_range_m),
-        "range of the target (m)": (4350.0, RADAR.reference_range_m + RETRO_M),
-    }
-    return parameters(rows, 2e-3)
+    return parameters(
+        {
+            "wavelength (um)": (1.55, 1e6 * RADAR.wave_speed_m_s / RADAR.carrier_hz),
+            "bandwidth (GHz)": (5.0, 1e-9 * RADAR.bandwidth_hz),
+            "period of the triangle (us)": (32.0, 1e6 * RADAR.period_s),
+            "range cell (m)": (0.03, RADAR.range_step_m),
+            "azimuth cell (m)": (0.0001, RADAR.speed_m_s * RADAR.period_s),
+            "reference range (m)": (4339.5, RADAR.reference_range_m),
+            "range of the target (m)": (4350.0, RADAR.reference_range_m + RETRO_M),
+        },
+        2e-3,
+    )
 
 
 def _table_5(seen: _Seen, path: Path) -> list[Check]:
@@ -315,10 +258,19 @@ def _table_5(seen: _Seen, path: Path) -> list[Check]:
 def _table_6(seen: _Seen, path: Path) -> list[Check]:
     compared = {"cross-correlation": "cross-correlation", "segmented": "segmented", "recommended": "segmented"}
     return [
-        number(f"{ours}: {words}", published, seen.each(ours, name), within, "lower")
+        number(f"{ours}: {words}", published, [one[ours][name] for one in seen.numbers], within, "lower")
         for ours, theirs in compared.items()
         for (name, words), published, within in zip(NAMES.items(), TABLE_6[theirs], WITHIN, strict=True)
     ]
+
+
+def _cut(image: Signal, dim: int, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets (m) from the strongest sample along one axis, and dB of it."""
+    amplitude = image.data.abs()
+    peak = np.unravel_index(int(amplitude.argmax()), amplitude.shape)
+    offset = image.axes[dim].step * (np.arange(image.axes[dim].n) - int(peak[dim]))
+    near = np.abs(offset) <= reach_m
+    return offset[near], plot.decibel(amplitude.select(1 - dim, int(peak[1 - dim])))[near]
 
 
 ITEMS = (

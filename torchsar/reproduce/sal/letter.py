@@ -9,24 +9,17 @@ phase as well: 4 pi / lambda times the rms range error, without constant and slo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from torchsar import plot
-from torchsar.compensate import (
-    CompensateMotion,
-    CorrectPulsePhase,
-    RadialMotion,
-    SegmentedInterference,
-    SpectrumCorrelation,
-)
-from torchsar.core import Axis, Chain, Draws, Signal, Trace, use
+from torchsar.compensate import SegmentedInterference, SpectrumCorrelation
+from torchsar.core import Draws, Signal, Stage, Trace
 from torchsar.echo import simulate_ladar
-from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import contrast, entropy
 from torchsar.reproduce.item import Check, Item, falling, number
-from torchsar.reproduce.sal.points import BEAM_RAD, MOTION, RADAR
+from torchsar.reproduce.sal.points import MOTION, RADAR, methods
 from torchsar.scene import LadarWorld, LetterE, QuadraticInSweep
+from torchsar.study.systems.sal.figures import in_milliseconds
 from torchsar.study.systems.sal.judge import course_of, finer_in_range
 
 # relative ranges of the letter (m), and SNR (dB) per sample before compression of one point
@@ -37,106 +30,65 @@ DRAWS = 3
 SHOWN = ("uncompensated", "cross-correlation", "segmented, summed")
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """What every method made of the first draw, and the numbers of all draws by method: entropy
-    (nats), contrast of the amplitude, residual (rad).
+Traces = dict[str, Trace]
+Means = dict[str, list[float]]
+
+
+def _letter(small: bool) -> tuple[Traces, Means]:
+    """What every method made of the first draw, and means over the draws by method: entropy (nats),
+    contrast of the amplitude, residual (rad).
     """
-
-    traces: dict[str, Trace]
-    numbers: list[dict[str, tuple[float, ...]]]
-
-    def mean(self, method: str, which: int) -> float:
-        return sum(one[method][which] for one in self.numbers) / len(self.numbers)
+    runs = [_run(256 if small else 512, seed) for seed in range(1, 2 if small else 1 + DRAWS)]
+    numbers = {name: zip(*(of[name] for _, of in runs), strict=True) for name in runs[0][1]}
+    return runs[0][0], {name: [sum(each) / len(each) for each in of] for name, of in numbers.items()}
 
 
-def _letter(small: bool) -> _Seen:
-    runs = [_run(LetterE(), 256 if small else 512, seed, SNR_DB) for seed in range(1, 2 if small else 1 + DRAWS)]
-    return _Seen(runs[0][0], [numbers for _, numbers in runs])
-
-
-def _methods() -> dict[str, Chain]:
-    """Chains by name; all but the last differ in the estimator alone.
-
-    "ideal" is for the recording without motion.
-    """
-    compress, deramp, image = (
-        CompressSweeps(RADAR, window_m=SCENE_M),
-        DerampAzimuth(RADAR),
-        AzimuthMatchedFilter(RADAR, beam_rad=BEAM_RAD),
-    )
-    compensate = use(CompensateMotion(RADAR), velocity_m_s="motion")
-    estimators = {
-        "cross-correlation": SpectrumCorrelation(RADAR, upsampling=20),
-        "segmented, at one peak": SegmentedInterference(
-            RADAR
-        ),  # points 5 cm apart merge in half sweeps, whose cell is 6 cm
-        "segmented, summed": SegmentedInterference(RADAR, bins="sum", unwrap="per_pulse", window_m=SCENE_M),
-    }
-    return {
-        "uncompensated": Chain(compress=compress, deramp=deramp, image=image),
-        **{
-            name: Chain(motion=motion, compensate=compensate, compress=compress, deramp=deramp, image=image)
-            for name, motion in estimators.items()
-        },
-        "recommended": Chain(
-            motion=RadialMotion(RADAR, window_m=(-2.5, 2.5)),
-            compensate=compensate,
-            compress=compress,
-            deramp=deramp,
-            correct=use(CorrectPulsePhase(), phase_rad="motion"),
-            image=image,
-        ),
-        "ideal": Chain(compress=compress, deramp=deramp, image=image),
-    }
-
-
-def _run(
-    scene: LetterE, n_period: int, seed: int, snr_db: float
-) -> tuple[dict[str, Trace], dict[str, tuple[float, ...]]]:
-    """What every method made of one letter, and its figures: entropy (nats), contrast of the
-    amplitude, residual (rad).
-    """
-    world = LadarWorld(scene, MOTION, snr_db=snr_db, fidelity=QuadraticInSweep())
+def _run(n_period: int, seed: int) -> tuple[Traces, dict[str, tuple[float, float, float]]]:
+    """The same of one draw; "ideal" is without motion."""
+    world = LadarWorld(LetterE(), MOTION, snr_db=SNR_DB, fidelity=QuadraticInSweep())
     recording, truth = simulate_ladar(RADAR, world, n_period, Draws(seed))
     assert truth.clean is not None
+    estimators: dict[str, Stage] = {
+        "cross-correlation": SpectrumCorrelation(RADAR, upsampling=20),
+        # points 5 cm apart merge in half sweeps, whose cell is 6 cm
+        "segmented, at one peak": SegmentedInterference(RADAR),
+        "segmented, summed": SegmentedInterference(RADAR, bins="sum", unwrap="per_pulse", window_m=SCENE_M),
+    }
+    chains = methods(estimators, (-2.5, 2.5), SCENE_M)
     traces, figures = {}, {}
-    for name, chain in _methods().items():
+    for name, chain in {**chains, "ideal": chains["uncompensated"]}.items():
         traces[name] = chain.trace(truth.clean if name == "ideal" else recording)
         left = course_of(chain, traces[name], truth.values, RADAR, clean=name == "ideal").metrics(RADAR)
         image = traces[name].signal
-        figures[name] = (
-            float(entropy(image)),
-            float(contrast(image, of="amplitude")),
-            float(left["residual_phase_rms_rad"]),
-        )
+        of = (entropy(image), contrast(image, of="amplitude"), left["residual_phase_rms_rad"])
+        figures[name] = (float(of[0]), float(of[1]), float(of[2]))
     return traces, figures
 
 
-def _figure_10(seen: _Seen, path: Path) -> list[Check]:
+def _figure_10(seen: tuple[Traces, Means], path: Path) -> list[Check]:
     points = LetterE().scatterers(Draws(0))
     x, y, level = (plot.array(value) for value in (points.azimuth_m, points.range_m, points.amplitude.abs()))
     plot.save(plot.scatterers(y, x, level, "range (m)", "azimuth (m)", "62 points", "auto"), path)
     return [number("points", 62, len(x), 0)]
 
 
-def _figure_11(seen: _Seen, path: Path) -> list[Check]:
-    profiles = {name: in_milliseconds(_about_letter(seen.traces[name].outputs["compress"])) for name in SHOWN}
+def _figure_11(seen: tuple[Traces, Means], path: Path) -> list[Check]:
+    profiles = {name: in_milliseconds(_about_letter(seen[0][name].outputs["compress"])) for name in SHOWN}
     plot.save(plot.images(profiles, dynamic_range_db=40, percentile=100), path, columns=3)
-    return [falling("residual phase (rad)", {name: seen.mean(name, 2) for name in SHOWN})]
+    return [falling("residual phase (rad)", {name: seen[1][name][2] for name in SHOWN})]
 
 
-def _figure_12(seen: _Seen, path: Path) -> list[Check]:
+def _figure_12(seen: tuple[Traces, Means], path: Path) -> list[Check]:
     images = {
-        name: _about_letter(finer_in_range(finer_in_range(seen.traces[name].signal)))
+        name: _about_letter(finer_in_range(finer_in_range(seen[0][name].signal)))
         for name in [*SHOWN, "segmented, at one peak", "recommended", "ideal"]
     }
     plot.save(plot.images(images, dynamic_range_db=25, percentile=100, reference="ideal"), path, columns=3)
-    return [falling("entropy (nats)", {name: seen.mean(name, 0) for name in SHOWN})]
+    return [falling("entropy (nats)", {name: seen[1][name][0] for name in SHOWN})]
 
 
-def _table_3(seen: _Seen, path: Path) -> list[Check]:
-    entropies, contrasts = ({name: seen.mean(name, which) for name in SHOWN} for which in (0, 1))
+def _table_3(seen: tuple[Traces, Means], path: Path) -> list[Check]:
+    entropies, contrasts = ({name: seen[1][name][which] for name in SHOWN} for which in (0, 1))
     return [
         falling("entropy (nats; published 11.4919, 11.4081, 11.3471)", entropies),
         falling("contrast (published 0.2375, 0.3146, 0.3433)", contrasts, rising=True),
@@ -149,19 +101,6 @@ def _about_letter(signal: Signal) -> Signal:
     """
     part = signal.sel(range=slice(-0.7, 0.9))
     return part.sel(azimuth=slice(-0.12, 0.12)) if "azimuth" in part.names else part
-
-
-def in_milliseconds(profiles: Signal) -> Signal:
-    """Slow time in milliseconds, for pictures.
-
-    Args:
-        profiles: Range profiles (pulse, range).
-
-    Returns:
-        The same with an axis in ms.
-    """
-    pulse, range_ = profiles.axes
-    return Signal(profiles.data, (Axis("slow time", pulse.n, 1e3 * pulse.start, 1e3 * pulse.step, "ms"), range_))
 
 
 ITEMS = (

@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchsar import plot
 from torchsar.compensate import CompensateMotion, CorrectPulsePhase, RadialMotion, SegmentedInterference
-from torchsar.core import Axis, Chain, Draws, Signal, Trace, Truth, use
+from torchsar.core import Axis, Chain, Draws, Signal, Stage, Trace, Truth, use
 from torchsar.echo import simulate_ladar, simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import impulse_response
@@ -47,6 +48,8 @@ MOTION = (
 NULLS = 2
 # half of this difference (dB)
 ISLR_DB = 0.7
+# relative ranges of all points (m), and the methods that compensate
+ALL_M, COMPENSATED = slice(0.7, 2.3), ("segmented", "recommended")
 # what is measured of an impulse response, and its name in words; widths in range are cells c / 2B,
 # 1 / 0.886 of -3 dB widths
 NAMES = {
@@ -62,9 +65,8 @@ TABLE_2 = (0.030, -13.23, -12.26, 0.006, -12.49, -11.98)
 WITHIN = (0.0005, 0.15, ISLR_DB, 0.0005, 0.15, ISLR_DB)
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """What every method made of the echoes, and the image without motion."""
+class Seen(NamedTuple):
+    """What every method made of the echoes, the truth, and the image without motion."""
 
     traces: dict[str, Trace]
     courses: dict[str, Course]
@@ -72,49 +74,52 @@ class _Seen:
     ideal: Signal
 
 
-def _three_points(small: bool) -> _Seen:
+def _three_points(small: bool) -> Seen:
     """The reduced form is the full one."""
     world = LadarWorld(SCENE, MOTION, fidelity=QuadraticInSweep())
     recording, truth = simulate_ladar(RADAR, world, 512, Draws(1))
-    chains = _methods(RADAR)
+    chains = methods({"segmented": SegmentedInterference(RADAR, hann=True)}, (0.0, 3.0))
     traces = {name: chain.trace(recording) for name, chain in chains.items()}
     courses = {name: course_of(chain, traces[name], truth.values, RADAR, clean=False) for name, chain in chains.items()}
-    return _Seen(traces, courses, truth, chains["uncompensated"](truth.clean))
+    return Seen(traces, courses, truth, chains["uncompensated"](truth.clean))
 
 
-def _methods(radar: TriangularLadar) -> dict[str, Chain]:
-    """No compensation, the paper's, and the recommended one: they share what comes before and
-    after.
+def methods(
+    estimators: Mapping[str, Stage], window_m: tuple[float, float], scene_m: tuple[float, float] | None = None
+) -> dict[str, Chain]:
+    """Make chains that differ in the compensation alone.
+
+    Args:
+        estimators: Estimators of the velocity by name.
+        window_m: Relative ranges in metres that the recommended estimator uses.
+        scene_m: Relative ranges in metres of the image; None for all.
+
+    Returns:
+        Chains by name: without compensation, by every estimator, and the recommended one.
     """
-    compress, deramp, image = (
-        CompressSweeps(radar),
-        DerampAzimuth(radar),
-        AzimuthMatchedFilter(radar, beam_rad=BEAM_RAD),
-    )
-    compensate = use(CompensateMotion(radar), velocity_m_s="motion")
-    segmented = SegmentedInterference(radar, hann=True)
-    polished = RadialMotion(radar, window_m=(0.0, 3.0))
+    after = {"compress": CompressSweeps(RADAR, window_m=scene_m), "deramp": DerampAzimuth(RADAR)}
+    image: dict[str, nn.Module] = {"image": AzimuthMatchedFilter(RADAR, beam_rad=BEAM_RAD)}
+    compensate = use(CompensateMotion(RADAR), velocity_m_s="motion")
     correct = use(CorrectPulsePhase(), phase_rad="motion")
+    best = RadialMotion(RADAR, window_m=window_m)
     return {
-        "uncompensated": Chain(compress=compress, deramp=deramp, image=image),
-        "segmented": Chain(motion=segmented, compensate=compensate, compress=compress, deramp=deramp, image=image),
-        "recommended": Chain(
-            motion=polished, compensate=compensate, compress=compress, deramp=deramp, correct=correct, image=image
-        ),
+        "uncompensated": Chain(**after, **image),
+        **{name: Chain(motion=one, compensate=compensate, **after, **image) for name, one in estimators.items()},
+        "recommended": Chain(motion=best, compensate=compensate, **after, correct=correct, **image),
     }
 
 
-def _figure_2(draws: Draws, path: Path) -> list[Check]:
+def _figure_2(small: bool, path: Path) -> list[Check]:
     """The triangle and its echo, and the dechirped beat at rest and in motion.
 
     50 MHz instead of 5 GHz, so that the delay can be seen.
     """
     radar, range_m = replace(RADAR, bandwidth_hz=50e6), 150.0
     time_s = torch.linspace(0, 3 * radar.period_s, 1500, dtype=torch.float64)
-    us, sent, echo = (
-        plot.array(1e6 * time_s),
-        *(1e-6 * _triangle_hz(time_s - delay, radar) for delay in (0, 2 * range_m / radar.wave_speed_m_s)),
-    )
+    delays, us = (0, 2 * range_m / radar.wave_speed_m_s), plot.array(1e6 * time_s)
+    # the triangle starts at time zero, and counts from the middle of its band
+    triangles = [0.5 - (2 * torch.remainder((time_s - delay) / radar.period_s, 1) - 1).abs() for delay in delays]
+    sent, echo = (1e-6 * (radar.bandwidth_hz * triangle) for triangle in triangles)
     swept = {"local oscillator": (us, plot.array(sent)), "echo of 150 m beyond the reference": (us, plot.array(echo))}
     beats: dict[str, list[float]] = {}
     parts: list[dict] = [
@@ -122,7 +127,7 @@ def _figure_2(draws: Draws, path: Path) -> list[Check]:
     ]
     for title, speed in (("dechirped, at rest", 0.0), ("dechirped, receding at 2 m/s", 2.0)):
         record, _ = simulate_ladar_record(
-            radar, LadarWorld(Points([0.0], [range_m]), [Polynomial((speed,))], snr_db=30.0), 3, draws
+            radar, LadarWorld(Points([0.0], [range_m]), [Polynomial((speed,))], snr_db=30.0), 3, Draws(1)
         )
         spectrum = plot.short_time_spectrum(record.signal.data.flatten(), radar.sample_rate_hz)
         theory = {"theory": (us, plot.array(sent - echo + 1e-6 * radar.doppler_hz(speed)))}
@@ -141,43 +146,6 @@ def _beat_mhz(spectrum: Signal, at_us: float) -> float:
     """Strongest frequency at a time."""
     column = spectrum.data[:, int(spectrum.axis("time").index_of(at_us).round())]
     return float(spectrum.axis("frequency").values()[int(column.argmax())])
-
-
-def _triangle_hz(time_s: Tensor, radar: TriangularLadar) -> Tensor:
-    """Frequency of the triangle that starts at time zero, from the middle of its band."""
-    return radar.bandwidth_hz * (0.5 - (2 * torch.remainder(time_s / radar.period_s, 1) - 1).abs())
-
-
-def _over_peak(signal: Signal) -> Signal:
-    return signal.with_data(signal.data / signal.data.abs().max())
-
-
-def _near(signal: Signal) -> Signal:
-    """The relative ranges of all points."""
-    return _within(signal, 0.7, 2.3)
-
-
-def _within(signal: Signal, low_m: float, high_m: float) -> Signal:
-    return signal.sel(range=slice(low_m, high_m))
-
-
-def _around(image: Signal, azimuth_m: float, range_m: float) -> Signal:
-    """Four cells to either side of a point."""
-    return image.sel(azimuth=slice(azimuth_m - 0.024, azimuth_m + 0.024), range=slice(range_m - 0.12, range_m + 0.12))
-
-
-def _draw_motion(courses: Mapping[str, Course], truth: Truth, path: Path) -> None:
-    """Figure 6: velocity and range error, true and estimated, and the error of the estimate."""
-    found, true = courses["segmented"], truth.values["range_error_up_m"] - truth.values["range_error_up_m"][0]
-    velocity = {"segmented": found.velocity_m_s, "true": truth.values["velocity_m_s"]}
-    motion = {"segmented": 1e3 * (true + found.error_m - found.error_m[0]), "true": 1e3 * true}
-    error = {name: 1e9 * (courses[name].error_m - courses[name].error_m[0]) for name in ("segmented", "recommended")}
-    drawn = {
-        "radial velocity": ("m/s", velocity),
-        "range error": ("mm", motion),
-        "estimated minus true range error": ("nm", error),
-    }
-    draw_over_time(found.pulse, drawn, path)
 
 
 def draw_over_time(pulse: Axis, drawn: Mapping[str, tuple[str, Mapping[str, Tensor]]], path: Path) -> None:
@@ -201,21 +169,6 @@ def draw_over_time(pulse: Axis, drawn: Mapping[str, tuple[str, Mapping[str, Tens
     plot.save(plot.panels(parts), path, columns=3)
 
 
-def _draw_slices(image: Signal, ideal: Signal, path: Path) -> None:
-    """Figure 9: the response of the middle point, and that without motion."""
-    cuts = {
-        name: impulse_cuts(finer_in_range(one), (0.0, 1.5))
-        for name, one in (("without motion", ideal), ("segmented", image))
-    }
-    parts = []
-    for axis in ("range", "azimuth"):
-        series = {name: (plot.array(cut[axis][0]), plot.decibel(cut[axis][1])) for name, cut in cuts.items()}
-        parts.append(
-            {"series": series, "xlabel": f"{axis} from the peak (m)", "ylabel": "amplitude (dB)", "ylim": (-40.0, 1.0)}
-        )
-    plot.save(plot.panels(parts), path)
-
-
 def _response(image: Signal, azimuth_m: float = 0.0, range_m: float = 1.5) -> dict[str, float]:
     """Impulse response of a point, with widths in range as cells."""
     found = impulse_response(image, (azimuth_m, range_m), sidelobe_nulls=NULLS, search_m=0.2, centre_turns=(None, 0.0))
@@ -223,79 +176,97 @@ def _response(image: Signal, azimuth_m: float = 0.0, range_m: float = 1.5) -> di
     return {**values, "irw_range_m": values["irw_range_m"] / 0.886}
 
 
-def _migration_cells(trace: Trace) -> float:
-    """Range cells over which the middle point moves in the range profiles."""
-    profiles = _within(trace.outputs["compress"], 1.2, 1.8)
-    peak = profiles.data.abs().argmax(-1)
-    return float(peak.max() - peak.min()) * profiles.axis("range").step / RADAR.range_step_m
-
-
-def _focus(seen: _Seen, method: str, path: Path) -> tuple[float, float]:
+def _focus(seen: Seen, method: str, path: Path) -> tuple[float, float]:
     """Draw range profiles and image; return the migration (cells) and the PSLR in azimuth (dB)."""
     trace = seen.traces[method]
-    shown = {
-        f"range profiles, {method}": _over_peak(_near(trace.outputs["compress"])),
-        f"image, {method}": _over_peak(_near(trace.signal)),
-    }
+    profiles, image = (signal.sel(range=ALL_M) for signal in (trace.outputs["compress"], trace.signal))
+    named = {f"range profiles, {method}": profiles, f"image, {method}": image}
+    shown = {name: one.with_data(one.data / one.data.abs().max()) for name, one in named.items()}
     plot.save(plot.images(shown, dynamic_range_db=40, percentile=100), path)
-    return _migration_cells(trace), _response(trace.signal)["pslr_azimuth_db"]
+    middle = trace.outputs["compress"].sel(range=slice(1.2, 1.8))
+    peak = middle.data.abs().argmax(-1)
+    cells = float(peak.max() - peak.min()) * middle.axis("range").step / RADAR.range_step_m
+    return cells, _response(trace.signal)["pslr_azimuth_db"]
 
 
-def _frequencies(small: bool) -> Draws:
-    """The reduced form is the full one."""
-    return Draws(1)
+def _table_1(seen: Seen, path: Path) -> list[Check]:
+    return parameters(
+        {
+            "wavelength (um)": (1.55, 1e6 * RADAR.wave_speed_m_s / RADAR.carrier_hz),
+            "bandwidth (GHz)": (5.0, 1e-9 * RADAR.bandwidth_hz),
+            "period of the triangle (us)": (16.0, 1e6 * RADAR.period_s),
+            "speed (m/s)": (60.0, RADAR.speed_m_s),
+            "height (m), our reference range": (3000.0, RADAR.reference_range_m),
+        },
+        1e-3,
+    )
 
 
-def _table_1(seen: _Seen, path: Path) -> list[Check]:
-    rows = {
-        "wavelength (um)": (1.55, 1e6 * RADAR.wave_speed_m_s / RADAR.carrier_hz),
-        "bandwidth (GHz)": (5.0, 1e-9 * RADAR.bandwidth_hz),
-        "period of the triangle (us)": (16.0, 1e6 * RADAR.period_s),
-        "speed (m/s)": (60.0, RADAR.speed_m_s),
-        "height (m), our reference range": (3000.0, RADAR.reference_range_m),
-    }
-    return parameters(rows, 1e-3)
-
-
-def _figure_4(seen: _Seen, path: Path) -> list[Check]:
+def _figure_4(seen: Seen, path: Path) -> list[Check]:
     x, y, level = (plot.array(torch.as_tensor(v)) for v in (SCENE.azimuth_m, SCENE.range_m, SCENE.amplitude))
     plot.save(plot.scatterers(y, x, level, "relative range (m)", "azimuth (m)", "three points", "auto"), path)
     return [number("points", 3, len(x), 0)]
 
 
-def _figure_5(seen: _Seen, path: Path) -> list[Check]:
+def _figure_5(seen: Seen, path: Path) -> list[Check]:
     cells, level = _focus(seen, "uncompensated", path)
     ours = f"{cells:.1f} range cells; PSLR in azimuth {level:.1f} dB"
     return [statement("no compensation", "bent range profiles, defocused points", cells > 2 and level > -6, ours)]
 
 
-def _figure_6(seen: _Seen, path: Path) -> list[Check]:
-    _draw_motion(seen.courses, seen.truth, path)
+def _figure_6(seen: Seen, path: Path) -> list[Check]:
+    found, true = seen.courses["segmented"], seen.truth.values["range_error_up_m"]
+    true = true - true[0]
+    drawn = {
+        "radial velocity": ("m/s", {"segmented": found.velocity_m_s, "true": seen.truth.values["velocity_m_s"]}),
+        "range error": ("mm", {"segmented": 1e3 * (true + found.error_m - found.error_m[0]), "true": 1e3 * true}),
+        "estimated minus true range error": (
+            "nm",
+            {name: 1e9 * (one.error_m - one.error_m[0]) for name, one in seen.courses.items() if name in COMPENSATED},
+        ),
+    }
+    draw_over_time(found.pulse, drawn, path)
     worst = float(seen.courses["segmented"].metrics(RADAR)["range_error_max_m"])
     return [number("largest error of the range (m)", 2e-7, worst, 0.5e-7, "lower")]
 
 
-def _figure_7(seen: _Seen, path: Path) -> list[Check]:
+def _figure_7(seen: Seen, path: Path) -> list[Check]:
     cells, level = _focus(seen, "segmented", path)
     ours = f"{cells:.2f} range cells; PSLR in azimuth {level:.1f} dB"
     return [statement("compensation", "profiles within a range cell, focused points", cells < 1 and level < -12, ours)]
 
 
-def _figure_8(seen: _Seen, path: Path) -> list[Check]:
+def _figure_8(seen: Seen, path: Path) -> list[Check]:
     image = seen.traces["segmented"].signal
     before, after = (
-        _near(finer_in_range(finer_in_range(seen.traces[name].signal))) for name in ("uncompensated", "segmented")
+        finer_in_range(finer_in_range(seen.traces[name].signal)).sel(range=ALL_M)
+        for name in ("uncompensated", "segmented")
     )
-    points = {f"point at {r:g} m": _around(after, x, r) for x, r in PLACES_M}
+    # four cells to either side of a point
+    points = {
+        f"point at {r:g} m": after.sel(azimuth=slice(x - 0.024, x + 0.024), range=slice(r - 0.12, r + 0.12))
+        for x, r in PLACES_M
+    }
     plot.save(plot.contours({"no compensation": before, "segmented interference": after, **points}), path, columns=3)
     levels = [_response(image, x, r)["pslr_azimuth_db"] for x, r in PLACES_M]
     ours = "PSLR in azimuth " + ", ".join(f"{level:.2f}" for level in levels) + " dB"
     return [statement("contours", "all three points are focused", max(levels) < -12, ours)]
 
 
-def _figure_9(seen: _Seen, path: Path) -> list[Check]:
+def _figure_9(seen: Seen, path: Path) -> list[Check]:
     image = seen.traces["segmented"].signal
-    _draw_slices(image, seen.ideal, path)
+    images = {"without motion": seen.ideal, "segmented": image}
+    cuts = {name: impulse_cuts(finer_in_range(one), (0.0, 1.5)) for name, one in images.items()}
+    parts = [
+        {
+            "series": {name: (plot.array(cut[axis][0]), plot.decibel(cut[axis][1])) for name, cut in cuts.items()},
+            "xlabel": f"{axis} from the peak (m)",
+            "ylabel": "amplitude (dB)",
+            "ylim": (-40.0, 1.0),
+        }
+        for axis in ("range", "azimuth")
+    ]
+    plot.save(plot.panels(parts), path)
     ours, ideal = _response(image), _response(seen.ideal)
     return [
         number(f"{axis}: PSLR beyond that without motion (dB)", 0.0, ours[name] - ideal[name], 0.15)
@@ -303,14 +274,14 @@ def _figure_9(seen: _Seen, path: Path) -> list[Check]:
     ]
 
 
-def _table_2(seen: _Seen, path: Path) -> list[Check]:
+def _table_2(seen: Seen, path: Path) -> list[Check]:
     ours = _response(seen.traces["segmented"].signal)
     rows = zip(NAMES.items(), TABLE_2, WITHIN, strict=True)
     return [number(words, published, ours[name], within, "lower") for (name, words), published, within in rows]
 
 
 ITEMS = (
-    Item("Figure 2", "frequencies of the sweeps and of the dechirped echo", of=_frequencies, make=_figure_2),
+    Item("Figure 2", "frequencies of the sweeps and of the dechirped echo", of=bool, make=_figure_2),
     Item("Figure 4", "scene of three points, at places of our own", of=_three_points, make=_figure_4),
     Item("Figure 5", "range profiles and image without compensation", of=_three_points, make=_figure_5),
     Item("Figure 6", "velocity and range error, true and estimated", of=_three_points, make=_figure_6),

@@ -1,0 +1,49 @@
+"""What the figures of several targets with non-uniform rotation share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+
+from torchsar.compensate import EntropyObjective, ImageEntropy, coarse_rotation, descend_rotation
+from torchsar.core import Axis, Estimate, Signal
+from torchsar.focus import MatchedFourier, RangePhase
+from torchsar.radar import LIGHT_M_S, InverseRadar
+
+
+def ladar(cell_m: float, prf_hz: float) -> InverseRadar:
+    """Return a ladar at 1.55 um with range cells of this size and this pulse rate."""
+    return InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * cell_m), prf_hz)
+
+
+def known_of(signal: Signal, radar: InverseRadar) -> dict[str, Any]:
+    """Return what estimators of the rotation take besides the data."""
+    return {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
+
+
+def focused(signal: Signal, radar: InverseRadar, rotation: Mapping[str, Tensor]) -> Signal:
+    """Return the image on a Doppler axis, with what is known of the rotation taken out: all of it,
+    its warp alone, or nothing.
+    """
+    if "omega_rad_s" in rotation:
+        signal = RangePhase(radar)(signal, **{name: rotation[name] for name in ("omega_rad_s", "warp_k", "yc_m")})
+    return MatchedFourier(radar)(signal, rotation.get("warp_k"))
+
+
+def in_metres(image: Signal, radar: InverseRadar, rate_rad_s: Tensor) -> Signal:
+    """Return an image whose Doppler is cross range (m) at a mean rate."""
+    doppler, range_ = image.axes
+    scale = radar.wavelength_m / (2 * float(rate_rad_s))
+    return Signal(image.data, (Axis("azimuth", doppler.n, doppler.start * scale, doppler.step * scale, "m"), range_))
+
+
+def second_order(signal: Signal, radar: InverseRadar) -> Estimate:
+    """Estimate by the second-order method (SM), azimuth only: its one number from short sections,
+    then by least entropy. It is not k1 of the target but about k1 + k2 T / 2.
+    """
+    figure = ImageEntropy.of(signal, radar, EntropyObjective(order=2, range_term=False))
+    return descend_rotation(
+        figure, figure.start(0.0, coarse_rotation(signal.data, order=2, **known_of(signal, radar))["warp_k"])
+    )
