@@ -1,0 +1,55 @@
+"""Figures of images, curves and parameter sweeps; the only package that imports matplotlib.
+
+Each function that draws takes signals or arrays and returns a matplotlib Figure, or a list of
+Figures, one for each panel, so that a page can set the panels side by side or below each other.
+`save` writes a Figure or such a list into one file, and notebooks show both as pictures.
+"""
+
+try:
+    import matplotlib as matplotlib
+except ImportError as error:
+    raise ImportError("torchsar.plot needs matplotlib: pip install 'torchsar-lab[study]'") from error
+
+from torchsar.plot.curves import alike, curves, panels, scatterers, trade
+from torchsar.plot.images import (
+    boxes,
+    contours,
+    decibel,
+    image,
+    images,
+    level,
+    overlays,
+    quicklook,
+    short_time_spectrum,
+    span,
+    within,
+)
+from torchsar.plot.labels import axis_label, name_and_unit
+from torchsar.plot.style import array, save
+from torchsar.plot.sweeps import error_curves, heat_map
+
+__all__ = [
+    "alike",
+    "array",
+    "axis_label",
+    "boxes",
+    "contours",
+    "curves",
+    "decibel",
+    "error_curves",
+    "heat_map",
+    "image",
+    "images",
+    "level",
+    "name_and_unit",
+    "overlays",
+    "panels",
+    "quicklook",
+    "save",
+    "scatterers",
+    "short_time_spectrum",
+    "span",
+    "trade",
+    "within",
+]
+__dir__ = __all__.copy

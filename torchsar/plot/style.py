@@ -1,0 +1,166 @@
+"""The style of all figures, their panels and legends, and how they are saved."""
+
+from __future__ import annotations
+
+import functools
+import io
+import math
+import textwrap
+from collections.abc import Callable, Sequence
+from os import PathLike
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from cycler import cycler
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imsave
+from torch import Tensor
+
+# palette by choice: text and frames, then colours of curves in their order
+INK, ACCENT, SECOND, THIRD, FAINT = "#1f2933", "#0b6e99", "#d1495b", "#e09f3e", "#9aa5b1"
+COLOURS = (ACCENT, SECOND, THIRD, "#4f7942", "#6a4c93", FAINT, "#8d5524", "#1aa6a6")
+# seven markers beside eight colours: more than eight curves still differ
+MARKERS, DASHES = "osD^vPX", ("--", ":", "-.")
+# widths in inches of a figure alone and of one panel among several: text of 9 points has at least 9
+# pixels where a page of 420 pixels leaves 386 of them
+ALONE, PANEL = 5.2, 3.9
+# pictures to scale become illegible when they are more elongated than this
+ELONGATED = 4.0
+# inches below images for labels, and the largest height of an image
+BELOW, HIGHEST = 0.85, 4.6
+# letters of titles and legends that fit in an inch
+_LETTERS = 11.0
+# appearance by choice
+_STYLE: Any = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e7eb",
+    "grid.linewidth": 0.6,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "lines.linewidth": 1.2,
+    "figure.facecolor": "white",
+    "axes.prop_cycle": cycler(color=COLOURS),
+}
+
+
+class _NotebookFigure(Figure):
+    """Figure that a notebook shows by itself, without pyplot and its settings."""
+
+    def _repr_png_(self) -> bytes:
+        return _png(self)
+
+
+class Panels(list[Figure]):
+    """Figures that a notebook shows side by side, row by row."""
+
+    def _repr_png_(self) -> bytes:
+        return _png(self)
+
+
+def _png(figure: Figure | Sequence[Figure]) -> bytes:
+    file = io.BytesIO()
+    save(figure, file)
+    return file.getvalue()
+
+
+Drawn = TypeVar("Drawn", Figure, list[Figure])
+
+
+def styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
+    """Run a drawing function in the style of this module, without a change of global settings."""
+
+    @functools.wraps(draw)
+    def styled(*args: Any, **options: Any) -> Any:
+        with rc_context(_STYLE):
+            drawn = draw(*args, **options)
+        return Panels(drawn) if isinstance(drawn, list) else drawn
+
+    return styled
+
+
+def new_figure(width: float, height: float, to_scale: bool = False) -> tuple[Figure, Axes]:
+    """Figure of one panel, with its axes."""
+    figure = _NotebookFigure(figsize=(width, height), layout="compressed" if to_scale else "constrained")
+    return figure, figure.subplots()
+
+
+def panel_width(count: int) -> float:
+    """Width in inches of each of several panels."""
+    return ALONE if count == 1 else PANEL
+
+
+def wrapped_title(title: str, width: float) -> str:
+    return textwrap.fill(title, round(_LETTERS * (width - 0.5)))
+
+
+def legend_below(figure: Figure, axes: Axes, least: int = 2) -> None:
+    """Legend below the axes, for which the figure grows, if there are enough entries."""
+    handles, names = axes.get_legend_handles_labels()
+    if len(names) < least:
+        return
+    fitting = int(_LETTERS * figure.get_figwidth() / (5 + max(map(len, names))))
+    columns = max(1, min(fitting, len(names)))
+    figure.set_figheight(figure.get_figheight() + 0.19 * math.ceil(len(names) / columns))
+    figure.legend(handles, names, loc="outside lower center", ncols=columns)
+
+
+def save(figure: Figure | Sequence[Figure], path: Any, dpi: int = 120, columns: int = 2) -> None:
+    """Write one figure, or several figures as one picture, to a file.
+
+    Args:
+        figure: Figure to write, or several, which are set side by side, row by row.
+        path: Path of the file, whose suffix gives the format, or a binary file for PNG.
+        dpi: Resolution in dots per inch.
+        columns: Number of panels in a row.
+    """
+    kind = "png" if not isinstance(path, str | PathLike) or str(path).endswith(".png") else None
+    figures = [figure] if isinstance(figure, Figure) else figure
+    if len(figures) == 1 and kind is None:
+        figures[0].savefig(path, dpi=dpi)  # with its vectors, where the format has them
+        return
+    # savefig draws a figure with a layout twice
+    drawn = [_pixels(one, dpi) for one in figures]
+    rows = [drawn[first : first + columns] for first in range(0, len(drawn), columns)]
+    wide = [max(row[i].shape[1] for row in rows if i < len(row)) for i in range(len(rows[0]))]
+    sheet = np.full((sum(max(len(one) for one in row) for row in rows), sum(wide), 4), 255, np.uint8)
+    above = 0
+    for row in rows:
+        for i, one in enumerate(row):
+            left = sum(wide[:i])
+            sheet[above : above + len(one), left : left + one.shape[1]] = one
+        above += max(len(one) for one in row)
+    imsave(path, sheet, dpi=dpi, format=kind)
+
+
+def _pixels(figure: Figure, dpi: int) -> np.ndarray:
+    """A figure as colours, shape (height, width, 4)."""
+    figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
+
+
+def array(x: Tensor) -> np.ndarray:
+    """Convert a tensor to a numpy array on the CPU, without gradient.
+
+    Args:
+        x: Tensor, any shape.
+
+    Returns:
+        Array of the same shape and type.
+    """
+    return torch.as_tensor(x).detach().cpu().resolve_conj().numpy()
