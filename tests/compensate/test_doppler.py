@@ -15,12 +15,12 @@ from torchsar.compensate import (
     PhaseIncrement,
     doppler_assess,
     energy_centre,
-    lag_products,
     phase_increment,
     point_doppler,
     velocity_assess,
 )
 from torchsar.compensate.aperture import _noise_variance
+from torchsar.compensate.doppler import lag_products
 from torchsar.compensate.group import BeamSpectrum
 from torchsar.compensate.velocity import velocity_objective
 from torchsar.core import Chain, Draws, Outcome, Recording, Signal, use
@@ -180,7 +180,7 @@ def test_velocity_within_a_third_of_a_metre_per_second(off: float) -> None:
     recording, _ = strip(radar, 4096, 900, trials=1, velocity=7000 + off)
     chain = Chain(
         doppler=DopplerCentroid(radar),
-        velocity=use(EffectiveVelocity(OmegaK(radar), refine=parabola_minimum, lines=256), doppler_hz="doppler"),
+        velocity=use(EffectiveVelocity(OmegaK(radar), lines=256), doppler_hz="doppler"),
     )
     estimate = chain.trace(recording).estimates["velocity"]
     assert abs(float(estimate["velocity_m_s"]) - 7000 - off) < 0.3
@@ -201,7 +201,7 @@ def test_gradient_of_the_objective_is_the_slope_and_both_refinements_agree() -> 
     torch.testing.assert_close(slope, numeric, rtol=1e-4, atol=1e-9)
     signal = recording.signal.with_data(raw)
     by_gradient = stage(signal, doppler_hz=truth)["velocity_m_s"]
-    by_parabola = EffectiveVelocity(OmegaK(radar), lines=128, refine=parabola_minimum)(signal, doppler_hz=truth)[
+    by_parabola = EffectiveVelocity(OmegaK(radar), lines=128)(signal, doppler_hz=truth)[
         "velocity_m_s"
     ]
     torch.testing.assert_close(by_gradient, by_parabola, atol=0.05, rtol=0)

@@ -7,7 +7,8 @@ import math
 import pytest
 import torch
 
-from torchsar.compensate import PointDoppler, doppler_assess, doppler_at, peak_time_s
+from torchsar.compensate import PointDoppler, doppler_assess, doppler_at
+from torchsar.compensate.point import peak_time_s
 from torchsar.core import Draws, Outcome, Signal
 from torchsar.echo import simulate, target_energy
 from torchsar.focus import OmegaK

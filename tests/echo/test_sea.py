@@ -13,7 +13,8 @@ from torch import Tensor
 from torchsar.core import Draws
 from torchsar.echo import sea_echo, simulate_bistatic
 from torchsar.echo.sea import _Light, _Lines
-from torchsar.radar import LIGHT_M_S, BistaticRadar, LinearFM, receive_range
+from torchsar.radar import LIGHT_M_S, BistaticRadar, LinearFM
+from torchsar.radar.bistatic import receive_range
 from torchsar.scene import BandLimited, BistaticWorld, ImageReflectivity, KSea, Pattern, Sea
 
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from torchsar.core import Draws
-from torchsar.radar import BistaticRadar, LinearFM, receive_range
+from torchsar.radar import BistaticRadar, LinearFM
+from torchsar.radar.bistatic import receive_range
 from torchsar.scene import (
     BandLimited,
     BistaticWorld,

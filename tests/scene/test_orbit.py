@@ -7,11 +7,12 @@ import math
 import pytest
 import torch
 
-from torchsar.radar import Orbit, orbit_range, range_coefficients, seen_point, timing_diagram
+from torchsar.radar import Orbit, range_coefficients, seen_point, timing_diagram
 from torchsar.radar.orbit import (
     EARTH_GRAVITY_M3_S2,
     EARTH_RADIUS_M,
     earth_velocity_m_s,
+    orbit_range,
     turned_with_earth,
 )
 from torchsar.radar.timing import ground_slant_m, off_nadir_ground_m

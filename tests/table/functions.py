@@ -31,7 +31,9 @@ from tests.table.stages import (
     Laws,
 )
 from torchsar import compensate, core, focus, metrics, multichannel, radar, repair
+from torchsar.compensate.doppler import lag_products
 from torchsar.compensate.group import RangeGroup
+from torchsar.compensate.point import peak_time_s
 from torchsar.core import Draws, Estimate, Signal, Stage
 from torchsar.echo.turntable import fast_time_axis
 from torchsar.multichannel.body import find_body
@@ -463,7 +465,7 @@ FUNCTIONS = [
     _entry("compensate.radial_motion", "sweeps", sweeps(compensate.radial_motion)),
     _entry("compensate.phase_increment", "raw", lambda x: compensate.phase_increment(x, 400.0, (2, 2))),
     _entry("compensate.energy_centre", "raw", lambda x: compensate.energy_centre(x, 400.0, (2, 2))),
-    _entry("compensate.lag_products", "raw", lambda x: compensate.lag_products(x, (2, 2)), 0),
+    _entry("compensate.doppler.lag_products", "raw", lambda x: lag_products(x, (2, 2)), 0),
     _entry("compensate.point_doppler", "row", lambda x: compensate.point_doppler(x, 400.0, 20.0), 0),
     _entry(
         "compensate.minimum_entropy_velocity",
@@ -478,9 +480,9 @@ FUNCTIONS = [
         ),
     ),
     _entry(
-        "compensate.peak_time_s",
+        "compensate.point.peak_time_s",
         "image",
-        lambda x: compensate.peak_time_s(
+        lambda x: peak_time_s(
             x,
             400.0,
             torch.full(x.shape[:-2], 30.0, dtype=F64),

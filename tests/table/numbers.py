@@ -19,6 +19,7 @@ from torchsar import compensate, core, echo, focus, metrics, multichannel, radar
 from torchsar.core import Draws, Stage
 from torchsar.multichannel.azimuth import azimuth_filter
 from torchsar.multichannel.reconstruct import band_matrix
+from torchsar.radar.bistatic import polynomial_range, receive_range
 
 REASONS: dict[str, str] = {
     "core.Stage": "the base class of all stages",
@@ -64,7 +65,6 @@ REASONS: dict[str, str] = {
     "focus.write_strip": "writes a file; tests/focus/test_strip.py",
     "focus.plan_strip": "counts lines and bytes; tests/focus/test_strip.py",
     "focus.recommended_form": "takes requirements only",
-    "radar.orbit_range": "works on an Orbit, whose class checks it; tests/scene/test_orbit.py",
     "radar.range_coefficients": "works on an Orbit, whose class checks it; tests/scene/test_orbit.py",
     "radar.seen_point": "works on a satellite's position; tests/scene/test_orbit.py",
     "radar.sweep_middles": "reads an axis that the radar has made",
@@ -209,9 +209,9 @@ NUMBERS: dict[str, tuple[Callable, dict[str, Any]]] = {
         lambda **given: radar.resample_path(torch.arange(9, dtype=F64), pulse_time_s=0.5 + ramp(4, 2.0), **given),
         {"position_m": torch.ones(9, 3, dtype=F64), "longest_gap_s": 2.0, "jump_m": 1.0},
     ),
-    "radar.polynomial_range": (radar.polynomial_range, {"coefficients": (1.0, 2.0), "time_s": ONES}),
+    "radar.polynomial_range": (polynomial_range, {"coefficients": (1.0, 2.0), "time_s": ONES}),
     "radar.receive_range": (
-        radar.receive_range,
+        receive_range,
         {"time_s": ONES, **MOTION, "speed_m_s": 300.0, "channel_m": 1.0},
     ),
     "scene.gamma_from_normal": (scene.gamma_from_normal, {"x": 0.3 * ONES, "shape": 1.5}),

@@ -5,7 +5,6 @@ from torchsar.compensate.doppler import (
     EnergyCentre,
     PhaseIncrement,
     energy_centre,
-    lag_products,
     phase_increment,
     point_doppler,
 )
@@ -24,7 +23,7 @@ from torchsar.compensate.path import (
     path_phase,
     strip_autofocus,
 )
-from torchsar.compensate.point import PointDoppler, doppler_at, peak_time_s
+from torchsar.compensate.point import PointDoppler, doppler_at
 from torchsar.compensate.pulse_phase import (
     Autofocus,
     CorrectPulsePhase,
@@ -149,7 +148,6 @@ __all__ = [
     "equalise_pulses",
     "evolve_rotation",
     "genetic_rotation",
-    "lag_products",
     "link_phases",
     "minimum_entropy_velocity",
     "mirror_product",
@@ -157,7 +155,6 @@ __all__ = [
     "newton_rotation",
     "path_autofocus",
     "path_phase",
-    "peak_time_s",
     "pga",
     "pga_sca",
     "phase_fit_rotation",

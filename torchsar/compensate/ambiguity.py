@@ -53,11 +53,6 @@ from torchsar.core import (
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
-# Probability above which the most probable ambiguity is taken, by choice. Otherwise it is that of
-# the nominal pointing.
-SURE = 0.9
-_BLOCKS = 8  # independent parts of the data; more give more degrees of freedom, each of less contrast
-
 
 def _evidence(scores: Tensor, weight: Tensor | None = None) -> Tensor:
     """Log-likelihood of each candidate (..., candidate) from the scores of blocks.
@@ -73,8 +68,8 @@ def _evidence(scores: Tensor, weight: Tensor | None = None) -> Tensor:
     deficit = take(scores, best[..., None].expand(scores.shape[:-1]))[..., None] - scores
     mean = (deficit * weight[..., None]).sum(-2)
     blocks = 1 / weight.square().sum(-1, keepdim=True)
-    gain = blocks / (blocks - 1).clamp_min(0.5)
-    variance = gain * (weight[..., None] * (deficit - mean[..., None, :])).square().sum(-2) + 0.01 * mean.square()
+    scatter = (weight[..., None] * (deficit - mean[..., None, :]).square()).sum(-2)
+    variance = blocks / (blocks - 1).clamp_min(0.5) * scatter + 0.01 * mean.square()
     tiny = 1e-24 * scores.square().amax((-2, -1))[..., None] + 1e-300
     return student_log_likelihood(mean / torch.sqrt(variance + tiny), (blocks - 1).clamp_min(0.5))
 
@@ -116,7 +111,7 @@ def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turn
     score = torch.zeros((), dtype=torch.float64, device=rows.device)
     for distance in (1, 2, 3):
         cross = (spectra[..., :-distance, :, :].conj() * spectra[..., distance:, :, :]).sum(-3)
-        blocks = torch.stack([part.sum(-2) for part in cross.tensor_split(_BLOCKS, -2)], -2).to(torch.complex128)
+        blocks = torch.stack([part.sum(-2) for part in cross.tensor_split(8, -2)], -2).to(torch.complex128)
         phase = 2 * math.pi * distance * (cells[..., None, None] * turns[:, None] * frequency)
         score = score + (blocks @ torch.polar(torch.ones_like(phase), phase).mT).real
     return score / n
@@ -152,12 +147,12 @@ def line_doppler(lines: Tensor, radar: StripmapRadar) -> tuple[Tensor, Tensor]:
 
     spectra = torch.fft.fft(limited)
     products = band(spectra[..., :-1, :].conj() * spectra[..., 1:, :])
-    blocks = torch.stack([part.sum(-2) for part in products.tensor_split(_BLOCKS, -2)], -2).to(torch.complex128)
+    blocks = torch.stack([part.sum(-2) for part in products.tensor_split(8, -2)], -2).to(torch.complex128)
     total = blocks.sum(-2, keepdim=True)
     scale = radar.prf_hz * radar.carrier_hz / (2 * math.pi)
     frequency = band(radar.range_frequency_hz(n, lines.device))
     value, left_out = scale * _phase_slope(total, frequency)[..., 0], scale * _phase_slope(total - blocks, frequency)
-    jackknife = left_out.std(-1, correction=0) * math.sqrt(_BLOCKS - 1)
+    jackknife = left_out.std(-1, correction=0) * math.sqrt(7)
     return settle(value, 0.0)[0], settle(jackknife, 1e9)[0]
 
 
@@ -169,32 +164,6 @@ def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
     centre = (weight * frequency_hz).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True)
     offset = frequency_hz - centre
     return (offset * turned.imag).sum(-1) / (offset.square() * weight).sum(-1)
-
-
-def entropy_scores(
-    group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, dwell_s: float
-) -> tuple[Tensor, Tensor]:
-    """Compute the negative image entropies of a group of range cells for each candidate ambiguity.
-
-    The group is focused once with each candidate for the absolute Doppler centroid.
-
-    Args:
-        group: Group of range cells.
-        doppler_hz: Baseband centroid in Hz, shape (...,), positive when closing.
-        velocity_m_s: Velocity of the platform in m/s.
-        turns: Candidates for the ambiguity in PRFs, shape (candidate,).
-        dwell_s: Time that a target stays in the beam, in seconds.
-
-    Returns:
-        The negative entropies in nats, shape (..., block, candidate), and the weights of the
-        blocks, shape (..., block), with sum 1. A block consists of about 32 neighbouring range
-        cells.
-    """
-    spectrum, scores = beam_spectrum(group, doppler_hz), []
-    for shift in turns * group.radar.prf_hz:
-        at = BeamSpectrum(group, spectrum.data, spectrum.doppler_hz + shift)
-        scores.append(-block_entropy(at.image(doppler_hz + shift, velocity_m_s)))
-    return torch.stack(scores, -1), block_weights(group.data, group.radar, doppler_hz, dwell_s)
 
 
 def ambiguity_evidence(
@@ -221,15 +190,18 @@ def ambiguity_evidence(
         shape (..., candidate), each up to a constant. "line_doppler_hz" and "line_doppler_std_hz",
         shape (...,), hold the two results of `line_doppler`.
     """
-    lines, dwell = aperture_lines(raw, radar, reference)
+    (lines, dwell), base = aperture_lines(raw, radar, reference), doppler_baseband_hz
     wide, narrow = pick_group(lines, radar, 4096), pick_group(lines, radar, 512)
     value, std = line_doppler(lines, radar)
-    base = doppler_baseband_hz
     miss = (base[..., None] + turns * radar.prf_hz - value[..., None]) / std.clamp_min(1e-3 * radar.prf_hz)[..., None]
+    spectrum, entropies = beam_spectrum(narrow, base), []
+    for shift in turns * radar.prf_hz:
+        at = BeamSpectrum(narrow, spectrum.data, spectrum.doppler_hz + shift)
+        entropies.append(block_entropy(at.image(base + shift, radar.velocity_m_s)))
     return {
         "looks": _evidence(look_scores(wide, base, radar.velocity_m_s, turns)),
-        "lines": student_log_likelihood(miss, _BLOCKS - 1),
-        "entropy": _evidence(*entropy_scores(narrow, base, radar.velocity_m_s, turns, dwell)),
+        "lines": student_log_likelihood(miss, 7),
+        "entropy": _evidence(-torch.stack(entropies, -1), block_weights(narrow.data, radar, base, dwell)),
         "line_doppler_hz": value,
         "line_doppler_std_hz": std,
     }
@@ -323,7 +295,7 @@ class DopplerCentroid(Stage):
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
         best, nominal = turns[joint.argmax(-1)], radar.pointing_doppler_hz
         if nominal is not None:
-            sure = torch.softmax(joint, -1).amax(-1) > SURE
+            sure = torch.softmax(joint, -1).amax(-1) > 0.9  # by choice, also in the assessment
             best = torch.where(sure, best, torch.round((nominal - base) / prf))
         first = base + prf * best
         refined, std = complete_aperture_centroid(raw, radar, first, self.reference)
@@ -331,7 +303,7 @@ class DopplerCentroid(Stage):
         if not self.assess:
             return found
         lines = doppler_assess.Increments.of(raw, products, power, prf, *swept_band(radar, n))
-        return doppler_assess.absolute(found, lines, base, std, joint, SURE)
+        return doppler_assess.absolute(found, lines, base, std, joint)
 
     def _values(self, doppler_hz: Tensor) -> dict[str, Tensor]:
         """All values that an absolute Doppler centroid in Hz determines."""

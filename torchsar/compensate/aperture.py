@@ -23,13 +23,9 @@ from torchsar.core import cis, settle, unit_level, wrapped
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
-# size of a tile, found by trial: larger tiles measure their coherence better, smaller ones resolve
-# the end of the complete lines
-_TILE_LINES, _TILE_COLUMNS = 16, 32
-# Share of the energy of targets that are left out that leaks into the chosen tiles. Its Doppler is
-# half way to the edge of the beam. Least share of the energy in lines whose targets have complete
-# apertures; what is less may be nothing but the sidelobes of other targets.
-_LEAK, _LEAST_SHARE = 0.005, 0.1
+# Lines and columns of a tile, found by trial: larger tiles measure their coherence better, smaller
+# ones resolve the end of the complete lines.
+_TILE = 16, 32
 
 
 def complete_aperture_centroid(
@@ -72,19 +68,27 @@ def complete_aperture_centroid(
 def _refined(
     raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell: int, reference: str | None
 ) -> tuple[Tensor, Tensor]:
-    """One round: form an image with centroid doppler_hz, then update lines and centroid in turn."""
-    parts = [_tiles(block, radar_part, doppler_hz, reference) for block, radar_part in _chunks(raw, radar, reference)]
-    products = torch.cat([p for p, _, _ in parts], -1)
+    """One round: form an image with centroid doppler_hz, then update lines and centroid in turn.
+
+    The image is formed in chunks of range that overlap by a pulse length, so that memory does not
+    grow with the swath.
+    """
+    extra = 0 if reference is None else raw.shape[-1] - full_columns(raw.shape[-1], radar.pulse_samples)
+    columns, scale = raw.shape[-1] - extra, radar.prf_hz / (2 * math.pi)
+    count = max(1, round(columns / 2048))
+    parts = []
+    for a, b in pairwise(round(i * columns / count) for i in range(count + 1)):
+        near = replace(radar, near_range_m=radar.near_range_m + a * radar.range_step_m)
+        parts.append(_tiles(raw[..., a : b + extra], near, doppler_hz, reference))
+    products, power = (torch.cat([part[k] for part in parts], -1) for k in (0, 1))
     rate = torch.cat([torch.full(p.shape[-1:], r, dtype=torch.float64, device=raw.device) for p, _, r in parts])
-    power = torch.cat([q for _, q, _ in parts], -1)
     # how far the coherence of a tile exceeds that of white noise, 0..1
     coherence = products.abs() / or_one(power)
-    weight = (1 - 6 / (_TILE_LINES * _TILE_COLUMNS * coherence.square()).clamp_min(1e-9)).clamp_min(0)
+    weight = (1 - 6 / (_TILE[0] * _TILE[1] * coherence.square()).clamp_min(1e-9)).clamp_min(0)
     products = products * weight
     tile = raw.shape[-2] / products.shape[-2]
     line = (torch.arange(products.shape[-2], dtype=torch.float64, device=raw.device) + 0.5) * tile
-    total, scale = doppler_hz, radar.prf_hz / (2 * math.pi)
-    whole, phase = torch.ones_like(power), torch.zeros_like(total)
+    total, whole, phase = doppler_hz, torch.ones_like(power), torch.zeros_like(doppler_hz)
     for _ in range(8):
         # in a frame with an error d, targets appear late by d / rate
         shift = (total - doppler_hz)[..., None, None] / rate * radar.prf_hz
@@ -95,8 +99,11 @@ def _refined(
     kept, energy = (products * whole).abs().sum((-2, -1)), products.abs().sum((-2, -1))
     half_way = math.pi / 2 * parts[0][2] * dwell / radar.prf_hz**2  # rad, between centre and edge of the beam
     noise = ((weight * whole).square() * _noise_variance(power, radar)).sum((-2, -1))
-    std = scale * _std_rad(products * whole, noise, phase, _LEAK * half_way * (energy - kept))
-    return total, torch.where(kept > _LEAST_SHARE * energy, std, math.inf)
+    # of the energy of targets that are left out, half a percent leaks into the chosen tiles, with a
+    # Doppler half way to the edge of the beam
+    std = scale * _std_rad(products * whole, noise, phase, 0.005 * half_way * (energy - kept))
+    # what is less than a tenth of the energy may be nothing but the sidelobes of other targets
+    return total, torch.where(kept > 0.1 * energy, std, math.inf)
 
 
 def _whole(crossing: Tensor, lines: int, dwell: int) -> Tensor:
@@ -110,18 +117,6 @@ def _whole(crossing: Tensor, lines: int, dwell: int) -> Tensor:
     return (margin / min(0.1 * dwell, (lines - dwell) / 4)).clamp(0, 1)
 
 
-def _chunks(raw: Tensor, radar: StripmapRadar, reference: str | None) -> list[tuple[Tensor, StripmapRadar]]:
-    """Range chunks that overlap by a pulse length, so that memory stays bounded on wide swaths."""
-    extra = 0 if reference is None else raw.shape[-1] - full_columns(raw.shape[-1], radar.pulse_samples)
-    columns = raw.shape[-1] - extra
-    count = max(1, round(columns / 2048))
-    edges = [round(i * columns / count) for i in range(count + 1)]
-    return [
-        (raw[..., a : b + extra], replace(radar, near_range_m=radar.near_range_m + a * radar.range_step_m))
-        for a, b in pairwise(edges)
-    ]
-
-
 def _tiles(
     raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, reference: str | None
 ) -> tuple[Tensor, Tensor, float]:
@@ -132,7 +127,7 @@ def _tiles(
     lines = compress(raw, radar, reference_spectrum(radar, reference, raw))
     group = RangeGroup(lines, torch.zeros(lines.shape[:-2], device=raw.device), radar)
     image = full_spectrum(group, doppler_hz).image(doppler_hz, radar.velocity_m_s)
-    tiles = (max(1, image.shape[-2] // _TILE_LINES), max(1, image.shape[-1] // _TILE_COLUMNS))
+    tiles = (max(1, image.shape[-2] // _TILE[0]), max(1, image.shape[-1] // _TILE[1]))
     inside = stays_inside(image.shape[-1], radar, doppler_hz, radar.integration_s or 0.0, always=False)
     image = image * inside[..., None, :].to(image.real.dtype)
     products, power = lag_products(image, tiles)
@@ -169,7 +164,7 @@ def _noise_variance(power: Tensor, radar: StripmapRadar) -> Tensor:
     floor = torch.where(flat > 0, flat, torch.inf).kthvalue(max(1, flat.shape[-1] // 10), dim=-1).values
     floor = settle(floor, 0.0)[0][..., None, None]
     alike = max(1.0, radar.sampling_hz / radar.pulse.bandwidth_hz)
-    return alike * floor * (power - 0.5 * floor).clamp_min(0) / (_TILE_LINES * _TILE_COLUMNS)
+    return alike * floor * (power - 0.5 * floor).clamp_min(0) / (_TILE[0] * _TILE[1])
 
 
 def _std_rad(products: Tensor, noise: Tensor, phase_rad: Tensor, leak: Tensor) -> Tensor:

@@ -21,19 +21,7 @@ from torchsar.metrics.bounds import tone_frequency_bound_hz
 
 # Largest standard deviation of an estimate that is ok, in PRF. Noise alone has a predicted standard
 # deviation about ten times as large, since the sum of its products is no larger than their scatter.
-# Standard deviation from which on the centroid of incoherent lines is that of noise, in PRF, by
-# choice: a third of that of random frequencies.
-MOST_STD, _NOISE_STD = 0.015, 0.1
-# Least extent of the energy along the record, as a share of its length: targets seen for less are
-# cut by the end of the record, or nearly as short as their own drift of Doppler.
-_LEAST_EXTENT = 0.3
-# Least power of a sum of products over the sum of their powers. It is exponentially distributed
-# with mean 1 in noise; more than 9 then occurs once in 8000 records.
-_LEAST_COHERENCE = 9.0
-# Power of the brightest point over that of any other, beyond the peaks of noise. Among equal points
-# or speckle nothing shows which point the beam centre crosses at the given time. Resolution cells
-# to each side of a point that belong to its response.
-_LEAST_LEAD, _POINT_CELLS = 4.0, 4
+MOST_STD = 0.015
 
 
 class Increments(NamedTuple):
@@ -104,8 +92,12 @@ class Increments(NamedTuple):
 
 
 def _adds_up(products: Tensor) -> Tensor:
-    """Whether products (..., n) add up to more than products of random phases."""
-    return products.sum(-1).abs().square() > _LEAST_COHERENCE * products.abs().square().sum(-1)
+    """Whether products (..., n) add up to more than products of random phases.
+
+    The power of their sum over the sum of their powers is exponentially distributed with mean 1 in
+    noise; more than 9 then occurs once in 8000 records.
+    """
+    return products.sum(-1).abs().square() > 9.0 * products.abs().square().sum(-1)
 
 
 def baseband(found: Estimate, lines: Increments) -> Estimate:
@@ -141,7 +133,9 @@ def baseband(found: Estimate, lines: Increments) -> Estimate:
     power = lines.power.sum((-2, -1))
     along = (lines.products.sum(-1) * cis(-phase)[..., None]).real.clamp_min(0)
     extent = along.sum(-1).square() / or_one(along.square().sum(-1)) / along.shape[-1]
-    short = (extent < _LEAST_EXTENT) & (along.shape[-1] >= 4)
+    # targets seen for less of the record are cut by its end, or nearly as short as their own drift
+    # of Doppler
+    short = (extent < 0.3) & (along.shape[-1] >= 4)
     return replace(
         found,
         std={"doppler_baseband_hz": lines.scale * torch.hypot(scatter, shift)},
@@ -157,7 +151,7 @@ def baseband(found: Estimate, lines: Increments) -> Estimate:
 
 
 def absolute(
-    found: Estimate, lines: Increments, base_hz: Tensor, refined_std_hz: Tensor, log_likelihood: Tensor, sure: float
+    found: Estimate, lines: Increments, base_hz: Tensor, refined_std_hz: Tensor, log_likelihood: Tensor
 ) -> Estimate:
     """Assess an absolute centroid; see `DopplerCentroid`.
 
@@ -168,24 +162,23 @@ def absolute(
         refined_std_hz: Standard deviation in Hz by the targets whose whole dwell lies in the
             record, shape (...,); infinite where there are none.
         log_likelihood: Of the candidates for the ambiguity, shape (..., candidate).
-        sure: Probability above which the ambiguity is known.
 
     Returns:
         The estimate with standard deviation, quality and outcome.
     """
-    plain = baseband(replace(found, value={"doppler_baseband_hz": base_hz}), lines)
-    turned = cis((found["doppler_hz"] - base_hz) / lines.scale)
+    plain, unit = baseband(replace(found, value={"doppler_baseband_hz": base_hz}), lines), 2 * math.pi * lines.scale
+    turned, shift = cis((found["doppler_hz"] - base_hz) / lines.scale), plain.info["cut_hz"].abs()
     moved = lines.scale * torch.atan2(turned.imag, turned.real)
     std = torch.minimum(refined_std_hz, torch.hypot(plain.std["doppler_baseband_hz"], moved))
     probability = torch.softmax(log_likelihood, -1).amax(-1)
-    shift = plain.info["cut_hz"].abs()
     scatter = (plain.std["doppler_baseband_hz"].square() - shift.square()).clamp_min(0).sqrt()
-    inexact = torch.minimum(refined_std_hz, scatter) >= 2 * math.pi * lines.scale * MOST_STD
+    inexact = torch.minimum(refined_std_hz, scatter) >= unit * MOST_STD
     outcome = worst(
         (Outcome.INEXACT, ~lines.coherent | inexact),
         (Outcome.MISFIT, shift >= lines.scale * lines.half_band_rad / 4),
-        (Outcome.AMBIGUOUS, probability <= sure),
-        (Outcome.NOISE, ~lines.coherent & (std >= 2 * math.pi * lines.scale * _NOISE_STD)),
+        (Outcome.AMBIGUOUS, probability <= 0.9),
+        # incoherent lines with a third of the deviation of random frequencies, by choice
+        (Outcome.NOISE, ~lines.coherent & (std >= 0.1 * unit)),
         (Outcome.EMPTY, plain.outcome == Outcome.EMPTY),
     )
     best = log_likelihood.topk(min(2, log_likelihood.shape[-1])).values
@@ -221,30 +214,29 @@ def of_point(
     Returns:
         The estimate with standard deviation, quality and outcome.
     """
-    power = power_of(image)
-    ordered = power.flatten(-2)
+    power, (tone, phasor), (line, sample) = power_of(image), history, at
+    ordered, n = power.flatten(-2), power.shape[-2]
     # The power of noise has an exponential distribution, with the mean median / ln 2: 99 of 100
     # samples do not exceed the median by more than mean * ln 50. In noise with a longer tail, such
     # as that of real samples, they do.
-    median = ordered.median(-1).values.double()
-    floor, count = median / math.log(2), ordered.shape[-1]
+    median, count = ordered.median(-1).values.double(), ordered.shape[-1]
+    floor, highest = median / math.log(2), math.log(count) + 10
     tail = (ordered.kthvalue(count - count // 100, -1).values.double() - median) / math.log(50)
-    highest = math.log(count) + 10
-    n, (line, sample) = power.shape[-2], at
-    apart = (torch.arange(n, device=power.device) - line[..., None]).abs()
-    rows = torch.minimum(apart, n - apart) <= _POINT_CELLS * cell[0][..., None]  # circular in azimuth
-    columns = (torch.arange(power.shape[-1], device=power.device) - sample[..., None]).abs() <= _POINT_CELLS * cell[1]
+    # Four resolution cells to each side belong to the response of a point. Among equal points or
+    # speckle nothing shows which point the beam centre crosses at the given time: no other one may
+    # have more than a quarter of the power, beyond the peaks of noise.
+    off = (torch.arange(n, device=power.device) - line[..., None]).abs()
+    rows = torch.minimum(off, n - off) <= 4 * cell[0][..., None]  # circular in azimuth
+    columns = (torch.arange(power.shape[-1], device=power.device) - sample[..., None]).abs() <= 4 * cell[1]
     rival = power.masked_fill(rows[..., :, None] & columns[..., None, :], 0).amax((-2, -1)).double()
-    peak = ordered.amax(-1).double()
     # The peak is the highest of many samples with noise of the whole PRF; the sum of the history
     # has that of its own band. Noise alone gives it a power of 1.
-    tone, phasor = history
-    total = (tone * phasor.conj()).sum(-1).abs().square()
+    peak, total = ordered.amax(-1).double(), (tone * phasor.conj()).sum(-1).abs().square()
     q = (total / ((tone != 0).sum(-1).clamp_min(1) * or_one(floor)) - 1).clamp_min(0)
     # without noise, the interpolation of the response leaves 2.5e-4 cycles per dwell
     std = torch.hypot(tone_frequency_bound_hz(q.clamp_min(1e-12), visible_s), q.new_tensor(2.5e-4 / visible_s))
     outcome = worst(
-        (Outcome.AMBIGUOUS, peak <= _LEAST_LEAD * (rival - highest * floor)),
+        (Outcome.AMBIGUOUS, peak <= 4.0 * (rival - highest * floor)),
         (Outcome.MISFIT, ~sees),
         (Outcome.NOISE, peak <= highest * torch.maximum(floor, tail)),
         (Outcome.EMPTY, floor == 0),

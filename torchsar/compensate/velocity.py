@@ -40,8 +40,6 @@ from torchsar.focus.omega_k import OmegaK
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import StripmapRadar
 
-Refine = Callable[..., tuple[Tensor, Tensor]]
-
 
 def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> Callable[[Tensor], Tensor]:
     """Make the function whose minimum is the effective velocity: the entropy of a group's image.
@@ -118,7 +116,6 @@ def minimum_entropy_velocity(
     doppler_hz: Tensor,
     dwell_s: float,
     reach_m_s: float,
-    refine: Refine,
     tolerance_m_s: float,
     *,
     assess: bool = True,
@@ -140,7 +137,6 @@ def minimum_entropy_velocity(
         dwell_s: Time that a target stays in the beam, in seconds.
         reach_m_s: Half width of the search about the nominal velocity of the radar, in m/s; at most
             half the nominal velocity is searched.
-        refine: Minimiser of one unknown, `torchsar.optim.scalar.parabola_minimum`.
         tolerance_m_s: Tolerance of the refinement in m/s.
         assess: Whether to add the standard deviation, the quality and the outcome.
 
@@ -168,7 +164,7 @@ def minimum_entropy_velocity(
     # last parabola. With half of that half width, estimates in speckle were displaced by 0.02 m/s.
     tolerance = max(tolerance_m_s, step / 60)
     if near > tolerance:
-        value, _ = refine(objective, value, near, tolerance)
+        value, _ = parabola_minimum(objective, value, near, tolerance)
     value, _ = settle(value, nominal)
     with torch.no_grad():
         half = min(step, nominal / 2) / 10
@@ -248,7 +244,6 @@ class EffectiveVelocity(Stage):
         focuser: Focusing stage of the chain, whose radar and range reference spectrum are used.
         reach_m_s: Largest error of the nominal velocity in m/s.
         lines: Number of range cells that are used, at least 16.
-        refine: Minimiser of one unknown, `torchsar.optim.scalar.parabola_minimum`.
         tolerance_m_s: Tolerance of the refinement in m/s.
         assess: Whether to add the standard deviation, the quality and the outcome.
 
@@ -267,7 +262,6 @@ class EffectiveVelocity(Stage):
         focuser: OmegaK,
         reach_m_s: float = 80.0,
         lines: int = 512,
-        refine: Refine = parabola_minimum,
         tolerance_m_s: float = 0.01,
         assess: bool = True,
     ) -> None:
@@ -280,8 +274,7 @@ class EffectiveVelocity(Stage):
         # in a list, so that torch does not register the focuser of the chain as a submodule twice
         self._focuser = [focuser]
         self.neutral = {"velocity_m_s": focuser.radar.velocity_m_s}
-        self.reach_m_s, self.lines, self.assess = reach_m_s, lines, assess
-        self.refine, self.tolerance_m_s = refine, tolerance_m_s
+        self.reach_m_s, self.lines, self.tolerance_m_s, self.assess = reach_m_s, lines, tolerance_m_s, assess
 
     def group(self, raw: Tensor) -> tuple[RangeGroup, float]:
         """Cut out the group of range cells that the estimate uses.
@@ -325,8 +318,7 @@ class EffectiveVelocity(Stage):
             INEXACT where the standard deviation exceeds that eighth.
         """
         (group, dwell), doppler = self.group(signal.data.detach()), self._doppler(signal.data, doppler_hz)
-        settings = self.reach_m_s, self.refine, self.tolerance_m_s
-        found = minimum_entropy_velocity(group, doppler, dwell, *settings, assess=self.assess)
+        found = minimum_entropy_velocity(group, doppler, dwell, self.reach_m_s, self.tolerance_m_s, assess=self.assess)
         return replace(found, info={**found.info, "group_start": group.start})
 
     @torch.no_grad()

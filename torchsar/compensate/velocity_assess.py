@@ -6,7 +6,6 @@ for whole apertures? How far do parts of the image disagree about it?
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -15,18 +14,6 @@ from torch import Tensor
 
 from torchsar.compensate.group import RangeGroup, block_entropy, quotient
 from torchsar.core import Estimate, Outcome, fft_lines, host_value, worst
-
-# Depth of a significant minimum in standard deviations of noise. On noise and on clutter that fills
-# the Doppler band evenly the depth is below 5; 20 dB above the noise it is above 100.
-_LEAST_DEPTH = 8.0
-# Distances from the minimum at which its depth is measured, in steps of the grid. The second
-# counts where the minimum reaches to the first, because the targets are seen for a short time.
-_NEAR, _FAR = 2.0, 8.0
-# Error that remains without noise: the spectrum of a short chirp is not that of the stationary
-# phase. It is a share of width^2 / velocity, or of the same with the step of the grid as the width.
-# Measured at time-bandwidth products of 19 to 374.
-_REST, _REST_STEP = 0.45, 0.11
-_COMBS = 4  # interleaved sets of Doppler rows, of independent noise
 
 
 def assessed(
@@ -72,19 +59,22 @@ def assessed(
         beside = 0.5 * (sides[0] + sides[1]) - entropy(rows[1])
         return beside, quotient(2 * beside.clamp_min(0), curvature).sqrt()
 
-    # depth of the minimum in nats, and its width, that of a parabola of this depth and curvature
-    near = _NEAR * min(step, radar.velocity_m_s / 18)
+    # Depth of the minimum in nats, and its width, that of a parabola of this depth and curvature.
+    # It is measured two steps of the grid away, or eight where the minimum reaches so far, because
+    # the targets are seen for a short time.
+    near = 2.0 * min(step, radar.velocity_m_s / 18)
     depth, width = measured(near)
     wide = width > near / 2
     if host_value(wide.any(), True):
-        depth, width = (
-            torch.where(wide, x, y) for x, y in zip(measured(near * _FAR / _NEAR), (depth, width), strict=True)
-        )
+        depth, width = (torch.where(wide, x, y) for x, y in zip(measured(4 * near), (depth, width), strict=True))
     by_parts = quotient(slope.flatten(-2).square().sum(-1).sqrt(), curvature)
-    rest = (_REST * width.square()).clamp_min(_REST_STEP * step**2) / radar.velocity_m_s
-    sets = [torch.stack([entropy(one[..., k::_COMBS, :]) for k in range(_COMBS)], -1) for one in rows]
+    # Without noise, an error remains: the spectrum of a short chirp is not that of the stationary
+    # phase. It is a share of width^2 / velocity, or of the same with the step of the grid as the
+    # width, measured at time-bandwidth products of 19 to 374.
+    rest = (0.45 * width.square()).clamp_min(0.11 * step**2) / radar.velocity_m_s
+    sets = [torch.stack([entropy(one[..., k::4, :]) for k in range(4)], -1) for one in rows]
     bend = (sets[0] - 2 * sets[1] + sets[2]).mean(-1) / half_m_s**2
-    by_combs = quotient(((sets[2] - sets[0]) / (2 * half_m_s)).std(-1) / math.sqrt(_COMBS), bend)
+    by_combs = quotient(((sets[2] - sets[0]) / (2 * half_m_s)).std(-1) / 2, bend)
     std = torch.hypot(torch.maximum(by_parts, by_combs), rest).clamp_max(1e6)
     known = radar.integration_s
     # an eighth of a cycle of phase at the ends of the aperture
@@ -94,7 +84,9 @@ def assessed(
         (Outcome.INEXACT, std >= most),
         (Outcome.MISFIT, torch.full_like(inside, short)),
         (Outcome.OUTSIDE_SEARCH, ~inside),
-        (Outcome.NOISE, ~((curvature > 0) & (depth > _LEAST_DEPTH * _noise_std(nominal, weight)))),
+        # In standard deviations, the depth is below 5 on noise and on clutter that fills the
+        # Doppler band evenly; 20 dB above the noise it is above 100.
+        (Outcome.NOISE, ~((curvature > 0) & (depth > 8.0 * _noise_std(nominal, weight)))),
         (Outcome.EMPTY, (group.data == 0).all((-2, -1))),
     )
     quality = torch.exp(-std / most.clamp_min(1e-12))

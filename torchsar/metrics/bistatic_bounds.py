@@ -15,7 +15,8 @@ from torch import Tensor
 
 from torchsar.core import per_trial, refuse_non_finite, unit_phasor
 from torchsar.metrics.bounds import nonnegative, range_of_point
-from torchsar.radar import BistaticRadar, receive_range
+from torchsar.radar import BistaticRadar
+from torchsar.radar.bistatic import receive_range
 
 # slant-range speed (closing positive), along-track speed, along-track position at t = 0
 UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")

@@ -27,7 +27,8 @@ from torchsar.focus import keystone
 from torchsar.focus.nufft import nufft_type2
 from torchsar.multichannel.channels import refuse_shifted
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.radar import BistaticRadar, receive_range
+from torchsar.radar import BistaticRadar
+from torchsar.radar.bistatic import receive_range
 
 # Relative error of the non-uniform FFT: -100 dB, well below the -60 dB asked of complex64 images;
 # in complex128 a smaller error would widen the kernel and cost time.

@@ -20,7 +20,8 @@ from torchsar.core import cis
 from torchsar.focus.requirements import Requirement, phase_error_db
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import LeastSquares, Rebuild, band_matrix, separates
-from torchsar.radar import BistaticRadar, receive_range
+from torchsar.radar import BistaticRadar
+from torchsar.radar.bistatic import receive_range
 
 # Phase in rad that does not matter, by convention: well below the pi / 4 at which a quadratic phase
 # broadens the impulse response.

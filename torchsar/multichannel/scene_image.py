@@ -35,15 +35,6 @@ from torchsar.multichannel.velocity.whitening import line_whitening
 from torchsar.radar import BistaticRadar
 
 Removal = Literal["subtract", "zero"]
-# Found by trial: velocities within this difference count as equal. A larger value rejects targets
-# beside a ship, a smaller one accepts side lobes of the ship as targets.
-# Level of range side lobes relative to those of one point of the mean level, found by trial: a body
-# has many points, and its brightest ones exceed the mean.
-_SAME_VELOCITY_M_S, _SIDE_LOBES = 5.0, 20.0
-# Range lines to either side of a body that are processed with it: 6 guard cells, and 28 lines for
-# the covariance of the sea. Found by trial: 20 to 80 give the same velocities, 80 take 1.4 times
-# the time; the lines must also hold the range migration of the body.
-_LINES_BESIDE = 34
 
 
 @dataclass(frozen=True)
@@ -250,21 +241,17 @@ class ImageMovers(Stage):
 
         It then has the same azimuth and nearly the same velocity as the other one.
         """
-        away_m = float((body.motion.range_m - other.motion.range_m).abs())
-        same_velocity = (
-            abs(float(body.motion.u_r_m_s - other.motion.u_r_m_s)) < _SAME_VELOCITY_M_S
-            and abs(float(body.motion.u_a_m_s - other.motion.u_a_m_s)) < _SAME_VELOCITY_M_S
+        # A larger difference than 5 m/s rejects targets beside a ship, a smaller one accepts its
+        # side lobes as targets. A body has many points, whose brightest ones exceed the mean level:
+        # hence the factor of 20. Both were found by trial.
+        away_m, cell_m = (
+            float((body.motion.range_m - other.motion.range_m).abs()),
+            self.radar.wave_speed_m_s / self.radar.pulse.bandwidth_hz,
         )
-        same_azimuth = (
-            abs(self._apparent_position(body).azimuth_m - self._apparent_position(other).azimuth_m)
-            < self.detector.apart_m[0] / 2
-        )
-        cell_m = self.radar.wave_speed_m_s / self.radar.pulse.bandwidth_hz
-        return (
-            same_velocity
-            and same_azimuth
-            and float(body.level) < _SIDE_LOBES * float(other.level) * (cell_m / (math.pi * max(away_m, cell_m))) ** 2
-        )
+        off_m_s = (abs(float(getattr(body.motion, n) - getattr(other.motion, n))) for n in ("u_r_m_s", "u_a_m_s"))
+        off_m = abs(self._apparent_position(body).azimuth_m - self._apparent_position(other).azimuth_m)
+        most = 20.0 * float(other.level) * (cell_m / (math.pi * max(away_m, cell_m))) ** 2
+        return max(off_m_s) < 5.0 and off_m < self.detector.apart_m[0] / 2 and float(body.level) < most
 
     def _apparent_position(self, body: Body) -> Detection:
         """Return where an image of the stationary scene shows a body."""
@@ -283,7 +270,9 @@ class ImageMovers(Stage):
     def _lines(self, signal: Signal, near_m: float) -> tuple[slice, Frame]:
         """Return the lines around a range, with lines beside it for the covariance of the sea."""
         axis = signal.axis("range")
-        half = math.ceil(self.extraction.range_m / axis.step) + _LINES_BESIDE
+        # 6 guard cells, and 28 lines for the covariance of the sea: by trial, 20 to 80 give the
+        # same velocities, 80 take 1.4 times the time; they also hold the migration of the body
+        half = math.ceil(self.extraction.range_m / axis.step) + 34
         at = round((near_m - axis.start) / axis.step)
         lines = slice(max(0, at - half), min(axis.n, at + half))
         frame = Frame.of(self.radar, signal)

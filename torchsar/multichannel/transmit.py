@@ -20,7 +20,8 @@ from torchsar.focus import range_compress
 from torchsar.focus.reference import REFERENCES
 from torchsar.multichannel.channels import ChannelStage, checked_channels
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.radar import BistaticRadar, polynomial_range
+from torchsar.radar import BistaticRadar
+from torchsar.radar.bistatic import polynomial_range
 
 
 def remove_transmit_range(

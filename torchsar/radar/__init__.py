@@ -1,13 +1,13 @@
 """Descriptions of instruments: radars and ladars, their geometry, timing, orbits and waveforms."""
 
 from torchsar.radar.antenna_path import AntennaPath
-from torchsar.radar.bistatic import BistaticRadar, polynomial_range, receive_range
+from torchsar.radar.bistatic import BistaticRadar
 from torchsar.radar.instrument import LIGHT_M_S
 from torchsar.radar.inverse import InverseRadar
 from torchsar.radar.ladar import TriangularLadar, sweep_middles
 from torchsar.radar.local_frame import LocalFrame, geocentric
 from torchsar.radar.navigation import resample_path
-from torchsar.radar.orbit import Ephemeris, Orbit, orbit_range, range_coefficients, seen_point
+from torchsar.radar.orbit import Ephemeris, Orbit, range_coefficients, seen_point
 from torchsar.radar.spotlight import (
     FarField,
     Spotlight,
@@ -38,11 +38,8 @@ __all__ = [
     "frequency_samples",
     "geocentric",
     "geometry_of",
-    "orbit_range",
-    "polynomial_range",
     "range_coefficients",
     "range_profiles",
-    "receive_range",
     "resample_path",
     "seen_point",
     "sweep_middles",

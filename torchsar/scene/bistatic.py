@@ -11,7 +11,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchsar.radar import BistaticRadar, Orbit, orbit_range, polynomial_range
+from torchsar.radar import BistaticRadar, Orbit
+from torchsar.radar.bistatic import polynomial_range
+from torchsar.radar.orbit import orbit_range
 from torchsar.scene.moving import ExactRange, Movers, MovingScene, ReceiveRange
 from torchsar.scene.sea import Sea
 from torchsar.scene.trials import positive, refuse_unless, refuse_unless_finite, stacked, with_dims

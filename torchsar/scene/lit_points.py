@@ -9,7 +9,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchsar.radar import BistaticRadar, receive_range
+from torchsar.radar import BistaticRadar
+from torchsar.radar.bistatic import receive_range
 from torchsar.scene.bistatic import Gate
 from torchsar.scene.moving import ExactRange, Movers, ReceiveRange
 

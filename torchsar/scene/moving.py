@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, per_trial
-from torchsar.radar import BistaticRadar, receive_range
+from torchsar.radar import BistaticRadar
+from torchsar.radar.bistatic import receive_range
 from torchsar.scene.trials import refuse_unless, refuse_unless_finite, with_dims
 
 Numbers = Sequence[Tensor | float] | Tensor

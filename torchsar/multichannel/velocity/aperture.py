@@ -12,15 +12,6 @@ from torchsar.multichannel.velocity.model import TINY, point_phasor
 from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
-# chosen: each of 8 parts has 10 dB at the SNR of 19 dB from which on a point counts as detected,
-# and the ends of 32 parts of the profile lie within 2 % of the aperture
-_PARTS, _FINE = 8, 32
-# found by trial: noise at this SNR lowers the share to 0.93, an aperture lit for 75 % to 0.75
-_LEAST_SHARE = 0.8
-# chosen: amplitude relative to that of the strongest part below which a part counts as dark; noise
-# in a dark part rarely reaches it where the point is detected
-_DARK = 0.35
-
 
 @dataclass(frozen=True)
 class Dwell:
@@ -143,9 +134,11 @@ def lit_as_expected(
     Returns:
         True where this share is at least 0.8, bool (...,).
     """
-    amplitude = _Pulses.of(data, radar, motion, aperture, _PARTS, whitening).amplitudes(_PARTS)
-    squares = _PARTS * amplitude.square().sum(-1)
-    return (amplitude.sum(-1).square() >= _LEAST_SHARE * squares) | (squares == 0)
+    # each of 8 parts has 10 dB at the SNR of 19 dB from which on a point counts as detected
+    amplitude = _Pulses.of(data, radar, motion, aperture, 8, whitening).amplitudes(8)
+    squares = 8 * amplitude.square().sum(-1)
+    # noise at this SNR lowers the share to 0.93, an aperture lit for 75 % to 0.75
+    return (amplitude.sum(-1).square() >= 0.8 * squares) | (squares == 0)
 
 
 @torch.no_grad()
@@ -173,12 +166,14 @@ def seen_aperture(
     uneven = ~lit_as_expected(data, radar, motion, aperture, whitening)
     if not bool(uneven.any()):
         return aperture, uneven
-    pulses = _Pulses.of(data, radar, motion, aperture, _FINE, whitening)
-    amplitude = pulses.amplitudes(_FINE)
+    # the ends of 32 parts of the profile lie within 2 % of the aperture
+    pulses = _Pulses.of(data, radar, motion, aperture, 32, whitening)
+    amplitude = pulses.amplitudes(32)
     level = amplitude / amplitude.amax(-1, keepdim=True).clamp_min(TINY)
     # beyond a dark part there is noise, whose phase far from the point would bend the fit
-    gaps = (level < _DARK).cumsum(-1)
-    lit = (level >= _DARK) & (gaps == gaps.gather(-1, level.argmax(-1, keepdim=True)))
+    # (chosen: noise in a dark part rarely reaches 0.35 where the point is detected)
+    gaps = (level < 0.35).cumsum(-1)
+    lit = (level >= 0.35) & (gaps == gaps.gather(-1, level.argmax(-1, keepdim=True)))
     return SeenAperture(aperture, torch.where(uneven[..., None], pulses.ended(level, lit), 1.0)), uneven
 
 

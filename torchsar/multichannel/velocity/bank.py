@@ -21,8 +21,6 @@ from torchsar.multichannel.velocity.model import chosen, point_phasor
 from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
-_BLOCK_BYTES = 64 << 20  # limits the memory of a block of hypotheses
-
 
 @dataclass(frozen=True)
 class Search:
@@ -99,7 +97,8 @@ def bank_search(
     best = PointMotion.of(radar, data, 0.0, u_a_m_s, 0.0, range_m)
     best = best.each(lambda value: value.expand(data.shape[:-2]))
     energy = torch.zeros(data.shape[:-2], dtype=torch.float64, device=data.device)
-    hypotheses, size = [], max(1, _BLOCK_BYTES // (32 * data.numel()))
+    # 64 MiB limit the memory of a block of hypotheses
+    hypotheses, size = [], max(1, (64 << 20) // (32 * data.numel()))
     for u_r in _steps(search.u_r_m_s, search.u_r_step_m_s, data.device):
         for offsets in _steps(search.u_a_m_s, search.u_a_step_m_s, data.device).split(size):
             u_a = per_trial(u_a_m_s, 1, data) + offsets

@@ -35,12 +35,6 @@ from torchsar.multichannel.velocity.model import (
 from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
-_HALVINGS = 4  # trials of a step: whole, half, quarter, eighth; then it is omitted
-_LOOK = 4  # steps on an accelerator between two decisions whether to stop, by choice
-# Predicted gain of energy below which no step is taken, relative to the noise of a sample (a step
-# of 3e-4 standard deviations) and to the energy that is explained already (rounding).
-_LEAST_GAIN, _LEAST_SHARE = 1e-7, 1e-13
-
 
 @dataclass(frozen=True)
 class PointFit:
@@ -256,11 +250,12 @@ def _climbed(
     fit = fit_at(motion)
     total = data.abs().square().sum((-2, -1))
     stuck = torch.zeros_like(fit.energy, dtype=torch.bool)  # no part of the step gained anything
-    every = 1 if data.device.type == "cpu" else _LOOK
+    every = 1 if data.device.type == "cpu" else 4  # steps between two decisions whether to stop, by choice
     for number in range(steps):
         step = solved(fit.normal, fit.gradient[..., None])[..., 0]
         noise = (total - fit.energy).clamp_min(0) / data.shape[-2:].numel()
-        pending = ~stuck & ((step * fit.gradient).sum(-1) > _LEAST_GAIN * noise + _LEAST_SHARE * fit.energy)
+        # no step for a gain below that of 3e-4 standard deviations, or below rounding
+        pending = ~stuck & ((step * fit.gradient).sum(-1) > 1e-7 * noise + 1e-13 * fit.energy)
         if number % every == 0 and not bool(pending.any()):
             break
         motion, fit, failed = _stepped(fit_at, motion, fit, unknowns, step, pending)
@@ -285,7 +280,7 @@ def _stepped(
     if "u_a_m_s" in unknowns:  # at most a tenth of the speed along track past the point
         along = step[..., unknowns.index("u_a_m_s")].abs().clamp_min(TINY)
         step = step * (0.1 * motion.along_m_s / along).clamp_max(1.0)[..., None]
-    for halvings in range(_HALVINGS):
+    for halvings in range(4):  # whole, half, quarter, eighth; then it is omitted
         there = moved(begin, 0.5**halvings * step, unknowns)
         fit_there = fit_at(there)
         better = pending & (fit_there.energy > before)

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Outcome, cholesky_factor, linear_solve, matrix_inverse, unit_phasor
 from torchsar.multichannel.motion import PointMotion
-from torchsar.radar import BistaticRadar, receive_range
+from torchsar.radar import BistaticRadar
+from torchsar.radar.bistatic import receive_range
 
 UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")
 # Detection threshold over all samples, -15 dB per sample with three channels and 810 pulses: below
@@ -19,9 +20,6 @@ UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")
 DETECTED_DB = 19.0
 TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 _ROUNDING = 1e-13  # added to the unit diagonal of normal matrices
-# chosen: Doppler cells on either side in which the noise of a point is measured; standard
-# deviations then scatter by 12 %
-_BESIDE = 16
 
 
 def point_phasor(radar: BistaticRadar, motion: PointMotion, time_s: Tensor, dtype: torch.dtype) -> Tensor:
@@ -140,7 +138,7 @@ def covariance_of(normal: Tensor, noise_power: Tensor) -> Tensor:
     )
 
 
-def noise_beside(left: Tensor, weight: Tensor, amplitude: Tensor, fitted: int) -> Tensor:
+def noise_beside(left: Tensor, weight: Tensor, amplitude: Tensor, fitted: int, cells: int = 16) -> Tensor:
     """Return the covariance across channels of the noise at the Doppler frequencies of a point.
 
     It is taken from what the fit leaves over within sixteen Doppler cells of the point, in
@@ -153,14 +151,15 @@ def noise_beside(left: Tensor, weight: Tensor, amplitude: Tensor, fitted: int) -
         weight: Expected amplitude, shape (..., 1, pulse).
         amplitude: Fitted amplitude, shape (..., 1, 1) or (..., channel, 1), complex.
         fitted: Number of real unknowns of the phase.
+        cells: Doppler cells on either side; with 16, standard deviations scatter by 12 %.
 
     Returns:
         Covariance per sample, float64 (..., channel, channel).
     """
     n = left.shape[-1]
     energy = weight.square().sum((-2, -1))
-    cells = energy.square() / weight.square().square().sum((-2, -1)).clamp_min(TINY) / n  # per bin
-    inside = torch.fft.fftfreq(n, 1 / n, dtype=torch.float64, device=left.device).abs() * cells[..., None] <= _BESIDE
+    per_bin = energy.square() / weight.square().square().sum((-2, -1)).clamp_min(TINY) / n  # Doppler cells
+    inside = torch.fft.fftfreq(n, 1 / n, dtype=torch.float64, device=left.device).abs() * per_bin[..., None] <= cells
     turned = (left * torch.polar(torch.ones_like(amplitude.abs()), -amplitude.angle())).imag
     spectrum = torch.fft.fft(weight * turned) * inside[..., None, :]
     samples = inside.sum(-1) * energy / n - fitted / left.shape[-2]

@@ -22,18 +22,6 @@ from torchsar.multichannel.velocity.model import TINY, UNKNOWNS, Found, estimate
 from torchsar.multichannel.velocity.whitening import Whitening, sample_whitening
 from torchsar.radar import BistaticRadar
 
-# Aperture of the first search: integration time of Remote Sens. 2020, 12, 1703, Table 1.
-_COARSE_S = 4.5
-# Least share of the energy of a further point in what is left: clutter that fills 800 Doppler cells
-# gives 0.01 to its strongest tone; a point just detected in noise gives 0.03. Share from which it
-# is a point rather than clutter, and Doppler cells within which it then bends the fit unless it is
-# separated, by choice. Least energy of such a point over that of the first: the model of the echo
-# of a wide chirp leaves 0.001 of the energy of the point itself.
-_POINT_SHARE, _CLEAR_SHARE, _OVERLAP, _LEAST_HIDDEN = 0.02, 0.05, 8.0, 0.002
-# Refinements of the residual covariance; points fitted besides the strongest, by choice: each takes
-# a search of its own; passes of their fit: the second has the amplitudes at the positions found.
-_ROUNDS, _OTHERS, _PASSES = 2, 3, 2
-
 
 def moving_point_velocity(
     data: Tensor,
@@ -105,7 +93,8 @@ def moving_point_velocity(
     unknowns = UNKNOWNS if u_a_m_s is None else ("u_r_m_s", "y0_m")
     if u_a_m_s is not None:
         search = replace(search, u_a_m_s=0.0)
-    coarse, u_a = aperture if isinstance(aperture, Dwell) else Dwell(_COARSE_S), 0.0 if u_a_m_s is None else u_a_m_s
+    # the first search takes the integration time of Remote Sens. 2020, 12, 1703, Table 1
+    coarse, u_a = aperture if isinstance(aperture, Dwell) else Dwell(4.5), 0.0 if u_a_m_s is None else u_a_m_s
     data = data.to(torch.complex128)
     job = _Job(data, radar, aperture, torch.ones_like(data[..., 0, :].real), coarse, search, u_a, range_m, unknowns)
     if whitening is not None:
@@ -197,16 +186,20 @@ class _Job:
         found = _chosen_fit(self.resolved(found, None), found, tried)
         tried = tried & sample_whitening(self.left(found), self.radar).coloured
         points, left = found.motion.each(lambda value: value.expand(tried.shape)[..., None]), whole.left(found)
-        for _ in range(_OTHERS):
+        for _ in range(3):  # by choice: each takes a search of its own
             further = replace(whole, data=left).found(None)
             share = further.energy / left.abs().square().sum((-2, -1)).clamp_min(TINY)
-            tried = tried & (share > _POINT_SHARE)
+            # clutter that fills 800 Doppler cells gives 0.01 to its strongest tone; a point just
+            # detected in noise gives 0.03
+            tried = tried & (share > 0.02)
             if not bool(tried.any()):
                 break
-            clear = (share > _CLEAR_SHARE) & (further.energy > _LEAST_HIDDEN * found.energy)
+            # by choice a point rather than clutter, and more than the 0.001 of the energy of the
+            # point itself that the model of the echo of a wide chirp leaves
+            clear = (share > 0.05) & (further.energy > 0.002 * found.energy)
             disturbed = disturbed | (tried & clear & self._overlap(found.motion, further.motion))
             points = points.each(lambda these, one: torch.cat([these, one[..., None]], -1), further.motion)
-            for _ in range(_PASSES):
+            for _ in range(2):  # the second pass has the amplitudes at the positions found
                 points, own, others, left = fitted_together(self.data, self.radar, points, self.expected, self.unknowns)
             done = tried & ~sample_whitening(left, self.radar).coloured
             found, job, tried = (
@@ -218,9 +211,9 @@ class _Job:
         return job, found, disturbed
 
     def _overlap(self, motion: PointMotion, other: PointMotion) -> Tensor:
-        """Whether the Doppler frequencies of two points differ by few Doppler cells."""
+        """Whether the Doppler frequencies of two points differ by less than eight Doppler cells."""
         doppler_hz = [(m.u_r_m_s + m.along_m_s * m.y0_m / m.range_m) / self.radar.wavelength_m for m in (motion, other)]
-        return (doppler_hz[0] - doppler_hz[1]).abs() < _OVERLAP / self.coarse.duration_s
+        return (doppler_hz[0] - doppler_hz[1]).abs() < 8.0 / self.coarse.duration_s
 
     def refined(self, found: Found) -> tuple[Found, Whitening]:
         """Repeat the fit up to two times with the covariance of its residual, and return both.
@@ -228,7 +221,7 @@ class _Job:
         Trials whose residual is white noise keep their fit.
         """
         whitening = sample_whitening(self.left(found), self.radar)
-        for _ in range(_ROUNDS):
+        for _ in range(2):
             if not bool(whitening.coloured.any()):
                 break
             found = _chosen_fit(self.fitted(found.motion, whitening), found, whitening.coloured)

@@ -30,8 +30,6 @@ from torchsar.multichannel.velocity.recommended import moving_point_velocity
 from torchsar.optim import lbfgs
 from torchsar.radar import BistaticRadar
 
-_LEAST_PULSES = 4  # convention: three pulses define a tone and its curvature, a fourth shows noise
-
 
 def strongest_line(data: Tensor) -> tuple[Tensor, Tensor]:
     """Select the range line of most energy in each trial.
@@ -142,10 +140,11 @@ class _Velocity(Stage):
         """
         refuse_shifted(self.radar, signal.axis("pulse"))
         channels, pulses = signal.axes[0].n, signal.axes[1].n
-        if channels != self.radar.channels or pulses < _LEAST_PULSES:
+        # three pulses define a tone and its curvature, a fourth shows noise
+        if channels != self.radar.channels or pulses < 4:
             raise ValueError(
                 f"{type(self).__name__} expects {self.radar.channels} channels as in the radar's "
-                f"channel_m and at least {_LEAST_PULSES} pulses, got {channels} channels and {pulses} pulses; "
+                f"channel_m and at least 4 pulses, got {channels} channels and {pulses} pulses; "
                 "select the same channels in radar and data"
             )
         if "range" not in signal.names:

@@ -18,7 +18,8 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.multichannel import PointMotion
 from torchsar.multichannel.reconstruct import doppler_centre_hz, shared_response
-from torchsar.radar import TimingDiagram, receive_range, timing_diagram
+from torchsar.radar import TimingDiagram, timing_diagram
+from torchsar.radar.bistatic import receive_range
 from torchsar.radar.timing import off_nadir_ground_m
 from torchsar.reproduce.geo.sensor import HEIGHT_M, INTEGRATION_S, OFF_NADIR_DEG, RADAR
 from torchsar.reproduce.item import Check, Item, number, statement
