@@ -475,7 +475,6 @@ FUNCTIONS = [
             torch.zeros(x.shape[:-2], dtype=F64),
             0.1,
             5.0,
-            parabola_minimum,
             0.1,
         ),
     ),

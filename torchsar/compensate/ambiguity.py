@@ -68,7 +68,7 @@ def _evidence(scores: Tensor, weight: Tensor | None = None) -> Tensor:
     deficit = take(scores, best[..., None].expand(scores.shape[:-1]))[..., None] - scores
     mean = (deficit * weight[..., None]).sum(-2)
     blocks = 1 / weight.square().sum(-1, keepdim=True)
-    scatter = (weight[..., None] * (deficit - mean[..., None, :]).square()).sum(-2)
+    scatter = (weight[..., None] * (deficit - mean[..., None, :])).square().sum(-2)
     variance = blocks / (blocks - 1).clamp_min(0.5) * scatter + 0.01 * mean.square()
     tiny = 1e-24 * scores.square().amax((-2, -1))[..., None] + 1e-300
     return student_log_likelihood(mean / torch.sqrt(variance + tiny), (blocks - 1).clamp_min(0.5))
