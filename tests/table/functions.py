@@ -41,7 +41,6 @@ from torchsar.multichannel.velocity.along_track import along_track_velocity
 from torchsar.multichannel.velocity.likelihood import explained_energy, maximum_likelihood
 from torchsar.multichannel.velocity.stages import gradient_likelihood
 from torchsar.multichannel.velocity.whitening import line_whitening, sample_whitening
-from torchsar.optim.scalar import parabola_minimum
 from torchsar.radar import FarField
 
 DECHIRPED = replace(TURNTABLE, pulse_s=1e-6)
