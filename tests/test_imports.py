@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from functools import cache
@@ -118,6 +119,13 @@ def test_only_plot_imports_matplotlib() -> None:
     for path in PACKAGE.rglob("*.py"):
         if PACKAGE / "plot" not in path.parents:
             assert not any(name.startswith("matplotlib") for name in _imports(path)), path
+
+
+@pytest.mark.parametrize("package", [*PROCESSING, "core", "radar", "scene", "echo", "io", "plot", "study"])
+def test_completion_shows_the_public_names(package: str) -> None:
+    module = importlib.import_module(f"torchsar.{package}")
+    assert sorted(dir(module)) == sorted(module.__all__)
+    assert package in dir(torchsar)
 
 
 class _Study:

@@ -174,3 +174,4 @@ __all__ = [
     "strip_autofocus",
     "uneven_rotation",
 ]
+__dir__ = __all__.copy

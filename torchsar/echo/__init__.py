@@ -68,3 +68,4 @@ __all__ = [
     "target_energy",
     "turntable_echo",
 ]
+__dir__ = __all__.copy

@@ -145,3 +145,4 @@ __all__ = [
     "to_db",
     "write_strip",
 ]
+__dir__ = __all__.copy

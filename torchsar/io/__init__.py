@@ -31,3 +31,4 @@ __all__ = [
     "write_sicd",
     "write_strip_geotiff",
 ]
+__dir__ = __all__.copy

@@ -55,3 +55,4 @@ __all__ = [
     "velocity_known_offset_bound_m_s",
     "velocity_segmented_bound_m_s",
 ]
+__dir__ = __all__.copy

@@ -110,3 +110,4 @@ __all__ = [
     "remove_transmit_range",
     "stationary_image",
 ]
+__dir__ = __all__.copy

@@ -14,3 +14,4 @@ __all__ = [
     "lbfgs",
     "newton",
 ]
+__dir__ = __all__.copy

@@ -45,3 +45,4 @@ __all__ = [
     "sweep_middles",
     "timing_diagram",
 ]
+__dir__ = __all__.copy

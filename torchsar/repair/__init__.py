@@ -103,3 +103,4 @@ __all__ = [
     "subtract_interference",
     "zero_fill",
 ]
+__dir__ = __all__.copy

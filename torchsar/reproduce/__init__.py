@@ -39,3 +39,4 @@ __all__ = [
     "table",
     "verdict",
 ]
+__dir__ = __all__.copy

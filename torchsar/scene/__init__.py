@@ -173,3 +173,4 @@ __all__ = [
     "gamma_from_normal",
     "start_phase_rad",
 ]
+__dir__ = __all__.copy

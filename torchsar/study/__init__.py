@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from torchsar.study.montecarlo import Difference, Interrupted, Record, Stop, differences, read_sweep, sweep
 
 __all__ = ["Difference", "Interrupted", "Record", "Stop", "differences", "read_sweep", "sweep"]
+__dir__ = __all__.copy
 
 
 def __getattr__(name: str) -> Any:

@@ -12,3 +12,4 @@ __all__ = [
     "path_phase",
     "strip_autofocus",
 ]
+__dir__ = __all__.copy

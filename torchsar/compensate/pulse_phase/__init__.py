@@ -26,3 +26,4 @@ __all__ = [
     "sca",
     "sharpest_phase",
 ]
+__dir__ = __all__.copy

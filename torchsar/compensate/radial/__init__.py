@@ -33,3 +33,4 @@ __all__ = [
     "segmented_interference",
     "spectrum_correlation",
 ]
+__dir__ = __all__.copy

@@ -63,3 +63,4 @@ __all__ = [
     "search_rotation",
     "uneven_rotation",
 ]
+__dir__ = __all__.copy

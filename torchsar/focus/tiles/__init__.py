@@ -3,3 +3,4 @@
 from torchsar.focus.tiles.plan import TilePlan, image_tiles
 
 __all__ = ["TilePlan", "image_tiles"]
+__dir__ = __all__.copy

@@ -6,6 +6,7 @@ from torchsar.reproduce.geo import geometry, ocean, reconstruction, sensor, targ
 from torchsar.reproduce.item import Item, Paper, in_order
 
 __all__ = ["PAPER"]
+__dir__ = __all__.copy
 
 PAPER = Paper(
     "geo",

@@ -6,6 +6,7 @@ from torchsar.reproduce.isal_rotation import cubes, profiles, satellite, snr
 from torchsar.reproduce.item import Paper, in_order
 
 __all__ = ["PAPER"]
+__dir__ = __all__.copy
 
 PAPER = Paper(
     "isal_rotation",

@@ -6,6 +6,7 @@ from torchsar.reproduce.item import Item, Paper, in_order
 from torchsar.reproduce.sal import ground, letter, points
 
 __all__ = ["PAPER"]
+__dir__ = __all__.copy
 
 PAPER = Paper(
     "sal",

@@ -7,3 +7,4 @@ from torchsar.study.montecarlo.record import Difference, Record, differences
 from torchsar.study.montecarlo.store import read_sweep
 
 __all__ = ["Difference", "Interrupted", "Record", "Stop", "differences", "read_sweep", "sweep"]
+__dir__ = __all__.copy
