@@ -20,10 +20,10 @@ from torchsar.repair import (
     NotchInterference,
     SubtractInterference,
     drop_interference,
-    find_contamination,
     notch_interference,
     subtract_interference,
 )
+from torchsar.repair.contamination import find_contamination
 from torchsar.scene import Dwell, Points, RandomPoints, Speckle, StripmapWorld
 
 RADAR = kondor_radar()

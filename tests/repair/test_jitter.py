@@ -18,14 +18,13 @@ from torchsar.repair import (
     BandLimited,
     BlindJitter,
     CorrectJitter,
-    Exact,
     Lagrange,
     PilotJitter,
     correct_jitter,
-    correct_jitter_exact,
     estimate_jitter_blind,
     estimate_jitter_pilot,
 )
+from torchsar.repair.jitter import Exact, correct_jitter_exact
 from torchsar.repair.jitter_blind import detect_jitter_period
 
 OFFSETS = torch.tensor([0.0, 0.18, -0.12, 0.07], dtype=torch.float64)

@@ -14,10 +14,9 @@ from torchsar.repair import (
     SplitSweeps,
     blank_turning_points,
     circular_shift,
-    split_record,
 )
 from torchsar.repair.analytic import delayed
-from torchsar.repair.triangle import canonical_ramps
+from torchsar.repair.triangle import canonical_ramps, split_record
 from torchsar.scene import EverySample, LadarWorld, Points, Polynomial
 
 

@@ -306,12 +306,6 @@ FUNCTIONS = [
         ),
     ),
     _entry("repair.circular_shift", "record", lambda x: repair.circular_shift(x, 3.3e-6, LADAR), laws=Laws(energy=1)),
-    _entry(
-        "repair.split_record",
-        "record",
-        lambda x: repair.split_record(x, LADAR, 3.3e-6),
-        laws=Laws(pulse="a sweep may begin in one block and end in the next"),
-    ),
     _entry("repair.find_trigger", "record", lambda x: repair.find_trigger(x, LADAR)),
     _entry(
         "repair.correct_imbalance",
@@ -326,12 +320,6 @@ FUNCTIONS = [
         laws=Laws(range="the jitter has a place on the clock"),
     ),
     _entry(
-        "repair.correct_jitter_exact",
-        "raw",
-        lambda x: repair.correct_jitter_exact(x, torch.tensor([0.05, -0.03, 0.02, -0.04], dtype=F64)),
-        laws=Laws(range="the jitter has a place on the clock"),
-    ),
-    _entry(
         "repair.correct_response",
         "raw",
         lambda x: repair.correct_response(x, 0.5 * torch.linspace(-1, 1, 129, dtype=F64) ** 3, None, BAND),
@@ -340,7 +328,6 @@ FUNCTIONS = [
     _entry("repair.drop_interference", "raw", repair.drop_interference),
     _entry("repair.notch_interference", "raw", repair.notch_interference),
     _entry("repair.subtract_interference", "raw", repair.subtract_interference),
-    _entry("repair.find_contamination", "raw", repair.find_contamination, laws=Laws(steps=("density",))),
     _entry("repair.estimate_imbalance", "raw", repair.estimate_imbalance),
     _entry("repair.estimate_jitter_blind", "wide", lambda x: repair.estimate_jitter_blind(x, 4)),
     _entry("repair.estimate_jitter_pilot", "row", lambda x: repair.estimate_jitter_pilot(x, 4)),
@@ -351,24 +338,10 @@ FUNCTIONS = [
     ),
     _entry("repair.estimate_response_sharpest", "wide image", lambda x: stages.FEW_POINTS(x, BAND)),
     _entry(
-        "repair.estimate_amplitude_response",
-        "wide image",
-        lambda x: repair.estimate_amplitude_response(
-            size(x).double().square().mean(-2), torch.ones(x.shape[-1], dtype=F64), BAND, 8
-        ),
-        0,
-    ),
-    _entry(
         "repair.line_integrity",
         "raw",
         lambda x: repair.line_integrity(x, torch.arange(x.shape[-2]) + 100),
         zero_ok="it is the numbers of the lines that are right",
-    ),
-    _entry(
-        "repair.place_lines",
-        "raw",
-        lambda x: repair.place_lines(x, (torch.arange(x.shape[-2]) - 1).expand(x.shape[:-1])),
-        laws=Laws(pulse="moves lines to fixed places"),
     ),
     # compensate
     _entry("compensate.align_envelopes", "raw", compensate.align_envelopes, laws=RANGE_FREE),

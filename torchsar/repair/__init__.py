@@ -19,22 +19,19 @@ from torchsar.repair.interference import (
     NotchInterference,
     SubtractInterference,
     drop_interference,
-    find_contamination,
     notch_interference,
     subtract_interference,
 )
 from torchsar.repair.jitter import (
     BandLimited,
     CorrectJitter,
-    Exact,
     Lagrange,
     correct_jitter,
-    correct_jitter_exact,
 )
 from torchsar.repair.jitter_blind import BlindJitter, estimate_jitter_blind
 from torchsar.repair.jitter_pilot import PilotJitter, estimate_jitter_pilot
-from torchsar.repair.lines import LineIntegrity, line_integrity, place_lines
-from torchsar.repair.response import CorrectResponse, correct_response, estimate_amplitude_response
+from torchsar.repair.lines import LineIntegrity, line_integrity
+from torchsar.repair.response import CorrectResponse, correct_response
 from torchsar.repair.response_phase import (
     EstimateFlatResponse,
     EstimateResponse,
@@ -48,7 +45,6 @@ from torchsar.repair.triangle import (
     SplitSweeps,
     blank_turning_points,
     circular_shift,
-    split_record,
 )
 from torchsar.repair.triangle_calibrate import CalibrateSweeps, calibrate_sweeps
 from torchsar.repair.trigger import find_trigger
@@ -67,7 +63,6 @@ __all__ = [
     "EstimateFlatResponse",
     "EstimateImbalance",
     "EstimateResponse",
-    "Exact",
     "Lagrange",
     "LineIntegrity",
     "LinearFill",
@@ -83,23 +78,18 @@ __all__ = [
     "circular_shift",
     "correct_imbalance",
     "correct_jitter",
-    "correct_jitter_exact",
     "correct_response",
     "drop_interference",
-    "estimate_amplitude_response",
     "estimate_imbalance",
     "estimate_jitter_blind",
     "estimate_jitter_pilot",
     "estimate_response_points",
     "estimate_response_sharpest",
-    "find_contamination",
     "find_trigger",
     "line_integrity",
     "linear_fill",
     "notch_interference",
-    "place_lines",
     "sparse_fill",
-    "split_record",
     "subtract_interference",
     "zero_fill",
 ]

@@ -19,26 +19,13 @@ from torch import Tensor
 from torchsar.core import Outcome, worst
 from torchsar.repair.jitter import uncrossed
 
-# Largest standard deviation of a phase in rad and of a relative gain: the remaining imbalance is 20
-# dB below the signal. Deviation of a phase from which on it is taken for that of noise, by choice.
-_MOST_IMBALANCE, _NOISE_PHASE = 0.1, 0.25
-# Standard deviations by which the noise may be wrong, the relative error of a power whose noise is
-# not known, and the least coherence of lines whose noise is not known, by choice.
-_NOISE_SIGMAS, _WEAK_NOISE, _LEAST_COHERENCE = 3.0, 0.03, 0.2
-# Largest standard deviation of an offset of sampling instants, in samples (-24 dB of the signal).
-_MOST_OFFSET = 0.01
-# Largest standard deviation of a phase response in rad (-18 dB of the signal), and bound up to
-# which the search finds the right minimum, by measurement: wrong from 0.09 on.
-_MOST_RESPONSE, _MOST_BOUND = 0.125, 0.08
-# Least curvature of the entropy in nats per rad^2, by measurement: 5 to 20 in sharp windows.
-_CURVATURE = 4.0
-# Least certainties of the order of up and down sweeps and of a fringe, in standard deviations, by
-# choice: in a normal distribution the chance is 3e-7 above 5 and 1e-3 above 3.
-_ORDER_SIGMAS, _FRINGE_SIGMAS = 5.0, 3.0
-# Least symmetry of a reliable result, over the share of the scene in the power. Measured on scenes
-# of 1 to 40 scatterers: above 0.7 in 97 % of the results that are right, below 0.66 where they are
-# wrong. And least share of a scene, by choice: chance gives 0.02 to white noise.
-_LEAST_SYMMETRY, _LEAST_SHARE = 0.7, 0.05
+# Largest standard deviations. Of a phase in rad and of a relative gain: the remaining imbalance is
+# 20 dB below the signal. Of an offset of sampling instants in samples: -24 dB. Of a phase response
+# in rad: -18 dB.
+_MOST_IMBALANCE, _MOST_OFFSET, _MOST_RESPONSE = 0.1, 0.01, 0.125
+# Cramer-Rao bound in rad up to which the search for a phase response finds the right minimum, by
+# measurement: wrong from 0.09 on.
+_MOST_BOUND = 0.08
 
 
 def root(square: Tensor) -> Tensor:
@@ -97,11 +84,14 @@ def assess_imbalance(
     coherence = (lag.abs() / product.clamp_min(1e-300)).mean(-1).clamp(0, 1)
     gain_std, phase_std = (left_out_deviation(values) for values in left_out)
     share = (noise / power[..., None].clamp_min(1e-300)).clamp_max(0.99)
-    # an error of the noise level brings the powers of the channels closer together or farther apart
-    bias = torch.where(share > 0, _NOISE_SIGMAS / math.sqrt(looks[1]) * share / (1 - share), _WEAK_NOISE)
+    # An error of the noise level brings the powers of the channels closer together or farther
+    # apart. It is three of its standard deviations, or 3 % of the power where it is not known.
+    bias = torch.where(share > 0, 3 / math.sqrt(looks[1]) * share / (1 - share), 0.03)
     gain_std = root(gain_std.square() + (gain * torch.log(gain) * bias).square())
-    chance = (coherence < 5 / math.sqrt(looks[0])) | (phase_std > _NOISE_PHASE).any(-1)
-    known = (share > 0).all(-1) | (coherence > _LEAST_COHERENCE)
+    # by choice: a phase that is uncertain by 0.25 rad is that of noise, and where the noise is not
+    # known the coherence must exceed 0.2
+    chance = (coherence < 5 / math.sqrt(looks[0])) | (phase_std > 0.25).any(-1)
+    known = (share > 0).all(-1) | (coherence > 0.2)
     inexact = (phase_std > _MOST_IMBALANCE) | (gain_std > _MOST_IMBALANCE * gain)
     outcome = worst(
         (Outcome.INEXACT, inexact.any(-1)),
@@ -218,7 +208,8 @@ def assess_response(
     moved = torch.cat([found, step.repeat(2, 1)], -1)
     change = sum(slope(moved).chunk(2)) - both
     curvature = (change / 2 * step).sum(-1) / step.square().sum(-1).clamp_min(1e-300)
-    finer = (first * second).sum(-1).clamp_min(0).sqrt() / curvature.clamp_min(_CURVATURE)
+    # the least curvature in nats per rad^2, by measurement: 5 to 20 in sharp windows
+    finer = (first * second).sum(-1).clamp_min(0).sqrt() / curvature.clamp_min(4)
     apart = left_out_deviation(torch.stack(found.chunk(2), -2))
     std = torch.hypot(torch.linalg.vector_norm(apart, dim=-1), finer).maximum(bound)
     outcome = worst(
@@ -250,9 +241,13 @@ def assess_trigger(
         symmetric.
     """
     outcome = worst(
-        (Outcome.MISFIT, ~(symmetry > _LEAST_SYMMETRY * share)),
-        (Outcome.AMBIGUOUS, ~((order > _ORDER_SIGMAS) & (fringe > _FRINGE_SIGMAS))),
+        # measured on scenes of 1 to 40 scatterers: above 0.7 in 97 % of the results that are right,
+        # below 0.66 where they are wrong
+        (Outcome.MISFIT, ~(symmetry > 0.7 * share)),
+        # in a normal distribution the chance is 3e-7 above 5 and 1e-3 above 3
+        (Outcome.AMBIGUOUS, ~((order > 5) & (fringe > 3))),
         (Outcome.OUTSIDE_SEARCH, outside),
-        (Outcome.NOISE, ~(share > _LEAST_SHARE)),
+        # chance gives white noise a share of 0.02
+        (Outcome.NOISE, ~(share > 0.05)),
     )
     return {"quality": quality.clamp(0, 1), "outcome": outcome}

@@ -26,18 +26,8 @@ from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, uni
 from torchsar.repair.assess import assess_offsets, of_trials
 from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap, uncrossed
 
-# Largest rms offset that is ok, in samples, found by trial: above it the fits settle on wrong
-# offsets. Error of the noise level: that of the lowest twentieth of a spectrum of 256 or more
-# looks.
-_MOST_RMS, _NOISE_ERROR = 0.22, 0.08
-# Least power over its mean that a frequency is given: the ends of a line leak as much.
-_LEAST_POWER = 1e-5
 # Standard deviation of a share that may be anything between 0 and 1.
 _MOST_SHARE = 0.3
-# Share of the standard deviation below which a further fit changes nothing of interest, by choice.
-_SETTLED = 0.1
-# Limits of the factor by which a fitted change is lengthened or shortened, by choice.
-_SHORTEST, _LONGEST = 0.3, 2.0
 
 
 def cyclic_fit(
@@ -85,7 +75,8 @@ def cyclic_fit(
         step = k * (n // period)
         own = floor * (noise * torch.roll(noise, step, -1).conj()).mean(-2)
         both = power + torch.roll(power, step, -1)  # the correlation that a periodic gain gives
-        weight = 1 / (power.clamp_min(_LEAST_POWER) * torch.roll(power, step, -1).clamp_min(_LEAST_POWER))
+        # the ends of a line leak at least 1e-5 of the mean power into every frequency
+        weight = 1 / (power.clamp_min(1e-5) * torch.roll(power, step, -1).clamp_min(1e-5))
         slope = 2j * math.pi * (torch.roll(tilted, step, -1) - tilted)
         slope = slope - both * _along(slope, both, weight)
         cross = (spectrum * torch.roll(spectrum, step, -1).conj()).mean(-2) / scale - share * own
@@ -260,7 +251,7 @@ def estimate_jitter_blind(
     quality = torch.where(periods == 1, 1, size / (size + std[:, 0].square()).clamp_min(1e-300))
     lit = (rows != 0).any(-1).any(-1)
     tested = std[:, 0] * torch.sqrt((longest - 1) / (torch.where(periods == 1, longest, periods) - 1))
-    fields = assess_offsets(offsets, std, tested, _signal_share(rows) >= 0.5, lit, quality, _MOST_RMS)
+    fields = assess_offsets(offsets, std, tested, _signal_share(rows) >= 0.5, lit, quality, most_rms=0.22)
     return Estimate(value, **of_trials(fields, y.shape[:-2]))
 
 
@@ -304,14 +295,16 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[Tensor, Tensor]
         if i:
             turned = before - step
             factor[active] *= (before * turned).sum(-1) / turned.square().sum(-1).clamp_min(1e-300)
-            factor[active] = factor[active].clamp(_SHORTEST, _LONGEST)
+            factor[active] = factor[active].clamp(0.3, 2.0)
         moved = at + factor[active, None] * step.clamp(-0.4, 0.4)
         total[active] = torch.where((smallest_gap(moved) >= 2 * MIN_GAP)[:, None], moved, at)
         converter[active] = torch.where(share_std < _MOST_SHARE, share.clamp(0, 1), converter[active])
-        unknown = torch.hypot(share_std.clamp_max(_MOST_SHARE), torch.full_like(factor[active], _NOISE_ERROR))
+        # 0.08: error of a noise level from the lowest twentieth of a spectrum of 256 or more looks
+        unknown = torch.hypot(share_std.clamp_max(_MOST_SHARE), torch.full_like(factor[active], 0.08))
         level = unknown * noise / (1 - noise).clamp_min(0.1) * total[active].square().mean(-1).sqrt()
         std[active], change[active] = torch.hypot(step_std, level), step
-        active = active[step.square().mean(-1).sqrt() > _SETTLED * step_std]
+        # a further fit changes nothing of interest below a tenth of the standard deviation
+        active = active[step.square().mean(-1).sqrt() > 0.1 * step_std]
         if not len(active):
             break
     return total, torch.hypot(std, change.square().mean(-1).sqrt())

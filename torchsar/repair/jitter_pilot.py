@@ -20,9 +20,6 @@ from torchsar.core import Estimate, Outcome, Signal, Stage, checked_samples, lin
 from torchsar.repair.assess import assess_offsets
 from torchsar.repair.jitter import uncrossed
 
-# steps after which the frequency is exact even in short records of strong jitter
-_STEPS = 12
-
 
 def estimate_jitter_pilot(
     pilot: Tensor, max_period: int = 16, period: int | None = None, origin: str = "mean", *, assess: bool = True
@@ -120,11 +117,12 @@ def _fit(x: Tensor, m: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     index = torch.arange(n, device=x.device) % m
     count = torch.bincount(index, minlength=m).to(torch.float64)
     position = torch.arange(n, dtype=torch.float64, device=x.device) - (n - 1) / 2
-    for step in range(_STEPS):
+    steps = 12  # after which the frequency is exact even in short records of strong jitter
+    for step in range(steps):
         z = x * linear_phasor(-frequency, 0, n, x.dtype)
         phasor = torch.zeros((*x.shape[:-1], m), dtype=x.dtype, device=x.device).index_add(-1, index, z) / count
         aligned = z * phasor[..., index].conj()
-        if step < _STEPS - 1:
+        if step < steps - 1:
             scale = phasor.abs().square().sum(-1).clamp_min(1e-300) / m
             frequency = frequency + (position * aligned.imag).sum(-1) / scale / (2 * math.pi * position.square().sum())
     noise = (z - phasor[..., index]).abs().square().sum(-1) / max(1, n - m - 1)

@@ -47,10 +47,6 @@ MAX_WINDOWS = 192
 # Steps per half sample in which the symmetry of the record is computed, enough for a linear
 # interpolation.
 _FINE = 8
-# Share of the greatest symmetry below which a fringe may be excluded, by trial on scenes of 1 to 40
-# scatterers; certainty above which it is excluded, and above which another one than the nearest is
-# chosen, in standard deviations, by choice.
-_SYMMETRIC, _EXCLUDED, _CHOSEN = 0.9, 5.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -67,27 +63,26 @@ class _Windows:
         n = self.radar.sweep_samples
         return ((self.lines.shape[-1] - 2 * self.margin) // n - 1) // 2 * 2
 
-    def chosen(self, every: bool) -> tuple[Tensor, Tensor]:
-        """Lines, and numbers j of the sweeps that are used, in pairs of up and down sweep: all of
-        them, or about MAX_WINDOWS.
-        """
+    def steps(self) -> tuple[int, int]:
+        """Steps of lines and of pairs of sweeps that leave about MAX_WINDOWS sweeps."""
         pairs, n_line = self.count // 2, self.lines.shape[-2]
-        step = 1 if every else max(1, pairs * n_line * 2 // MAX_WINDOWS)
-        line_step = min(step, n_line)
-        j = torch.arange(0, pairs, min(pairs, max(1, step // line_step)), device=self.lines.device) * 2
-        return self.lines[..., ::line_step, :], torch.stack([j, j + 1], -1).flatten()
+        step = max(1, pairs * n_line * 2 // MAX_WINDOWS)
+        return min(step, n_line), min(pairs, max(1, step // min(step, n_line)))
 
     def cut(self, start: Tensor, every: bool = False) -> Tensor:
-        """Cut sweeps of N samples from each start sample (..., o) on, (..., o, line, sweep, N);
-        lines are continued by their last sample.
+        """Cut sweeps of N samples from each start sample (..., o) on, (..., o, line, sweep, N), in
+        pairs of up and down sweep: all of them, or about MAX_WINDOWS. Lines are continued by their
+        last sample.
         """
-        n, (lines, j) = self.radar.sweep_samples, self.chosen(every)
-        position = (start[..., None, None] + (j[:, None] * n + torch.arange(n, device=lines.device))).clamp_max(
-            lines.shape[-1] - 1
-        )
+        n, device = self.radar.sweep_samples, self.lines.device
+        line_step, pair_step = (1, 1) if every else self.steps()
+        lines = self.lines[..., ::line_step, :]
+        first = torch.arange(0, self.count // 2, pair_step, device=device) * 2
+        j = torch.stack([first, first + 1], -1).flatten()
+        position = start[..., None, None] + (j[:, None] * n + torch.arange(n, device=device))
+        index = position.clamp_max(lines.shape[-1] - 1).flatten(-2)[..., None, :]
         source = lines[..., None, :, :].expand(*start.shape, *lines.shape[-2:])
-        index = position.flatten(-2)[..., None, :].expand(*start.shape, lines.shape[-2], j.numel() * n)
-        return source.gather(-1, index).unflatten(-1, (j.numel(), n))
+        return source.gather(-1, index.expand(*source.shape[:-1], j.numel() * n)).unflatten(-1, (j.numel(), n))
 
 
 def find_trigger(
@@ -99,6 +94,12 @@ def find_trigger(
     assess: bool = True,
 ) -> Estimate:
     """Estimate the start of the up sweep in the blocks of a record, one block per period.
+
+    >>> import torch
+    >>> radar = TriangularLadar(2e14, 5e9, 16e-6, 64e6, 60.0, 3000.0)
+    >>> noise = torch.randn(24, 2 * radar.sweep_samples, dtype=torch.complex64)
+    >>> int(find_trigger(noise, radar).outcome) == Outcome.NOISE
+    True
 
     A scene that extends to both sides of the reference range has beats of both signs; the estimate
     is then unreliable.
@@ -188,7 +189,7 @@ def _turning_by_stft(windows: _Windows) -> tuple[Tensor, Tensor]:
     """Sample of the turning points, margin..margin + N, and the drop of concentration."""
     n = windows.radar.sweep_samples
     hop, width = max(1, n // 32), max(8, n // 8)
-    lines, _ = windows.chosen(False)
+    lines = windows.lines[..., :: windows.steps()[0], :]
     lines = lines[..., : min(lines.shape[-1] // n, max(4, MAX_WINDOWS // lines.shape[-2])) * n]
     window = torch.hann_window(width, dtype=real_dtype(lines.dtype), device=lines.device)
     spectra = torch.stft(
@@ -222,19 +223,12 @@ def _apex(windows: _Windows, near: Tensor, reach: int) -> Tensor:
     step = max(1, reach // 8)
     offset = torch.tensor([*range(-8, -2), *range(3, 9)], device=near.device) * step
     start = (near[..., None] + offset).clamp(0, windows.radar.sweep_samples + 2 * windows.margin)
-    mean = torch.stack([_sharpness(windows, first) for first in start.split(1, -1)], -1)
-    left, right = (
-        _line_through(offset[part].to(torch.float64), mean[..., part]) for part in (slice(0, 6), slice(6, 12))
-    )
-    top = (right[0] - left[0]) / (left[1] - right[1]).clamp_min(1e-300)
+    mean = torch.stack([_sharpness(windows, first) for first in start.split(1, -1)], -1).unflatten(-1, (2, 6))
+    side = offset.to(torch.float64).unflatten(0, (2, 6))
+    terms = torch.linalg.pinv(torch.stack([torch.ones_like(side), side], -1))  # (side, term, offset)
+    (left, rise), (right, fall) = ((mean[..., i, None, :] * terms[i]).sum(-1).unbind(-1) for i in (0, 1))
+    top = (right - left) / (rise - fall).clamp_min(1e-300)
     return near.to(torch.float64) + top.clamp(-8 * step, 8 * step)
-
-
-def _line_through(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Least-squares line y = a + b x along the last dimension: (a, b)."""
-    centred = x - x.mean()
-    slope = (y * centred).sum(-1) / centred.square().sum()
-    return y.mean(-1) - slope * x.mean(), slope
 
 
 def _find_tones(sweeps: Tensor, skip: int, count: int = 4) -> tuple[Tensor, Tensor]:
@@ -297,9 +291,13 @@ def _fringe(
     n, reach = windows.radar.sweep_samples, windows.margin
     around = windows.cut((base - reach)[..., None], every=True).squeeze(-4)[..., 1::2, : 2 * reach]
     position = torch.arange(-reach, reach, dtype=torch.float64, device=base.device)
-    cycles, value = tones
-    even = _extrapolated(cycles[..., 0::2, :], value[..., 0::2, :], position + (n + 1) / 2)
-    odd = _extrapolated(cycles[..., 1::2, :], value[..., 1::2, :], position - (n - 1) / 2)
+    even, odd = (  # tones of the sweeps before and after, from the middle of each on
+        (value[..., None] * unit_phasor(cycles[..., None] * at, torch.complex128)).sum(-2)
+        for cycles, value, at in (
+            (*(x[..., 0::2, :] for x in tones), position + (n + 1) / 2),
+            (*(x[..., 1::2, :] for x in tones), position - (n - 1) / 2),
+        )
+    )
     difference = (around - odd).abs().square() - (around - even).abs().square()
     total = torch.nn.functional.pad(torch.cumsum(difference, -1), (1, 0)).flatten(-3, -2)
     # three fringes on either side of the one nearest to the sharpest cuts, by choice
@@ -311,7 +309,8 @@ def _fringe(
     most, at = mean.max(-1)
     short = symmetry.gather(-1, at[..., None, None].expand(*symmetry.shape[:-1], 1)) - found
     clear = _sigmas(short)
-    excluded = (found.mean(-2) < _SYMMETRIC * most[..., None]) & (clear > _EXCLUDED)
+    # checked on scenes of 1 to 40 scatterers; certainties are in standard deviations
+    excluded = (found.mean(-2) < 0.9 * most[..., None]) & (clear > 5)
     best = torch.where(excluded, -torch.inf, gain.mean(-2)).argmax(-1)
     sigmas = _sigmas(take(gain.movedim(-1, -2), best, -2)[..., None] - gain)
     others = torch.arange(len(order), device=base.device) != best[..., None]
@@ -319,7 +318,7 @@ def _fringe(
     # at an end of the search, further fringes may be better
     beyond = (best == 0) | (best == len(order) - 1) | excluded.all(-1)
     certainty = torch.where(beyond, 0, certainty)
-    chosen = torch.where(certainty > _CHOSEN, take(offsets, best), expected)
+    chosen = torch.where(certainty > 3, take(offsets, best), expected)
     return chosen, certainty, take(found.mean(-2), best)
 
 
@@ -362,17 +361,6 @@ def _scene_share(windows: _Windows, base: Tensor, is_complex: bool) -> Tensor:
     mean = power.mean((-3, -2, -1), dtype=torch.float64)
     # the median of an exponential distribution is ln 2 times its mean
     return torch.where(mean > 0, 1 - power.flatten(-3).median(-1).values / math.log(2) / mean.clamp_min(1e-300), 0)
-
-
-def _extrapolated(cycles: Tensor, value: Tensor, position: Tensor) -> Tensor:
-    """Sum of tones (..., tone) at samples (m,) from the middle of their sweep, (..., m)."""
-    return sum(
-        (
-            value[..., i, None] * unit_phasor(cycles[..., i, None] * position, torch.complex128)
-            for i in range(cycles.shape[-1])
-        ),
-        start=torch.zeros_like(value[..., :1]),
-    )
 
 
 def _interpolated(x: Tensor, position: Tensor) -> Tensor:

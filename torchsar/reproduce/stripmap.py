@@ -22,7 +22,8 @@ from torchsar.echo import ChannelResponse, Impairment, PeriodicJitter, Tone, app
 from torchsar.focus import OmegaK
 from torchsar.metrics import impulse_response
 from torchsar.radar import LinearFM, StripmapRadar
-from torchsar.repair import CorrectJitter, CorrectResponse, EstimateResponse, PilotJitter, find_contamination
+from torchsar.repair import CorrectJitter, CorrectResponse, EstimateResponse, PilotJitter
+from torchsar.repair.contamination import find_contamination
 from torchsar.reproduce.item import Check, Item, Paper, in_order, number, statement
 from torchsar.scene import Dwell, Points, StripmapWorld
 
